@@ -1,0 +1,24 @@
+"""The pipeline: photographs go in at the top, an asset comes out at the bottom."""
+
+# zlib first: pycolmap's bundled copy corrupts the heap when Python's own is loaded after it.
+import importlib
+import zlib  # noqa: F401
+
+from stages.run import threads
+from stages.run.stage import Stage
+
+threads.configure()
+
+STAGE_NAMES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
+
+
+def load_stage(name: str) -> Stage:
+    """The `Stage` called `name`, imported now: `splat --help` must not wait for torch.
+
+    Raises KeyError for an unknown name.
+    """
+
+    if name not in STAGE_NAMES:
+        raise KeyError(name)
+    stage: Stage = importlib.import_module(f"stages.{name}").STAGE
+    return stage

@@ -1,0 +1,5 @@
+"""The rasteriser: several backends, one definition (`reference`)."""
+
+from stages.raster.api import RasterSettings, Rendering, render
+
+__all__ = ["RasterSettings", "Rendering", "render"]

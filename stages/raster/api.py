@@ -1,0 +1,68 @@
+"""One call draws splats; which kernels do it is a setting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Camera, Splats
+
+ALPHA_MIN = 1.0 / 255.0  # below it a splat is not drawn in a pixel: it could not change 8 bits
+ALPHA_MAX = 0.99  # as every viewer caps it
+TRANSMITTANCE_MIN = 1e-4  # a pixel is finished once less light than this passes
+LOG_SCALE_MAX = 44.0  # exp(2 x 44) is the last square of a scale that float32 holds
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How to draw.
+
+    near: splats whose centre is nearer (along z) are not drawn; world units.
+    dilation_px2: added to both variances of a splat's footprint, as all viewers do; pixels^2.
+    antialias: make up in opacity for what the dilation adds in area.
+    background: RGB behind everything.
+    sh_degree: bands above it are ignored.
+    """
+
+    near: float = 0.01
+    dilation_px2: float = 0.3
+    antialias: bool = False
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sh_degree: int = 3
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """image [H, W, 3], alpha [H, W], depth [H, W] float32; depth is the expected z of what was hit
+    (world units, 0 where alpha is 0). culled: splats with values that cannot be drawn (NaN,
+    infinite, overflowing), which is not the same as out of view."""
+
+    image: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    culled: int
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings | None = None,
+    backend: str = "auto",
+) -> Rendering:
+    """Draw `splats` as `camera` sees them.
+
+    backend: "auto" (the fastest that is present), "cpu" (Numba) or "reference" (torch).
+    Raises ValueError for another name.
+    """
+    settings = settings or RasterSettings()
+    if backend in ("auto", "cpu"):
+        from stages.raster.cpu import render_cpu
+
+        return render_cpu(splats, camera, settings)
+    if backend == "reference":
+        from stages.raster.reference import render_reference
+
+        return render_reference(splats, camera, settings)
+    raise ValueError(f"backend {backend!r}, wanted auto, cpu or reference")

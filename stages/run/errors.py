@@ -1,0 +1,63 @@
+"""The one error class that a user is meant to see.
+
+A `SplatError` says what was given, what was wanted and what to do next. It has a stable code for
+scripts and documentation, and an exit status for its family, so that a shell can tell bad input
+from a bad reconstruction from a full disk.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Family(IntEnum):
+    """Exit status of each family of errors (1 is left to crashes, 130 to Ctrl-C)."""
+
+    USAGE = 2  # wrong option, wrong order of commands
+    INPUT = 3  # photographs or files that cannot be used
+    RECONSTRUCTION = 4  # structure from motion failed its gates
+    RUN_FOLDER = 5  # a run folder that is missing, newer, edited or damaged
+    RESOURCES = 6  # disk, memory, permissions
+    QUALITY = 7  # a result that failed its own check
+
+
+class SplatError(Exception):
+    """A problem that the user can act on.
+
+    code: stable, kebab-case, prefixed by the part it comes from ("sfm-too-few-registered").
+    given, wanted, hint: one or two plain sentences each; `hint` says what to do next.
+    """
+
+    def __init__(
+        self, code: str, *, given: str, wanted: str, hint: str, family: Family = Family.INPUT
+    ) -> None:
+        super().__init__(f"{given} {wanted} {hint}")
+        self.code = code
+        self.given = given
+        self.wanted = wanted
+        self.hint = hint
+        self.family = family
+
+    def as_dict(self) -> dict[str, str | int]:
+        """The error as plain data, for `--json` and for passing between processes."""
+        return {
+            "code": self.code,
+            "given": self.given,
+            "wanted": self.wanted,
+            "hint": self.hint,
+            "family": int(self.family),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, str | int]) -> SplatError:
+        return cls(
+            str(data["code"]),
+            given=str(data["given"]),
+            wanted=str(data["wanted"]),
+            hint=str(data["hint"]),
+            family=Family(int(data["family"])),
+        )
+
+
+class Interrupted(Exception):  # noqa: N818 - a normal way to stop, not an error
+    """A stage stopped at a safe boundary because the user asked; its checkpoint is on disk."""

@@ -1,0 +1,71 @@
+"""What a stage is, and what it may say while it runs.
+
+A stage knows nothing of manifests, skipping or the terminal. Tests call `stage.run` with a plain
+`Report` and a folder of their own.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+Numbers = dict[str, float | int | str]
+
+
+@dataclass
+class Report:
+    """Collects what a stage has to say; `listener` (if any) is told of every progress tick.
+
+    metrics: plain JSON values, written to the manifest.
+    warnings: (code, message) pairs; the message is a full sentence with advice.
+    stop_requested: set from outside (Ctrl-C); long stages look at it at each step boundary, write
+        their checkpoint and raise `Interrupted`.
+    """
+
+    metrics: dict[str, Any] = field(default_factory=dict)
+    warnings: list[tuple[str, str]] = field(default_factory=list)
+    listener: Callable[[str, int, int, Numbers], None] | None = None
+    stop_requested: threading.Event = field(default_factory=threading.Event)
+    device: str = "cpu"
+
+    def metric(self, name: str, value: Any) -> None:
+        """Record one figure (JSON-serialisable; unit in the name, such as `train_seconds`)."""
+        self.metrics[name] = value
+
+    def warn(self, code: str, message: str) -> None:
+        """Record one warning; the same pair is kept once."""
+        if (code, message) not in self.warnings:
+            self.warnings.append((code, message))
+
+    def progress(
+        self, done: int, total: int, label: str = "", **numbers: float | int | str
+    ) -> None:
+        """Tell the listener that `done` of `total` units are finished, with the numbers to show."""
+        if self.listener is not None:
+            self.listener(label, done, total, numbers)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A small frozen description of one step of the pipeline.
+
+    name: also the command's name and the end of its folder's name.
+    version: raised when equal inputs and settings give different bytes.
+    reads: names of the earlier stages whose outputs `run` receives.
+    settings_type: one flat frozen dataclass, torch-free; each field has a default and carries
+        `metadata={"help": ...}` with its unit. Fields with `metadata={"affects_output": False}` (number of
+        threads, say) do not make a stage run again.
+    run(inputs, settings, folder, report): writes everything under `folder` and returns the output.
+        `folder` may hold what an interrupted run of the same inputs and settings left there.
+    load(folder): the output again, from a finished folder. Cheap: arrays may be loaded, images not.
+    """
+
+    name: str
+    version: int
+    reads: tuple[str, ...]
+    settings_type: type
+    run: Callable[[Mapping[str, Any], Any, Path, Report], Any]
+    load: Callable[[Path], Any]

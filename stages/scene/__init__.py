@@ -1,0 +1,35 @@
+"""The types that stages meet in, and the conventions, stated once.
+
+World: right-handed, y down (up = -Y), as in COLMAP and in the .ply files that viewers read;
+recentred in float64. Camera: x right, y down, z forward; pixel centres at +0.5. Colour =
+max(0, 0.5 + SH), in the photographs' own sRGB values. Images: [H, W, 3] float32 in [0, 1].
+"""
+
+from stages.scene.camera import Camera, fitted_size, look_at
+from stages.scene.capture import (
+    Capture,
+    Photo,
+    Reconstruction,
+    View,
+    scene_extent,
+    split_held_out,
+)
+from stages.scene.splats import SH_C0, QuantisedSplats, Splats, dc_to_rgb, logit, rgb_to_dc
+
+__all__ = [
+    "SH_C0",
+    "Camera",
+    "Capture",
+    "Photo",
+    "QuantisedSplats",
+    "Reconstruction",
+    "Splats",
+    "View",
+    "dc_to_rgb",
+    "fitted_size",
+    "logit",
+    "look_at",
+    "rgb_to_dc",
+    "scene_extent",
+    "split_held_out",
+]

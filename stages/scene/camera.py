@@ -1,0 +1,82 @@
+"""Pinhole cameras. x right, y down, z forward; pixel centres at +0.5; intrinsics in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    width, height: pixels. fx, fy, cx, cy: pixels; the centre of the first pixel is (0.5, 0.5), so
+    the centre of the image is (width / 2, height / 2).
+    world_to_camera: [4, 4] float64, rigid: x_camera = R x_world + t.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: NDArray[np.float64]
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """[3] the camera's position in the world."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+    @property
+    def forward(self) -> NDArray[np.float64]:
+        """[3] unit viewing direction in the world."""
+        return self.world_to_camera[2, :3].copy()
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on another pixel grid (both axes scaled separately)."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def fitted(self, long_side: int) -> Camera:
+        """The same view with its longer side at most `long_side` pixels; never enlarged."""
+        return self.resized(*fitted_size(self.width, self.height, long_side))
+
+    def moved(self, world_from_new: NDArray[np.float64]) -> Camera:
+        """The camera as seen from a new world frame (x_world = world_from_new x_new), [4, 4]."""
+        return replace(self, world_to_camera=self.world_to_camera @ world_from_new)
+
+
+def fitted_size(width: int, height: int, long_side: int) -> tuple[int, int]:
+    """(width, height) scaled down so that the longer side is at most `long_side`; at least 1."""
+    if max(width, height) <= long_side:
+        return width, height
+    scale = long_side / max(width, height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def look_at(
+    eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """[4, 4] world_to_camera of a camera at `eye` that looks at `target`; up is -Y by default."""
+    up_vector = np.array([0.0, -1.0, 0.0]) if up is None else np.asarray(up, dtype=np.float64)
+    z = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+    z = z / np.linalg.norm(z)
+    x = np.cross(-up_vector, z)
+    x = x / np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ np.asarray(eye, np.float64)
+    return matrix

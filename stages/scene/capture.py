@@ -1,0 +1,97 @@
+"""Photographs, the capture that they form, and the reconstruction found from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene.camera import Camera
+
+HELD_OUT_EVERY = 8
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One usable photograph, as ingest left it.
+
+    name: the user's own relative path, posix style ("day 1/IMG_01.HEIC").
+    image: the normalised picture (upright, sRGB, 8 bit), relative to the capture's folder.
+    width, height: of the normalised picture, pixels.
+    focal_px: focal length from EXIF in pixels of the normalised picture, or None.
+    camera: a key that is equal for photographs of the same camera, lens setting and size.
+    sharpness: the higher the sharper; comparable within one capture.
+    log2_luminance: log2 of the median linear luminance. exposure_ev: EV at ISO 100 from EXIF.
+    """
+
+    name: str
+    image: str
+    width: int
+    height: int
+    focal_px: float | None
+    camera: str
+    sharpness: float
+    log2_luminance: float
+    exposure_ev: float | None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The usable photographs of one folder. folder: where `Photo.image` paths start."""
+
+    folder: Path
+    photos: tuple[Photo, ...]
+
+
+@dataclass(frozen=True)
+class View:
+    """A registered photograph, undistorted. image: relative to the reconstruction's folder."""
+
+    name: str
+    image: str
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Posed pinhole views and a sparse cloud, in the levelled and recentred world.
+
+    points [P, 3] float64, colours [P, 3] uint8, errors_px [P] mean reprojection error, tracks [P]
+    number of photographs that see the point.
+    origin [3]: what to add to be back in the coordinates that `units` speaks of (float64).
+    units: "metres" or "arbitrary". levelled: whether up = -Y was found from the cameras.
+    """
+
+    folder: Path
+    views: tuple[View, ...]
+    points: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    errors_px: NDArray[np.float64]
+    tracks: NDArray[np.int32]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    units: str = "arbitrary"
+    levelled: bool = False
+
+
+def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """(training, held out): every eighth by name is held out, starting with the first.
+
+    Fewer than 4 views are too few to spare one: then nothing is held out.
+    """
+    ordered = tuple(sorted(views, key=lambda view: view.name))
+    if len(ordered) < 4:
+        return ordered, ()
+    held = ordered[::HELD_OUT_EVERY]
+    kept = tuple(view for i, view in enumerate(ordered) if i % HELD_OUT_EVERY)
+    return kept, held
+
+
+def scene_extent(views: tuple[View, ...]) -> float:
+    """The reference trainer's scale of a scene: 1.1 x the largest distance of a camera from the
+    cameras' centre, with the median taken as centre and the 95th percentile as "largest" so that
+    one stray camera does not set it. Never 0."""
+    centres = np.array([view.camera.centre for view in views])
+    distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    return max(1.1 * float(np.percentile(distances, 95)), 1e-6)

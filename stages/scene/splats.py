@@ -1,0 +1,118 @@
+"""Gaussian splats as plain arrays, and their quantised form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N splats. Arrays are float32, or float64 where a test wants more.
+
+    means [N, 3]: centres, in the world less `origin`.
+    quaternions [N, 4]: w, x, y, z; not necessarily unit.
+    log_scales [N, 3]: natural logarithm of the standard deviations along the splat's own axes.
+    opacity_logits [N]: opacity = 1 / (1 + exp(-logit)).
+    sh [N, (L + 1)^2, 3]: spherical harmonics, DC first, then m = -l..l of each degree; RGB last.
+        colour = max(0, 0.5 + sum of basis x coefficient), in the photographs' own sRGB values.
+    sh_degrees [N] uint8: the degree that each splat uses; coefficients above it are zero.
+    origin [3] float64: what to add to `means` to be back in the capture's coordinates. float32
+        positions near zero keep their precision however far away the capture lies.
+    """
+
+    means: NDArray[np.floating]
+    quaternions: NDArray[np.floating]
+    log_scales: NDArray[np.floating]
+    opacity_logits: NDArray[np.floating]
+    sh: NDArray[np.floating]
+    sh_degrees: NDArray[np.uint8]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        wanted = {
+            "means": (n, 3),
+            "quaternions": (n, 4),
+            "log_scales": (n, 3),
+            "opacity_logits": (n,),
+            "sh": (n, self.sh.shape[1] if self.sh.ndim == 3 else -1, 3),
+            "sh_degrees": (n,),
+            "origin": (3,),
+        }
+        for name, shape in wanted.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, wanted {shape}")
+        if self.sh.shape[1] not in (1, 4, 9, 16):
+            raise ValueError(f"sh has {self.sh.shape[1]} coefficients, wanted 1, 4, 9 or 16")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree that `sh` has room for."""
+        return {1: 0, 4: 1, 9: 2, 16: 3}[self.sh.shape[1]]
+
+    @property
+    def opacities(self) -> NDArray[np.floating]:
+        """[N] in [0, 1]."""
+        with np.errstate(over="ignore"):
+            return 1.0 / (1.0 + np.exp(-self.opacity_logits))
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Splats:
+        """The rows named by an index or a mask."""
+        return replace(
+            self,
+            means=self.means[index],
+            quaternions=self.quaternions[index],
+            log_scales=self.log_scales[index],
+            opacity_logits=self.opacity_logits[index],
+            sh=self.sh[index],
+            sh_degrees=self.sh_degrees[index],
+        )
+
+    def with_sh_degree(self, degree: int) -> Splats:
+        """Higher bands dropped, or zero bands added."""
+        wanted = (degree + 1) ** 2
+        have = self.sh.shape[1]
+        if wanted <= have:
+            sh = self.sh[:, :wanted]
+        else:
+            sh = np.concatenate(
+                [self.sh, np.zeros((len(self), wanted - have, 3), self.sh.dtype)], axis=1
+            )
+        return replace(self, sh=sh, sh_degrees=np.minimum(self.sh_degrees, degree))
+
+
+@dataclass(frozen=True)
+class QuantisedSplats:
+    """Splats as decided for export: what was kept, and at which precision.
+
+    splats: the values to export, SH already cut to the degree decided for each splat.
+    degree: the SH degree kept. decisions: plain data for the manifest (what was kept, its cost).
+    """
+
+    splats: Splats
+    degree: int
+    decisions: dict[str, object]
+
+
+def rgb_to_dc(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
+    """DC coefficients whose colour is `rgb` (0..1)."""
+    return (rgb - 0.5) / SH_C0
+
+
+def dc_to_rgb(dc: NDArray[np.floating]) -> NDArray[np.floating]:
+    """View-independent colour of DC coefficients, not clamped above."""
+    return np.maximum(0.0, 0.5 + SH_C0 * dc)
+
+
+def logit(p: NDArray[np.floating] | float) -> NDArray[np.floating]:
+    """Inverse of the logistic function; p strictly between 0 and 1."""
+    p = np.asarray(p)
+    return np.log(p / (1.0 - p))
