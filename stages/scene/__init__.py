@@ -5,6 +5,7 @@ recentred in float64. Camera: x right, y down, z forward; pixel centres at +0.5.
 max(0, 0.5 + SH), in the photographs' own sRGB values. Images: [H, W, 3] float32 in [0, 1].
 """
 
+from stages.scene.assets import ExportedAssets, ExportedFile
 from stages.scene.camera import Camera, fitted_size, look_at
 from stages.scene.capture import (
     Capture,
@@ -15,11 +16,14 @@ from stages.scene.capture import (
     split_held_out,
 )
 from stages.scene.splats import SH_C0, QuantisedSplats, Splats, dc_to_rgb, logit, rgb_to_dc
+from stages.scene.storage import load_splats, save_splats
 
 __all__ = [
     "SH_C0",
     "Camera",
     "Capture",
+    "ExportedAssets",
+    "ExportedFile",
     "Photo",
     "QuantisedSplats",
     "Reconstruction",
@@ -27,9 +31,11 @@ __all__ = [
     "View",
     "dc_to_rgb",
     "fitted_size",
+    "load_splats",
     "logit",
     "look_at",
     "rgb_to_dc",
+    "save_splats",
     "scene_extent",
     "split_held_out",
 ]

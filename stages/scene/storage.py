@@ -1,0 +1,89 @@
+"""Splats on disk between stages: exact, deterministic, and quick to load.
+
+Layout: the 8 bytes of `MAGIC`, then one block in NumPy's .npy format (version 1.0) for each array
+in the order of `FIELDS`. No compression and no timestamps (a zip, and so .npz, would carry them),
+so equal splats give equal bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from stages.run.atomic import replacing
+from stages.run.errors import Family, SplatError
+from stages.scene.splats import Splats
+
+MAGIC = b"SPLATS1\n"
+FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees", "origin")
+FILE_NAME = "splats.bin"
+_DTYPES = {"<f4", "<f8", "|u1"}
+
+
+def save_splats(path: Path, splats: Splats) -> Path:
+    """Write `splats` to `path` (to `FILE_NAME` inside, if `path` is a folder); return the file.
+
+    Float arrays keep their type (float32 or float64), little-endian. Written whole or not at all.
+    Raises SplatError when the file cannot be written.
+    """
+    target = _file_of(path)
+    with replacing(target) as temporary, temporary.open("wb") as file:
+        file.write(MAGIC)
+        for name in FIELDS:
+            array = np.ascontiguousarray(getattr(splats, name))
+            array = array.astype(array.dtype.newbyteorder("<"), copy=False)
+            npy.write_array(file, array, version=(1, 0), allow_pickle=False)
+    return target
+
+
+def load_splats(path: Path) -> Splats:
+    """The splats that `save_splats` wrote to `path` (a file, or the folder that holds it).
+
+    Raises SplatError "splats-file-damaged" if it is missing, cut short or not such a file.
+    """
+    source = _file_of(path)
+    try:
+        with source.open("rb") as file:
+            size = source.stat().st_size
+            if file.read(len(MAGIC)) != MAGIC:
+                raise ValueError("it does not start as a splats file")
+            arrays = {name: _read_array(file, size, name) for name in FIELDS}
+            if file.read(1):
+                raise ValueError("bytes follow its end")
+        return Splats(**arrays)  # type: ignore[arg-type]
+    except (OSError, ValueError, EOFError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise SplatError(
+            "splats-file-damaged",
+            given=f"{source} cannot be read: {reason}.",
+            wanted="A splats file as a stage wrote it.",
+            hint="Delete the stage's folder and run the command again; it will be made anew.",
+            family=Family.RUN_FOLDER,
+        ) from error
+
+
+def _file_of(path: Path) -> Path:
+    path = Path(path)
+    return path / FILE_NAME if path.is_dir() else path
+
+
+def _read_array(file: BinaryIO, file_bytes: int, name: str) -> NDArray[np.generic]:
+    """One .npy block; its size is checked against the file before memory is asked for."""
+    if npy.read_magic(file) != (1, 0):
+        raise ValueError(f"{name} has another version")
+    try:
+        shape, fortran_order, dtype = npy.read_array_header_1_0(file)
+    except Exception as error:  # NumPy evaluates the header: what it raises depends on the damage
+        raise ValueError(f"{name} has a damaged header") from error
+    if fortran_order or dtype.str not in _DTYPES or min(shape, default=0) < 0:
+        raise ValueError(f"{name} is laid out in another way")
+    count = math.prod(shape)
+    if count * dtype.itemsize > file_bytes - file.tell():
+        raise ValueError(f"{name} is cut short")
+    array: NDArray[np.generic] = np.fromfile(file, dtype, count)
+    return array.reshape(shape)
