@@ -1,0 +1,48 @@
+"""Normalised photographs as arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.run.errors import Family, SplatError
+
+
+def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
+    """[height, width, 3] float32 RGB in [0, 1], sRGB values as stored.
+
+    Scaled down by averaging over the area of each new pixel, which is what `Camera.resized`
+    assumes (pixel centres at +0.5); grey becomes RGB and alpha is dropped. Raises SplatError
+    "photo-unreadable" for a file that is missing or does not decode.
+    """
+    import cv2
+
+    try:
+        # Not cv2.imread: it cannot open non-ASCII names on Windows.
+        encoded = np.fromfile(path, np.uint8)
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
+        image = cv2.imdecode(encoded, flags) if encoded.size else None
+    except (OSError, cv2.error) as error:
+        raise _unreadable(path, str(error)) from error
+    if image is None:
+        raise _unreadable(path, "it does not decode as an image")
+    full = {"uint8": 255.0, "uint16": 65535.0}.get(image.dtype.name)
+    if full is None:
+        raise _unreadable(path, f"its samples are {image.dtype}, not 8 or 16 bit integers")
+    pixels: NDArray[Any] = image.astype(np.float32) / np.float32(full)
+    if pixels.shape[:2] != (height, width):
+        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(np.clip(pixels, 0.0, 1.0), dtype=np.float32)
+
+
+def _unreadable(path: Path, reason: str) -> SplatError:
+    return SplatError(
+        "photo-unreadable",
+        given=f"{path} cannot be read: {reason}.",
+        wanted="A picture as an earlier stage wrote it.",
+        hint="Delete the folder of the stage that wrote it and run the command again.",
+        family=Family.RUN_FOLDER,
+    )
