@@ -1,4 +1,4 @@
-"""Thread pools, set up before torch, Numba or OpenCV load.
+"""Thread pools and the kernel cache, set up before torch, Numba or OpenCV load.
 
 OpenMP's default is to spin while it waits. With another process on the same cores a training run
 then takes ten times as long, and laptops are busy machines.
@@ -6,13 +6,31 @@ then takes ten times as long, and laptops are busy machines.
 
 from __future__ import annotations
 
+import hashlib
 import os
+import sys
+from pathlib import Path
 
 
 def configure() -> None:
-    """Set the waiting policy and Numba's threading layers, unless the user set them."""
+    """Set OpenMP's waiting policy and where Numba keeps compiled kernels, unless the user did."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(kernel_cache()))
+
+
+def kernel_cache() -> Path:
+    """The folder of compiled kernels for exactly these sources.
+
+    Numba notices a changed kernel file but not a changed file that it imports from; a folder per
+    digest of all of them cannot serve a stale kernel, and works where the package is read-only.
+    """
+    digest = hashlib.sha256(sys.version.encode())
+    stages = Path(__file__).resolve().parent.parent
+    for source in sorted([*stages.glob("raster/*.py"), *stages.glob("training/*.py")]):
+        digest.update(source.name.encode() + source.read_bytes())
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or ""
+    root = Path(base) if base else Path.home() / ".cache"
+    return root / "splat" / f"kernels-{digest.hexdigest()[:16]}"
 
 
 def count() -> int:

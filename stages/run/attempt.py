@@ -1,0 +1,126 @@
+"""One attempt at one stage: run it in its working folder, account for it, make it final."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from stages.run.digests import combined_digest, record_files
+from stages.run.errors import Interrupted
+from stages.run.failures import as_splat_error
+from stages.run.libraries import versions
+from stages.run.manifest import Manifest, plain, write_json
+from stages.run.memory import PeakMemory
+from stages.run.request import Request
+from stages.run.stage import Numbers, Report, Stage
+from stages.run.workspace import BOOKKEEPING, USAGE, Workspace
+
+_NOTE_EVERY_S = 5.0
+
+
+class Listener:
+    """Hears what happens in a run; a method that is left as it is does nothing."""
+
+    def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
+        """`resumed`: an interrupted attempt at the same request left work to go on with."""
+
+    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
+        """As `Report.progress`."""
+
+    def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        """The stage ran and its output is final."""
+
+    def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        """The stage was finished before and nothing changed."""
+
+    def stopping(self) -> None:
+        """A signal asked the run to stop; it will, at the next safe place."""
+
+
+def attempt(
+    stage: Stage,
+    settings: Any,
+    request: Request,
+    inputs: Mapping[str, Any],
+    space: Workspace,
+    stop: Event,
+    listener: Listener,
+) -> Manifest:
+    """Run `stage` in `space.partial`, which `Workspace.begin` made ready, and make it final.
+
+    Raises Interrupted (the working folder is kept), SplatError for what the machine refused, and
+    whatever else the stage raises.
+    """
+    report = Report(stop_requested=stop)
+    report.listener = lambda label, done, total, numbers: listener.progressed(
+        stage, label, done, total, numbers
+    )
+    usage = _Usage(space.partial)
+    try:
+        with PeakMemory(tick=usage.note) as memory:
+            stage.run(inputs, settings, space.partial, report)
+    except Interrupted:
+        raise
+    except Exception as error:
+        explained = as_splat_error(error, stage.name, space.run_folder)
+        if explained is None or explained is error:
+            raise
+        raise explained from error
+    finally:
+        usage.note(memory.peak_mib, now=True)
+    manifest = _manifest(request, report, space.partial, usage)
+    space.finish(manifest)
+    return manifest
+
+
+def _manifest(request: Request, report: Report, folder: Path, usage: _Usage) -> Manifest:
+    outputs = record_files(folder, leave_out=BOOKKEEPING)
+    return Manifest(
+        stage=request.stage,
+        version=request.version,
+        settings=request.settings,
+        inputs=request.inputs,
+        input_files=request.input_files,
+        outputs=outputs,
+        output_digest=combined_digest(outputs),
+        seconds=round(usage.seconds, 3),
+        peak_memory_mib=round(usage.peak_mib, 1),
+        device=report.device,
+        seed=request.settings.get("seed"),
+        libraries=versions(),
+        metrics=plain(report.metrics),
+        warnings=[list(pair) for pair in report.warnings],
+    )
+
+
+class _Usage:
+    """Seconds and peak memory of all attempts together, noted in the working folder now and then,
+    so that a run that is killed and resumed still accounts for the time before."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._start = self._noted = time.monotonic()
+        self._seconds_before = self.peak_mib = 0.0
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            before = json.loads((folder / USAGE).read_text(encoding="utf-8"))
+            self._seconds_before = float(before["seconds"])
+            self.peak_mib = float(before["peak_memory_mib"])
+
+    @property
+    def seconds(self) -> float:
+        return self._seconds_before + time.monotonic() - self._start
+
+    def note(self, peak_mib: float, now: bool = False) -> None:
+        self.peak_mib = max(self.peak_mib, peak_mib)
+        if now or time.monotonic() - self._noted >= _NOTE_EVERY_S:
+            self._noted = time.monotonic()
+            with suppress(OSError):  # an account that cannot be kept must not stop the work
+                write_json(
+                    self._folder / USAGE,
+                    {"seconds": self.seconds, "peak_memory_mib": self.peak_mib},
+                )

@@ -1,0 +1,84 @@
+"""What the machine refused, as an error that says what to do: disk, permissions, memory."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from pathlib import Path
+
+from stages.run.errors import Family, SplatError
+
+_DISK = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
+_DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
+_FULL_BELOW_BYTES = 4 * 1024 * 1024  # libraries that report a full disk as something else
+_MEMORY_WORDS = ("can't allocate memory", "out of memory", "not enough memory")
+
+
+def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError | None:
+    """The SplatError that explains `error`, or None if it is not the machine's refusal.
+
+    doing: what was going on ("train"). folder: where it wrote. The chain of causes is searched,
+    since libraries wrap what the system told them.
+    """
+    chain = _chain(error)
+    if any(isinstance(link, OSError) and link.errno in _DISK for link in chain):
+        return disk_full(doing, folder)
+    for link in chain:
+        if isinstance(link, SplatError):
+            return link
+        if isinstance(link, OSError) and link.errno in _DENIED:
+            return not_writable(Path(link.filename or folder), link)
+        if isinstance(link, MemoryError) or any(w in str(link).lower() for w in _MEMORY_WORDS):
+            return out_of_memory(doing, link)
+    if isinstance(error, Exception) and _free_bytes(folder) < _FULL_BELOW_BYTES:
+        return disk_full(doing, folder)
+    return None
+
+
+def _chain(error: BaseException) -> list[BaseException]:
+    links: list[BaseException] = []
+    link: BaseException | None = error
+    while link is not None and link not in links:
+        links.append(link)
+        link = link.__cause__ or link.__context__
+    return links
+
+
+def disk_full(doing: str, folder: Path) -> SplatError:
+    return SplatError(
+        "disk-full",
+        given=f"The disk of {folder} became full during {doing}.",
+        wanted="Room for what the stage writes.",
+        hint="Free some space and give the same command again: finished stages are kept.",
+        family=Family.RESOURCES,
+    )
+
+
+def not_writable(path: Path, error: OSError) -> SplatError:
+    return SplatError(
+        "not-permitted",
+        given=f"{path}: {error.strerror or error}.",
+        wanted="A place that may be written to.",
+        hint="Change its permissions, or name another folder with --out.",
+        family=Family.RESOURCES,
+    )
+
+
+def out_of_memory(doing: str, error: BaseException) -> SplatError:
+    said = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return SplatError(
+        "out-of-memory",
+        given=f"Memory ran out during {doing} ({said}).",
+        wanted="Enough free memory for the settings.",
+        hint="Close other programs, or ask for less: --max-splats, --train-side, --max-side.",
+        family=Family.RESOURCES,
+    )
+
+
+def _free_bytes(folder: Path) -> int:
+    for place in (folder, *folder.parents):
+        try:
+            return shutil.disk_usage(place).free
+        except OSError:
+            continue
+    return _FULL_BELOW_BYTES

@@ -1,0 +1,166 @@
+"""What a finished stage wrote down about itself.
+
+`manifest.json` is written last: its presence is what "finished" means. It carries a digest of its
+own contents, so that one edited by hand is noticed and not believed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from stages.run.digests import FileRecords, records_from_data, records_to_data
+from stages.run.errors import Family, SplatError
+
+SCHEMA = 1  # raised when an older program could not read what this one writes
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """One finished stage.
+
+    stage, version: which code ran. settings: all of them, as plain data.
+    inputs: digest of each input by name. input_files: for inputs that are the user's own files,
+        each file, so that the one that changed can be named.
+    outputs: each file that the stage made. output_digest: one digest over their names and bytes.
+    seconds: wall clock, all attempts together. peak_memory_mib: of the process and its children
+        while the stage ran. device, libraries, seed: what ran it.
+    metrics: plain figures from the stage. warnings: (code, sentence) pairs.
+    """
+
+    stage: str
+    version: int
+    settings: dict[str, Any]
+    inputs: dict[str, str]
+    outputs: FileRecords
+    output_digest: str
+    seconds: float
+    peak_memory_mib: float
+    device: str
+    seed: int | None = None
+    input_files: dict[str, FileRecords] = field(default_factory=dict)
+    libraries: dict[str, str] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    warnings: list[list[str]] = field(default_factory=list)
+
+    @property
+    def output_bytes(self) -> int:
+        """Size of all output files together, bytes."""
+        return sum(record.size for record in self.outputs.values())
+
+    def write(self, folder: Path) -> None:
+        """Write `manifest.json` into `folder`, whole or not at all. Raises OSError."""
+        data = asdict(self)
+        data["outputs"] = records_to_data(self.outputs)
+        data["input_files"] = {k: records_to_data(v) for k, v in self.input_files.items()}
+        write_sealed(folder / MANIFEST, data)
+
+    @classmethod
+    def read(cls, folder: Path) -> Manifest | None:
+        """The manifest in `folder`, or None if there is none.
+
+        Raises SplatError (run-folder-newer, manifest-edited).
+        """
+        data = read_sealed(folder / MANIFEST)
+        if data is None:
+            return None
+        try:
+            data["outputs"] = records_from_data(data["outputs"])
+            files = data["input_files"]
+            data["input_files"] = {k: records_from_data(v) for k, v in files.items()}
+            return cls(**{f.name: data[f.name] for f in fields(cls)})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise _edited(folder / MANIFEST) from error
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON holds it: arrays and tuples as lists, numpy scalars as numbers, infinity and
+    NaN as the words "inf", "-inf", "nan" (JSON has none)."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy, without importing it
+        return plain(value.tolist())
+    if isinstance(value, bool) or value is None or isinstance(value, (int, str)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return str(value)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write JSON under a temporary name, flush it to the disk, rename. Raises OSError."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("w", encoding="utf-8") as file:
+        json.dump(plain(data), file, indent=1, ensure_ascii=False)
+        file.write("\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def write_sealed(path: Path, data: Mapping[str, Any]) -> None:
+    """`write_json` with the schema version and a digest of the contents added."""
+    body = {"schema": SCHEMA, **plain(data)}
+    write_json(path, {**body, "digest": _seal(body)})
+
+
+def read_sealed(path: Path) -> dict[str, Any] | None:
+    """What `write_sealed` wrote, or None if there is no such file.
+
+    Raises SplatError: run-folder-newer for another schema, manifest-edited if it is not JSON, not
+    of the right shape, or does not match its own digest; run-folder-unreadable.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise SplatError(
+            "run-folder-unreadable",
+            given=f"{path} cannot be read: {error.strerror}.",
+            wanted="A run folder that you may read.",
+            hint="Check the permissions of the folder.",
+            family=Family.RUN_FOLDER,
+        ) from error
+    except ValueError as error:
+        raise _edited(path) from error
+    if not isinstance(data, dict) or not isinstance(data.get("schema"), int):
+        raise _edited(path)
+    if data["schema"] > SCHEMA:
+        raise SplatError(
+            "run-folder-newer",
+            given=f"{path} was written by a newer version of splat (schema {data['schema']}).",
+            wanted=f"A run folder of schema {SCHEMA} or older.",
+            hint="Upgrade splat, or start a new run folder with --out.",
+            family=Family.RUN_FOLDER,
+        )
+    digest = data.pop("digest", None)
+    if digest != _seal(data):
+        raise _edited(path)
+    return data
+
+
+def _seal(body: Mapping[str, Any]) -> str:
+    text = json.dumps(body, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _edited(path: Path) -> SplatError:
+    what = f"the folder {path.parent}" if path.name == MANIFEST else path
+    again = "its stage runs again" if path.name == MANIFEST else "it is written anew"
+    return SplatError(
+        "manifest-edited",
+        given=f"{path} was changed after it was written, or is damaged.",
+        wanted="The file as splat wrote it: what was made from what depends on it.",
+        hint=f"Restore the file, or delete {what}: then {again}. Nothing else is lost.",
+        family=Family.RUN_FOLDER,
+    )

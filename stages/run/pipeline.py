@@ -1,0 +1,188 @@
+"""Runs stages in order, skips what is finished and unchanged, and says why the rest runs again."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from stages import STAGE_NAMES, load_stage
+from stages.run import runfolder
+from stages.run.attempt import Listener, attempt
+from stages.run.errors import Family, Interrupted, SplatError
+from stages.run.failures import as_splat_error
+from stages.run.interrupt import stop_on_signals
+from stages.run.lock import holder
+from stages.run.manifest import Manifest
+from stages.run.planning import PHOTOS, Planner, Step
+from stages.run.runfile import RunFile
+from stages.run.stage import Stage
+from stages.run.workspace import Layout
+
+__all__ = ["Listener", "Pipeline", "Step"]
+
+
+class Pipeline:
+    """The stages over one run folder.
+
+    run_folder: made by `run` when missing. photos: the photographs, else those that the run folder
+    remembers. stages: all seven by default.
+    """
+
+    def __init__(
+        self, run_folder: Path, photos: Path | None = None, stages: Sequence[Stage] | None = None
+    ) -> None:
+        every = tuple(stages) if stages else tuple(load_stage(name) for name in STAGE_NAMES)
+        self.run_folder = Path(run_folder)
+        self.photos = Path(photos).absolute() if photos is not None else None
+        self.layout = Layout(self.run_folder, every)
+
+    def stage_folder(self, name: str) -> Path:
+        """Where the finished output of a stage lies (whether or not it does yet)."""
+        return self.layout.workspace(self.layout.stage(name)).final
+
+    def manifest(self, name: str) -> Manifest | None:
+        """Of a finished stage, else None. Raises SplatError for one that cannot be believed."""
+        return Manifest.read(self.stage_folder(name))
+
+    def load(self, name: str) -> Any:
+        """The output of a finished stage. Raises SplatError (stage-not-finished)."""
+        if self.manifest(name) is None:
+            raise self._not_finished(name, f"{name} has not finished")
+        return self.layout.stage(name).load(self.stage_folder(name))
+
+    def recorded_settings(self) -> dict[str, Any]:
+        """Settings by stage name, as last asked for; defaults where nothing was."""
+        return (RunFile.read(self.run_folder) or RunFile()).settings_of(self.layout.stages)
+
+    def recorded_photos(self) -> Path | None:
+        """The photographs that the run folder remembers."""
+        recorded = RunFile.read(self.run_folder)
+        return recorded.photographs if recorded else None
+
+    def busy(self) -> int | None:
+        """Process id of whoever works on the run folder now."""
+        return holder(self.run_folder)
+
+    def status(self) -> list[Step]:
+        """The plan for the settings last asked for. Raises SplatError (run-folder-missing)."""
+        if not runfolder.is_run_folder(self.run_folder):
+            raise runfolder.missing(self.run_folder)
+        return self.plan()
+
+    def plan(self, settings: Mapping[str, Any] | None = None) -> list[Step]:
+        """What `run` would do, stage by stage. settings: dataclasses by stage name; the recorded
+        ones where left out. Changes nothing. Raises SplatError."""
+        wanted = {**self.recorded_settings(), **(settings or {})}
+        photos = self.photos or self.recorded_photos()
+        try:
+            return Planner(self.layout, photos).plan(wanted)
+        except OSError as error:
+            raise self._unusable(error) from error
+
+    def run(
+        self,
+        settings: Mapping[str, Any] | None = None,
+        until: str | None = None,
+        may_run: Collection[str] | None = None,
+        listener: Listener | None = None,
+    ) -> list[Manifest]:
+        """Run what has to run, up to and including the stage `until`.
+
+        settings: dataclasses by stage name, remembered for later; the recorded ones where left out.
+        may_run: stages that may run; another one that is not finished and unchanged is an error.
+        Returns the manifests in order. Raises SplatError; Interrupted when a signal stopped it,
+        with everything finished kept and the stage's own checkpoint in its working folder.
+        """
+        listener = listener or Listener()
+        stop = Event()
+        first = self.layout.workspace(self.layout.stages[0]).final
+        try:
+            with (
+                runfolder.opened(self.run_folder, self.photos),
+                stop_on_signals(stop, listener.stopping),
+            ):
+                for stage in self.layout.stages:
+                    self.layout.workspace(stage).recover()
+                run_file = runfolder.recorded_for(self.run_folder, self.photos, first)
+                run_file = run_file.updated(settings or {})
+                wanted = run_file.settings_of(self.layout.stages)
+                planner = Planner(self.layout, run_file.photographs)
+                self._check_allowed(planner.photos, wanted, until, may_run)
+                run_file.write(self.run_folder)
+                return self._run_all(planner, wanted, until, stop, listener)
+        except OSError as error:
+            raise self._unusable(error) from error
+
+    def _run_all(
+        self,
+        planner: Planner,
+        wanted: Mapping[str, Any],
+        until: str | None,
+        stop: Event,
+        listener: Listener,
+    ) -> list[Manifest]:
+        manifests = []
+        for stage in self.layout.up_to(until):
+            step = planner.assess(stage, wanted[stage.name])
+            if step.will_run or step.manifest is None:
+                if stop.is_set():
+                    raise Interrupted(stage.name)
+                manifest = self._run_one(planner, step, wanted[stage.name], stop, listener)
+                listener.finished(stage, step.number, manifest)
+            else:
+                manifest = step.manifest
+                listener.skipped(stage, step.number, manifest)
+            planner.learn(stage, manifest)
+            manifests.append(manifest)
+        return manifests
+
+    def _run_one(
+        self, planner: Planner, step: Step, settings: Any, stop: Event, listener: Listener
+    ) -> Manifest:
+        stage = step.stage
+        space = self.layout.workspace(stage)
+        request = planner.request(stage, settings)
+        resumed = space.begin(request, stage.settings_type)
+        listener.started(stage, step.number, step.reason, resumed)
+        inputs = {name: self.load(name) for name in stage.reads} or {
+            PHOTOS: planner.existing_photos()
+        }
+        return attempt(stage, settings, request, inputs, space, stop, listener)
+
+    def _check_allowed(
+        self,
+        photos: Path | None,
+        wanted: Mapping[str, Any],
+        until: str | None,
+        may_run: Collection[str] | None,
+    ) -> None:
+        """Raises SplatError (stage-not-finished) for the first stage that must not run but has
+        to. A planner of its own: the run learns what the stages really made."""
+        if may_run is None:
+            return
+        reached = self.layout.up_to(until)
+        for step in Planner(self.layout, photos).plan(wanted):
+            if step.stage in reached and step.will_run and step.stage.name not in may_run:
+                again = "" if step.manifest is None else "would run again: "
+                what = f"{step.stage.name} {again}{step.reason}"
+                raise self._not_finished(step.stage.name, what)
+
+    def _not_finished(self, name: str, what: str) -> SplatError:
+        return SplatError(
+            "stage-not-finished",
+            given=f"In {self.run_folder}, {what}.",
+            wanted="Every earlier stage finished and unchanged.",
+            hint=f"Run `splat {name}` first, or `splat process` for everything that is missing.",
+            family=Family.USAGE,
+        )
+
+    def _unusable(self, error: OSError) -> SplatError:
+        return as_splat_error(error, "the run", self.run_folder) or SplatError(
+            "run-folder-unusable",
+            given=f"{error.filename or self.run_folder}: {error.strerror or error}.",
+            wanted="A run folder that can be made and written to.",
+            hint="Check the path, or name another folder with --out.",
+            family=Family.RUN_FOLDER,
+        )

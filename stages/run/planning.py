@@ -1,0 +1,117 @@
+"""Decides which stages run, and says why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stages.run.digests import FileRecords, combined_digest, damage, record_files
+from stages.run.errors import SplatError
+from stages.run.manifest import Manifest
+from stages.run.request import Request, request_for, why_again
+from stages.run.stage import Stage
+from stages.run.workspace import Layout
+
+PHOTOS = "photos"  # the input of a stage that reads no other
+_NAMED_AT_MOST = 3
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of a plan. reason: why it runs, in words; "" if it does not. interrupted: work on
+    it was begun and left. manifest: of the finished run, if there is one."""
+
+    stage: Stage
+    number: int
+    will_run: bool
+    reason: str
+    manifest: Manifest | None = None
+    interrupted: bool = False
+
+
+class Planner:
+    """Walks the stages in order, learning the digest of each output as it becomes known.
+
+    photos: the photographs, or None if the run folder does not say.
+    """
+
+    def __init__(self, layout: Layout, photos: Path | None) -> None:
+        self.layout = layout
+        self.photos = photos
+        self._digests: dict[str, str] = {}
+        self._pending: dict[str, bool] = {}  # name -> has finished before
+        self._photo_records: FileRecords | None = None
+
+    def plan(self, wanted: Mapping[str, Any]) -> list[Step]:
+        """A step a stage. wanted: settings by stage name. Raises SplatError, OSError."""
+        steps = []
+        for stage in self.layout.stages:
+            step = self.assess(stage, wanted[stage.name])
+            if step.will_run:
+                self._pending[stage.name] = step.manifest is not None
+            elif step.manifest is not None:
+                self.learn(stage, step.manifest)
+            steps.append(step)
+        return steps
+
+    def learn(self, stage: Stage, manifest: Manifest) -> None:
+        """The stage's output is final for this walk."""
+        self._digests[stage.name] = manifest.output_digest
+
+    def assess(self, stage: Stage, settings: Any) -> Step:
+        """Whether `stage` has to run, given what was learnt of the stages before it."""
+        space = self.layout.workspace(stage)
+        number = self.layout.number(stage)
+        manifest = Manifest.read(space.final)
+        interrupted = space.partial.exists()
+        waiting = [
+            f"{name} {'runs again' if self._pending[name] else 'has to run'} first"
+            for name in stage.reads
+            if name in self._pending
+        ]
+        if manifest is None:
+            first = "was interrupted" if interrupted else "has not run yet"
+            return Step(stage, number, True, ", ".join([first, *waiting]), None, interrupted)
+        reasons = why_again(
+            self._request_if_known(stage, settings, manifest, bool(waiting)),
+            manifest,
+            stage.settings_type,
+        )
+        broken = damage(space.final, manifest.outputs)[:_NAMED_AT_MOST]
+        reasons += waiting + [f"its output {words}" for words in broken]
+        return Step(stage, number, bool(reasons), ", ".join(reasons), manifest, interrupted)
+
+    def request(self, stage: Stage, settings: Any) -> Request:
+        """What `stage` is asked to do. Raises SplatError (photographs-missing), OSError."""
+        if stage.reads:
+            inputs = {name: self._digests[name] for name in stage.reads}
+            return request_for(stage, settings, inputs, {})
+        if self._photo_records is None:
+            done = Manifest.read(self.layout.workspace(stage).final)
+            known = done.input_files.get(PHOTOS) if done else None
+            self._photo_records = record_files(self.existing_photos(), known, hidden=False)
+        inputs = {PHOTOS: combined_digest(self._photo_records)}
+        return request_for(stage, settings, inputs, {PHOTOS: self._photo_records})
+
+    def existing_photos(self) -> Path:
+        """Where the photographs are. Raises SplatError (photographs-missing)."""
+        if self.photos is None or not self.photos.exists():
+            raise SplatError(
+                "photographs-missing",
+                given=f"The photographs are not at {self.photos}.",
+                wanted="The folder of photographs that the run is made from.",
+                hint="Put it back, or say where it is now: splat process PHOTOS --out RUN",
+            )
+        return self.photos
+
+    def _request_if_known(
+        self, stage: Stage, settings: Any, done: Manifest, waiting: bool
+    ) -> Request:
+        """With inputs as the finished run had them where they are not known now: outputs still to
+        come are named on their own, and photographs moved away after ingest are no reason."""
+        gone = not stage.reads and (self.photos is None or not self.photos.exists())
+        if waiting or gone:
+            return request_for(stage, settings, done.inputs, done.input_files)
+        return self.request(stage, settings)

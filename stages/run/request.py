@@ -1,0 +1,131 @@
+"""What a stage is asked to do: settings, inputs and version. Equal requests give equal bytes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from stages.run.digests import FileRecords, differences
+from stages.run.manifest import Manifest, plain, write_json
+from stages.run.stage import Stage
+
+REQUEST = "request.json"
+
+
+@dataclass(frozen=True)
+class Request:
+    """stage, version: which code. settings: plain data. inputs: digest by name. input_files: the
+    user's own files behind an input, one by one."""
+
+    stage: str
+    version: int
+    settings: dict[str, Any]
+    inputs: dict[str, str]
+    input_files: dict[str, FileRecords]
+
+    def key(self, settings_type: type) -> dict[str, Any]:
+        """What decides the output, as plain data: settings that cannot change it are left out."""
+        quiet = _quiet_fields(settings_type)
+        settings = {k: v for k, v in self.settings.items() if k not in quiet}
+        return {"version": self.version, "settings": settings, "inputs": self.inputs}
+
+    def write(self, folder: Path, settings_type: type) -> None:
+        """Leave the request in a working folder. Raises OSError."""
+        write_json(folder / REQUEST, self.key(settings_type))
+
+    def matches(self, folder: Path, settings_type: type) -> bool:
+        """Whether a working folder was begun for this same request."""
+        try:
+            left = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        return bool(left == json.loads(json.dumps(self.key(settings_type))))
+
+
+def settings_to_data(settings: Any) -> dict[str, Any]:
+    """A settings dataclass as JSON holds it."""
+    data: dict[str, Any] = plain(asdict(settings))
+    return data
+
+
+def settings_from_data(settings_type: type, data: Mapping[str, Any]) -> Any:
+    """The settings that `settings_to_data` wrote; fields that this version lacks are dropped and
+    new ones take their defaults. Raises TypeError or ValueError if the values do not fit."""
+    hints = get_type_hints(settings_type)
+    known = {}
+    for field in fields(settings_type):
+        if field.name in data:
+            value = data[field.name]
+            known[field.name] = tuple(value) if isinstance(value, list) else value
+            if hints[field.name] is Path:
+                known[field.name] = Path(value)
+    return settings_type(**known)
+
+
+def why_again(request: Request, done: Manifest, settings_type: type) -> list[str]:
+    """In words, what differs between a request and the run that is finished; [] if nothing does."""
+    words = []
+    if request.version != done.version:
+        words.append(f"new version of the stage ({done.version} -> {request.version})")
+    words += _settings_changes(request.settings, done.settings, settings_type)
+    for name in sorted(request.inputs.keys() | done.inputs.keys()):
+        if request.inputs.get(name) != done.inputs.get(name):
+            words += _input_changes(name, request, done)
+    return words
+
+
+def _settings_changes(
+    now: Mapping[str, Any], then: Mapping[str, Any], settings_type: type
+) -> list[str]:
+    """["steps 7000 -> 30000"]. A setting that did not exist yet counts as its default."""
+    defaults = _defaults(settings_type)
+    quiet = _quiet_fields(settings_type)
+    words = []
+    for name, value in now.items():
+        before = then.get(name, defaults.get(name))
+        if name not in quiet and value != before:
+            label = name.replace("_", " ")
+            words.append(f"{label} {_show(before)} -> {_show(value)}")
+    return words
+
+
+def _input_changes(name: str, request: Request, done: Manifest) -> list[str]:
+    if name not in request.input_files:
+        return [f"{name} changed"]
+    now, then = request.input_files[name], done.input_files.get(name, {})
+    changes = [f"photograph {words}" for words in differences(then, now)]
+    if len(changes) > 3:
+        return [*changes[:3], f"{len(changes) - 3} more photographs changed"]
+    return changes or [f"{name} changed"]
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, list):
+        return " ".join(map(str, value)) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "none" if value is None else str(value)
+
+
+def _quiet_fields(settings_type: type) -> set[str]:
+    return {f.name for f in fields(settings_type) if not f.metadata.get("affects_output", True)}
+
+
+def _defaults(settings_type: type) -> dict[str, Any]:
+    values = {}
+    for field in fields(settings_type):
+        if field.default is not MISSING:
+            values[field.name] = plain(field.default)
+        elif field.default_factory is not MISSING:
+            values[field.name] = plain(field.default_factory())
+    return values
+
+
+def request_for(
+    stage: Stage, settings: Any, inputs: dict[str, str], input_files: dict[str, FileRecords]
+) -> Request:
+    """The request that `stage` gets with these settings and inputs."""
+    return Request(stage.name, stage.version, settings_to_data(settings), inputs, input_files)

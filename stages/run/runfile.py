@@ -1,0 +1,52 @@
+"""`run.json`: which photographs a run folder belongs to, and the settings last asked for.
+
+It makes a folder a run folder. With it `splat train` goes on with what was asked before, and
+`splat status` can say what would run again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stages.run.manifest import read_sealed, write_sealed
+from stages.run.request import settings_from_data, settings_to_data
+from stages.run.stage import Stage
+
+RUN_FILE = "run.json"
+
+
+@dataclass(frozen=True)
+class RunFile:
+    """photographs: absolute path. settings: plain data by stage name."""
+
+    photographs: Path | None = None
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, folder: Path) -> RunFile | None:
+        """The folder's `run.json`, or None. Raises SplatError (see `read_sealed`)."""
+        data = read_sealed(folder / RUN_FILE)
+        if data is None:
+            return None
+        photographs = data.get("photographs")
+        return cls(Path(photographs) if photographs else None, data.get("settings", {}))
+
+    def write(self, folder: Path) -> None:
+        """Write it, whole or not at all. Raises OSError."""
+        photographs = str(self.photographs) if self.photographs else None
+        write_sealed(folder / RUN_FILE, {"photographs": photographs, "settings": self.settings})
+
+    def updated(self, settings: Mapping[str, Any]) -> RunFile:
+        """With the settings (dataclasses by stage name) of some stages replaced."""
+        changed = {name: settings_to_data(value) for name, value in settings.items()}
+        return RunFile(self.photographs, {**self.settings, **changed})
+
+    def settings_of(self, stages: Sequence[Stage]) -> dict[str, Any]:
+        """Settings dataclasses of all stages: as recorded, else the defaults."""
+        return {
+            stage.name: settings_from_data(stage.settings_type, self.settings.get(stage.name, {}))
+            for stage in stages
+        }

@@ -1,0 +1,111 @@
+"""Opening a run folder: is it ours, is it for these photographs, is anyone else at work in it?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stages.run.digests import combined_digest, record_files
+from stages.run.errors import Family, SplatError
+from stages.run.lock import LOCK, locked
+from stages.run.manifest import Manifest
+from stages.run.planning import PHOTOS
+from stages.run.runfile import RUN_FILE, RunFile
+
+
+def is_run_folder(folder: Path) -> bool:
+    """Whether splat made this folder."""
+    return (folder / RUN_FILE).is_file()
+
+
+@contextmanager
+def opened(folder: Path, photos: Path | None) -> Iterator[None]:
+    """The run folder, made if it is new, and locked.
+
+    photos: where new ones come from; None means that the folder must exist. Raises SplatError
+    (photographs-missing, run-folder-inside-photographs, run-folder-missing, run-folder-foreign,
+    run-folder-busy), OSError.
+    """
+    if photos is not None:
+        _check_photos(folder, photos)
+    if not is_run_folder(folder):
+        if photos is None:
+            raise missing(folder)
+        if folder.exists() and any(path.name != LOCK for path in folder.iterdir()):
+            raise _foreign(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        yield
+
+
+def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) -> RunFile:
+    """The folder's run file, speaking of `photos` (absolute) if they are given.
+
+    A moved folder of photographs, or a copy of it, is the same one; another is an error
+    (run-folder-other-photographs). A new run folder gets an empty run file. Raises SplatError.
+    """
+    recorded = RunFile.read(folder)
+    if recorded is None:
+        return RunFile(photos)
+    if photos is None or recorded.photographs in (None, photos):
+        return RunFile(recorded.photographs or photos, recorded.settings)
+    if recorded.photographs.exists() and not _same(photos, first_stage_folder):
+        raise _other_photographs(folder, recorded.photographs, photos)
+    return RunFile(photos, recorded.settings)
+
+
+def _same(photos: Path, first_stage_folder: Path) -> bool:
+    done = Manifest.read(first_stage_folder)
+    if done is None:
+        return False
+    return combined_digest(record_files(photos, hidden=False)) == done.inputs.get(PHOTOS)
+
+
+def _check_photos(folder: Path, photos: Path) -> None:
+    if not photos.exists():
+        raise SplatError(
+            "photographs-missing",
+            given=f"{photos} does not exist.",
+            wanted="A folder of photographs.",
+            hint="Check the path; put quotes around one with spaces.",
+        )
+    if folder.resolve().is_relative_to(photos.resolve()):
+        raise SplatError(
+            "run-folder-inside-photographs",
+            given=f"The run folder {folder} would lie inside {photos}.",
+            wanted="A run folder elsewhere: nothing is written among your photographs.",
+            hint="Name one with --out, for example --out ../run",
+            family=Family.USAGE,
+        )
+
+
+def _foreign(folder: Path) -> SplatError:
+    return SplatError(
+        "run-folder-foreign",
+        given=f"{folder} exists and holds other things.",
+        wanted="A new folder, an empty one, or a run folder that splat made.",
+        hint="Name another folder with --out.",
+        family=Family.RUN_FOLDER,
+    )
+
+
+def _other_photographs(folder: Path, recorded: Path, photos: Path) -> SplatError:
+    return SplatError(
+        "run-folder-other-photographs",
+        given=f"{folder} was made from {recorded}, not from {photos}.",
+        wanted="One run folder for one set of photographs.",
+        hint="Name another run folder with --out.",
+        family=Family.RUN_FOLDER,
+    )
+
+
+def missing(folder: Path) -> SplatError:
+    """The error for a folder that is not a run folder."""
+    return SplatError(
+        "run-folder-missing",
+        given=f"{folder} is not a run folder.",
+        wanted="A folder that `splat process` made.",
+        hint="Start one: splat process PHOTOS --out run/",
+        family=Family.RUN_FOLDER,
+    )

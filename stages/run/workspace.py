@@ -1,0 +1,101 @@
+"""The folders of one stage in a run folder, and how work becomes finished by rename.
+
+`4-train` is finished work. `.4-train.partial` is where work goes on; it is kept when it is
+interrupted. `.4-train.old` is the finished work that is being replaced, for the moment between two
+renames. A crash at any point leaves either the old or the new work whole.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from stages.run.manifest import MANIFEST, Manifest
+from stages.run.request import REQUEST, Request
+from stages.run.stage import Stage
+
+USAGE = "usage.json"
+_FILES = (MANIFEST, REQUEST, USAGE)
+BOOKKEEPING = frozenset([*_FILES, *(name + ".tmp" for name in _FILES)])
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """run_folder: the run's folder. label: "4-train"."""
+
+    run_folder: Path
+    label: str
+
+    @property
+    def final(self) -> Path:
+        return self.run_folder / self.label
+
+    @property
+    def partial(self) -> Path:
+        return self.run_folder / f".{self.label}.partial"
+
+    @property
+    def old(self) -> Path:
+        return self.run_folder / f".{self.label}.old"
+
+    def begin(self, request: Request, settings_type: type) -> bool:
+        """Make the working folder ready; True if it holds work on the same request. OSError."""
+        if self.partial.exists():
+            if request.matches(self.partial, settings_type):
+                return True
+            shutil.rmtree(self.partial)
+        self.partial.mkdir()
+        request.write(self.partial, settings_type)
+        return False
+
+    def finish(self, manifest: Manifest) -> None:
+        """Turn the working folder into the finished one. Raises OSError."""
+        manifest.write(self.partial)
+        self._replace()
+
+    def recover(self) -> None:
+        """Complete or undo a replacement that a crash cut short. Raises OSError."""
+        if (self.partial / MANIFEST).exists():
+            self._replace()
+        elif self.old.exists() and not self.final.exists():
+            self.old.rename(self.final)
+        if self.old.exists():
+            shutil.rmtree(self.old)
+
+    def _replace(self) -> None:
+        for name in BOOKKEEPING - {MANIFEST}:
+            (self.partial / name).unlink(missing_ok=True)
+        if self.final.exists():
+            if self.old.exists():
+                shutil.rmtree(self.old)
+            self.final.rename(self.old)
+        self.partial.rename(self.final)
+        if self.old.exists():
+            shutil.rmtree(self.old, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which stages a run folder holds, and where. stages: in order."""
+
+    run_folder: Path
+    stages: tuple[Stage, ...]
+
+    def stage(self, name: str) -> Stage:
+        """The stage called `name`. Raises KeyError."""
+        for stage in self.stages:
+            if stage.name == name:
+                return stage
+        raise KeyError(name)
+
+    def number(self, stage: Stage) -> int:
+        """Counted from 1."""
+        return self.stages.index(stage) + 1
+
+    def workspace(self, stage: Stage) -> Workspace:
+        return Workspace(self.run_folder, f"{self.number(stage)}-{stage.name}")
+
+    def up_to(self, name: str | None) -> tuple[Stage, ...]:
+        """The stages up to and including `name`; all of them for None."""
+        return self.stages if name is None else self.stages[: self.number(self.stage(name))]

@@ -1,0 +1,456 @@
+"""What runs, what is skipped, what is said about it, and what survives a failure."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from stages.run.errors import Family, Interrupted, SplatError
+from stages.run.lock import locked
+from stages.run.manifest import Manifest
+from stages.run.pipeline import Listener, Pipeline
+from tests.run.fakes import CopySettings, CountSettings, fake_stages, photographs
+
+
+class Heard(Listener):
+    def __init__(self) -> None:
+        self.events: list[tuple[str, str]] = []
+
+    def started(self, stage, number, reason, resumed) -> None:
+        self.events.append(("resumed" if resumed else "started", stage.name))
+
+    def skipped(self, stage, number, manifest) -> None:
+        self.events.append(("skipped", stage.name))
+
+    def ran(self) -> list[str]:
+        return [name for kind, name in self.events if kind != "skipped"]
+
+
+@pytest.fixture()
+def photos(tmp_path: Path) -> Path:
+    return photographs(tmp_path / "photos")
+
+
+@pytest.fixture()
+def run_folder(tmp_path: Path) -> Path:
+    return tmp_path / "run"
+
+
+@pytest.fixture()
+def finished(photos: Path, run_folder: Path) -> Pipeline:
+    pipeline = Pipeline(run_folder, photos, fake_stages())
+    pipeline.run()
+    return pipeline
+
+
+def ran(pipeline: Pipeline, settings=None) -> list[str]:
+    heard = Heard()
+    pipeline.run(settings, listener=heard)
+    return heard.ran()
+
+
+def reasons(pipeline: Pipeline, settings=None) -> dict[str, str]:
+    return {step.stage.name: step.reason for step in pipeline.plan(settings)}
+
+
+def test_run_makes_one_finished_folder_a_stage(finished: Pipeline, run_folder: Path) -> None:
+    assert sorted(p.name for p in run_folder.iterdir() if not p.name.startswith(".")) == [
+        "1-copy",
+        "2-count",
+        "3-sign",
+        "run.json",
+    ]
+    assert finished.load("sign") == "42000 a b"
+    assert not list(run_folder.glob(".*.partial"))
+
+
+def test_manifest_says_what_was_made_from_what(finished: Pipeline, run_folder: Path) -> None:
+    copied, counted = finished.manifest("copy"), finished.manifest("count")
+    assert copied and counted
+    assert counted.inputs == {"copy": copied.output_digest}
+    assert counted.settings == {"iterations": 7000, "seed": 0}
+    assert counted.seed == 0
+    assert counted.warnings == [["count-low", "Few letters. Write more."]]
+    assert set(copied.input_files["photos"]) == {"a.jpg", "b.jpg"}
+    assert set(copied.outputs) == {"text/all.txt"}
+    assert copied.metrics == {"characters": 6}
+    assert copied.seconds >= 0.0
+    assert copied.peak_memory_mib > 5.0
+    assert copied.libraries["python"]
+    # from `printf onetwo | sha256sum`
+    assert copied.outputs["text/all.txt"].sha256 == (
+        "25b6746d5172ed6352966a013d93ac846e1110d5a25e8f183b5931f4688842a1"
+    )
+
+
+def test_nothing_runs_twice(finished: Pipeline) -> None:
+    assert ran(finished) == []
+    assert all(not step.will_run for step in finished.status())
+
+
+def test_changed_setting_runs_its_stage_and_those_after_it(finished: Pipeline) -> None:
+    settings = {"count": CountSettings(iterations=30000)}
+    assert reasons(finished, settings) == {
+        "copy": "",
+        "count": "iterations 7000 -> 30000",
+        "sign": "count runs again first",
+    }
+    assert ran(finished, settings) == ["count", "sign"]
+
+
+def test_settings_are_remembered(finished: Pipeline, run_folder: Path) -> None:
+    finished.run({"count": CountSettings(iterations=5)})
+    again = Pipeline(run_folder, stages=fake_stages())
+    assert ran(again) == []
+    assert again.load("count") == "30"
+
+
+def test_setting_that_cannot_change_the_output_is_no_reason(finished: Pipeline) -> None:
+    assert ran(finished, {"copy": CopySettings(threads=8)}) == []
+
+
+def test_edited_photograph_is_named(finished: Pipeline, photos: Path) -> None:
+    (photos / "a.jpg").write_text("six")
+    assert reasons(finished)["copy"] == "photograph a.jpg changed"
+    assert ran(finished) == ["copy", "count"]  # as many letters as before: sign has nothing to do
+
+
+def test_added_and_removed_photographs_are_named(finished: Pipeline, photos: Path) -> None:
+    (photos / "b.jpg").unlink()
+    (photos / "c.jpg").write_text("x")
+    assert reasons(finished)["copy"] == "photograph b.jpg is missing, photograph c.jpg is new"
+
+
+def test_hidden_files_among_photographs_do_not_count(finished: Pipeline, photos: Path) -> None:
+    (photos / ".DS_Store").write_text("desktop")
+    assert ran(finished) == []
+
+
+def test_touched_photograph_with_the_same_bytes_is_no_reason(
+    finished: Pipeline, photos: Path
+) -> None:
+    os.utime(photos / "a.jpg", (1, 1))
+    assert ran(finished) == []
+
+
+def test_changed_output_upstream_is_a_reason(finished: Pipeline, run_folder: Path) -> None:
+    stages = fake_stages()
+    stages[0] = dataclasses.replace(stages[0], version=2)
+    newer = Pipeline(run_folder, stages=stages)
+    assert reasons(newer)["copy"] == "new version of the stage (1 -> 2)"
+    assert ran(newer) == ["copy"]  # the same bytes again
+
+
+@pytest.mark.parametrize("harm", ["edit", "truncate", "remove"])
+def test_damaged_output_runs_its_stage_again(
+    finished: Pipeline, run_folder: Path, harm: str
+) -> None:
+    victim = run_folder / "2-count" / "count.txt"
+    if harm == "edit":
+        victim.write_text("42001")
+    elif harm == "truncate":
+        victim.write_text("")
+    else:
+        victim.unlink()
+    words = "is missing" if harm == "remove" else "changed"
+    assert reasons(finished)["count"] == f"its output count.txt {words}"
+    assert ran(finished) == ["count"]
+    assert victim.read_text() == "42000"
+
+
+def test_extra_file_beside_the_outputs_does_no_harm(finished: Pipeline, run_folder: Path) -> None:
+    (run_folder / "3-sign" / "thumbnail.png").write_text("a viewer left this")
+    assert ran(finished) == []
+
+
+def test_copied_run_folder_stays_finished(finished: Pipeline, run_folder: Path) -> None:
+    copy = run_folder.with_name("copy of run")
+    shutil.copytree(run_folder, copy)
+    for path in copy.rglob("*"):
+        os.utime(path, (1, 1))
+    assert ran(Pipeline(copy, stages=fake_stages())) == []
+
+
+def test_photographs_moved_away_after_ingest_are_no_reason(
+    finished: Pipeline, photos: Path, run_folder: Path
+) -> None:
+    shutil.move(photos, photos.with_name("archive"))
+    assert ran(Pipeline(run_folder, stages=fake_stages())) == []
+    assert ran(Pipeline(run_folder, photos.with_name("archive"), fake_stages())) == []
+
+
+def test_output_digest_does_not_depend_on_time(photos: Path, tmp_path: Path) -> None:
+    digests = []
+    for name in ("one", "two"):
+        pipeline = Pipeline(tmp_path / name, photos, fake_stages())
+        digests.append([m.output_digest for m in pipeline.run()])
+    assert digests[0] == digests[1]
+
+
+# -- what must be refused
+
+
+def test_other_photographs_are_refused(finished: Pipeline, run_folder: Path, tmp_path) -> None:
+    other = photographs(tmp_path / "other", z="zzz")
+    with pytest.raises(SplatError, match="--out") as caught:
+        Pipeline(run_folder, other, fake_stages()).run()
+    assert caught.value.code == "run-folder-other-photographs"
+
+
+def test_foreign_folder_is_refused_and_untouched(photos: Path, run_folder: Path) -> None:
+    run_folder.mkdir()
+    (run_folder / "thesis.txt").write_text("mine")
+    with pytest.raises(SplatError) as caught:
+        Pipeline(run_folder, photos, fake_stages()).run()
+    assert caught.value.code == "run-folder-foreign"
+    assert [p.name for p in run_folder.iterdir()] == ["thesis.txt"]
+
+
+def test_run_folder_among_the_photographs_is_refused(photos: Path) -> None:
+    with pytest.raises(SplatError) as caught:
+        Pipeline(photos / "run", photos, fake_stages()).run()
+    assert caught.value.code == "run-folder-inside-photographs"
+    assert sorted(p.name for p in photos.iterdir()) == ["a.jpg", "b.jpg"]
+
+
+def test_missing_photographs_are_refused(run_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(SplatError) as caught:
+        Pipeline(run_folder, tmp_path / "nowhere", fake_stages()).run()
+    assert caught.value.code == "photographs-missing"
+    assert not run_folder.exists()
+
+
+def test_manifest_edited_by_hand_is_refused(finished: Pipeline, run_folder: Path) -> None:
+    path = run_folder / "2-count" / "manifest.json"
+    path.write_text(path.read_text().replace("7000", "9000"))
+    with pytest.raises(SplatError, match="2-count") as caught:
+        finished.run()
+    assert caught.value.code == "manifest-edited"
+    assert caught.value.family is Family.RUN_FOLDER
+    shutil.rmtree(run_folder / "2-count")  # what the hint says
+    assert ran(finished) == ["count"]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"schema": "one"}', '{"schema": 1}'])
+def test_damaged_manifest_is_refused(finished: Pipeline, run_folder: Path, text: str) -> None:
+    (run_folder / "1-copy" / "manifest.json").write_text(text)
+    with pytest.raises(SplatError) as caught:
+        finished.plan()
+    assert caught.value.code == "manifest-edited"
+
+
+@pytest.mark.parametrize("name", ["run.json", "1-copy/manifest.json"])
+def test_newer_schema_is_refused(finished: Pipeline, run_folder: Path, name: str) -> None:
+    path = run_folder / name
+    path.write_text(json.dumps({**json.loads(path.read_text()), "schema": 99}))
+    with pytest.raises(SplatError) as caught:
+        finished.run()
+    assert caught.value.code == "run-folder-newer"
+
+
+def test_later_stage_alone_names_the_command_to_run_first(photos: Path, run_folder: Path) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages())
+    pipeline.run(until="copy")
+    with pytest.raises(SplatError, match="splat count") as caught:
+        pipeline.run(until="sign", may_run={"sign"})
+    assert caught.value.code == "stage-not-finished"
+    pipeline.run(until="count", may_run={"count"})
+    pipeline.run(until="sign", may_run={"sign"})
+
+
+def test_second_process_is_refused_and_named(finished: Pipeline, run_folder: Path) -> None:
+    with locked(run_folder), pytest.raises(SplatError, match=str(os.getpid())) as caught:
+        finished.run()
+    assert caught.value.code == "run-folder-busy"
+    finished.run()
+
+
+def test_lock_of_a_killed_process_does_not_count(finished: Pipeline, run_folder: Path) -> None:
+    code = (
+        "import os, sys, pathlib, signal\n"
+        "from stages.run.lock import locked\n"
+        "with locked(pathlib.Path(sys.argv[1])):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", code, str(run_folder)], check=False, timeout=30)
+    assert (run_folder / ".lock").read_text().strip().isdigit()
+    assert finished.busy() is None
+    assert ran(finished) == []
+
+
+def test_unwritable_place_is_refused(photos: Path) -> None:
+    for place in (Path("/proc/run"), photos / "a.jpg" / "run"):
+        with pytest.raises(SplatError):
+            Pipeline(place, photos.parent / "photos", fake_stages()).run()
+
+
+def test_folder_without_write_permission_is_refused(
+    photos: Path, run_folder: Path, monkeypatch
+) -> None:
+    def denied(self: Path, *args, **kwargs) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", denied)
+    with pytest.raises(SplatError, match="--out") as caught:
+        Pipeline(run_folder, photos, fake_stages()).run()
+    assert caught.value.code == "not-permitted"
+    assert caught.value.family is Family.RESOURCES
+
+
+# -- what must survive
+
+
+def failing(error: BaseException):
+    def run(inputs, settings, folder, report) -> None:
+        (folder / "half.txt").write_text("half")
+        raise error
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "disk-full"),
+        (MemoryError(), "out-of-memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), "out-of-memory"),
+        (PermissionError(errno.EACCES, "Permission denied", "x.png"), "not-permitted"),
+    ],
+)
+def test_machine_refusals_keep_what_is_finished(
+    photos: Path, run_folder: Path, error: Exception, code: str
+) -> None:
+    broken = Pipeline(run_folder, photos, fake_stages(count=failing(error)))
+    with pytest.raises(SplatError) as caught:
+        broken.run()
+    assert caught.value.code == code
+    assert caught.value.family is Family.RESOURCES
+    assert broken.manifest("copy") is not None
+    assert not (run_folder / "2-count").exists()
+    assert ran(Pipeline(run_folder, photos, fake_stages())) == ["count", "sign"]
+
+
+def test_full_disk_under_a_library_error_is_recognised(photos: Path, run_folder: Path) -> None:
+    def run(inputs, settings, folder, report) -> None:
+        try:
+            with open("/dev/full", "w") as full:
+                full.write("x" * 100_000)
+        except OSError as error:
+            raise RuntimeError("archive writer failed") from error
+
+    with pytest.raises(SplatError) as caught:
+        Pipeline(run_folder, photos, fake_stages(count=run)).run()
+    assert caught.value.code == "disk-full"
+
+
+def test_failing_stage_keeps_the_old_finished_work(finished: Pipeline, run_folder: Path) -> None:
+    broken = Pipeline(run_folder, stages=fake_stages(count=failing(ValueError("bug"))))
+    with pytest.raises(ValueError, match="bug"):
+        broken.run({"count": CountSettings(iterations=1)})
+    assert finished.load("count") == "42000"
+    assert "iterations 7000 -> 1" in reasons(finished)["count"]
+
+
+def checkpointing(total: int, stop_after: int):
+    """Adds a letter at a time to a checkpoint; stops after some, once."""
+
+    def run(inputs, settings, folder, report) -> None:
+        checkpoint = folder / "checkpoint"
+        done = int(checkpoint.read_text()) if checkpoint.exists() else 0
+        first = done
+        while done < total:
+            if report.stop_requested.is_set() or done - first == stop_after:
+                raise Interrupted
+            done += 1
+            checkpoint.write_text(str(done))
+        checkpoint.unlink()
+        (folder / "count.txt").write_text(f"{total} from {first}")
+
+    return run
+
+
+def test_interrupted_stage_goes_on_from_its_checkpoint(photos: Path, run_folder: Path) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    assert [s.interrupted for s in pipeline.status()] == [False, True, False]
+    heard = Heard()
+    pipeline.run(listener=heard)
+    assert heard.events == [("skipped", "copy"), ("resumed", "count"), ("started", "sign")]
+    assert pipeline.load("count") == "10 from 6"
+
+
+def test_leftovers_of_other_settings_are_not_used(photos: Path, run_folder: Path) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    with pytest.raises(Interrupted):
+        pipeline.run({"count": CountSettings(seed=1)})
+    pipeline.run()
+    assert pipeline.load("count") == "10 from 6"  # 12 would be both attempts added up
+
+
+def test_stop_between_stages_keeps_the_finished_ones(photos: Path, run_folder: Path) -> None:
+    def stop_then_finish(inputs, settings, folder, report) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        (folder / "count.txt").write_text("7")
+
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=stop_then_finish))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    assert pipeline.load("count") == "7"
+    assert pipeline.manifest("sign") is None
+
+
+def test_second_signal_stops_at_once(photos: Path, run_folder: Path) -> None:
+    def stubborn(inputs, settings, folder, report) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGINT)
+        threading.Event().wait(10)
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        Pipeline(run_folder, photos, fake_stages(count=stubborn)).run()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("moment", ["before both renames", "between the renames", "after both"])
+def test_crash_while_replacing_leaves_one_whole_result(
+    finished: Pipeline, run_folder: Path, moment: str
+) -> None:
+    final, partial = run_folder / "2-count", run_folder / ".2-count.partial"
+    old = run_folder / ".2-count.old"
+    shutil.copytree(final, partial)
+    if moment == "between the renames":
+        final.rename(old)
+    elif moment == "after both":
+        final.rename(old)
+        partial.rename(final)
+    assert ran(finished) == []
+    assert not partial.exists()
+    assert not old.exists()
+    assert isinstance(Manifest.read(final), Manifest)
+
+
+def test_seconds_and_memory_of_all_attempts_are_added_up(photos: Path, run_folder: Path) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    usage = run_folder / ".2-count.partial" / "usage.json"
+    usage.write_text(json.dumps({"seconds": 100.0, "peak_memory_mib": 9e6}))
+    pipeline.run()
+    counted = pipeline.manifest("count")
+    assert counted is not None
+    assert counted.seconds > 100.0
+    assert counted.peak_memory_mib == 9e6
+    assert set(counted.outputs) == {"count.txt"}
