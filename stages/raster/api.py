@@ -13,6 +13,7 @@ ALPHA_MIN = 1.0 / 255.0  # below it a splat is not drawn in a pixel: it could no
 ALPHA_MAX = 0.99  # as every viewer caps it
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished once less light than this passes
 LOG_SCALE_MAX = 44.0  # exp(2 x 44) is the last square of a scale that float32 holds
+QUATERNION_MIN = 1e-20  # largest component; below it a rotation is lost to rounding
 
 
 @dataclass(frozen=True)

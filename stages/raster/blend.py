@@ -1,0 +1,289 @@
+"""Blending the splats of a tile, near to far, and the gradient back through it, far to near.
+
+A tile is 16x16 pixels; a row of it is one vector. Per (splat, tile) the exponent is rewritten in
+float64 around the tile's first pixel, so that everything that runs in float32 is small:
+    exponent(i, j) = A (u + i or j)^2 + B (M_i + m j)^2,
+u along the axis of the larger variance. `exponent_row` is the one function for both directions:
+alpha must be the same to the last bit, since the way back divides by 1 - alpha.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.raster.api import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from stages.raster.binning import TILE
+from stages.raster.projection import GA, GB, GK, GO, GVX, GVY, GX, GY
+from stages.raster.simd import (
+    iota16,
+    kernel,
+    splat16,
+    take_ticket,
+    vand,
+    vany,
+    vexp2,
+    vfma,
+    vge,
+    vgt,
+    vload,
+    vmax,
+    vmin,
+    vselect,
+    vstore,
+    vsum,
+)
+
+PIXELS = TILE * TILE
+GRADIENTS = 9  # mean along the major axis, along the minor, A, B, K, opacity, red, green, blue
+_LOG2E = 1.4426950408889634
+_F = np.float32
+_ALPHA_MIN, _ALPHA_MAX, _T_MIN = _F(ALPHA_MIN), _F(ALPHA_MAX), _F(TRANSMITTANCE_MIN)
+_CUT = _F(100.0)  # exponents beyond it (alpha 1e-30) would leave the range of `vexp2`
+
+
+@kernel
+def tile_frame(record, tile_x, tile_y):
+    """The record around the tile's first pixel centre.
+
+    Returns (wide, A, B, K, opacity, u, m): wide, whether the major axis is x; u: offset of the
+    first pixel along the major axis; m: offset across less K u.
+    """
+    dx = tile_x * TILE + 0.5 - record[GX]
+    dy = tile_y * TILE + 0.5 - record[GY]
+    k = record[GK]
+    wide = record[GVX] >= record[GVY]
+    u = dx if wide else dy
+    m = dy - k * dx if wide else dx - k * dy
+    return wide, _F(record[GA]), _F(record[GB]), _F(k), _F(record[GO]), _F(u), _F(m)
+
+
+@kernel
+def column_parts(wide, a, k, u, m):
+    """What does not depend on the row: (u per column, A u^2 per column, M per column)."""
+    i = iota16()
+    if wide:
+        us = splat16(u) + i
+        return us, splat16(a) * us * us, splat16(m) - splat16(k) * i
+    zero = splat16(_F(0.0))
+    return zero, zero, splat16(m) + i
+
+
+@kernel
+def row_parts(wide, a, k, u, j):
+    """What does not depend on the column: (u, A u^2, m j)."""
+    if wide:
+        return _F(0.0), _F(0.0), _F(j)
+    uj = u + _F(j)
+    return uj, a * uj * uj, -k * _F(j)
+
+
+@kernel
+def alpha_row(b, opacity, columns_q, columns_m, row_q, row_m):
+    """(alpha before the cap, falloff exp(-exponent), distance across) of one row of pixels."""
+    across = columns_m + splat16(row_m)
+    exponent = vfma(splat16(b) * across, across, columns_q + splat16(row_q))
+    falloff = vexp2(vmin(exponent, splat16(_CUT)) * splat16(_F(-_LOG2E)))
+    return splat16(opacity) * falloff, falloff, across
+
+
+@kernel
+def start_light(light, tile_x, tile_y, width, height):
+    """1 in the tile's pixels that lie in the picture, 0 in those beyond its rim."""
+    for j in range(TILE):
+        for i in range(TILE):
+            inside = tile_x * TILE + i < width and tile_y * TILE + j < height
+            light[j * TILE + i] = _F(1.0) if inside else _F(0.0)
+
+
+@kernel
+def _brightest(light):
+    most = vload(light, 0)
+    for j in range(1, TILE):
+        most = vmax(most, vload(light, j * TILE))
+    return vany(vge(most, splat16(_T_MIN)))
+
+
+@kernel
+def blend_tile(tile_x, tile_y, start, end, ranks, rows, geometry, paint, work):
+    """Blend entries start..end into work[6, 256]: light, red, green, blue, depth, last entry.
+
+    paint [visible, 4] float32: red, green, blue, depth of each splat.
+    """
+    light, red, green, blue, depth, last = work[0], work[1], work[2], work[3], work[4], work[5]
+    zero = splat16(_F(0.0))
+    for entry in range(start, end):
+        if (entry - start) % 16 == 15 and not _brightest(light):
+            break
+        rank = ranks[entry]
+        wide, a, b, k, opacity, u, m = tile_frame(geometry[rank], tile_x, tile_y)
+        _, columns_q, columns_m = column_parts(wide, a, k, u, m)
+        number = splat16(_F(entry - start + 1))
+        r, g = splat16(paint[rank, 0]), splat16(paint[rank, 1])
+        bl, z = splat16(paint[rank, 2]), splat16(paint[rank, 3])
+        for j in range(rows[entry] & 15, (rows[entry] >> 4) + 1):
+            at = j * TILE
+            _, row_q, row_m = row_parts(wide, a, k, u, j)
+            alpha, _, _ = alpha_row(b, opacity, columns_q, columns_m, row_q, row_m)
+            passing = vload(light, at)
+            drawn = vand(vge(alpha, splat16(_ALPHA_MIN)), vge(passing, splat16(_T_MIN)))
+            if vany(drawn):
+                alpha = vselect(drawn, vmin(alpha, splat16(_ALPHA_MAX)), zero)
+                weight = alpha * passing
+                vstore(light, at, passing * (splat16(_F(1.0)) - alpha))
+                vstore(red, at, vfma(weight, r, vload(red, at)))
+                vstore(green, at, vfma(weight, g, vload(green, at)))
+                vstore(blue, at, vfma(weight, bl, vload(blue, at)))
+                vstore(depth, at, vfma(weight, z, vload(depth, at)))
+                vstore(last, at, vselect(drawn, number, vload(last, at)))
+
+
+@kernel
+def blend_tiles(
+    ticket, width, height, tile_starts, ranks, rows, geometry, paint, background, image, light, last
+):
+    """Draw every tile. image [5, H, W] float32: red, green, blue, alpha, expected depth.
+
+    light, last [tiles, 256] float32: what the way back needs: the light that passes at the end and
+    the number of the last entry drawn.
+    """
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
+    work = np.empty((6, PIXELS), np.float32)
+    while True:
+        tile = take_ticket(ticket)
+        if tile >= tiles_x * tiles_y:
+            break
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        work[1:] = 0.0
+        start_light(work[0], tile_x, tile_y, width, height)
+        start, end = tile_starts[tile], tile_starts[tile + 1]
+        blend_tile(tile_x, tile_y, start, end, ranks, rows, geometry, paint, work)
+        light[tile] = work[0]
+        last[tile] = work[5]
+        for j in range(min(TILE, height - tile_y * TILE)):
+            y = tile_y * TILE + j
+            for i in range(min(TILE, width - tile_x * TILE)):
+                x, at = tile_x * TILE + i, j * TILE + i
+                passed = work[0, at]
+                image[0, y, x] = work[1, at] + passed * background[0]
+                image[1, y, x] = work[2, at] + passed * background[1]
+                image[2, y, x] = work[3, at] + passed * background[2]
+                image[3, y, x] = _F(1.0) - passed
+                image[4, y, x] = work[4, at] / max(_F(1.0) - passed, _F(0.5) * _ALPHA_MIN)
+
+
+@kernel
+def blend_gradient_tiles(
+    ticket,
+    width,
+    height,
+    tile_starts,
+    ranks,
+    slots,
+    rows,
+    geometry,
+    paint,
+    background,
+    light,
+    last,
+    v_image,
+    gradients,
+):
+    """gradients [intersections, 9] at each entry's slot, from v_image [3, H, W]."""
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
+    v = np.empty((3, PIXELS), np.float32)
+    passing = np.empty(PIXELS, np.float32)
+    behind = np.empty(PIXELS, np.float32)
+    while True:
+        tile = take_ticket(ticket)
+        if tile >= tiles_x * tiles_y:
+            break
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        v[:] = 0.0
+        furthest = _F(0.0)
+        for j in range(min(TILE, height - tile_y * TILE)):
+            for i in range(min(TILE, width - tile_x * TILE)):
+                at = j * TILE + i
+                for channel in range(3):
+                    v[channel, at] = v_image[channel, tile_y * TILE + j, tile_x * TILE + i]
+                furthest = max(furthest, last[tile, at])
+        for at in range(PIXELS):
+            passing[at] = light[tile, at]
+            behind[at] = light[tile, at] * (
+                v[0, at] * background[0] + v[1, at] * background[1] + v[2, at] * background[2]
+            )
+        start, end = tile_starts[tile], tile_starts[tile + 1]
+        drawn_end = start + np.int64(furthest)
+        for entry in range(drawn_end, end):
+            gradients[slots[entry]] = 0.0
+        for entry in range(drawn_end - 1, start - 1, -1):
+            entry_gradient(
+                tile_x,
+                tile_y,
+                _F(entry - start + 1),
+                rows[entry],
+                geometry[ranks[entry]],
+                paint[ranks[entry]],
+                v,
+                passing,
+                behind,
+                last[tile],
+                gradients[slots[entry]],
+            )
+
+
+@kernel
+def entry_gradient(
+    tile_x, tile_y, number, row_range, record, colour, v, passing, behind, last, out
+):
+    """Gradient of one splat in one tile into out[9]; moves `passing` and `behind` in front of it.
+
+    behind: per pixel, what lies behind, weighted by the incoming gradient (a suffix sum).
+    """
+    wide, a, b, k, opacity, u, m = tile_frame(record, tile_x, tile_y)
+    columns_u, columns_q, columns_m = column_parts(wide, a, k, u, m)
+    red, green, blue = v[0], v[1], v[2]
+    r, g, bl = splat16(colour[0]), splat16(colour[1]), splat16(colour[2])
+    zero, one = splat16(_F(0.0)), splat16(_F(1.0))
+    s_u, s_uu, s_t, s_tt, s_ut = zero, zero, zero, zero, zero
+    s_o, s_r, s_g, s_b = zero, zero, zero, zero
+    for j in range(row_range & 15, (row_range >> 4) + 1):
+        at = j * TILE
+        row_u, row_q, row_m = row_parts(wide, a, k, u, j)
+        raw, falloff, across = alpha_row(b, opacity, columns_q, columns_m, row_q, row_m)
+        drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, at), splat16(number)))
+        if not vany(drawn):
+            continue
+        alpha = vselect(drawn, vmin(raw, splat16(_ALPHA_MAX)), zero)
+        inverse = one / (one - alpha)
+        before = vload(passing, at) * inverse
+        vstore(passing, at, before)
+        weight = alpha * before
+        vr, vg, vb = vload(red, at), vload(green, at), vload(blue, at)
+        s_r = vfma(weight, vr, s_r)
+        s_g = vfma(weight, vg, s_g)
+        s_b = vfma(weight, vb, s_b)
+        shade = vfma(vr, r, vfma(vg, g, vb * bl))
+        after = vload(behind, at)
+        vstore(behind, at, vfma(weight, shade, after))
+        v_alpha = before * shade - after * inverse
+        free = vand(drawn, vgt(splat16(_ALPHA_MAX), raw))  # the cap passes nothing on
+        v_alpha = vselect(free, v_alpha, zero)
+        s_o = vfma(v_alpha, falloff, s_o)
+        v_exponent = zero - v_alpha * alpha
+        us = columns_u + splat16(row_u)
+        by_u, by_t = v_exponent * us, v_exponent * across
+        s_u = s_u + by_u
+        s_uu = vfma(by_u, us, s_uu)
+        s_t = s_t + by_t
+        s_tt = vfma(by_t, across, s_tt)
+        s_ut = vfma(by_t, us, s_ut)
+    t_sum = vsum(s_t)
+    out[0] = _F(2.0) * (b * k * t_sum - a * vsum(s_u))
+    out[1] = _F(-2.0) * b * t_sum
+    out[2] = vsum(s_uu)
+    out[3] = vsum(s_tt)
+    out[4] = _F(-2.0) * b * vsum(s_ut)
+    out[5] = vsum(s_o)
+    out[6], out[7], out[8] = vsum(s_r), vsum(s_g), vsum(s_b)

@@ -1,0 +1,257 @@
+"""The definition of a rendering, in plain torch: any dtype, any device, autograd.
+
+Every backend is held against this file. It is written to be read, not to be fast.
+
+A splat with mean m, rotation R(q), scales s and opacity o is seen through the local affine
+approximation of the projection (Zwicker et al. 2001): with V = J W R diag(s), its footprint is a
+Gaussian of covariance V V^T + e I, e the dilation. Along a pixel's ray splats are blended from
+near to far: alpha = min(0.99, o exp(-d)), left out where it is below 1/255, and a pixel is finished
+once less than 1e-4 of the light behind passes, after the splat that did it has been blended.
+
+Order: by depth (z in the camera) rounded to float32; equal depths by the splat's own values (mean,
+opacity, scales, rotation, SH), so that the order of rows in a file never shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.raster.api import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    LOG_SCALE_MAX,
+    QUATERNION_MIN,
+    TRANSMITTANCE_MIN,
+    RasterSettings,
+    Rendering,
+)
+from stages.raster.sh import C0, C1, C2, C3
+from stages.scene import Camera, Splats
+
+BLOCK = 32  # pixels; the picture is made block by block to bound memory
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The five arrays of `Splats` as tensors of one dtype; see there for shapes."""
+
+    means: Tensor
+    quaternions: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+
+    def rows(self, index: Tensor) -> Parameters:
+        return Parameters(*(tensor[index] for tensor in self.tensors()))
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        return (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh)
+
+
+def parameters_of(splats: Splats, dtype: torch.dtype = torch.float64) -> Parameters:
+    """Leaf tensors of `splats`, ready for autograd."""
+    arrays = (
+        splats.means,
+        splats.quaternions,
+        splats.log_scales,
+        splats.opacity_logits,
+        splats.sh,
+    )
+    return Parameters(*(torch.tensor(a, dtype=dtype, requires_grad=True) for a in arrays))
+
+
+def drawable(p: Parameters) -> Tensor:
+    """[N] bool: finite values, scales whose squares float32 can hold, a rotation that exists."""
+    finite = torch.stack([t.flatten(1).isfinite().all(1) for t in map(_two_d, p.tensors())]).all(0)
+    bounded = (p.log_scales <= LOG_SCALE_MAX).all(1)
+    rotates = p.quaternions.abs().amax(1) >= QUATERNION_MIN
+    return finite & bounded & rotates
+
+
+def _two_d(tensor: Tensor) -> Tensor:
+    return tensor[:, None] if tensor.ndim == 1 else tensor
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """[N, 3, 3] of quaternions w, x, y, z of any norm; scaled first: no square overflows."""
+    q = quaternions / quaternions.abs().amax(1, keepdim=True).detach()
+    w, x, y, z = (q / q.norm(dim=1, keepdim=True)).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """[N, (degree + 1)^2] real spherical harmonics of unit directions [N, 3]."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    columns = [torch.full_like(x, C0), -C1 * y, C1 * z, -C1 * x]
+    columns += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * zz - xx - yy)]
+    columns += [-C2[0] * x * z, C2[2] * (xx - yy)]
+    columns += [-C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, -C3[2] * y * (4 * zz - xx - yy)]
+    columns += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -C3[2] * x * (4 * zz - xx - yy)]
+    columns += [C3[4] * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)]
+    return torch.stack(columns[: (degree + 1) ** 2], -1)
+
+
+def colours(p: Parameters, camera_centre: Tensor, degree: int) -> Tensor:
+    """[N, 3] colour of each splat seen from `camera_centre`."""
+    offset = p.means - camera_centre
+    directions = offset / offset.norm(dim=1, keepdim=True)
+    degree = min(degree, int(p.sh.shape[1] ** 0.5) - 1)
+    basis = sh_basis(directions, degree)
+    return (0.5 + (basis[:, :, None] * p.sh[:, : basis.shape[1]]).sum(1)).clamp_min(0.0)
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Footprints of M splats, in blending order.
+
+    index [M] rows of the input. means2d [M, 2] px. a, b, c [M]: cov2d = [[a, b], [b, c]], px^2,
+    with its determinant det [M]. opacities [M], compensation included. depths [M].
+    """
+
+    index: Tensor
+    means2d: Tensor
+    a: Tensor
+    b: Tensor
+    c: Tensor
+    det: Tensor
+    opacities: Tensor
+    depths: Tensor
+
+
+def project(p: Parameters, camera: Camera, settings: RasterSettings) -> Projected:
+    """Footprints of the splats that can be seen at all, nearest first."""
+    like = {"dtype": p.means.dtype, "device": p.means.device}
+    world_to_camera = torch.tensor(camera.world_to_camera, **like)
+    rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    z = (p.means.detach() @ rotation.T + translation)[:, 2]
+    index = (drawable(p) & (z > settings.near)).nonzero()[:, 0]
+    p = p.rows(index)
+    at = p.means @ rotation.T + translation
+    z = at[:, 2]
+    slope_x, slope_y = at[:, 0] / z, at[:, 1] / z
+    means2d = torch.stack([camera.fx * slope_x + camera.cx, camera.fy * slope_y + camera.cy], 1)
+
+    low_x, high_x, low_y, high_y = clamp_limits(camera)
+    jacobian = torch.zeros(len(index), 2, 3, **like)
+    jacobian[:, 0, 0] = camera.fx / z
+    jacobian[:, 0, 2] = -camera.fx * slope_x.clamp(low_x, high_x) / z
+    jacobian[:, 1, 1] = camera.fy / z
+    jacobian[:, 1, 2] = -camera.fy * slope_y.clamp(low_y, high_y) / z
+    v = jacobian @ rotation @ rotation_matrices(p.quaternions) * p.log_scales.exp()[:, None, :]
+    # By Cauchy-Binet det(V V^T) is the sum of the squared 2x2 minors: never negative.
+    minors = torch.linalg.cross(v[:, 0], v[:, 1]).square().sum(1)
+    a0, b, c0 = v[:, 0].square().sum(1), (v[:, 0] * v[:, 1]).sum(1), v[:, 1].square().sum(1)
+    e = settings.dilation_px2
+    det = minors + e * (a0 + c0) + e * e
+    opacities = p.opacity_logits.sigmoid()
+    if settings.antialias:
+        opacities = opacities * (minors.clamp_min(1e-60) / det).sqrt()
+    seen = (opacities >= ALPHA_MIN).nonzero()[:, 0]
+    order = seen[_order(p.rows(seen), z[seen])]
+    return Projected(
+        index[order],
+        *(t[order] for t in (means2d, a0 + e, b, c0 + e, det, opacities, z)),
+    )
+
+
+def clamp_limits(camera: Camera) -> tuple[float, float, float, float]:
+    """Range of x/z and of y/z outside which the affine approximation is frozen: the picture's own
+    range and 0.3 of the half field of view on each side (the reference trainer's 1.3)."""
+    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
+    return (
+        -camera.cx / camera.fx - margin_x,
+        (camera.width - camera.cx) / camera.fx + margin_x,
+        -camera.cy / camera.fy - margin_y,
+        (camera.height - camera.cy) / camera.fy + margin_y,
+    )
+
+
+def _order(p: Parameters, z: Tensor) -> Tensor:
+    keys = [z.detach().to(torch.float32)[:, None]]
+    keys += [
+        _two_d(t.detach()) for t in (p.means, p.opacity_logits, p.log_scales, p.quaternions)
+    ] + [p.sh.detach().flatten(1)]
+    table = torch.cat([k.to(torch.float64).cpu() for k in keys], 1).numpy()
+    return torch.from_numpy(np.lexsort(table.T[::-1])).to(z.device)
+
+
+def blend_weights(projected: Projected, rows: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """([M, P] blend weights, [P] light that still passes) of splats `rows` at pixel centres [P, 2].
+
+    The exponent in Cholesky form: never negative, whatever the rounding.
+    """
+    q = Projected(*(getattr(projected, f)[rows] for f in projected.__dataclass_fields__))
+    dx = pixels[None, :, 0] - q.means2d[:, None, 0]
+    dy = pixels[None, :, 1] - q.means2d[:, None, 1]
+    wide = (q.a >= q.c)[:, None]
+    major = torch.where(wide, q.a[:, None], q.c[:, None])
+    u, v = torch.where(wide, dx, dy), torch.where(wide, dy, dx)
+    across = v - q.b[:, None] / major * u
+    exponent = 0.5 * (u * u / major + across * across * (major / q.det[:, None]))
+    alpha = (q.opacities[:, None] * torch.exp(-exponent)).clamp_max(ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
+    through = torch.cumprod(1 - alpha, 0)
+    before = torch.cat([torch.ones_like(through[:1]), through[:-1]])
+    alive = before >= TRANSMITTANCE_MIN
+    passed = torch.where(alive, 1 - alpha, torch.ones_like(alpha)).prod(0)
+    return torch.where(alive, alpha * before, torch.zeros_like(alpha)), passed
+
+
+def render_tensors(
+    p: Parameters, camera: Camera, settings: RasterSettings
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(image [H, W, 3], alpha [H, W], depth [H, W]), differentiable in all of `p`."""
+    like = {"dtype": p.means.dtype, "device": p.means.device}
+    projected = project(p, camera, settings)
+    centre = torch.tensor(camera.centre, **like)
+    rgb = colours(p.rows(projected.index), centre, settings.sh_degree)
+    background = torch.tensor(settings.background, **like)
+    reach = (2 * torch.log(255 * projected.opacities.detach())).clamp_min(0).sqrt()
+    extent = torch.stack([projected.a, projected.c], 1).detach().sqrt() * reach[:, None]
+    low, high = projected.means2d.detach() - extent, projected.means2d.detach() + extent
+
+    image = torch.zeros(camera.height, camera.width, 3, **like)
+    alpha = torch.zeros(camera.height, camera.width, **like)
+    depth = torch.zeros(camera.height, camera.width, **like)
+    for top in range(0, camera.height, BLOCK):
+        for left in range(0, camera.width, BLOCK):
+            bottom, right = min(top + BLOCK, camera.height), min(left + BLOCK, camera.width)
+            corner, end = torch.tensor([left, top], **like), torch.tensor([right, bottom], **like)
+            rows = ((high >= corner) & (low <= end)).all(1).nonzero()[:, 0]
+            ys, xs = torch.meshgrid(
+                torch.arange(top, bottom, **like) + 0.5,
+                torch.arange(left, right, **like) + 0.5,
+                indexing="ij",
+            )
+            weights, passed = blend_weights(
+                projected, rows, torch.stack([xs, ys], -1).flatten(0, 1)
+            )
+            shape = ys.shape
+            colour = weights.T @ rgb[rows] + passed[:, None] * background
+            image[top:bottom, left:right] = colour.reshape(*shape, 3)
+            hit = weights.sum(0)
+            alpha[top:bottom, left:right] = (1 - passed).reshape(shape)
+            mean_depth = (weights.T @ projected.depths[rows]) / hit.clamp_min(ALPHA_MIN / 2)
+            depth[top:bottom, left:right] = mean_depth.reshape(shape)
+    return image, alpha, depth
+
+
+def render_reference(splats: Splats, camera: Camera, settings: RasterSettings) -> Rendering:
+    """`render` in float64 by the definition itself."""
+    to_world = np.eye(4)
+    to_world[:3, 3] = splats.origin
+    p = parameters_of(splats)
+    with torch.no_grad():
+        image, alpha, depth = render_tensors(p, camera.moved(to_world), settings)
+        culled = int((~drawable(p)).sum())
+    return Rendering(*(t.numpy().astype(np.float32) for t in (image, alpha, depth)), culled)

@@ -1,0 +1,269 @@
+"""Sixteen float32 at a time, spelled out.
+
+LLVM's loop vectoriser does not see through a rasteriser's inner loop (arrays that may alias,
+masks, an exponential), so the kernels say what they mean: values of type `f32x16` and masks of 16
+bits, which LLVM lowers to whatever the processor has (one AVX-512 register, two of AVX2, four of
+SSE or NEON). All functions here can be called from `numba.njit` code only.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numba
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, models, overload, register_model
+
+LANES = 16
+_F32 = ir.FloatType()
+_I32 = ir.IntType(32)
+_VECTOR = ir.VectorType(_F32, LANES)
+_INTEGERS = ir.VectorType(_I32, LANES)
+_MASK = ir.VectorType(ir.IntType(1), LANES)
+
+
+class _VectorType(types.Type):
+    def __init__(self, name: str) -> None:
+        super().__init__(name=name)
+
+
+f32x16 = _VectorType("f32x16")
+mask16 = _VectorType("mask16")
+
+
+@register_model(_VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, _MASK if fe_type is mask16 else _VECTOR)
+
+
+def _constant(value: float) -> ir.Constant:
+    return ir.Constant(_VECTOR, [ir.Constant(_F32, value)] * LANES)
+
+
+def _broadcast(builder: Any, scalar: Any) -> Any:
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    one = builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
+    zeros = ir.Constant(ir.VectorType(_I32, LANES), [ir.Constant(_I32, 0)] * LANES)
+    return builder.shuffle_vector(one, undefined, zeros)
+
+
+def _call(builder: Any, name: str, result: Any, args: list[Any]) -> Any:
+    function_type = ir.FunctionType(result, [a.type for a in args])
+    function = cgutils.get_or_insert_function(builder.module, function_type, name)
+    return builder.call(function, args)
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    struct = context.make_array(array_type)(context, builder, array)
+    address = builder.gep(struct.data, [index])
+    return builder.bitcast(address, _VECTOR.as_pointer())
+
+
+def _unary(typing_result: Any, emit: Any) -> Any:
+    @intrinsic
+    def op(typingctx: Any, a: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return emit(builder, *args)
+
+        return typing_result(a), codegen
+
+    return op
+
+
+def _binary(result: Any, emit: Any) -> Any:
+    @intrinsic
+    def op(typingctx: Any, a: Any, b: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return emit(builder, *args)
+
+        return result(a, b), codegen
+
+    return op
+
+
+@intrinsic
+def vload(typingctx: Any, array: Any, index: Any) -> Any:
+    """array[index : index + 16] of a C-contiguous 1-D float32 array; not bounds-checked."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = _pointer(context, builder, sig.args[0], args[0], args[1])
+        return builder.load(address, align=4)
+
+    return f32x16(array, types.intp), codegen
+
+
+@intrinsic
+def vstore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """array[index : index + 16] = value; not bounds-checked."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = _pointer(context, builder, sig.args[0], args[0], args[1])
+        builder.store(args[2], address, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, f32x16), codegen
+
+
+@intrinsic
+def splat16(typingctx: Any, scalar: Any) -> Any:
+    """The same float32 in all lanes."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _broadcast(builder, args[0])
+
+    return f32x16(types.float32), codegen
+
+
+@intrinsic
+def iota16(typingctx: Any) -> Any:
+    """0, 1, ..., 15."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return ir.Constant(_VECTOR, [ir.Constant(_F32, float(i)) for i in range(LANES)])
+
+    return f32x16(), codegen
+
+
+@intrinsic
+def vfma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+    """a * b + c, rounded once."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _call(builder, "llvm.fma.v16f32", _VECTOR, list(args))
+
+    return f32x16(a, b, c), codegen
+
+
+@intrinsic
+def vselect(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
+    """a where the mask is set, else b."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(*args)
+
+    return f32x16(mask, a, b), codegen
+
+
+def _any(builder: Any, mask: Any) -> Any:
+    bits = builder.bitcast(mask, ir.IntType(LANES))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
+
+def _sum(builder: Any, vector: Any) -> Any:
+    """A tree of fixed shape, so that every processor adds in the same order."""
+    width = LANES
+    undefined = ir.Constant(_VECTOR, ir.Undefined)
+    while width > 1:
+        width //= 2
+        lanes = [ir.Constant(_I32, (i + width) % LANES) for i in range(LANES)]
+        shuffled = builder.shuffle_vector(vector, undefined, ir.Constant(_INTEGERS, lanes))
+        vector = builder.fadd(vector, shuffled)
+    return builder.extract_element(vector, ir.Constant(_I32, 0))
+
+
+# exp2 on [-1/2, 1/2]: Taylor coefficients ln(2)^k / k! to degree 6, relative error below 1.3e-7.
+_EXP2 = (
+    1.0,
+    0.6931471805599453,
+    0.2402265069591007,
+    0.05550410866482158,
+    0.009618129107628477,
+    0.0013333558146428443,
+    0.0001540353039338161,
+)
+
+
+def _exp2(builder: Any, x: Any) -> Any:
+    """2^x for x in [-126, 126]: the whole part goes into the exponent bits."""
+    magic = _constant(12582912.0)  # 1.5 x 2^23: adding it rounds to the nearest integer
+    shifted = builder.fadd(x, magic)
+    whole = builder.fsub(shifted, magic)
+    rest = builder.fsub(x, whole)
+    value = _constant(_EXP2[-1])
+    for coefficient in _EXP2[-2::-1]:
+        value = _call(builder, "llvm.fma.v16f32", _VECTOR, [value, rest, _constant(coefficient)])
+    bits = builder.bitcast(shifted, _INTEGERS)
+    exponent = builder.shl(bits, ir.Constant(_INTEGERS, [ir.Constant(_I32, 23)] * LANES))
+    return builder.bitcast(builder.add(builder.bitcast(value, _INTEGERS), exponent), _VECTOR)
+
+
+def _min(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+
+
+def _max(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+
+def _vector1(a: Any) -> Any:
+    return f32x16(a)
+
+
+def _vector2(a: Any, b: Any) -> Any:
+    return f32x16(a, b)
+
+
+def _mask2(a: Any, b: Any) -> Any:
+    return mask16(a, b)
+
+
+vmin = _binary(_vector2, _min)  # the second where a lane holds NaN
+vmax = _binary(_vector2, _max)
+vexp2 = _unary(_vector1, _exp2)
+vabs = _unary(_vector1, lambda b, x: _call(b, "llvm.fabs.v16f32", _VECTOR, [x]))
+vsum = _unary(lambda a: types.float32(a), _sum)
+vany = _unary(lambda a: types.boolean(a), _any)
+vge = _binary(_mask2, lambda b, x, y: b.fcmp_ordered(">=", x, y))  # False where a lane holds NaN
+vgt = _binary(_mask2, lambda b, x, y: b.fcmp_ordered(">", x, y))
+vand = _binary(_mask2, lambda b, x, y: b.and_(x, y))
+_vadd = _binary(_vector2, lambda b, x, y: b.fadd(x, y))
+_vsub = _binary(_vector2, lambda b, x, y: b.fsub(x, y))
+_vmul = _binary(_vector2, lambda b, x, y: b.fmul(x, y))
+_vdiv = _binary(_vector2, lambda b, x, y: b.fdiv(x, y))
+
+
+# Numba compares signatures with annotations and all, so the overloads carry none.
+def _both_vectors(a, b):
+    return a is f32x16 and b is f32x16
+
+
+@overload(operator.add)
+def _add(a, b):
+    return (lambda a, b: _vadd(a, b)) if _both_vectors(a, b) else None
+
+
+@overload(operator.sub)
+def _sub(a, b):
+    return (lambda a, b: _vsub(a, b)) if _both_vectors(a, b) else None
+
+
+@overload(operator.mul)
+def _mul(a, b):
+    return (lambda a, b: _vmul(a, b)) if _both_vectors(a, b) else None
+
+
+@overload(operator.truediv)
+def _truediv(a, b):
+    return (lambda a, b: _vdiv(a, b)) if _both_vectors(a, b) else None
+
+
+@intrinsic
+def take_ticket(typingctx: Any, counter: Any) -> Any:
+    """counter[0]++ as one atomic operation; the value before. Threads share work with it.
+
+    Only the order in which work is taken depends on it, never a result.
+    """
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        struct = context.make_array(sig.args[0])(context, builder, args[0])
+        one = ir.Constant(ir.IntType(64), 1)
+        return builder.atomic_rmw("add", struct.data, one, "monotonic")
+
+    return types.int64(counter), codegen
+
+
+kernel = numba.njit(nogil=True, cache=True, fastmath=False, error_model="numpy", boundscheck=False)
+"""Decorator of every kernel: runs without the GIL, compiled once and kept on disk."""
