@@ -1,0 +1,305 @@
+"""Capture -> Reconstruction: where each photograph was taken, and a sparse cloud of points.
+
+Structure from motion by COLMAP, in a process of its own. The result is used only if it passes the
+gates of `stages.structure.gates`; if it does not, other ways are tried, and if none helps, the
+user is told what to photograph differently.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.run import threads
+from stages.run.errors import Family, SplatError
+from stages.run.stage import Report, Stage
+
+if TYPE_CHECKING:
+    from stages.scene import Capture, Reconstruction
+    from stages.structure.job import Job
+    from stages.structure.ladder import Attempt, Climb
+    from stages.structure.sparse_model import SparseModel
+
+EXHAUSTIVE_UP_TO = 300  # photographs; beyond, matching every pair takes hours
+_FEWEST_PHOTOGRAPHS = 3
+_FEWEST_PARTIAL_POINTS = 50
+_FINISHED = "sfm.json"
+_WORK = "work"
+_NAMED = 12  # photographs that a message names before it counts the rest
+
+
+@dataclass(frozen=True)
+class SfmSettings:
+    """Settings of structure from motion."""
+
+    seed: int = field(
+        default=0, metadata={"help": "Seed of every random choice; same seed, same result."}
+    )
+    max_features: int = field(
+        default=8192, metadata={"help": "Features to look for in each photograph (about)."}
+    )
+    matching: str = field(
+        default="auto",
+        metadata={
+            "help": "Which photographs to compare: exhaustive (every pair), sequential (neighbours "
+            "in order of name) or auto (exhaustive up to 300 photographs)."
+        },
+    )
+    allow_partial: bool = field(
+        default=False,
+        metadata={"help": "Go on with the best reconstruction found even if it fails its gates."},
+    )
+    max_minutes: float = field(
+        default=120.0,
+        metadata={"help": "Give up after this time (minutes).", "affects_output": False},
+    )
+
+
+def run(
+    inputs: Mapping[str, Any], settings: SfmSettings, folder: Path, report: Report
+) -> Reconstruction:
+    """Reconstruct the capture in inputs["ingest"]; see the module's docstring.
+
+    Leaves in `folder`: reconstruction.json and arrays (`load` reads them), colmap/ (undistorted
+    pictures and a COLMAP model of them), sfm.json (metrics and warnings). Raises SplatError of
+    family RECONSTRUCTION when no reconstruction passes, and Interrupted.
+    """
+    from stages.structure import attempts, finish, ladder, reconstruction_files
+
+    capture: Capture = inputs["ingest"]
+    _check(capture, settings)
+    if (folder / _FINISHED).exists():
+        return _again(folder, report)
+    work = folder / _WORK
+    base = _base_job(capture, settings, work)
+    _reuse_or_clear(work, base)
+    bench = attempts.Workbench(
+        folder=work,
+        base=base,
+        report=report,
+        deadline=time.monotonic() + 60.0 * settings.max_minutes,
+        allow_partial=settings.allow_partial,
+    )
+    climbed = ladder.climb(
+        bench.try_rung,
+        already_exhaustive=base.matching == "exhaustive",
+        out_of_time=bench.out_of_time,
+    )
+    best = climbed.best
+    report.metric("rungs", [_rung_figures(attempt) for attempt in climbed.attempts])
+    model = _accepted(best, settings)
+    _tell(best, climbed, capture, report)
+    reconstruction = finish.finish(model, capture, folder, report)
+    reconstruction_files.save_reconstruction(folder, reconstruction)
+    _model_metrics(best, model, reconstruction, capture, report)
+    _write_finished(folder, report)
+    shutil.rmtree(work)
+    return reconstruction
+
+
+def load(folder: Path) -> Reconstruction:
+    """The reconstruction of a finished folder; pictures are not opened."""
+    from stages.structure.reconstruction_files import load_reconstruction
+
+    return load_reconstruction(folder)
+
+
+def _check(capture: Capture, settings: SfmSettings) -> None:
+    if settings.matching not in ("auto", "exhaustive", "sequential"):
+        raise SplatError(
+            "sfm-unknown-matching",
+            given=f"--matching {settings.matching}.",
+            wanted="One of auto, exhaustive, sequential.",
+            hint="Leave it out to let the number of photographs decide.",
+            family=Family.USAGE,
+        )
+    if settings.max_features < 100 or not settings.max_minutes > 0 or settings.seed < 0:
+        raise SplatError(
+            "sfm-bad-setting",
+            given=f"max_features {settings.max_features}, max_minutes {settings.max_minutes:g}, "
+            f"seed {settings.seed}.",
+            wanted="At least 100 features, some time, and a seed that is not negative.",
+            hint="Leave these options out to use their defaults.",
+            family=Family.USAGE,
+        )
+    if len(capture.photos) < _FEWEST_PHOTOGRAPHS:
+        raise SplatError(
+            "sfm-too-few-photographs",
+            given=f"There are {len(capture.photos)} usable photographs.",
+            wanted=f"At least {_FEWEST_PHOTOGRAPHS}; 20 to 50 do an object or a room well.",
+            hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
+            family=Family.INPUT,
+        )
+
+
+def _base_job(capture: Capture, settings: SfmSettings, work: Path) -> Job:
+    """The standard job: one camera for all photographs of the same key and size."""
+    from stages.structure.job import CameraGuess, Job
+
+    positions: dict[tuple[str, int, int], int] = {}
+    guesses: list[CameraGuess] = []
+    camera_of = []
+    for photo in capture.photos:
+        key = (photo.camera, photo.width, photo.height)
+        if key not in positions:
+            positions[key] = len(guesses)
+            guesses.append(CameraGuess(photo.width, photo.height, photo.focal_px))
+        camera_of.append(positions[key])
+    matching = settings.matching
+    if matching == "auto":
+        matching = "exhaustive" if len(capture.photos) <= EXHAUSTIVE_UP_TO else "sequential"
+    return Job(
+        step="",
+        images_root=str(capture.folder.resolve()),
+        database=str(work / "base.db"),
+        out="",
+        progress="",
+        names=tuple(photo.image for photo in capture.photos),
+        camera_of=tuple(camera_of),
+        cameras=tuple(guesses),
+        seed=settings.seed,
+        threads=threads.count(),
+        max_features=settings.max_features,
+        matching=matching,
+    )
+
+
+def _reuse_or_clear(work: Path, base: Job) -> None:
+    """Keep what an interrupted run left only if it was about the very same job."""
+    described = work / "base.json"
+    # Where things lie and how many threads work on them changes nothing.
+    plain = asdict(base) | {"images_root": "", "database": "", "threads": 0}
+    wanted = json.dumps(plain, ensure_ascii=False, sort_keys=True)
+    try:
+        same = described.read_text(encoding="utf-8") == wanted
+    except (OSError, ValueError):
+        same = False
+    if not same:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        described.write_text(wanted, encoding="utf-8")
+
+
+def _accepted(best: Attempt, settings: SfmSettings) -> SparseModel:
+    """The model to go on with, or the error that says why there is none."""
+    model = best.result.model if best.result is not None else None
+    usable = model is not None and len(model.names) >= _FEWEST_PHOTOGRAPHS
+    if model is not None and usable and best.passed:
+        return model
+    enough = model is not None and len(model.points) >= _FEWEST_PARTIAL_POINTS
+    if model is not None and usable and enough and settings.allow_partial:
+        return model
+    worst = best.failures[0]
+    raise SplatError(
+        worst.code,
+        given=worst.given,
+        wanted=worst.wanted,
+        hint=worst.hint,
+        family=Family.RECONSTRUCTION,
+    )
+
+
+def _tell(best: Attempt, climbed: Climb, capture: Capture, report: Report) -> None:
+    """Warnings about what is not as it should be."""
+    assert best.result is not None
+    assert best.result.model is not None
+    registered = set(best.result.model.names)
+    left_out = [photo.name for photo in capture.photos if photo.image not in registered]
+    if left_out:
+        one = len(left_out) == 1
+        report.warn(
+            "sfm-photographs-left-out",
+            f"{len(left_out)} of {len(capture.photos)} photographs {'was' if one else 'were'} left "
+            f"out, because {'it' if one else 'they'} could not be placed: {_listed(left_out)}. "
+            "More overlap with the others would help.",
+        )
+    if len(best.result.groups) > 1:
+        sizes = ", ".join(str(len(group)) for group in best.result.groups)
+        report.warn(
+            "sfm-several-models",
+            f"The photographs fell into separate models of {sizes}; the largest is used.",
+        )
+    if best.passed and best is not climbed.attempts[0]:
+        report.warn(
+            "sfm-second-try",
+            f"The usual way did not work ({climbed.attempts[0].failures[0].given}) but "
+            f"another did: {best.rung.name}. Look at the result with care.",
+        )
+    for failure in best.failures:
+        report.warn(failure.code, f"Accepted all the same: {failure.given} {failure.wanted}")
+
+
+def _listed(names: list[str]) -> str:
+    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + rest
+
+
+def _rung_figures(attempt: Attempt) -> dict[str, Any]:
+    figures = {
+        name: round(value, 4) if isinstance(value, float) else value
+        for name, value in asdict(attempt.figures).items()
+    }
+    return {
+        "rung": attempt.rung.name,
+        "passed": attempt.passed,
+        "failures": [failure.code for failure in attempt.failures],
+        "keypoints_median": attempt.keypoints_median,
+        **figures,
+    }
+
+
+def _model_metrics(
+    best: Attempt,
+    model: SparseModel,
+    reconstruction: Reconstruction,
+    capture: Capture,
+    report: Report,
+) -> None:
+    registered = set(model.names)
+    figures = best.figures
+    report.metric("photographs", len(capture.photos))
+    report.metric("registered", len(model.names))
+    report.metric("left_out", [p.name for p in capture.photos if p.image not in registered])
+    report.metric("points", len(model.points))
+    report.metric("mean_reprojection_error_px", round(figures.mean_reprojection_error_px, 4))
+    report.metric("mean_track_length", round(figures.mean_track_length, 3))
+    report.metric(
+        "median_triangulation_angle_deg", round(figures.median_triangulation_angle_deg, 2)
+    )
+    report.metric("baseline_over_depth", round(figures.baseline_over_depth, 4))
+    report.metric("keypoints_median", best.keypoints_median)
+    report.metric("focal_px", [round(float(f), 2) for f in model.camera_params[:, 0]])
+    report.metric("distortion", [round(float(k), 5) for k in model.camera_params[:, 3]])
+    report.metric("rung", best.rung.name)
+    report.metric("levelled", reconstruction.levelled)
+    report.metric("units", reconstruction.units)
+    report.metric("origin", [float(value) for value in reconstruction.origin])
+
+
+def _write_finished(folder: Path, report: Report) -> None:
+    from stages.run.atomic import replacing
+
+    data = {"metrics": report.metrics, "warnings": report.warnings}
+    with replacing(folder / _FINISHED) as path:
+        path.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
+
+
+def _again(folder: Path, report: Report) -> Reconstruction:
+    """What a run that was killed just after its end had found and said."""
+    data = json.loads((folder / _FINISHED).read_text(encoding="utf-8"))
+    for name, value in data["metrics"].items():
+        report.metric(name, value)
+    for code, message in data["warnings"]:
+        report.warn(code, message)
+    shutil.rmtree(folder / _WORK, ignore_errors=True)
+    return load(folder)
+
+
+STAGE = Stage(
+    name="sfm", version=1, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+)

@@ -1,0 +1,205 @@
+"""One rung after another, made real: which databases, which jobs, what is kept for resuming.
+
+Everything lies under one work folder. A step that is finished leaves a marker, and a run that was
+killed goes on after the last marker; half-done extraction and matching go on inside COLMAP's
+database, whose content does not depend on how often it was interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+
+from stages.run.stage import Report
+from stages.structure import database as sqlite
+from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
+from stages.structure.job import Job
+from stages.structure.ladder import Attempt, Rung
+from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
+from stages.structure.sparse_model import load_result, measure, without_weak_views
+
+MORE_FEATURES = 2.0  # times as many, at most
+LOWER_PEAK = 0.4  # times SIFT's peak threshold
+
+
+@dataclass
+class Workbench:
+    """Runs rungs for one capture. base: the job that rungs vary. deadline: time.monotonic()."""
+
+    folder: Path
+    base: Job
+    report: Report
+    deadline: float
+    allow_partial: bool = False
+
+    def out_of_time(self) -> bool:
+        return self.seconds_left() <= 0
+
+    def seconds_left(self) -> float:
+        return self.deadline - time.monotonic()
+
+    def try_rung(self, rung: Rung) -> Attempt:
+        """Features, matches, mapping and all gates for one rung.
+
+        Raises SplatError for crashes of extraction and matching, and Interrupted.
+        """
+        photographs = len(self.base.names)
+        nothing = Figures(photographs=photographs, mapper=rung.mapper)
+        job = self._job(rung)
+        try:
+            self._features(job)
+            counts = sqlite.keypoint_counts(Path(job.database), photographs)
+            attempt = Attempt(rung, (), nothing, keypoints_median=float(median(counts)))
+            failures = check_keypoints(counts)
+            if failures and not self._hopeful(rung):
+                return replace(attempt, failures=tuple(failures))
+            job = self._matching(job, rung)
+            failures = check_pairs(sqlite.verified_pairs(Path(job.database)), photographs)
+            if failures and not self.allow_partial:
+                return replace(attempt, failures=tuple(failures))
+            if any(failure.code == "sfm-no-matches" for failure in failures):
+                return replace(attempt, failures=tuple(failures))
+        except WorkerTimedOut:
+            return Attempt(rung, (_too_slow(photographs),), nothing)
+        except WorkerCrashed as crash:
+            raise crash_error(crash, self.folder) from crash
+        return self._mapped(job, attempt, failures)
+
+    def _hopeful(self, rung: Rung) -> bool:
+        """Whether to go on with few features: only if there is no richer rung to come."""
+        return self.allow_partial and rung.more_features
+
+    def _mapped(self, job: Job, attempt: Attempt, before: list[Failure]) -> Attempt:
+        try:
+            self._mapping(job)
+        except WorkerTimedOut:
+            figures = replace(attempt.figures, timed_out=True)
+            return replace(attempt, figures=figures, failures=tuple(check_model(figures)))
+        except WorkerCrashed as crash:
+            error = crash_error(crash, self.folder)
+            failure = Failure(error.code, error.given, error.wanted, error.hint)
+            return replace(attempt, failures=(failure,))
+        result = load_result(Path(job.out))
+        if result.model is not None:
+            result = replace(result, model=without_weak_views(result.model))
+        figures = measure(result, len(self.base.names), attempt.rung.mapper)
+        failures = tuple(before) + tuple(check_model(figures))
+        return replace(attempt, figures=figures, failures=failures, result=result)
+
+    def _job(self, rung: Rung) -> Job:
+        base = self.base
+        name = "more" if rung.more_features else "base"
+        return replace(
+            base,
+            database=str(self.folder / f"{name}.db"),
+            out=str(self.folder / ("model-" + re.sub(r"\W+", "-", rung.name))),
+            progress=str(self.folder / "progress.json"),
+            max_features=round(base.max_features * (MORE_FEATURES if rung.more_features else 1)),
+            peak_threshold=base.peak_threshold * (LOWER_PEAK if rung.more_features else 1.0),
+            matching="exhaustive" if rung.exhaustive else base.matching,
+            drop_stationary=rung.drop_stationary,
+            mapper=rung.mapper,
+            loose=rung.loose,
+            other_pair=rung.other_pair,
+        )
+
+    def _features(self, job: Job) -> None:
+        database = Path(job.database)
+        marker = database.with_suffix(".features-done")
+        if marker.exists() and database.exists():
+            return
+        if database.exists():
+            _repair_or_delete(database)
+        total = len(job.names)
+        self._run(replace(job, step="features"), lambda: self._count(job, "features", total))
+        marker.touch()
+
+    def _matching(self, job: Job, rung: Rung) -> Job:
+        """Match; returns the job with the database that holds the geometries to use."""
+        database = Path(job.database)
+        if rung.drop_stationary:
+            copied = database.with_name(database.stem + "-moving.db")
+            if not copied.exists():
+                sqlite.copy(database, copied)
+                sqlite.forget_geometries(copied)
+            database = copied
+            job = replace(job, database=str(copied))
+        marker = database.with_suffix(f".{job.matching}-done")
+        if marker.exists() and database.exists():
+            return job
+        if not rung.drop_stationary:
+            sqlite.repair(database)
+        total = pair_count(len(job.names), job.matching)
+        self._run(replace(job, step="matching"), lambda: self._count(job, "matching", total))
+        marker.touch()
+        return job
+
+    def _mapping(self, job: Job) -> None:
+        if (Path(job.out) / "result.json").exists():
+            return
+        Path(job.progress).unlink(missing_ok=True)
+        total = len(job.names)
+        budget = min(self.seconds_left(), mapping_seconds(total))
+        timed = replace(job, step="mapping", max_seconds=max(1, int(budget)))
+
+        def tick() -> None:
+            registered = _registered(Path(job.progress))
+            self.report.progress(registered, total, "placing photographs", registered=registered)
+
+        # COLMAP looks at its own clock only between photographs.
+        self._run(timed, tick, timed.max_seconds + 60.0)
+
+    def _run(self, job: Job, tick: Callable[[], None], max_seconds: float | None = None) -> None:
+        seconds = self.seconds_left() if max_seconds is None else max_seconds
+        run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+
+    def _count(self, job: Job, step: str, total: int) -> None:
+        done = sqlite.count_done(Path(job.database), step)
+        label, unit = ("finding features", "photographs")
+        if step == "matching":
+            label, unit = ("matching", "pairs")
+        if done is not None:
+            self.report.progress(min(done, total), total, label, **{unit: done})
+
+
+def pair_count(photographs: int, matching: str) -> int:
+    """Pairs that will be matched (for sequential matching about, and at most)."""
+    every = photographs * (photographs - 1) // 2
+    if matching == "exhaustive":
+        return every
+    return min(every, photographs * 24)
+
+
+def mapping_seconds(photographs: int) -> float:
+    """Time for one mapping: several times what good captures need on two slow cores, because
+    captures that cannot be mapped go on for ever."""
+    return 240.0 + 10.0 * photographs
+
+
+def _repair_or_delete(database: Path) -> None:
+    try:
+        sqlite.repair(database)
+    except sqlite3.DatabaseError:
+        sqlite.delete(database)
+
+
+def _registered(progress: Path) -> int:
+    try:
+        return int(json.loads(progress.read_text())["registered"])
+    except (OSError, ValueError, KeyError):
+        return 0
+
+
+def _too_slow(photographs: int) -> Failure:
+    return Failure(
+        "sfm-timed-out",
+        f"Features and matches of {photographs} photographs were not ready in time.",
+        "The search must come to an end.",
+        "Allow more time with --max-minutes, or use fewer or smaller photographs (--max-side).",
+    )

@@ -1,0 +1,106 @@
+"""Features and matches, in the worker process (imports pycolmap)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from stages.structure import database as sqlite
+from stages.structure.job import CameraGuess, Job
+
+FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess where EXIF says nothing
+SEQUENTIAL_OVERLAP = 20
+
+
+def extract(job: Job) -> None:
+    """SIFT features of every photograph into the job's database; goes on where it stopped."""
+    database = Path(job.database)
+    if not database.exists():
+        _create(database, job)
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = job.threads
+    options.use_gpu = pycolmap.has_cuda
+    options.sift.max_num_features = job.max_features
+    options.sift.peak_threshold = job.peak_threshold
+    pycolmap.extract_features(
+        database,
+        job.images_root,
+        image_names=list(job.names),
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        extraction_options=options,
+        device=_device(),
+    )
+
+
+def match(job: Job) -> None:
+    """Match and verify pairs of photographs; pairs that the database holds are not done again."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = job.threads
+    matching.use_gpu = pycolmap.has_cuda
+    common: dict[str, Any] = {
+        "matching_options": matching,
+        "verification_options": _verification(job),
+        "device": _device(),
+    }
+    if job.matching == "sequential":
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = SEQUENTIAL_OVERLAP
+        pairing.quadratic_overlap = True
+        pycolmap.match_sequential(job.database, pairing_options=pairing, **common)
+    else:
+        pycolmap.match_exhaustive(job.database, **common)
+
+
+def _verification(job: Job) -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job.seed
+    options.compute_relative_pose = True  # also tells a turn on the spot from a planar scene
+    options.filter_stationary_matches = job.drop_stationary
+    return options
+
+
+def _device() -> pycolmap.Device:
+    return pycolmap.Device.auto if pycolmap.has_cuda else pycolmap.Device.cpu
+
+
+def _create(path: Path, job: Job) -> None:
+    """A database with the cameras and photographs, ids = position + 1.
+
+    Written by hand because COLMAP numbers photographs in the order in which its threads finish,
+    and trusts EXIF focal lengths that a resize made wrong. Appears under its name when complete.
+    """
+    partial = path.with_name(path.name + ".partial")
+    sqlite.delete(partial)
+    database = pycolmap.Database.open(partial)
+    for camera_id, guess in enumerate(job.cameras, 1):
+        camera = _camera(camera_id, guess)
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig()
+        rig.rig_id = camera_id
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for image_id, (name, position) in enumerate(zip(job.names, job.camera_of, strict=True), 1):
+        image = pycolmap.Image()
+        image.image_id = image_id
+        image.name = name
+        image.camera_id = position + 1
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame()
+        frame.frame_id = image_id
+        frame.rig_id = position + 1
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)
+    database.close()
+    os.replace(partial, path)
+
+
+def _camera(camera_id: int, guess: CameraGuess) -> pycolmap.Camera:
+    focal_px = guess.focal_px or FOCAL_WITHOUT_PRIOR * max(guess.width, guess.height)
+    camera = pycolmap.Camera.create_from_model_name(
+        camera_id, "SIMPLE_RADIAL", focal_px, guess.width, guess.height
+    )
+    camera.has_prior_focal_length = guess.focal_px is not None
+    return camera

@@ -1,0 +1,174 @@
+"""From an accepted sparse model to what later stages and other programs read."""
+
+from __future__ import annotations
+
+import posixpath
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stages.run.atomic import replacing
+from stages.run.errors import Interrupted, SplatError
+from stages.run.stage import Report
+from stages.scene import Camera, Capture, Photo, Reconstruction, View
+from stages.structure.colmap_files import ColmapModel, write_colmap_model
+from stages.structure.levelling import upright
+from stages.structure.sparse_model import SparseModel, point_errors
+from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px
+
+IMAGES = "colmap/images"
+SPARSE = "colmap/sparse/0"
+JPEG_QUALITY = 97
+
+
+def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -> Reconstruction:
+    """Level and recentre `model`, write undistorted pictures and a COLMAP model of them, and
+    return the reconstruction (not stored yet: see `reconstruction_files`).
+
+    Raises Interrupted, and SplatError "sfm-photo-unreadable" if a photograph has gone.
+    """
+    model, levelled = upright(model)
+    photos = {photo.image: photo for photo in capture.photos}
+    ordered = [photos[name] for name in model.names]
+    pinholes = [
+        pinhole_for(size, params)
+        for size, params in zip(model.camera_sizes, model.camera_params, strict=True)
+    ]
+    pictures = picture_names([photo.name for photo in ordered])
+    _write_pictures(model, pinholes, ordered, pictures, capture.folder, folder, report)
+    cameras = [
+        _camera(pinholes[model.view_cameras[i]], model.world_to_camera[i])
+        for i in range(len(ordered))
+    ]
+    errors = point_errors(model)
+    _write_model(model, pinholes, cameras, pictures, errors, folder)
+    return Reconstruction(
+        folder=folder,
+        views=tuple(
+            View(name=photo.name, image=f"{IMAGES}/{picture}", camera=camera)
+            for photo, picture, camera in zip(ordered, pictures, cameras, strict=True)
+        ),
+        points=model.points,
+        colours=model.colours,
+        errors_px=errors,
+        tracks=model.tracks,
+        levelled=levelled,
+    )
+
+
+def picture_names(names: list[str]) -> list[str]:
+    """A .jpg path for each photograph: its own name where that is a JPEG's, else with ".jpg"
+    added; distinct also where upper and lower case are the same."""
+    taken: set[str] = set()
+    pictures = []
+    for name in names:
+        clean = posixpath.normpath("/" + name).lstrip("/")
+        picture = clean if clean.lower().endswith((".jpg", ".jpeg")) else clean + ".jpg"
+        while picture.casefold() in taken:
+            picture = picture.rsplit(".", 1)[0] + "_.jpg"
+        taken.add(picture.casefold())
+        pictures.append(picture)
+    return pictures
+
+
+def _camera(pinhole: Pinhole, world_to_camera: np.ndarray) -> Camera:
+    return Camera(
+        width=pinhole.width,
+        height=pinhole.height,
+        fx=pinhole.focal,
+        fy=pinhole.focal,
+        cx=pinhole.cx,
+        cy=pinhole.cy,
+        world_to_camera=world_to_camera,
+    )
+
+
+def _write_pictures(
+    model: SparseModel,
+    pinholes: list[Pinhole],
+    photos: list[Photo],
+    pictures: list[str],
+    source: Path,
+    folder: Path,
+    report: Report,
+) -> None:
+    made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for done, (photo, picture) in enumerate(zip(photos, pictures, strict=True)):
+        if report.stop_requested.is_set():
+            raise Interrupted
+        report.progress(done, len(photos), "undistorting", photographs=done)
+        target = folder / IMAGES / picture
+        if target.exists():  # written whole or not at all, so an interrupted run left it
+            continue
+        camera = int(model.view_cameras[done])
+        if camera not in made:
+            made = {camera: maps(pinholes[camera], model.camera_params[camera])}
+        image = cv2.remap(
+            _read(source / photo.image),
+            *made[camera],
+            interpolation=cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _write(target, image)
+    report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
+
+
+def _read(path: Path) -> np.ndarray:
+    try:
+        data = np.fromfile(path, np.uint8)  # cv2.imread fails on some paths under Windows
+    except OSError:
+        data = np.empty(0, np.uint8)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if data.size else None
+    if image is None:
+        raise SplatError(
+            "sfm-photo-unreadable",
+            given=f"{path} cannot be read any more.",
+            wanted="The pictures that ingest wrote must stay as they are.",
+            hint="Run `splat ingest` again.",
+        )
+    return image
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    options = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        JPEG_QUALITY,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
+    encoded = cv2.imencode(".jpg", image, options)[1]
+    with replacing(path) as partial:
+        encoded.tofile(partial)
+
+
+def _write_model(
+    model: SparseModel,
+    pinholes: list[Pinhole],
+    cameras: list[Camera],
+    pictures: list[str],
+    errors: np.ndarray,
+    folder: Path,
+) -> None:
+    observed = np.empty_like(model.observed_px)
+    camera_of = model.view_cameras[model.observing_views]
+    for number, pinhole in enumerate(pinholes):
+        mine = camera_of == number
+        observed[mine] = undistorted_px(
+            model.observed_px[mine], model.camera_params[number], pinhole
+        )
+    write_colmap_model(
+        folder / SPARSE,
+        ColmapModel(
+            names=tuple(pictures),
+            cameras=tuple(cameras),
+            points=model.points,
+            colours=model.colours,
+            errors_px=errors,
+            observed_points=model.observed_points,
+            observing_views=model.observing_views,
+            observed_px=observed,
+        ),
+    )

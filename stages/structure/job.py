@@ -1,0 +1,65 @@
+"""What the worker process is told: plain data that travels as JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+STEPS = ("features", "matching", "mapping")
+
+
+@dataclass(frozen=True)
+class CameraGuess:
+    """A camera as known before structure from motion. focal_px: from EXIF, or None."""
+
+    width: int
+    height: int
+    focal_px: float | None
+
+
+@dataclass(frozen=True)
+class Job:
+    """One step of structure from motion.
+
+    step: one of `STEPS`. images_root: folder that `names` are relative to. database: COLMAP's.
+    out: where mapping leaves its model (`sparse_model.save_model`). progress: a small JSON file
+    that mapping keeps up to date.
+    names [P] in order of the capture, which fixes the image ids (position + 1);
+    camera_of [P] position in `cameras` of each photograph's camera.
+    max_features, peak_threshold: of SIFT (Lowe 2004). matching: "exhaustive" or "sequential".
+    drop_stationary: leave out matches that stay in place in the picture (a date stamp).
+    mapper: "incremental" or "global". loose: register photographs with fewer matches.
+    other_pair: start from another pair of photographs than COLMAP would. max_seconds: of mapping.
+    """
+
+    step: str
+    images_root: str
+    database: str
+    out: str
+    progress: str
+    names: tuple[str, ...]
+    camera_of: tuple[int, ...]
+    cameras: tuple[CameraGuess, ...]
+    seed: int = 0
+    threads: int = 1
+    max_features: int = 8192
+    peak_threshold: float = 0.02 / 3
+    matching: str = "exhaustive"
+    drop_stationary: bool = False
+    mapper: str = "incremental"
+    loose: bool = False
+    other_pair: bool = False
+    max_seconds: int = 3600
+
+    def write(self, path: Path) -> Path:
+        path.write_text(json.dumps(asdict(self), ensure_ascii=False), encoding="utf-8")
+        return path
+
+    @classmethod
+    def read(cls, path: Path) -> Job:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        data["names"] = tuple(data["names"])
+        data["camera_of"] = tuple(data["camera_of"])
+        data["cameras"] = tuple(CameraGuess(**camera) for camera in data["cameras"])
+        return cls(**data)

@@ -1,0 +1,202 @@
+"""Camera poses and points from the matches, in the worker process (imports pycolmap)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from stages.structure import database as sqlite
+from stages.structure.job import Job
+from stages.structure.sparse_model import SparseModel, save_model
+
+SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without a word
+MOST_MODELS = 8
+LOOSE_INLIERS = 15
+
+
+def map_photographs(job: Job) -> None:
+    """Write the largest model to `job.out`, with the names in each model that was found."""
+    out = Path(job.out)
+    shutil.rmtree(out, ignore_errors=True)
+    scratch = out.with_name(out.name + "-colmap")
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    started = time.monotonic()
+    models = _global(job, scratch) if job.mapper == "global" else _incremental(job, scratch)
+    timed_out = job.mapper != "global" and time.monotonic() - started >= job.max_seconds
+    ordered = sorted(
+        (m for m in models.values() if m.num_reg_images() > 0),
+        key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
+    )
+    groups = [sorted(m.images[i].name for i in m.reg_image_ids()) for m in ordered]
+    model = _plain(ordered[0], job) if ordered else None
+    save_model(out, model, groups=groups, timed_out=timed_out)
+    shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1  # more threads sum residuals in another order each time
+    options.random_seed = options.mapper.random_seed = job.seed
+    options.triangulation.random_seed = job.seed
+    options.mapper.num_threads = 1
+    options.min_model_size = SMALLEST_MODEL
+    options.max_num_models = MOST_MODELS
+    options.max_runtime_seconds = job.max_seconds
+    if job.loose:
+        options.mapper.abs_pose_min_num_inliers = LOOSE_INLIERS
+        options.mapper.abs_pose_min_inlier_ratio = 0.15
+        options.mapper.init_min_num_inliers = 50
+        options.mapper.init_min_tri_angle = 8.0
+    if job.other_pair:
+        pair = _other_pair(Path(job.database))
+        if pair is not None:
+            options.init_image_id1, options.init_image_id2 = pair
+            options.multiple_models = False
+            options.mapper.init_min_tri_angle = 4.0
+    counter = _Counter(Path(job.progress))
+    return dict(
+        pycolmap.incremental_mapping(
+            job.database,
+            job.images_root,
+            scratch,
+            options,
+            initial_image_pair_callback=counter.began,
+            next_image_callback=counter.registered,
+        )
+    )
+
+
+def _global(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
+    database = scratch / "database.db"  # calibration rewrites the two-view geometries
+    sqlite.copy(Path(job.database), database)
+    if any(camera.focal_px is None for camera in job.cameras):
+        pycolmap.calibrate_view_graph(database)
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = options.mapper.random_seed = job.seed
+    options.mapper.num_threads = 1
+    options.mapper.rotation_averaging.random_seed = job.seed
+    options.mapper.global_positioning.random_seed = job.seed
+    options.mapper.retriangulation.random_seed = job.seed
+    models = dict(pycolmap.global_mapping(database, job.images_root, scratch, options))
+    for model in models.values():
+        model.normalize()
+        model.extract_colors_for_all_images(job.images_root, num_threads=1)
+    return models
+
+
+def _other_pair(database: Path) -> tuple[int, int] | None:
+    """Image ids of the calibrated pair with most inliers among pairs that are far apart in the
+    order of shooting, which COLMAP, looking for most inliers, tries last."""
+    pairs = [pair for pair in sqlite.verified_pairs(database) if pair[3] == 2]
+    far = [pair for pair in pairs if pair[1] - pair[0] >= 2] or pairs
+    if not far:
+        return None
+    first, second, _, _ = max(far, key=lambda pair: (pair[2], -pair[0], -pair[1]))
+    return first + 1, second + 1
+
+
+class _Counter:
+    """Keeps the job's progress file up to date."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.count = 0
+
+    def began(self) -> None:
+        self.count = 2
+        self._write()
+
+    def registered(self) -> None:
+        self.count += 1
+        self._write()
+
+    def _write(self) -> None:
+        partial = self.path.with_name(self.path.name + ".partial")
+        partial.write_text(json.dumps({"registered": self.count}))
+        os.replace(partial, self.path)
+
+
+def _plain(model: pycolmap.Reconstruction, job: Job) -> SparseModel:
+    """COLMAP's model as arrays, everything in order of ids."""
+    image_ids = sorted(model.reg_image_ids())
+    position = {image_id: i for i, image_id in enumerate(image_ids)}
+    point_ids = sorted(model.point3D_ids())
+    points = [model.points3D[point_id] for point_id in point_ids]
+    observations = _observations(model, points, position)
+    rotations = _two_view_rotations(Path(job.database), position)
+    cameras = [
+        model.cameras[camera_id + 1]
+        for camera_id in range(len(job.cameras))
+        if camera_id + 1 in model.cameras
+    ]
+    camera_position = {camera.camera_id: i for i, camera in enumerate(cameras)}
+    return SparseModel(
+        names=tuple(model.images[i].name for i in image_ids),
+        view_cameras=np.array(
+            [camera_position[model.images[i].camera_id] for i in image_ids], np.int32
+        ),
+        world_to_camera=np.array([_matrix(model.images[i].cam_from_world()) for i in image_ids]),
+        camera_sizes=np.array([(c.width, c.height) for c in cameras], np.int32).reshape(-1, 2),
+        camera_params=np.array([c.params for c in cameras], np.float64).reshape(-1, 4),
+        focal_priors_px=np.array(
+            [job.cameras[c.camera_id - 1].focal_px or np.nan for c in cameras], np.float64
+        ),
+        points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
+        colours=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+        **observations,
+        **rotations,
+    )
+
+
+def _matrix(pose: Any) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3] = pose.matrix()
+    return matrix
+
+
+def _observations(
+    model: pycolmap.Reconstruction, points: list[Any], position: dict[int, int]
+) -> dict[str, np.ndarray]:
+    keypoints = {i: model.images[i].points2D for i in position}
+    rows = []
+    for number, point in enumerate(points):
+        for element in point.track.elements:
+            x, y = keypoints[element.image_id][element.point2D_idx].xy
+            rows.append((number, position[element.image_id], x, y))
+    rows.sort()
+    table = np.array(rows, np.float64).reshape(-1, 4)
+    return {
+        "observed_points": table[:, 0].astype(np.int32),
+        "observing_views": table[:, 1].astype(np.int32),
+        "observed_px": table[:, 2:],
+    }
+
+
+def _two_view_rotations(path: Path, position: dict[int, int]) -> dict[str, np.ndarray]:
+    """Relative rotations that the matches of two photographs alone gave, for checking."""
+    database = pycolmap.Database.open(path)
+    pair_ids, geometries = database.read_two_view_geometries()
+    database.close()
+    pairs, rotations, inliers = [], [], []
+    for pair_id, geometry in zip(pair_ids, geometries, strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        pose = geometry.cam2_from_cam1
+        if pose is None or first not in position or second not in position:
+            continue
+        pairs.append((position[first], position[second]))
+        rotations.append(pose.rotation.matrix())
+        inliers.append(len(geometry.inlier_matches))
+    return {
+        "pairs": np.array(pairs, np.int32).reshape(-1, 2),
+        "pair_rotations": np.array(rotations, np.float64).reshape(-1, 3, 3),
+        "pair_inliers": np.array(inliers, np.int32),
+    }

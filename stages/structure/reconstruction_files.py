@@ -1,0 +1,96 @@
+"""A reconstruction on disk: reconstruction.json (views, in plain text) and .npy arrays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.run.atomic import replacing
+from stages.run.errors import Family, SplatError
+from stages.scene import Camera, Reconstruction, View
+
+FILE_NAME = "reconstruction.json"
+_ARRAYS = {"points": "<f8", "colours": "|u1", "errors_px": "<f8", "tracks": "<i4"}
+
+
+def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
+    """Write everything but the pictures; reconstruction.json comes last. Floats are written so
+    that they are read back exactly."""
+    for name, dtype in _ARRAYS.items():
+        array = np.ascontiguousarray(getattr(reconstruction, name), dtype)
+        with replacing(folder / f"{name}.npy") as path, path.open("wb") as file:
+            np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
+    data = {
+        "format": 1,
+        "units": reconstruction.units,
+        "levelled": reconstruction.levelled,
+        "origin": [float(value) for value in reconstruction.origin],
+        "points": len(reconstruction.points),
+        "views": [_view_to_dict(view) for view in reconstruction.views],
+    }
+    with replacing(folder / FILE_NAME) as path:
+        path.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
+
+
+def load_reconstruction(folder: Path) -> Reconstruction:
+    """What `save_reconstruction` wrote; pictures are not opened.
+
+    Raises SplatError "reconstruction-damaged" if something is missing or inconsistent.
+    """
+    try:
+        data = json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))
+        arrays = {name: _load_array(folder, name, dtype) for name, dtype in _ARRAYS.items()}
+        count = int(data["points"])
+        if any(len(array) != count for array in arrays.values()):
+            raise ValueError("its arrays differ in length")
+        return Reconstruction(
+            folder=folder,
+            views=tuple(_view_from_dict(view) for view in data["views"]),
+            origin=np.array(data["origin"], np.float64).reshape(3),
+            units=str(data["units"]),
+            levelled=bool(data["levelled"]),
+            **arrays,
+        )
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise SplatError(
+            "reconstruction-damaged",
+            given=f"The reconstruction in {folder} cannot be read ({error}).",
+            wanted="The files as `splat sfm` wrote them.",
+            hint="Delete that folder and run `splat sfm` again.",
+            family=Family.RUN_FOLDER,
+        ) from error
+
+
+def _load_array(folder: Path, name: str, dtype: str) -> Any:
+    array = np.load(folder / f"{name}.npy", allow_pickle=False)
+    width = () if name in ("errors_px", "tracks") else (3,)
+    if array.dtype != np.dtype(dtype) or array.shape[1:] != width or not array.ndim:
+        raise ValueError(f"{name}.npy is laid out in another way")
+    return array
+
+
+def _view_to_dict(view: View) -> dict[str, Any]:
+    camera = view.camera
+    return {
+        "name": view.name,
+        "image": view.image,
+        "width": camera.width,
+        "height": camera.height,
+        "fx": float(camera.fx),
+        "fy": float(camera.fy),
+        "cx": float(camera.cx),
+        "cy": float(camera.cy),
+        "world_to_camera": [[float(v) for v in row] for row in camera.world_to_camera],
+    }
+
+
+def _view_from_dict(data: dict[str, Any]) -> View:
+    matrix = np.array(data["world_to_camera"], np.float64).reshape(4, 4)
+    numbers = {name: float(data[name]) for name in ("fx", "fy", "cx", "cy")}
+    camera = Camera(
+        width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
+    )
+    return View(name=str(data["name"]), image=str(data["image"]), camera=camera)

@@ -1,0 +1,239 @@
+"""A sparse model as plain arrays: what the worker hands over, and the figures that judge it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.structure.gates import Figures
+
+_SAMPLED_POINTS = 4000  # angles need every pair of rays of a point: a sample is enough
+_SAMPLED_RAYS = 24
+FEWEST_OBSERVATIONS = 15
+_WEAK_OBSERVATIONS = 30
+_PAIR_INLIERS = 50  # a relative rotation from fewer matches is too rough to check another by
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """V registered photographs, C cameras, P points, O observations, Q verified pairs.
+
+    names [V]. view_cameras [V] position of each photograph's camera. world_to_camera [V, 4, 4].
+    camera_sizes [C, 2] width, height. camera_params [C, 4] f, cx, cy, k of COLMAP's SIMPLE_RADIAL:
+    x = f (1 + k r^2) u + cx with u = X / Z, r^2 = u^2 + v^2; pixels, pixel centres at +0.5.
+    focal_priors_px [C], NaN where EXIF said nothing.
+    points [P, 3], colours [P, 3] uint8.
+    observed_points [O], observing_views [O], observed_px [O, 2]; sorted by point, then view.
+    pairs [Q, 2] positions of photographs, pair_rotations [Q, 3, 3] second from first, from the
+    matches of the two alone, pair_inliers [Q].
+    """
+
+    names: tuple[str, ...]
+    view_cameras: NDArray[np.int32]
+    world_to_camera: NDArray[np.float64]
+    camera_sizes: NDArray[np.int32]
+    camera_params: NDArray[np.float64]
+    focal_priors_px: NDArray[np.float64]
+    points: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    observed_points: NDArray[np.int32]
+    observing_views: NDArray[np.int32]
+    observed_px: NDArray[np.float64]
+    pairs: NDArray[np.int32]
+    pair_rotations: NDArray[np.float64]
+    pair_inliers: NDArray[np.int32]
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """[V, 3] camera positions."""
+        rotations = self.world_to_camera[:, :3, :3]
+        return -np.einsum("vij,vi->vj", rotations, self.world_to_camera[:, :3, 3])
+
+    @property
+    def tracks(self) -> NDArray[np.int32]:
+        """[P] photographs that see each point."""
+        return np.bincount(self.observed_points, minlength=len(self.points)).astype(np.int32)
+
+
+@dataclass(frozen=True)
+class MappingResult:
+    """model: the largest, or None. groups: names in each model found, largest first."""
+
+    model: SparseModel | None
+    groups: tuple[tuple[str, ...], ...]
+    timed_out: bool
+
+
+def save_model(
+    folder: Path, model: SparseModel | None, *, groups: list[list[str]], timed_out: bool
+) -> None:
+    """Write a mapping's result; the folder appears when it is complete."""
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    if model is not None:
+        for field in fields(model):
+            if field.name != "names":
+                np.save(partial / f"{field.name}.npy", getattr(model, field.name))
+    result = {
+        "names": None if model is None else list(model.names),
+        "groups": groups,
+        "timed_out": timed_out,
+    }
+    (partial / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(partial, folder)
+
+
+def load_result(folder: Path) -> MappingResult:
+    """What `save_model` wrote. Raises OSError or ValueError if it is missing or damaged."""
+    result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    model = None
+    if result["names"] is not None:
+        arrays = {
+            field.name: np.load(folder / f"{field.name}.npy", allow_pickle=False)
+            for field in fields(SparseModel)
+            if field.name != "names"
+        }
+        model = SparseModel(names=tuple(result["names"]), **arrays)
+    groups = tuple(tuple(group) for group in result["groups"])
+    return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
+
+
+def without_weak_views(model: SparseModel, fewest: int = FEWEST_OBSERVATIONS) -> SparseModel:
+    """The model less photographs that see fewer than `fewest` points: their poses are guesses.
+    Points that fewer than 2 of the others see go with them."""
+    keep_view = np.bincount(model.observing_views, minlength=len(model.names)) >= fewest
+    if keep_view.all():
+        return model
+    kept = keep_view[model.observing_views]
+    tracks = np.bincount(model.observed_points[kept], minlength=len(model.points))
+    keep_point = tracks >= 2
+    kept &= keep_point[model.observed_points]
+    new_view = np.cumsum(keep_view, dtype=np.int32) - 1
+    new_point = np.cumsum(keep_point, dtype=np.int32) - 1
+    pairs = keep_view[model.pairs].all(axis=1)
+    return replace(
+        model,
+        names=tuple(name for name, keep in zip(model.names, keep_view, strict=True) if keep),
+        view_cameras=model.view_cameras[keep_view],
+        world_to_camera=model.world_to_camera[keep_view],
+        points=model.points[keep_point],
+        colours=model.colours[keep_point],
+        observed_points=new_point[model.observed_points[kept]].astype(np.int32),
+        observing_views=new_view[model.observing_views[kept]].astype(np.int32),
+        observed_px=model.observed_px[kept],
+        pairs=new_view[model.pairs[pairs]].astype(np.int32),
+        pair_rotations=model.pair_rotations[pairs],
+        pair_inliers=model.pair_inliers[pairs],
+    )
+
+
+def reprojection_errors(model: SparseModel) -> NDArray[np.float64]:
+    """[O] distance in pixels between each observation and its point's projection."""
+    poses = model.world_to_camera[model.observing_views]
+    xyz = np.einsum("oij,oj->oi", poses[:, :3, :3], model.points[model.observed_points])
+    xyz += poses[:, :3, 3]
+    params = model.camera_params[model.view_cameras[model.observing_views]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = xyz[:, :2] / xyz[:, 2:]
+        factor = params[:, :1] * (1.0 + params[:, 3:] * np.sum(uv**2, axis=1, keepdims=True))
+        errors = np.linalg.norm(uv * factor + params[:, 1:3] - model.observed_px, axis=1)
+    return np.where(xyz[:, 2] > 0, errors, np.inf)
+
+
+def point_errors(model: SparseModel) -> NDArray[np.float64]:
+    """[P] mean reprojection error of each point, pixels (infinite without observations)."""
+    total = np.bincount(
+        model.observed_points, weights=reprojection_errors(model), minlength=len(model.points)
+    )
+    tracks = model.tracks
+    return np.where(tracks > 0, total / np.maximum(tracks, 1), np.inf)
+
+
+def triangulation_angles(model: SparseModel, index: NDArray[np.integer]) -> NDArray[np.float64]:
+    """[len(index)] largest angle, in degrees, between the rays of two photographs to each point."""
+    starts = np.searchsorted(model.observed_points, np.arange(len(model.points) + 1))
+    centres = model.centres
+    angles = np.zeros(len(index))
+    for i, point in enumerate(index):
+        views = model.observing_views[starts[point] : starts[point + 1]]
+        if len(views) < 2:
+            continue
+        step = -(-len(views) // _SAMPLED_RAYS)
+        rays = centres[views[::step]] - model.points[point]
+        lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = rays / np.maximum(lengths, 1e-300)
+        angles[i] = np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))
+    return angles
+
+
+def rotation_disagreements(model: SparseModel) -> NDArray[np.float64]:
+    """Angles in degrees between the model's relative rotations and those of well-matched pairs."""
+    strong = model.pair_inliers >= _PAIR_INLIERS
+    first, second = model.pairs[strong].T
+    rotations = model.world_to_camera[:, :3, :3]
+    relative = rotations[second] @ np.swapaxes(rotations[first], 1, 2)
+    cosine = (np.einsum("qij,qij->q", relative, model.pair_rotations[strong]) - 1.0) / 2.0
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def baseline_over_depth(model: SparseModel) -> float:
+    """How far the cameras are spread (90th percentile of distances from their median position,
+    doubled) over the median distance from them to the points that they see."""
+    if not len(model.observed_points):
+        return 0.0
+    centres = model.centres
+    spread = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    rays = model.points[model.observed_points] - centres[model.observing_views]
+    depth = float(np.median(np.linalg.norm(rays, axis=1)))
+    return 2.0 * float(np.percentile(spread, 90)) / max(depth, 1e-300)
+
+
+def measure(result: MappingResult, photographs: int, mapper: str) -> Figures:
+    """The figures that the gates look at."""
+    model = result.model
+    sizes = tuple(len(group) for group in result.groups)
+    if model is None:
+        return Figures(
+            photographs=photographs, models=sizes, mapper=mapper, timed_out=result.timed_out
+        )
+    sample = np.arange(0, len(model.points), max(1, len(model.points) // _SAMPLED_POINTS))
+    angles = triangulation_angles(model, sample)
+    errors = reprojection_errors(model)
+    seen = np.bincount(model.observing_views, minlength=len(model.names))
+    turned = rotation_disagreements(model)
+    return Figures(
+        photographs=photographs,
+        registered=len(model.names),
+        models=sizes,
+        mapper=mapper,
+        timed_out=result.timed_out,
+        points=len(model.points),
+        mean_reprojection_error_px=float(errors.mean()) if len(errors) else 0.0,
+        long_side_px=int(model.camera_sizes.max()),
+        mean_track_length=float(model.tracks.mean()) if len(model.points) else 0.0,
+        median_triangulation_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
+        baseline_over_depth=baseline_over_depth(model),
+        weak_photographs=int(np.sum(seen < _WEAK_OBSERVATIONS)),
+        distortion=_largest(model.camera_params[:, 3]),
+        focal_over_prior=_focal_over_prior(model),
+        rotation_disagreement_deg=float(np.percentile(turned, 80)) if len(turned) else None,
+    )
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    return float(values[np.argmax(np.abs(values))]) if len(values) else 0.0
+
+
+def _focal_over_prior(model: SparseModel) -> float | None:
+    """The ratio that is farthest from 1, or None without priors."""
+    ratios = model.camera_params[:, 0] / model.focal_priors_px
+    ratios = ratios[np.isfinite(ratios)]
+    return float(ratios[np.argmax(np.abs(np.log(ratios)))]) if len(ratios) else None
