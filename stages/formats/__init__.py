@@ -1,0 +1,64 @@
+"""One module a file format: read and write, nothing else.
+
+`write` takes splats in our own conventions (y down, ln scales, logit opacity) and `read` gives
+them back so; each format's own axes and units of measure stay inside its module.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from stages.run.errors import Family, SplatError
+
+if TYPE_CHECKING:
+    from stages.scene import Splats
+
+# Suffix without the dot -> module. The first four are what an export writes by default.
+FORMATS = {
+    "ply": "ply",
+    "splat": "splat32",
+    "glb": "gltf",
+    "usdz": "usd",
+    "gltf": "gltf",
+    "usda": "usd",
+    "usdc": "usd",
+}
+
+
+def format_of(path: Path) -> str:
+    """The format that the suffix names. Raises SplatError "format-unknown" for another suffix."""
+    name = Path(path).suffix.lower().lstrip(".")
+    if name not in FORMATS:
+        raise SplatError(
+            "format-unknown",
+            given=f"{path} has the suffix {Path(path).suffix!r}.",
+            wanted=f"One of {', '.join('.' + known for known in FORMATS)}.",
+            hint="Choose a name with one of these suffixes.",
+            family=Family.USAGE,
+        )
+    return name
+
+
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+    """Write `splats` in the format that the suffix of `path` names, whole or not at all; return
+    how many could not be drawn (values not finite, or too large) and were left out.
+
+    units: "metres" or "arbitrary", noted in the formats that can carry it.
+    Raises SplatError "format-unknown", or what keeps the file from being written.
+    """
+    dropped: int = _module(path).write(Path(path), splats, units=units)
+    return dropped
+
+
+def read(path: Path) -> Splats:
+    """The splats of a file, float32, y down. Raises SplatError "format-unknown" or
+    "splats-unreadable"."""
+    splats: Splats = _module(path).read(Path(path))
+    return splats
+
+
+def _module(path: Path) -> ModuleType:
+    return importlib.import_module(f"stages.formats.{FORMATS[format_of(path)]}")

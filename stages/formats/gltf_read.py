@@ -1,0 +1,318 @@
+"""Reading KHR_gaussian_splatting, from our own files and from other programs'.
+
+Every number of the JSON is checked before it is used: a file may come from anywhere. Buffers are
+the file's own, data: URIs, or files in its folder or below; nothing is fetched.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import checked, joined, logits_of, logs_of
+from stages.formats.turn import turned
+from stages.scene import Splats
+
+_EXTENSION = "KHR_gaussian_splatting"
+_TYPES = {5120: "i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_LEAST_BYTES = 12 + 4 + 3 + 1 + 12  # of one splat, with every attribute at its narrowest
+
+
+def read(path: Path) -> Splats:
+    """All splats of the file's scene, turned to y down, float32.
+
+    Node transforms may move and scale evenly. Raises SplatError "splats-unreadable" for a damaged
+    file, one without splats, one that reaches outside its folder, or a feature that is not read
+    (sparse accessors, compression, rotated nodes).
+    """
+    path = Path(path)
+    with reading(path):
+        document, chunk = _parse(path)
+        buffers = _Buffers(path, _list(document, "buffers"), chunk)
+        source = _Source(document, buffers)
+        parts: list[Splats] = []
+        for node, move in _nodes(document):
+            for part in source.splats(node, move):
+                parts.append(part)
+                # Without sharing, files have no more splats than this: it bounds the memory.
+                if sum(map(len, parts)) * _LEAST_BYTES > buffers.total_bytes():
+                    raise BadFileError("it shows its splats several times, which is not read")
+        extras = document["asset"].get("extras")
+        origin = extras.get("splat_origin") if isinstance(extras, dict) else None
+        origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
+        if not parts and "meshes" in document:
+            raise BadFileError(f"no mesh in its scene uses {_EXTENSION}")
+        return checked(turned(replace(joined(parts), origin=origin)))
+
+
+def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
+    """(the JSON, the binary chunk of a .glb)."""
+    content = _mapped(path)
+    chunk: memoryview | None = None
+    if content[:4] == b"glTF":
+        if len(content) < 20:
+            raise BadFileError("it is cut short")
+        _, version, total, size, kind = struct.unpack_from("<4sIII4s", content)
+        if version != 2:
+            raise BadFileError(f"it is glTF version {version}, not 2")
+        if total > len(content) or kind != b"JSON" or 20 + size > total:
+            raise BadFileError(f"it is cut short: {total} bytes declared, {len(content)} there")
+        text = content[20 : 20 + size]
+        rest = content[20 + size : total]
+        if rest:
+            if len(rest) < 8:
+                raise BadFileError("it is cut short")
+            length, kind = struct.unpack_from("<I4s", rest)
+            if kind == b"BIN\0":
+                if 8 + length > len(rest):
+                    raise BadFileError("its binary chunk is cut short")
+                chunk = rest[8 : 8 + length]
+    else:
+        text = content
+    document = json.loads(bytes(text).decode("utf-8"))
+    if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
+        raise BadFileError("it is not a glTF document")
+    if str(document["asset"].get("version")).split(".")[0] != "2":
+        raise BadFileError("it is not glTF version 2")
+    required = set(_list(document, "extensionsRequired")) - {_EXTENSION}
+    if required:
+        raise BadFileError(f"it requires {', '.join(sorted(map(str, required)))[:80]}")
+    return document, chunk
+
+
+def _mapped(path: Path) -> memoryview:
+    """The file's bytes, read only where they are touched."""
+    return np.memmap(path, np.uint8, "r").data
+
+
+class _Buffers:
+    """The document's buffers; each is loaded when it is first used."""
+
+    def __init__(self, path: Path, described: list[Any], chunk: memoryview | None) -> None:
+        self._path, self._described, self._chunk = path, described, chunk
+        self._loaded: dict[int, memoryview] = {}
+
+    def get(self, index: int) -> memoryview:
+        if index not in self._loaded:
+            content = self._load(_item(self._described, index, "buffer"), index)
+            length = _whole(self._described[index], "byteLength")
+            if length > len(content):
+                raise BadFileError(f"buffer {index} is cut short: {len(content)} of {length} bytes")
+            self._loaded[index] = content
+        return self._loaded[index]
+
+    def total_bytes(self) -> int:
+        return sum(len(content) for content in self._loaded.values())
+
+    def _load(self, described: dict[str, Any], index: int) -> memoryview:
+        uri = described.get("uri")
+        if uri is None:
+            if index != 0 or self._chunk is None:
+                raise BadFileError(f"buffer {index} has no content")
+            return self._chunk
+        if not isinstance(uri, str):
+            raise BadFileError(f"the address of buffer {index} is no text")
+        if uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            if not head.endswith(";base64"):
+                raise BadFileError(f"buffer {index} has an encoding that is not read")
+            return memoryview(base64.b64decode(body, validate=True))
+        return _mapped(_file_beside(self._path, uri))
+
+
+def _file_beside(path: Path, uri: str) -> Path:
+    """The file that a relative URI names. Raises BadFileError if it lies outside the folder."""
+    parts = urlsplit(uri)
+    name = unquote(parts.path)
+    folder = path.parent.resolve()
+    inside = not (parts.scheme or parts.netloc or "\\" in name or "\0" in name or ":" in name)
+    target = (folder / name).resolve() if inside else folder
+    if not inside or not name or not target.is_relative_to(folder):
+        raise BadFileError(f"it names {uri[:80]!r}, which is not a file in its own folder")
+    if not target.is_file():
+        raise BadFileError(f"{name[:80]!r}, which it names, is not there")
+    return target
+
+
+@dataclass(frozen=True)
+class _Move:
+    """x -> scale x + offset."""
+
+    scale: float = 1.0
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def then(self, inner: _Move) -> _Move:
+        offset = np.array(self.offset) + self.scale * np.array(inner.offset)
+        return _Move(self.scale * inner.scale, (offset[0], offset[1], offset[2]))
+
+
+def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _Move]]:
+    """The scene's nodes with their place in the world; each node at most once."""
+    nodes, scenes = _list(document, "nodes"), _list(document, "scenes")
+    if scenes:
+        index = document.get("scene", 0)
+        roots = _list(_item(scenes, index, "scene"), "nodes")
+    else:
+        children = {
+            child for node in nodes if isinstance(node, dict) for child in _list(node, "children")
+        }
+        roots = [index for index in range(len(nodes)) if index not in children]
+    waiting = [(index, _Move()) for index in reversed(roots)]
+    found: list[tuple[dict[str, Any], _Move]] = []
+    seen: set[int] = set()
+    while waiting:
+        index, outer = waiting.pop()
+        node = _item(nodes, index, "node")
+        if index in seen:
+            raise BadFileError("a node has two parents")
+        seen.add(index)
+        move = outer.then(_move_of(node))
+        found.append((node, move))
+        waiting += [(child, move) for child in reversed(_list(node, "children"))]
+    return found
+
+
+def _move_of(node: dict[str, Any]) -> _Move:
+    if "matrix" in node:
+        matrix = _numbers(node["matrix"], 16).reshape(4, 4).T
+        scale, offset = float(matrix[0, 0]), matrix[:3, 3]
+        even = np.array_equal(matrix[:3, :3], scale * np.eye(3))
+        if not even or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+            raise BadFileError("one of its nodes is rotated or stretched, which is not read")
+    else:
+        rotation = _numbers(node.get("rotation", [0, 0, 0, 1]), 4)
+        scales = _numbers(node.get("scale", [1, 1, 1]), 3)
+        offset = _numbers(node.get("translation", [0, 0, 0]), 3)
+        scale = float(scales[0])
+        if np.abs(rotation[:3]).max() > 1e-7 or not (scales == scale).all():
+            raise BadFileError("one of its nodes is rotated or stretched, which is not read")
+    if not scale > 0:
+        raise BadFileError("one of its nodes has a scale that is not positive")
+    return _Move(scale, (float(offset[0]), float(offset[1]), float(offset[2])))
+
+
+@dataclass(frozen=True)
+class _Source:
+    document: dict[str, Any]
+    buffers: _Buffers
+
+    def splats(self, node: dict[str, Any], move: _Move) -> Iterator[Splats]:
+        """The splats of a node's mesh, primitive after primitive, in the file's axes."""
+        if "mesh" not in node:
+            return
+        mesh = _item(_list(self.document, "meshes"), node["mesh"], "mesh")
+        for primitive in _list(mesh, "primitives"):
+            extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
+            if isinstance(extensions, dict) and isinstance(extensions.get(_EXTENSION), dict):
+                yield self._primitive(primitive, extensions[_EXTENSION], move)
+
+    def _primitive(
+        self, primitive: dict[str, Any], extension: dict[str, Any], move: _Move
+    ) -> Splats:
+        if extension.get("kernel") != "ellipse":
+            raise BadFileError("its splats have another kernel than ellipse")
+        if extension.get("colorSpace") != "srgb_rec709_display":
+            raise BadFileError("its colours are in another space than srgb_rec709_display")
+        if "extensions" in extension:
+            raise BadFileError("its splats are compressed, which is not read")
+        attributes = primitive.get("attributes")
+        if not isinstance(attributes, dict):
+            raise BadFileError("a primitive has no attributes")
+        degree = max(
+            d for d in range(4) if d == 0 or f"{_EXTENSION}:SH_DEGREE_{d}_COEF_0" in attributes
+        )
+
+        def values(name: str, width: int) -> NDArray[np.float32]:
+            if name not in attributes:
+                raise BadFileError(f"a primitive lacks {name}")
+            return self._accessor(attributes[name], width)
+
+        means = values("POSITION", 3)
+        rotations = values(f"{_EXTENSION}:ROTATION", 4)
+        scales = values(f"{_EXTENSION}:SCALE", 3)
+        opacities = values(f"{_EXTENSION}:OPACITY", 1)
+        bands = [
+            values(f"{_EXTENSION}:SH_DEGREE_{d}_COEF_{i}", 3)
+            for d in range(degree + 1)
+            for i in range(2 * d + 1)
+        ]
+        if len({len(array) for array in (means, rotations, scales, opacities, *bands)}) != 1:
+            raise BadFileError("the attributes of a primitive differ in length")
+        return Splats(
+            means=(means * move.scale + np.array(move.offset)).astype(np.float32),
+            quaternions=rotations[:, [3, 0, 1, 2]],
+            log_scales=logs_of(scales.astype(np.float64) * move.scale),
+            opacity_logits=logits_of(opacities[:, 0]),
+            sh=np.stack(bands, axis=1),
+            sh_degrees=np.full(len(means), degree, np.uint8),
+        )
+
+    def _accessor(self, index: Any, width: int) -> NDArray[np.float32]:
+        """[count, width] float32, normalised integers decoded."""
+        accessor = _item(_list(self.document, "accessors"), index, "accessor")
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise BadFileError(f"accessor {index} is sparse or empty, which is not read")
+        if (
+            accessor.get("componentType") not in _TYPES
+            or _WIDTHS.get(str(accessor.get("type"))) != width
+        ):
+            raise BadFileError(f"accessor {index} has a type that its attribute must not have")
+        dtype = np.dtype(_TYPES[accessor["componentType"]])
+        count = _whole(accessor, "count")
+        view = _item(_list(self.document, "bufferViews"), accessor["bufferView"], "buffer view")
+        content = self.buffers.get(_whole(view, "buffer"))
+        start, length = _whole(view, "byteOffset", 0), _whole(view, "byteLength")
+        offset = _whole(accessor, "byteOffset", 0)
+        element = dtype.itemsize * width
+        stride = _whole(view, "byteStride", element)
+        if stride < element or (stride > 252 and stride != element):
+            raise BadFileError(f"accessor {index} has stride {stride} for elements of {element}")
+        if start + length > len(content) or offset + (count - 1) * stride + element > length:
+            raise BadFileError(f"accessor {index} reaches past its buffer")
+        if count * _LEAST_BYTES > self.buffers.total_bytes():
+            raise BadFileError(f"accessor {index} counts more splats than its buffers can hold")
+        raw: NDArray[Any] = np.ndarray(
+            (count, width), dtype, content, start + offset, (stride, dtype.itemsize)
+        )
+        values = raw.astype(np.float32)
+        if accessor.get("normalized") is True and dtype.kind in "iu":
+            values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
+        return values
+
+
+def _list(holder: dict[str, Any], key: str) -> list[Any]:
+    value = holder.get(key, [])
+    if not isinstance(value, list):
+        raise BadFileError(f"its {key} are no list")
+    return value
+
+
+def _item(items: list[Any], index: Any, what: str) -> dict[str, Any]:
+    if type(index) is not int or not 0 <= index < len(items) or not isinstance(items[index], dict):
+        raise BadFileError(f"it names {what} {str(index)[:40]}, which it does not hold")
+    return items[index]
+
+
+def _whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
+    value = holder.get(key, default)
+    if type(value) is not int or value < 0:
+        raise BadFileError(f"{key} is {str(value)[:40]}, not a whole number from 0")
+    return value
+
+
+def _numbers(values: Any, count: int) -> NDArray[np.float64]:
+    array = np.array(values, np.float64)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise BadFileError(f"a node's transform is not {count} numbers")
+    return array

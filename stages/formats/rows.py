@@ -1,0 +1,125 @@
+"""Which splats a file can hold, and the change between our values and linear ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.problems import BadFileError
+from stages.scene import Splats
+
+# Beyond these a scale no longer squares to a finite, or stays a normal, float32.
+LOG_SCALE_MIN, LOG_SCALE_MAX = -87.0, 44.0
+# What linear 0 and 1 become: alpha is drawn between 1/255 and 0.99, so neither can be told from
+# the exact value.
+LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
+
+
+def drawable(splats: Splats) -> NDArray[np.bool_]:
+    """[N] true where every value is finite, the scales can be squared in float32 and the
+    quaternion has a direction: the others no viewer can draw."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        good = np.isfinite(splats.means).all(axis=1)
+        good &= np.abs(splats.means).max(axis=1, initial=0.0) <= np.finfo(np.float32).max
+        good &= np.isfinite(splats.log_scales).all(axis=1)
+        good &= splats.log_scales.max(axis=1, initial=-np.inf) <= LOG_SCALE_MAX
+        good &= np.isfinite(splats.opacity_logits)
+        good &= np.isfinite(splats.sh).all(axis=(1, 2))
+        good &= np.abs(splats.sh).max(axis=(1, 2), initial=0.0) <= np.finfo(np.float32).max
+        lengths = np.linalg.norm(splats.quaternions.astype(np.float64), axis=1)
+        good &= np.isfinite(lengths) & (lengths > 0)
+    return np.asarray(good, bool)
+
+
+def kept_rows(splats: Splats) -> tuple[Splats, int]:
+    """(the drawable splats, how many were dropped)."""
+    mask = drawable(splats)
+    if mask.all():
+        return splats, 0
+    return splats.take(mask), int(len(mask) - mask.sum())
+
+
+def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
+    """[N, 4] w, x, y, z of length 1; the norm is taken in float64, where 1e-23 squared is not 0."""
+    exact = quaternions.astype(np.float64)
+    return (exact / np.linalg.norm(exact, axis=1, keepdims=True)).astype(np.float32)
+
+
+def linear_scales(splats: Splats) -> NDArray[np.float32]:
+    """[N, 3] standard deviations; never below the least normal float32, so that a logarithm
+    gives the scale back."""
+    exact = np.maximum(splats.log_scales.astype(np.float64), LOG_SCALE_MIN)
+    return np.exp(exact).astype(np.float32)
+
+
+def linear_opacities(splats: Splats) -> NDArray[np.float32]:
+    """[N] in [0, 1]."""
+    with np.errstate(over="ignore"):
+        return (1.0 / (1.0 + np.exp(-splats.opacity_logits.astype(np.float64)))).astype(np.float32)
+
+
+def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
+    """[N] the inverse of `linear_opacities`. Raises BadFileError for values outside [0, 1]."""
+    p = opacities.astype(np.float64)
+    if not ((p >= 0) & (p <= 1)).all():
+        raise BadFileError("opacities lie outside 0..1")
+    with np.errstate(divide="ignore"):
+        return np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX).astype(np.float32)
+
+
+def logs_of(scales: NDArray[np.floating]) -> NDArray[np.float32]:
+    """[N, 3] the inverse of `linear_scales`; 0 (a flat splat) becomes the least scale that a
+    float32 keeps. Raises BadFileError for negative scales."""
+    if not (scales >= 0).all():
+        raise BadFileError("scales are negative or not numbers")
+    with np.errstate(divide="ignore"):
+        return np.maximum(np.log(scales.astype(np.float64)), LOG_SCALE_MIN).astype(np.float32)
+
+
+def degrees_in_use(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """[N] the highest degree with a coefficient that is not 0, of `sh` [N, (L + 1)^2, 3]."""
+    degrees = np.zeros(len(sh), np.uint8)
+    for degree in range(1, round(sh.shape[1] ** 0.5)):
+        band = sh[:, degree * degree : (degree + 1) ** 2]
+        degrees[(band != 0).any(axis=(1, 2))] = degree
+    return degrees
+
+
+def checked(splats: Splats) -> Splats:
+    """What a reader hands out: infinite opacity and scale logarithms made finite (files hold them
+    for opaque and for flat splats), and the degree of each splat found.
+
+    Raises BadFileError if any other value is not finite: such a file is damaged, and silence would
+    move or lose splats.
+    """
+    logits = np.clip(splats.opacity_logits, -1e30, 1e30)
+    logits = np.where(
+        np.isinf(splats.opacity_logits), np.clip(logits, LOGIT_MIN, LOGIT_MAX), logits
+    )
+    logs = np.where(np.isneginf(splats.log_scales), LOG_SCALE_MIN, splats.log_scales)
+    clean = replace(
+        splats,
+        opacity_logits=logits.astype(splats.opacity_logits.dtype, copy=False),
+        log_scales=logs.astype(splats.log_scales.dtype, copy=False),
+        sh_degrees=degrees_in_use(splats.sh),
+    )
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
+        bad = int((~np.isfinite(getattr(clean, name))).sum())
+        if bad:
+            raise BadFileError(f"{bad} values of {name} are not finite numbers")
+    return clean
+
+
+def joined(parts: list[Splats]) -> Splats:
+    """All rows of all parts, at the highest degree among them; the origin is left at 0."""
+    degree = max((part.sh_degree for part in parts), default=0)
+    wide = [part.with_sh_degree(degree) for part in parts]
+    empty = {"opacity_logits": (0,), "sh_degrees": (0,), "sh": (0, 1, 3), "quaternions": (0, 4)}
+    arrays = {}
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees"):
+        dtype = np.uint8 if name == "sh_degrees" else np.float32
+        rows = [getattr(part, name) for part in wide]
+        arrays[name] = np.concatenate(rows) if rows else np.zeros(empty.get(name, (0, 3)), dtype)
+    return Splats(**arrays)

@@ -1,0 +1,96 @@
+"""The 32-byte .splat of web viewers: small, without view-dependent colour.
+
+Each record: position 3 x float32, standard deviations 3 x float32, RGBA 4 x uint8, quaternion
+w, x, y, z as 4 x uint8 = 128 + 128 q. No header; axes as in memory (y down). Records come largest
+first (volume x opacity), so that a viewer that is still loading shows the most.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import (
+    checked,
+    kept_rows,
+    linear_opacities,
+    linear_scales,
+    logits_of,
+    logs_of,
+    unit_quaternions,
+)
+from stages.run.atomic import replacing
+from stages.scene import Splats, dc_to_rgb, rgb_to_dc
+
+RECORD = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)]
+)
+
+
+def order(splats: Splats) -> NDArray[np.intp]:
+    """[N] rows from the largest volume x opacity to the least; equals keep their order."""
+    with np.errstate(divide="ignore"):
+        size = splats.log_scales.astype(np.float64).sum(axis=1) + np.log(linear_opacities(splats))
+    return np.argsort(-size, kind="stable")
+
+
+def encode(splats: Splats) -> NDArray[np.void]:
+    """[N] records in the order of the rows. All rows must be drawable."""
+    records = np.zeros(len(splats), RECORD)
+    records["mean"] = splats.means
+    records["scale"] = linear_scales(splats)
+    rgb = dc_to_rgb(splats.sh[:, 0].astype(np.float64))
+    records["rgba"][:, :3] = np.rint(255 * np.clip(rgb, 0, 1))
+    records["rgba"][:, 3] = np.rint(255 * linear_opacities(splats))
+    records["quaternion"] = _encode_quaternions(unit_quaternions(splats.quaternions))
+    return records
+
+
+def _encode_quaternions(unit: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """q and -q are one rotation, but 8 bits hold -1 exactly and +1 not: take the nearer one."""
+    best = np.clip(np.rint(128 + 128 * unit), 0, 255)
+    other = np.clip(np.rint(128 - 128 * unit), 0, 255)
+    error = np.square((best - 128) / 128 - unit).sum(axis=1)
+    other_error = np.square((other - 128) / 128 + unit).sum(axis=1)
+    return np.where((other_error < error)[:, None], other, best).astype(np.uint8)
+
+
+def decode(records: NDArray[np.void]) -> Splats:
+    """Splats of degree 0, as a viewer understands the records."""
+    quaternions = (records["quaternion"].astype(np.float32) - 128) / 128
+    quaternions[~quaternions.any(axis=1)] = (1, 0, 0, 0)  # four times 128: no rotation
+    rgba = records["rgba"].astype(np.float64) / 255
+    return Splats(
+        means=records["mean"].astype(np.float32),
+        quaternions=unit_quaternions(quaternions),
+        log_scales=logs_of(records["scale"]),
+        opacity_logits=logits_of(rgba[:, 3]),
+        sh=rgb_to_dc(rgba[:, None, :3]).astype(np.float32),
+        sh_degrees=np.zeros(len(records), np.uint8),
+    )
+
+
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+    """Write `splats`; return how many could not be drawn and were left out.
+
+    The format has no place for units, the origin and SH above degree 0: they are not written.
+    Raises SplatError when the file cannot be written.
+    """
+    splats, dropped = kept_rows(splats)
+    records = encode(splats.take(order(splats)))
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(records.tobytes())
+    return dropped
+
+
+def read(path: Path) -> Splats:
+    """The splats of a .splat. Raises SplatError "splats-unreadable" for what is no such file."""
+    path = Path(path)
+    with reading(path):
+        size = path.stat().st_size
+        if size % RECORD.itemsize:
+            raise BadFileError(f"its {size} bytes are no multiple of {RECORD.itemsize}")
+        return checked(decode(np.fromfile(path, RECORD)))

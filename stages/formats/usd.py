@@ -1,0 +1,247 @@
+"""USD: .usda, .usdc and .usdz with the schema ParticleField3DGaussianSplat (usd-core >= 25.11).
+
+Linear scales and opacities, raw SH with all bands of one splat together, y up: the splats are
+turned upright. What a file leaves out silently becomes identity, unit scale, opaque or grey in
+viewers, and degree 3: so everything is written.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import (
+    checked,
+    joined,
+    kept_rows,
+    linear_opacities,
+    linear_scales,
+    logits_of,
+    logs_of,
+    unit_quaternions,
+)
+from stages.formats.turn import turned
+from stages.run.atomic import replacing
+from stages.scene import Splats
+
+_ROOT, _PRIM = "/Scene", "/Scene/Splats"
+_TYPE = "ParticleField3DGaussianSplat"
+
+
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+    """Write `splats` as `path` (.usda, .usdc or .usdz); return how many could not be drawn and
+    were left out.
+
+    Positions stay relative to `splats.origin`, which float32 could not hold; customLayerData says
+    it, in the file's axes, together with the units. Raises SplatError when the file cannot be
+    written.
+    """
+    path = Path(path)
+    splats, dropped = kept_rows(splats)
+    layer = _layer(turned(splats), units, ".usda" if path.suffix.lower() == ".usda" else ".usdc")
+    with replacing(path) as temporary:
+        if path.suffix.lower() == ".usdz":
+            _write_package(temporary, layer, f"{path.stem}.usdc")
+        else:
+            _export(layer, temporary)
+    return dropped
+
+
+def _layer(splats: Splats, units: str, suffix: str) -> Any:
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
+
+    layer = Sdf.Layer.CreateAnonymous(suffix)
+    stage = Usd.Stage.Open(layer)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # also where nobody knows: `units` says which
+    root = UsdGeom.Xform.Define(stage, _ROOT).GetPrim()
+    stage.SetDefaultPrim(root)
+    note: dict[str, Any] = {"units": units}
+    if splats.origin.any():
+        note["origin"] = Gf.Vec3d(*map(float, splats.origin))
+    layer.customLayerData = {"splat": note}
+
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PRIM)
+    scales = linear_scales(splats)
+    unit = unit_quaternions(splats.quaternions)
+    vectors = Vt.Vec3fArray.FromNumpy
+    field.CreatePositionsAttr(vectors(_f4(splats.means)))
+    # Gf keeps the real part last in memory, although it is written first.
+    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(_f4(unit[:, [1, 2, 3, 0]])))
+    field.CreateScalesAttr(vectors(scales))
+    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(linear_opacities(splats)))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.sh_degree)
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(_f4(splats.sh.reshape(-1, 3))))
+    field.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
+    field.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)  # as the splats were trained
+    if len(splats):
+        field.CreateExtentAttr(vectors(_extent(splats.means, unit, scales)))
+    colour = Usd.ColorSpaceAPI.Apply(field.GetPrim())
+    colour.CreateColorSpaceNameAttr("srgb_rec709_scene")
+    return layer
+
+
+def _f4(values: NDArray[Any]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, np.float32)
+
+
+def _extent(
+    means: NDArray[np.floating], unit: NDArray[np.float32], scales: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """[2, 3] the box of all ellipsoids of 3 standard deviations."""
+    w, x, y, z = unit.astype(np.float64).T
+    rows = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    reach = 3 * np.sqrt(np.einsum("ijn,nj->ni", rows**2, scales.astype(np.float64) ** 2))
+    box = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+    return np.clip(box, -np.finfo(np.float32).max, np.finfo(np.float32).max).astype(np.float32)
+
+
+def _export(layer: Any, path: Path) -> None:
+    from pxr import Tf
+
+    try:
+        done = layer.Export(str(path))
+    except Tf.ErrorException as error:
+        raise OSError(_first_line(error)) from error
+    if not done:
+        raise OSError("the USD library could not write it")
+
+
+def _write_package(path: Path, layer: Any, name: str) -> None:
+    """A .usdz: an uncompressed zip with every file aligned to 64 bytes, the first file the scene.
+
+    The zip writer copies the time of the file, in local time: a fixed one keeps the bytes equal.
+    """
+    from pxr import Sdf
+
+    with tempfile.TemporaryDirectory(prefix=".partial-", dir=path.parent) as folder:
+        inner = Path(folder) / "scene.usdc"
+        _export(layer, inner)
+        moment = time.mktime((1980, 1, 1, 12, 0, 0, 0, 0, -1))
+        os.utime(inner, (moment, moment))
+        with Sdf.ZipFileWriter.CreateNew(str(path)) as package:
+            if not package.AddFile(str(inner), _archive_name(name)):
+                raise OSError("the USD library could not write it")
+
+
+def _archive_name(name: str) -> str:
+    """Plain ASCII: brackets separate names inside packages, and zip has several encodings."""
+    plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in name)
+    return plain.lstrip(".") or "scene.usdc"
+
+
+def read(path: Path) -> Splats:
+    """All Gaussian splats of a USD file, turned to y down, float32.
+
+    Prims may be moved and scaled evenly; up axis y. Raises SplatError "splats-unreadable" for a
+    damaged file, one without splats, one that refers to other files, or one with rotated prims.
+    """
+    path = Path(path)
+    with reading(path):
+        stage = _open(path)
+        parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
+        if not parts:
+            raise BadFileError(f"it holds no {_TYPE}")
+        origin = _origin(stage)
+        return checked(turned(replace(joined(parts), origin=origin)))
+
+
+def _open(path: Path) -> Any:
+    from pxr import Sdf, Tf, Usd, UsdGeom
+
+    try:
+        # Anonymous: not from the library's cache, which may hold an older file of that name.
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    except Tf.ErrorException as error:
+        raise BadFileError(f"it is damaged ({_first_line(error)})") from error
+    if layer is None:
+        raise BadFileError("it is not USD")
+    if layer.GetCompositionAssetDependencies():
+        raise BadFileError("it refers to other files, which are not read")
+    try:
+        stage = Usd.Stage.Open(layer)
+    except Tf.ErrorException as error:
+        raise BadFileError(f"it is damaged ({_first_line(error)})") from error
+    if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
+        raise BadFileError("its up axis is not y, which is not read")
+    return stage
+
+
+def _first_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text[:160]
+
+
+def _origin(stage: Any) -> NDArray[np.float64]:
+    note = stage.GetRootLayer().customLayerData.get("splat", {})
+    origin = note.get("origin") if isinstance(note, dict) else None
+    return np.zeros(3) if origin is None else np.array(origin, np.float64).reshape(3)
+
+
+def _splats(prim: Any) -> Splats:
+    """One particle field, in the file's axes."""
+    from pxr import Tf
+
+    try:
+        means = _array(prim, "positions", 3)
+        n = len(means)
+        orientations = _array(prim, "orientations", 4)
+        scales = _array(prim, "scales", 3)
+        opacities = _array(prim, "opacities", 1)[:, 0]
+        degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+        coefficients = _array(prim, "radiance:sphericalHarmonicsCoefficients", 3)
+    except Tf.ErrorException as error:
+        raise BadFileError(f"it is damaged ({_first_line(error)})") from error
+    if degree not in (0, 1, 2, 3):
+        raise BadFileError(f"its SH degree is {degree}, not 0 to 3")
+    wanted = {"orientations": n, "scales": n, "opacities": n, "coefficients": n * (degree + 1) ** 2}
+    lengths = (len(orientations), len(scales), len(opacities), len(coefficients))
+    for (name, length), given in zip(wanted.items(), lengths, strict=True):
+        if given != length:
+            raise BadFileError(f"it has {given} {name} for {n} splats, wanted {length}")
+    scale, offset = _placement(prim)
+    return Splats(
+        means=(means * scale + offset).astype(np.float32),
+        quaternions=orientations[:, [3, 0, 1, 2]],
+        log_scales=logs_of(scales.astype(np.float64) * scale),
+        opacity_logits=logits_of(opacities),
+        sh=coefficients.reshape(n, (degree + 1) ** 2, 3),
+        sh_degrees=np.full(n, degree, np.uint8),
+    )
+
+
+def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
+    """[N, width] float32: the attribute, or its twin in half precision where only that is set."""
+    for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
+        value = attribute.Get() if attribute else None
+        if value is not None:
+            array = np.array(value, np.float32)
+            return array.reshape(-1, width)
+    raise BadFileError(f"its splats have no {name}")
+
+
+def _placement(prim: Any) -> tuple[float, NDArray[np.float64]]:
+    """(scale, offset) of the prim in the world."""
+    from pxr import Usd, UsdGeom
+
+    matrix = np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim))
+    scale = float(matrix[0, 0])
+    if not (np.isfinite(matrix).all() and scale > 0):
+        raise BadFileError("its splats are mirrored or have no size")
+    if np.abs(matrix[:3, :3] / scale - np.eye(3)).max() > 1e-6:
+        raise BadFileError("its splats are rotated or stretched, which is not read")
+    return scale, matrix[3, :3]

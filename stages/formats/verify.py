@@ -1,0 +1,174 @@
+"""Second readers, for checking what the writers wrote.
+
+None of them shares code with its writer: plyfile, pygltflib with raw accessors, usd-core's
+attributes, and a byte-wise reading of .splat. They leave the splats in the file's own axes and
+say how those lie in our world, so that a check can move the camera instead of the splats: then a
+wrong turn of positions, rotations or SH shows in the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Splats
+
+_Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class FileContent:
+    """splats: as the file holds them, in its axes. world_from_file [4, 4]: from those axes to
+    ours (y down)."""
+
+    splats: Splats
+    world_from_file: NDArray[np.float64]
+
+
+def read_back(path: Path) -> FileContent:
+    """What another program would find in the file. Raises whatever its parser raises: a file that
+    was just written has no excuse."""
+    reader = {
+        ".ply": _ply,
+        ".splat": _splat,
+        ".glb": _gltf,
+        ".gltf": _gltf,
+        ".usda": _usd,
+        ".usdc": _usd,
+        ".usdz": _usd,
+    }[path.suffix.lower()]
+    return reader(path)
+
+
+def _ply(path: Path) -> FileContent:
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(path), mmap="c")["vertex"]
+    names = [item.name for item in vertex.properties]
+    per_channel = sum(name.startswith("f_rest_") for name in names) // 3
+    sh = np.zeros((len(vertex.data), per_channel + 1, 3), np.float32)
+    for channel in range(3):
+        sh[:, 0, channel] = vertex[f"f_dc_{channel}"]
+        for k in range(per_channel):
+            sh[:, k + 1, channel] = vertex[f"f_rest_{channel * per_channel + k}"]
+    splats = _splats(
+        means=np.stack([vertex[c] for c in "xyz"], axis=1),
+        quaternions=np.stack([vertex[f"rot_{i}"] for i in range(4)], axis=1),
+        log_scales=np.stack([vertex[f"scale_{i}"] for i in range(3)], axis=1),
+        opacity_logits=np.asarray(vertex["opacity"]),
+        sh=sh,
+    )
+    return FileContent(splats, np.eye(4))
+
+
+def _splat(path: Path) -> FileContent:
+    records = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 32)
+    floats = np.ascontiguousarray(records[:, :24]).view("<f4").astype(np.float64)
+    colours = records[:, 24:28] / 255.0
+    splats = _splats(
+        means=floats[:, :3],
+        quaternions=(records[:, 28:].astype(np.float64) - 128.0) / 128.0,
+        log_scales=np.log(floats[:, 3:]),
+        opacity_logits=_logits(colours[:, 3]),
+        sh=((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
+    )
+    return FileContent(splats, np.eye(4))
+
+
+def _gltf(path: Path) -> FileContent:
+    from urllib.parse import unquote
+
+    from pygltflib import GLTF2
+
+    document = GLTF2().load(str(path))
+    assert document is not None
+    if path.suffix.lower() == ".gltf" and document.buffers:
+        blob = (path.parent / unquote(document.buffers[0].uri)).read_bytes()
+    else:
+        blob = document.binary_blob() or b""
+    kinds = {5121: np.uint8, 5123: np.uint16, 5126: np.float32}
+    widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+    def values(primitive: Any, name: str) -> NDArray[np.floating]:
+        accessor = document.accessors[getattr(primitive.attributes, name)]
+        view = document.bufferViews[accessor.bufferView]
+        start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+        count = accessor.count * widths[accessor.type]
+        flat = np.frombuffer(blob, kinds[accessor.componentType], count, start)
+        return flat.reshape(accessor.count, widths[accessor.type])
+
+    prefix = "KHR_gaussian_splatting:"
+    parts = []
+    for primitive in document.meshes[0].primitives if document.meshes else []:
+        bands = [
+            values(primitive, f"{prefix}SH_DEGREE_{d}_COEF_{i}")
+            for d in range(4)
+            for i in range(2 * d + 1)
+            if hasattr(primitive.attributes, f"{prefix}SH_DEGREE_{d}_COEF_{i}")
+        ]
+        sh = np.zeros((len(bands[0]), 16, 3), np.float32)
+        sh[:, : len(bands)] = np.stack(bands, axis=1)
+        xyzw = values(primitive, f"{prefix}ROTATION")
+        parts.append(
+            _splats(
+                means=values(primitive, "POSITION"),
+                quaternions=np.roll(xyzw, 1, axis=1),
+                log_scales=np.log(values(primitive, f"{prefix}SCALE").astype(np.float64)),
+                opacity_logits=_logits(values(primitive, f"{prefix}OPACITY")[:, 0]),
+                sh=sh,
+            )
+        )
+    return FileContent(_concatenated(parts), _Y_UP)
+
+
+def _usd(path: Path) -> FileContent:
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(path))
+    stage.Reload()  # the library's cache may hold an older file of the same name
+    parts = []
+    for prim in stage.Traverse():
+        if prim.GetTypeName() != "ParticleField3DGaussianSplat":
+            continue
+        get = prim.GetAttribute
+        degree = get("radiance:sphericalHarmonicsDegree").Get()
+        coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
+        sh = coefficients.reshape(-1, (degree + 1) ** 2, 3)
+        turns = get("orientations").Get()
+        parts.append(
+            _splats(
+                means=np.array(get("positions").Get(), np.float32),
+                quaternions=np.array([(q.real, *q.imaginary) for q in turns], np.float32),
+                log_scales=np.log(np.array(get("scales").Get(), np.float64)),
+                opacity_logits=_logits(np.array(get("opacities").Get())),
+                sh=sh,
+            )
+        )
+    return FileContent(_concatenated(parts), _Y_UP)
+
+
+def _logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
+    inside = np.clip(p.astype(np.float64), 1e-30, 1 - 1e-9)
+    return np.log(inside / (1 - inside))
+
+
+def _splats(**arrays: NDArray[np.floating]) -> Splats:
+    values = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+    n, k = values["sh"].shape[:2]
+    for name, width in {"means": 3, "quaternions": 4, "log_scales": 3}.items():
+        values[name] = values[name].reshape(n, width)
+    return Splats(**values, sh_degrees=np.full(n, math.isqrt(k) - 1, np.uint8))  # type: ignore[arg-type]
+
+
+def _concatenated(parts: list[Splats]) -> Splats:
+    if not parts:
+        shapes = {"means": 3, "quaternions": 4, "log_scales": 3}
+        empty = {name: np.zeros((0, width)) for name, width in shapes.items()}
+        return _splats(**empty, opacity_logits=np.zeros(0), sh=np.zeros((0, 1, 3)))
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    return _splats(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
