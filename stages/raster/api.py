@@ -54,6 +54,8 @@ def render(
 ) -> Rendering:
     """Draw `splats` as `camera` sees them.
 
+    The camera is given in the frame of `splats.means`; `splats.local` moves one that is not.
+
     backend: "auto" (the fastest that is present), "cpu" (Numba) or "reference" (torch).
     Raises ValueError for another name.
     """

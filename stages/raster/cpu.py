@@ -242,16 +242,9 @@ def splat_arrays(splats: Splats) -> tuple[NDArray[np.float32], ...]:
     )
 
 
-def at_origin(splats: Splats, camera: Camera) -> Camera:
-    """The camera in the splats' own, recentred frame; the shift is made in float64."""
-    to_world = np.eye(4)
-    to_world[:3, 3] = splats.origin
-    return camera.moved(to_world)
-
-
 def render_cpu(splats: Splats, camera: Camera, settings: RasterSettings) -> Rendering:
     """`render` by the kernels."""
-    forward = CpuRasteriser().forward(splat_arrays(splats), at_origin(splats, camera), settings)
+    forward = CpuRasteriser().forward(splat_arrays(splats), camera, settings)
     image = forward.image
     return Rendering(
         np.ascontiguousarray(image[:3].transpose(1, 2, 0)),

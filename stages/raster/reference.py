@@ -15,6 +15,7 @@ opacity, scales, rotation, SH), so that the order of rows in a file never shows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -130,7 +131,7 @@ class Projected:
 
 def project(p: Parameters, camera: Camera, settings: RasterSettings) -> Projected:
     """Footprints of the splats that can be seen at all, nearest first."""
-    like = {"dtype": p.means.dtype, "device": p.means.device}
+    like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     world_to_camera = torch.tensor(camera.world_to_camera, **like)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     z = (p.means.detach() @ rotation.T + translation)[:, 2]
@@ -211,8 +212,14 @@ def render_tensors(
     p: Parameters, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(image [H, W, 3], alpha [H, W], depth [H, W]), differentiable in all of `p`."""
-    like = {"dtype": p.means.dtype, "device": p.means.device}
-    projected = project(p, camera, settings)
+    return render_projected(p, project(p, camera, settings), camera, settings)
+
+
+def render_projected(
+    p: Parameters, projected: Projected, camera: Camera, settings: RasterSettings
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`render_tensors` from footprints already made (their means2d may be asked for gradients)."""
+    like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     centre = torch.tensor(camera.centre, **like)
     rgb = colours(p.rows(projected.index), centre, settings.sh_degree)
     background = torch.tensor(settings.background, **like)
@@ -248,10 +255,9 @@ def render_tensors(
 
 def render_reference(splats: Splats, camera: Camera, settings: RasterSettings) -> Rendering:
     """`render` in float64 by the definition itself."""
-    to_world = np.eye(4)
-    to_world[:3, 3] = splats.origin
     p = parameters_of(splats)
     with torch.no_grad():
-        image, alpha, depth = render_tensors(p, camera.moved(to_world), settings)
+        image, alpha, depth = render_tensors(p, camera, settings)
         culled = int((~drawable(p)).sum())
-    return Rendering(*(t.numpy().astype(np.float32) for t in (image, alpha, depth)), culled)
+    arrays = [t.numpy().astype(np.float32) for t in (image, alpha, depth)]
+    return Rendering(arrays[0], arrays[1], arrays[2], culled)

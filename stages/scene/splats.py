@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.scene.camera import Camera
+
 SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
 
@@ -75,6 +77,13 @@ class Splats:
             sh=self.sh[index],
             sh_degrees=self.sh_degrees[index],
         )
+
+    def local(self, camera: Camera) -> Camera:
+        """A camera of the capture's coordinates, in the frame of `means`; shifted in float64, so
+        that a capture 6000 km from its origin renders as one beside it."""
+        shift = np.eye(4)
+        shift[:3, 3] = self.origin
+        return camera.moved(shift)
 
     def with_sh_degree(self, degree: int) -> Splats:
         """Higher bands dropped, or zero bands added."""

@@ -1,0 +1,235 @@
+"""Stage 4: fit splats to the photographs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.run.errors import Family, SplatError
+from stages.run.stage import Report, Stage
+
+if TYPE_CHECKING:
+    from stages.scene import Reconstruction, Splats
+    from stages.training.optimiser import Model
+    from stages.training.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    steps: int = field(default=7000, metadata={"help": "Steps of training, one photograph each."})
+    train_side: int = field(
+        default=800, metadata={"help": "Longer side of the photographs in training (pixels)."}
+    )
+    sh_degree: int = field(
+        default=2,
+        metadata={"help": "Degree of view-dependent colour, 0 (none) to 3."},
+    )
+    max_splats: int = field(
+        default=0, metadata={"help": "Splats at most; 0 takes what free memory allows."}
+    )
+    antialias: bool = field(
+        default=False,
+        metadata={"help": "Make up in opacity for the widening of splats under a pixel."},
+    )
+    seed: int = field(default=0, metadata={"help": "Seed of all random numbers."})
+    backend: str = field(
+        default="auto", metadata={"help": "Rasteriser: auto, cpu, gpu or reference."}
+    )
+
+
+PRESETS: dict[str, TrainSettings] = {
+    "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
+    "standard": TrainSettings(steps=7000, train_side=800, sh_degree=2, max_splats=250_000),
+    "best": TrainSettings(steps=30_000, train_side=1600, sh_degree=3),
+}
+
+
+def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report: Report) -> Splats:
+    """Train; write splats.bin, history.csv, a plot and a contact sheet of held-out photographs."""
+    from stages.scene.storage import save_splats
+    from stages.training.checkpoint import remove_checkpoint
+
+    started = time.monotonic()
+    check(settings)
+    reconstruction: Reconstruction = inputs["sfm"]
+    start: Splats = inputs["seed"]
+    trainer = make_trainer(reconstruction, settings, folder, report)
+    report.metric("backend", "reference" if trainer.use_reference else "cpu")
+    report.metric("splat_cap", trainer.cap)
+    report.metric("train_photographs", len(trainer.train))
+    report.metric("held_out_photographs", len(trainer.held_out))
+    model = trainer.run(start)
+    splats = finished(model, settings.sh_degree, start)
+    if len(splats) == 0:
+        raise _nothing_left()
+    write_quality(trainer, model, folder, report)
+    save_splats(folder, splats)
+    remove_checkpoint(folder)
+    report.metric("steps", settings.steps)
+    report.metric("splats", len(splats))
+    if len(splats) >= 0.98 * trainer.cap:
+        report.warn(
+            "train-splat-cap-reached",
+            f"Growth stopped at the cap of {trainer.cap:,} splats; more memory, or a higher "
+            "--max-splats, may add detail.",
+        )
+    report.metric("train_seconds", round(time.monotonic() - started, 1))
+    return splats
+
+
+def check(settings: TrainSettings) -> None:
+    """Raises SplatError for values that no training can have."""
+    limits = {
+        "steps": (1, 1_000_000),
+        "train_side": (16, 8192),
+        "sh_degree": (0, 3),
+        "max_splats": (0, 100_000_000),
+    }
+    for name, (low, high) in limits.items():
+        value = getattr(settings, name)
+        if not low <= value <= high:
+            raise SplatError(
+                "train-setting-out-of-range",
+                given=f"--{name.replace('_', '-')} {value}.",
+                wanted=f"A number from {low:,} to {high:,}.",
+                hint="Leave the option out to get the preset's value.",
+                family=Family.USAGE,
+            )
+    if settings.backend not in ("auto", "cpu", "reference"):
+        given = f"--backend {settings.backend}."
+        raise SplatError(
+            "train-backend-unavailable",
+            given=given,
+            wanted="auto, cpu or reference: this version has no GPU kernels.",
+            hint="Leave --backend out; the CPU kernels run everywhere.",
+            family=Family.USAGE,
+        )
+
+
+def make_trainer(
+    reconstruction: Reconstruction, settings: TrainSettings, folder: Path, report: Report
+) -> Trainer:
+    """Load the photographs and compute the cap, before anything grows."""
+    from stages.run.memory import available_mib
+    from stages.scene import scene_extent, split_held_out
+    from stages.training.densify import splat_cap
+    from stages.training.schedule import Schedule
+    from stages.training.trainer import Trainer
+    from stages.training.views import load_views
+
+    kept, held = split_held_out(reconstruction.views)
+    train = load_views(reconstruction.folder, kept, settings.train_side)
+    held_out = load_views(reconstruction.folder, held, settings.train_side)
+    smaller = [
+        v
+        for v in reconstruction.views
+        if max(v.camera.width, v.camera.height) < settings.train_side
+    ]
+    if smaller:
+        report.warn(
+            "train-photographs-smaller",
+            f"{len(smaller)} photographs are smaller than --train-side {settings.train_side}; "
+            "they are used at their own size. --max-side sets how large ingest keeps them.",
+        )
+    memory_cap = splat_cap(available_mib())
+    return Trainer(
+        schedule=Schedule(
+            steps=settings.steps,
+            extent=scene_extent(reconstruction.views),
+            sh_degree=settings.sh_degree,
+            n_views=len(train),
+            seed=settings.seed,
+        ),
+        train=train,
+        held_out=held_out,
+        cap=settings.max_splats or memory_cap,
+        folder=folder,
+        report=report,
+        antialias=settings.antialias,
+        use_reference=settings.backend == "reference",
+    )
+
+
+def finished(model: Model, sh_degree: int, start: Splats) -> Splats:
+    """The model as splats: unit quaternions, without rows that are not finite."""
+    import numpy as np
+
+    from stages.scene import Splats
+
+    norms = np.linalg.norm(model.quaternions.astype(np.float64), axis=1, keepdims=True)
+    good = np.isfinite(norms[:, 0]) & (norms[:, 0] > 0)
+    for array in model.arrays:
+        good &= np.isfinite(array.reshape(len(model), -1)).all(1)
+    quaternions = (model.quaternions[good] / norms[good]).astype(np.float32)
+    return Splats(
+        model.means[good],
+        quaternions,
+        model.log_scales[good],
+        model.opacity_logits[good],
+        model.sh[good],
+        np.full(int(good.sum()), sh_degree, np.uint8),
+        start.origin,
+    )
+
+
+def write_quality(trainer: Trainer, model: Model, folder: Path, report: Report) -> None:
+    """Final held-out figures into the report; table, plot and contact sheet into the folder."""
+    import numpy as np
+
+    from stages.run.atomic import replacing
+    from stages.training.pictures import contact_sheet, training_plot
+
+    scores = trainer.evaluate(model)
+    if scores:
+        values = [s["psnr_db"] for s in scores]
+        worst = min(scores, key=lambda s: s["psnr_db"])
+        report.metric("psnr_db", round(float(np.mean(values)), 3))
+        report.metric("psnr_worst_db", round(worst["psnr_db"], 3))
+        report.metric("psnr_worst_photograph", worst["name"])
+        report.metric("psnr_spread_db", round(float(np.std(values)), 3))
+        report.metric("ssim", round(float(np.mean([s["ssim"] for s in scores])), 4))
+    else:
+        report.warn(
+            "train-nothing-held-out",
+            "Too few photographs to hold one out: quality was not measured.",
+        )
+    report.metric("held_out", scores)
+    lines = ["step,splats,psnr_db,ssim"]
+    for h in trainer.history:
+        lines.append(
+            f"{h['step']},{h['splats']},{h.get('psnr_db', float('nan')):.4f},"
+            f"{h.get('ssim', float('nan')):.5f}"
+        )
+    with replacing(folder / "history.csv") as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    training_plot(folder / "training.png", trainer.history)
+    rows = []
+    for view, score in zip(trainer.held_out, scores, strict=True):
+        rows.append((view.name, score["psnr_db"], *trainer.picture(model, view)))
+    contact_sheet(folder / "held_out.png", rows)
+
+
+def _nothing_left() -> SplatError:
+    return SplatError(
+        "train-nothing-left",
+        given="Every splat faded away or became invalid in training.",
+        wanted="A scene that the photographs agree on.",
+        hint="Check the reconstruction with `splat status`; retake blurred photographs, or try "
+        "another --seed.",
+        family=Family.QUALITY,
+    )
+
+
+def load(folder: Path) -> Splats:
+    """The trained splats."""
+    from stages.scene.storage import load_splats
+
+    return load_splats(folder)
+
+
+STAGE = Stage(
+    name="train", version=1, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+)

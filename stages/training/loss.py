@@ -1,0 +1,40 @@
+"""The training loss: what it is worth and its gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.raster.pool import Pool
+from stages.training.loss_kernels import BAND, loss_bands
+
+SSIM_WEIGHT = 0.2  # Kerbl et al. 2023
+
+
+@dataclass(frozen=True)
+class Loss:
+    """value = 0.8 l1 + 0.2 (1 - ssim); v_image [3, H, W]: gradient of H x W x value, so that its
+    entries do not shrink with the picture."""
+
+    value: float
+    l1: float
+    ssim: float
+    v_image: NDArray[np.float32]
+
+
+def image_loss(
+    pool: Pool,
+    image: NDArray[np.float32],
+    target: NDArray[np.float32],
+    v_image: NDArray[np.float32],
+    ssim_weight: float = SSIM_WEIGHT,
+) -> Loss:
+    """Compare image [>= 3, H, W] with target [3, H, W]; the gradient is written to v_image."""
+    _, height, width = target.shape
+    means = target.reshape(3, -1).mean(1, dtype=np.float64).astype(np.float32)
+    sums = np.zeros((3 * (-(-height // BAND)), 2))
+    pool.share(loss_bands, image, target, means, ssim_weight, v_image, sums)
+    l1, ssim = (float(s) for s in sums.sum(0) / (3 * height * width))
+    return Loss((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim, v_image)

@@ -1,0 +1,44 @@
+"""A training step's gradients by the torch reference: slow, and what the kernels are held to."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stages.raster.api import RasterSettings
+from stages.raster.pool import Pool
+from stages.raster.reference import Parameters, project, render_projected
+from stages.scene import Camera
+from stages.training.loss import image_loss
+
+
+def reference_gradients(
+    pool: Pool,
+    arrays: tuple[NDArray[np.float32], ...],
+    camera: Camera,
+    settings: RasterSettings,
+    target: NDArray[np.float32],
+    v_image: NDArray[np.float32],
+) -> tuple[NDArray[np.int32], NDArray[np.float32], float]:
+    """(rows of visible splats, their gradients as in CpuRasteriser.backward, loss), in float64."""
+    p = Parameters(*(torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in arrays))
+    projected = project(p, camera, settings)
+    projected.means2d.retain_grad()
+    image, _, _ = render_projected(p, projected, camera, settings)
+    planar = np.ascontiguousarray(image.detach().numpy().astype(np.float32).transpose(2, 0, 1))
+    loss = image_loss(pool, planar, target, v_image)
+    image.backward(torch.tensor(v_image.transpose(1, 2, 0), dtype=torch.float64))
+
+    index = projected.index.numpy()
+    bands = (min(settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
+    columns = [_gradient(t, index) for t in p.tensors()[:4]]
+    columns.append(_gradient(projected.means2d, np.arange(len(index))))
+    columns.append(_gradient(p.sh, index)[:, : 3 * bands])
+    return index.astype(np.int32), np.concatenate(columns, 1).astype(np.float32), loss.value
+
+
+def _gradient(tensor: torch.Tensor, index: NDArray[np.integer]) -> NDArray[np.float64]:
+    if tensor.grad is None:
+        return np.zeros((len(index), int(np.prod(tensor.shape[1:]))))
+    return np.asarray(tensor.grad.numpy()[index].reshape(len(index), -1))

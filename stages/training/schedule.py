@@ -1,0 +1,70 @@
+"""What happens at which step. The reference recipe is written for 30,000 steps; all its events
+move with the number of steps that a preset can afford."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+RECIPE_STEPS = 30_000
+MEANS_LR = 1.6e-4  # x scene extent
+MEANS_LR_END = 0.01  # of the first
+THRESHOLD = 2e-4
+MIN_DENSIFY_INTERVAL = 25  # steps: fewer do not see enough of the scene to judge a splat by
+MIN_STEPS_FOR_RESET = 15_000  # a shorter run does not recover from an opacity reset
+# (share of the run, scale of the picture): coarse pictures first, they are cheap and smooth
+RESOLUTIONS = ((0.25, 0.5), (1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """steps: of the whole run. extent: of the scene, world units. sh_degree: reached at the end.
+    n_views: photographs trained on."""
+
+    steps: int
+    extent: float
+    sh_degree: int
+    n_views: int
+    seed: int
+
+    def _scaled(self, recipe_step: int) -> int:
+        return max(1, round(recipe_step * self.steps / RECIPE_STEPS))
+
+    def means_lr(self, step: int) -> float:
+        """Exponential decay to 1 %."""
+        return MEANS_LR * self.extent * MEANS_LR_END ** (step / max(self.steps - 1, 1))
+
+    def active_sh_degree(self, step: int) -> int:
+        """One degree more every 1000 steps of the recipe."""
+        return min(self.sh_degree, step // self._scaled(1000))
+
+    def densifies_after(self, step: int) -> bool:
+        """Whether to densify once `step` is done."""
+        interval = max(self._scaled(100), MIN_DENSIFY_INTERVAL)
+        done = step + 1
+        return self._scaled(500) <= done <= self.steps // 2 and done % interval == 0
+
+    def resets_after(self, step: int) -> bool:
+        """Whether to reset opacities once `step` is done."""
+        if self.steps < MIN_STEPS_FOR_RESET:
+            return False
+        return (step + 1) % self._scaled(3000) == 0 and step + 1 <= self.steps // 2
+
+    def prunes_giants(self, step: int) -> bool:
+        return step >= self._scaled(3000)
+
+    def level(self, step: int) -> int:
+        """Index into RESOLUTIONS."""
+        share = step / self.steps
+        return next(i for i, (end, _) in enumerate(RESOLUTIONS) if share < end)
+
+    def view(self, step: int) -> int:
+        """Every photograph once in each round, in a new order each round."""
+        round_number, place = divmod(step, self.n_views)
+        order = np.random.default_rng([self.seed, 1, round_number]).permutation(self.n_views)
+        return int(order[place])
+
+    def rng(self, step: int) -> np.random.Generator:
+        """Random numbers of one step, whatever happened before it."""
+        return np.random.default_rng([self.seed, 2, step])

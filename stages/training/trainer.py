@@ -1,0 +1,170 @@
+"""The training loop: a view, a picture, a loss, a step; now and then more splats or fewer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.measure.images import psnr, ssim
+from stages.raster.api import RasterSettings
+from stages.raster.cpu import CpuRasteriser
+from stages.run.errors import Interrupted
+from stages.run.stage import Report
+from stages.scene import Splats
+from stages.training.checkpoint import load_checkpoint, save_checkpoint
+from stages.training.densify import densify, reset_opacities
+from stages.training.loss import image_loss
+from stages.training.optimiser import LearningRates, Model, apply_gradients, new_model
+from stages.training.schedule import THRESHOLD, Schedule
+from stages.training.views import TrainingView
+
+CHECKPOINT_SECONDS = 30.0
+EVALUATIONS = 10  # during a run, evenly spaced
+NEAR = 0.01  # of the scene's extent
+
+StepGradients = Callable[..., tuple[NDArray[np.int32], NDArray[np.float32], float]]
+
+
+@dataclass
+class Trainer:
+    """One run. cap: splats at most. folder: where checkpoints go."""
+
+    schedule: Schedule
+    train: list[TrainingView]
+    held_out: list[TrainingView]
+    cap: int
+    folder: Path
+    report: Report
+    antialias: bool = False
+    use_reference: bool = False
+
+    def __post_init__(self) -> None:
+        self.rasteriser = CpuRasteriser()
+        self.history: list[dict[str, Any]] = []
+        self._v_image = np.empty(0, np.float32)
+
+    def run(self, start: Splats) -> Model:
+        """Train from `start`, or go on from the folder's checkpoint; the finished model.
+
+        Raises Interrupted at a step boundary, checkpoint written, when the report asks to stop.
+        """
+        self.report.progress(0, self.schedule.steps, "compiling kernels")
+        model, step = self._begin(start)
+        last_saved = time.monotonic()
+        while step < self.schedule.steps:
+            loss = self.step(model, step)
+            model = self._adapt(model, step)
+            step += 1
+            if step % max(1, self.schedule.steps // EVALUATIONS) == 0:
+                self._record(model, step)
+            if self.report.stop_requested.is_set() and step < self.schedule.steps:
+                save_checkpoint(self.folder, model, step, self.history)
+                raise Interrupted(f"train stopped after step {step} of {self.schedule.steps}")
+            if time.monotonic() - last_saved > CHECKPOINT_SECONDS:
+                save_checkpoint(self.folder, model, step, self.history)
+                last_saved = time.monotonic()
+            self._tick(model, step, loss)
+        return model
+
+    def _begin(self, start: Splats) -> tuple[Model, int]:
+        saved = load_checkpoint(self.folder)
+        if saved is not None:
+            model, step, self.history = saved
+            self.report.metric("resumed_from_step", step)
+            return model, step
+        start = start.with_sh_degree(self.schedule.sh_degree)
+        return new_model(
+            *(
+                np.array(a, np.float32, order="C")
+                for a in (
+                    start.means,
+                    start.quaternions,
+                    start.log_scales,
+                    start.opacity_logits,
+                    start.sh,
+                )
+            )
+        ), 0
+
+    def settings(self, degree: int) -> RasterSettings:
+        return RasterSettings(
+            near=NEAR * self.schedule.extent, antialias=self.antialias, sh_degree=degree
+        )
+
+    def step(self, model: Model, step: int) -> float:
+        """One step of Adam on one photograph; the loss before it."""
+        view = self.train[self.schedule.view(step)]
+        camera, target = view.target(self.schedule.level(step))
+        settings = self.settings(self.schedule.active_sh_degree(step))
+        if self._v_image.shape != target.shape:
+            self._v_image = np.empty(target.shape, np.float32)
+        pool = self.rasteriser.pool
+        if self.use_reference:
+            from stages.training.reference_step import reference_gradients
+
+            visible, gradients, value = reference_gradients(
+                pool, model.arrays, camera, settings, target, self._v_image
+            )
+        else:
+            forward = self.rasteriser.forward(model.arrays, camera, settings)
+            loss = image_loss(pool, forward.image, target, self._v_image)
+            gradients = self.rasteriser.backward(model.arrays, forward, self._v_image)
+            visible, value = forward.visible, loss.value
+        rates = LearningRates(means=self.schedule.means_lr(step))
+        apply_gradients(pool, model, visible, gradients, rates, camera.width, camera.height)
+        return value
+
+    def _adapt(self, model: Model, step: int) -> Model:
+        if self.schedule.densifies_after(step):
+            model, _ = densify(
+                model,
+                THRESHOLD,
+                self.schedule.extent,
+                self.cap,
+                self.schedule.prunes_giants(step),
+                self.schedule.rng(step),
+            )
+        if self.schedule.resets_after(step):
+            reset_opacities(model)
+        return model
+
+    def _tick(self, model: Model, step: int, loss: float) -> None:
+        numbers: dict[str, float | int | str] = {"splats": len(model), "loss": round(loss, 4)}
+        if self.history and "psnr_db" in self.history[-1]:
+            numbers["held_out_psnr_db"] = round(self.history[-1]["psnr_db"], 2)
+        self.report.progress(step, self.schedule.steps, "training", **numbers)
+
+    def _record(self, model: Model, step: int) -> None:
+        scores = self.evaluate(model)
+        entry: dict[str, Any] = {"step": step, "splats": len(model)}
+        if scores:
+            entry["psnr_db"] = float(np.mean([s["psnr_db"] for s in scores]))
+            entry["ssim"] = float(np.mean([s["ssim"] for s in scores]))
+        self.history.append(entry)
+
+    def evaluate(self, model: Model) -> list[dict[str, Any]]:
+        """PSNR and SSIM of each held-out photograph at full training resolution."""
+        scores = []
+        for view in self.held_out:
+            image, target = self.picture(model, view)
+            scores.append(
+                {"name": view.name, "psnr_db": psnr(image, target), "ssim": ssim(image, target)}
+            )
+        return scores
+
+    def picture(
+        self, model: Model, view: TrainingView
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(render, photograph), [H, W, 3], what a viewer would show: clipped to [0, 1]."""
+        camera, target = view.target(len(view.levels) - 1)
+        forward = self.rasteriser.forward(
+            model.arrays, camera, self.settings(self.schedule.sh_degree)
+        )
+        image = np.clip(forward.image[:3].transpose(1, 2, 0), 0.0, 1.0)
+        return image, target.transpose(1, 2, 0)
