@@ -4,10 +4,10 @@
 import importlib
 import zlib  # noqa: F401
 
-from stages.run import threads
 from stages.run.stage import Stage
+from stages.run.threads import configure
 
-threads.configure()
+configure()
 
 STAGE_NAMES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
 

@@ -41,6 +41,9 @@ class Listener:
     def stopping(self) -> None:
         """A signal asked the run to stop; it will, at the next safe place."""
 
+    def ended(self) -> None:
+        """The run is over, whether it succeeded or not."""
+
 
 def attempt(
     stage: Stage,

@@ -114,6 +114,8 @@ class Pipeline:
                 return self._run_all(planner, wanted, until, stop, listener)
         except OSError as error:
             raise self._unusable(error) from error
+        finally:
+            listener.ended()
 
     def _run_all(
         self,

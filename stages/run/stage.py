@@ -56,8 +56,8 @@ class Stage:
     version: raised when equal inputs and settings give different bytes.
     reads: names of the earlier stages whose outputs `run` receives.
     settings_type: one flat frozen dataclass, torch-free; each field has a default and carries
-        `metadata={"help": ...}` with its unit. Fields with `metadata={"affects_output": False}` (number of
-        threads, say) do not make a stage run again.
+        `metadata={"help": ...}` with its unit. Fields with `metadata={"affects_output": False}`
+        (number of threads, say) do not make a stage run again.
     run(inputs, settings, folder, report): writes everything under `folder` and returns the output.
         `folder` may hold what an interrupted run of the same inputs and settings left there.
     load(folder): the output again, from a finished folder. Cheap: arrays may be loaded, images not.

@@ -43,6 +43,8 @@ class Workspace:
         """Make the working folder ready; True if it holds work on the same request. OSError."""
         if self.partial.exists():
             if request.matches(self.partial, settings_type):
+                for half in self.partial.rglob(".partial-*"):  # of `replacing`, killed half-way
+                    half.unlink()
                 return True
             shutil.rmtree(self.partial)
         self.partial.mkdir()

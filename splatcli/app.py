@@ -1,0 +1,169 @@
+"""The command: parse, call, print."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from splatcli import jobs, summary
+from splatcli.console import guarded
+from splatcli.folders import find_run_folder
+from splatcli.options import with_parameters
+from stages import STAGE_NAMES
+from stages.run.pipeline import Pipeline
+
+app = typer.Typer(
+    name="splat",
+    help="Turn a folder of photographs into a 3D Gaussian splat that opens everywhere.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Examples:\n\n"
+    "splat process photos/\n\n"
+    "splat process photos/ --preset preview --format glb --out run/\n\n"
+    "splat status\n\n"
+    "splat export --format gltf",
+)
+
+Photos = Annotated[
+    Path | None,
+    typer.Argument(help="Folder of photographs; a run folder, or nothing, continues that run."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="Run folder to make or continue.", show_default="run"),
+]
+Run = Annotated[
+    Path | None, typer.Argument(help="Run folder; by default the one in the current folder.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Events and results as lines of JSON.")]
+
+_STAGE_HELP = {
+    "ingest": "Read and check the photographs.",
+    "sfm": "Find where each photograph was taken from.",
+    "seed": "Turn the sparse points into first splats.",
+    "train": "Fit the splats to the photographs.",
+    "prune": "Remove floaters.",
+    "quantise": "Decide what to keep at which precision.",
+    "export": "Write the files that other programs open.",
+}
+_STAGE_EXAMPLES = {
+    "ingest": "splat ingest photos/ --out run/",
+    "train": "splat train --preset best",
+    "export": "splat export --format gltf --format usdz",
+}
+
+
+def _example(line: str) -> str:
+    return f"Example: {line}"
+
+
+def process(
+    photos: Photos = None,
+    *,
+    out: Out = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    **given: Any,
+) -> None:
+    """Photographs in, assets out: all seven stages.
+
+    Finished work is kept: after an interruption the same command goes on where it stopped.
+    """
+    jobs.run_all(photos, out, given, quiet, as_json)
+
+
+def _stage_command(name: str) -> Callable[..., None]:
+    def ingest(
+        photos: Photos = None,
+        *,
+        out: Out = None,
+        quiet: Quiet = False,
+        as_json: AsJson = False,
+        **given: Any,
+    ) -> None:
+        pipeline = Pipeline(*jobs.target_of(photos, out))
+        jobs.run_stage("ingest", pipeline, given, quiet, as_json)
+
+    def later(
+        run: Run = None, *, quiet: Quiet = False, as_json: AsJson = False, **given: Any
+    ) -> None:
+        jobs.run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
+
+    return ingest if name == "ingest" else later
+
+
+def status(run: Run = None, as_json: AsJson = False) -> None:
+    """Say what is finished, what would run again, and why."""
+    pipeline = Pipeline(find_run_folder(run))
+    summary.show_status(pipeline, pipeline.status(), as_json)
+
+
+def render(
+    target: Annotated[
+        Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("view.png"),
+    camera: Annotated[
+        str | None,
+        typer.Option(help="A photograph's name or number; by default the first, or one in front."),
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option(min=1, max=16384, help="Width of the picture (pixels).")
+    ] = None,
+    backend: Annotated[str, typer.Option(help="auto, cpu, gpu or reference.")] = "auto",
+) -> None:
+    """Draw the splats as one of the photographs saw them."""
+    from splatcli import views
+
+    views.render_to(target, out, camera, width, backend)
+
+
+def info(
+    target: Annotated[
+        Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Count the splats of a file or a run, with bounds and degrees."""
+    from splatcli import views
+
+    views.show_info(target, as_json)
+
+
+def doctor(as_json: AsJson = False) -> None:
+    """Check what this machine has, and what is missing."""
+    from splatcli import checkup
+
+    raise typer.Exit(checkup.show(as_json))
+
+
+def _register() -> None:
+    example = _example("splat process photos/ --preset preview --out run/")
+    command = with_parameters(process, jobs.process_parameters())
+    app.command("process", epilog=example)(guarded(command))
+    for name in STAGE_NAMES:
+        line = _STAGE_EXAMPLES.get(name, f"splat {name}")
+        command = with_parameters(_stage_command(name), jobs.stage_parameters(name))
+        app.command(name, help=_STAGE_HELP[name], epilog=_example(line))(guarded(command))
+    for extra, line in (
+        (status, "splat status run/"),
+        (render, "splat render run/ --camera IMG_0042.jpg --out view.png"),
+        (info, "splat info run/7-export/scene.ply"),
+        (doctor, "splat doctor"),
+    ):
+        app.command(extra.__name__, epilog=_example(line))(guarded(extra))
+
+
+_register()
+
+
+def main() -> None:
+    """Entry point of the `splat` command."""
+    app()

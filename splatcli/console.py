@@ -1,0 +1,171 @@
+"""What a person sees: errors, tables, figures in words. Progress is in progress.py."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import shlex
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from stages.run.errors import Interrupted, SplatError
+from stages.run.failures import as_splat_error
+
+STOPPED = 130  # what shells expect after Ctrl-C
+CRASHED = 1
+
+out = Console(highlight=False, soft_wrap=True)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def emit(event: str, **values: Any) -> None:
+    """One line of JSON on standard output."""
+    sys.stdout.write(json.dumps({"event": event, **values}, ensure_ascii=False) + "\n")
+    sys.stdout.flush()
+
+
+def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command whose failures are told in words, with the exit status of their family."""
+
+    @functools.wraps(command)
+    def call(**values: Any) -> None:
+        as_json = bool(values.get("as_json"))
+        try:
+            command(**values)
+        except SplatError as error:
+            raise typer.Exit(show_error(error, as_json)) from error
+        except (Interrupted, KeyboardInterrupt) as stop:
+            raise typer.Exit(show_stopped(as_json)) from stop
+        except (typer.Exit, BrokenPipeError):
+            raise
+        except Exception as error:
+            explained = as_splat_error(error, "the command", Path())
+            if explained is not None:
+                raise typer.Exit(show_error(explained, as_json)) from error
+            if os.environ.get("SPLAT_DEBUG") == "1":
+                raise
+            raise typer.Exit(show_bug(error, as_json)) from error
+
+    return call
+
+
+def show_error(error: SplatError, as_json: bool = False) -> int:
+    """Print an error; returns the exit status."""
+    if as_json:
+        emit("error", **error.as_dict())
+        return int(error.family)
+    err.print(Text("Error: ", style="bold red") + Text(error.given))
+    err.print(Text("Wanted: ", style="bold") + Text(error.wanted))
+    err.print(Text("Next: ", style="bold") + Text(error.hint))
+    err.print(Text(f"({error.code}, exit status {int(error.family)})", style="dim"))
+    return int(error.family)
+
+
+def show_stopped(as_json: bool = False) -> int:
+    """Say how to go on after Ctrl-C; returns the exit status."""
+    again = shlex.join(["splat", *sys.argv[1:]])
+    if as_json:
+        emit("stopped", go_on=again)
+    else:
+        err.print("Stopped. What was finished is kept.")
+        err.print(Text("Go on with: ", style="bold") + Text(again))
+    return STOPPED
+
+
+def show_bug(error: BaseException, as_json: bool = False) -> int:
+    """Print an unexpected failure and where its traceback is; returns the exit status."""
+    log = _write_log(error)
+    what = f"{type(error).__name__}: {error}".splitlines()[0]
+    if as_json:
+        emit("bug", message=what, log=str(log) if log else None)
+        return CRASHED
+    err.print(Text("Unexpected failure: ", style="bold red") + Text(what))
+    err.print("This is a bug in splat. What was finished is kept.")
+    if log:
+        err.print(Text("Next: ", style="bold") + Text(f"report it with {log}"))
+    return CRASHED
+
+
+def _write_log(error: BaseException) -> Path | None:
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="splat-", suffix=".log", delete=False, encoding="utf-8"
+        ) as file:
+            file.write(shlex.join(sys.argv) + "\n")
+            traceback.print_exception(error, file=file)
+            return Path(file.name)
+    except OSError:
+        return None
+
+
+def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> None:
+    """Print a table; columns of figures are aligned right."""
+    rows = [list(map(str, row)) for row in rows]
+    drawn = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
+    for i, heading in enumerate(headings):
+        figures = all(row[i][:1].isdigit() or row[i] in ("", "-") for row in rows)
+        drawn.add_column(heading, justify="right" if figures and i else "left", overflow="fold")
+    for row in rows:
+        drawn.add_row(*map(Text, row))
+    out.print(drawn, soft_wrap=False)
+
+
+def note(text: str, style: str = "") -> None:
+    """One line for the reader, on standard error."""
+    err.print(Text(text, style=style))
+
+
+_UNITS = {"_db": " dB", "_px": " px", "_s": " s", "_mib": " MiB", "_deg": "°"}
+
+
+def figures(numbers: Mapping[str, Any]) -> str:
+    """ "psnr 27.1 dB, splats 36,700": names give the unit."""
+    return ", ".join(f"{label(name)} {figure(name, value)}" for name, value in numbers.items())
+
+
+def label(name: str) -> str:
+    """A figure's name without its unit: "held_out_psnr_db" -> "held out PSNR"."""
+    for suffix in _UNITS:
+        name = name.removesuffix(suffix)
+    words = name.replace("_", " ").split()
+    return " ".join(w.upper() if w in ("psnr", "ssim", "sh") else w for w in words)
+
+
+def figure(name: str, value: Any) -> str:
+    """A figure with its unit."""
+    unit = next((u for suffix, u in _UNITS.items() if name.endswith(suffix)), "")
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}{unit}"
+    if isinstance(value, float):
+        return f"{value:.4g}{unit}" if abs(value) < 1e4 else f"{value:,.0f}{unit}"
+    return f"{value}{unit}"
+
+
+def size(count: float) -> str:
+    """Bytes as people read them: "1.3 MB"."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000 or unit == "GB":
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    raise AssertionError
+
+
+def duration(seconds: float) -> str:
+    """ "4.2 s", "3:05", "1:02:03"."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

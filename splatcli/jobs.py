@@ -1,0 +1,156 @@
+"""From what was typed to a run of the pipeline: settings, presets, which stages may run."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from inspect import Parameter
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from splatcli import options, progress, summary
+from splatcli.folders import DEFAULT, find_run_folder
+from stages import STAGE_NAMES, load_stage
+from stages.run import runfolder
+from stages.run.errors import Family, SplatError
+from stages.run.pipeline import Pipeline
+
+DEFAULT_PRESET = "standard"
+PROCESS_OPTIONS = (
+    "backend",
+    "max_side",
+    "train_side",
+    "steps",
+    "max_splats",
+    "formats",
+    "allow_partial",
+    "seed",
+)
+
+
+def preset_parameter() -> Parameter:
+    """`--preset`, with the names that training defines."""
+    option = typer.Option(
+        "--preset",
+        help="How much training: preview (minutes), standard, or best (the full recipe).",
+        show_default=DEFAULT_PRESET,
+        metavar="NAME",
+    )
+    return options.keyword("preset", options.choice("preset", presets()) | None, option)
+
+
+def presets() -> Mapping[str, Any]:
+    """Training settings by preset name."""
+    from stages.train import PRESETS
+
+    found: Mapping[str, Any] = PRESETS
+    return found
+
+
+def process_parameters() -> list[Parameter]:
+    """The few options of `process`; one that several stages share is given to all of them."""
+    found: dict[str, Parameter] = {}
+    for name in STAGE_NAMES:
+        for parameter in options.parameters(load_stage(name).settings_type, PROCESS_OPTIONS):
+            found.setdefault(parameter.name, parameter)
+    return [preset_parameter(), *(found[name] for name in PROCESS_OPTIONS if name in found)]
+
+
+def stage_parameters(name: str) -> list[Parameter]:
+    """All settings of one stage; training has presets too."""
+    own = options.parameters(load_stage(name).settings_type)
+    return [preset_parameter(), *own] if name == "train" else own
+
+
+def settings_for(
+    base: Mapping[str, Any], typed: Mapping[str, Any], preset: str | None
+) -> dict[str, Any]:
+    """`base` (settings by stage name) with a preset and what was typed. Raises SplatError."""
+    chosen = dict(base)
+    if preset is not None and "train" in chosen:
+        chosen["train"] = presets()[preset]
+    return {name: options.changed(settings, typed) for name, settings in chosen.items()}
+
+
+def defaults() -> dict[str, Any]:
+    """Settings by stage name, with the default preset."""
+    fresh = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
+    return {**fresh, "train": presets()[DEFAULT_PRESET]}
+
+
+def target_of(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]:
+    """(run folder, photographs or None) that a command is about.
+
+    Photographs start or continue the run folder `out`, or `run/`; a run folder in their place, or
+    nothing, continues what it was asked before. Raises SplatError.
+    """
+    if photos is None:
+        return find_run_folder(out), None
+    if runfolder.is_run_folder(photos):
+        if out is not None and out.absolute() != photos.absolute():
+            raise SplatError(
+                "option-out",
+                given=f"{photos} is itself a run folder, and --out names {out}.",
+                wanted="Photographs to start from, or one run folder to continue.",
+                hint=f"Leave --out away to continue {photos}.",
+                family=Family.USAGE,
+            )
+        return photos, None
+    return out or DEFAULT, photos
+
+
+def run(
+    pipeline: Pipeline,
+    settings: Mapping[str, Any],
+    *,
+    until: str | None = None,
+    may_run: Collection[str] | None = None,
+    quiet: bool = False,
+    as_json: bool = False,
+) -> None:
+    """Run the pipeline and show what came of it."""
+    listener = progress.listener_for(quiet, as_json)
+    pipeline.run(settings, until=until, may_run=may_run, listener=listener)
+    summary.show(pipeline, until, quiet=quiet, as_json=as_json)
+
+
+def run_all(
+    photos: Path | None, out: Path | None, given: Mapping[str, Any], quiet: bool, as_json: bool
+) -> None:
+    """`splat process`. Without photographs, what was asked before counts too."""
+    run_folder, photos = target_of(photos, out)
+    pipeline = Pipeline(run_folder, photos)
+    base = defaults() if photos is not None else pipeline.recorded_settings()
+    typed = options.given_only(given)
+    settings = settings_for(base, typed, typed.pop("preset", None))
+    run(pipeline, settings, quiet=quiet, as_json=as_json)
+
+
+def run_stage(
+    name: str,
+    pipeline: Pipeline,
+    given: Mapping[str, Any],
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """One stage, with the settings recorded before and what was typed.
+
+    The stages after training are cheap: those that are missing in between run too.
+    """
+    if not runfolder.is_run_folder(pipeline.run_folder):
+        base = defaults()
+    else:
+        base = pipeline.recorded_settings()
+    typed = options.given_only(given)
+    preset = typed.pop("preset", None)
+    settings = settings_for({name: base[name]}, typed, preset)
+    if not runfolder.is_run_folder(pipeline.run_folder):
+        settings = {**base, **settings}
+    may_run = _may_run(name)
+    run(pipeline, settings, until=name, may_run=may_run, quiet=quiet, as_json=as_json)
+
+
+def _may_run(name: str) -> Collection[str]:
+    after_training = STAGE_NAMES[STAGE_NAMES.index("train") + 1 :]
+    return after_training if name in after_training else (name,)

@@ -1,0 +1,213 @@
+"""Progress of a run: a bar on a terminal, lines elsewhere, events for machines."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from splatcli import console
+from stages.run.manifest import Manifest, plain
+from stages.run.pipeline import Listener
+from stages.run.stage import Numbers, Stage
+
+_LINE_EVERY_S = 10.0
+_EVENT_EVERY_S = 0.5
+STOPPING = "Stopping at the next safe place (Ctrl-C again stops at once)."
+
+
+def listener_for(quiet: bool, as_json: bool) -> Listener:
+    """The listener that suits the options and the output."""
+    if as_json:
+        return Events()
+    if quiet:
+        return Quiet()
+    return Bars(console.err) if console.err.is_terminal else Lines()
+
+
+class Quiet(Listener):
+    """Only what needs a person."""
+
+    def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        warn(stage, manifest)
+
+    def stopping(self) -> None:
+        console.note(STOPPING)
+
+
+def warn(stage: Stage, manifest: Manifest) -> None:
+    """Print a stage's warnings."""
+    for code, sentence in manifest.warnings:
+        console.note(f"Warning ({stage.name}): {sentence} ({code})", "yellow")
+
+
+class Events(Listener):
+    """One JSON object a line, on standard output."""
+
+    def __init__(self) -> None:
+        self._last = 0.0
+
+    def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
+        self._last = 0.0
+        console.emit("started", stage=stage.name, reason=reason, resumed=resumed)
+
+    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
+        now = time.monotonic()
+        if now - self._last >= _EVENT_EVERY_S or done >= total:
+            self._last = now
+            values: dict[str, Any] = {"label": label, "done": done, "total": total}
+            console.emit("progress", stage=stage.name, **values, numbers=plain(numbers))
+
+    def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        console.emit("finished", stage=stage.name, **_account(manifest))
+
+    def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        console.emit("skipped", stage=stage.name)
+
+    def stopping(self) -> None:
+        console.emit("stopping")
+
+
+def _account(manifest: Manifest) -> dict[str, Any]:
+    return {
+        "seconds": manifest.seconds,
+        "peak_memory_mib": manifest.peak_memory_mib,
+        "metrics": manifest.metrics,
+        "warnings": manifest.warnings,
+    }
+
+
+class _Pace:
+    """Rate and remaining time of one phase, over what was done since it was first seen."""
+
+    def __init__(self, label: str, done: int) -> None:
+        self.label = label
+        self._start, self._first = time.monotonic(), done
+
+    def text(self, done: int, total: int) -> str:
+        spent = time.monotonic() - self._start
+        if done <= self._first or spent <= 0:
+            return ""
+        rate = (done - self._first) / spent
+        return f"{_rate(rate)}, {console.duration((total - done) / rate)} left"
+
+
+def _rate(per_second: float) -> str:
+    return f"{per_second:.1f}/s" if per_second >= 1 else f"{1 / per_second:.1f} s each"
+
+
+class Lines(Listener):
+    """A line now and then: output that is read later, or goes to a file."""
+
+    def __init__(self) -> None:
+        self._last = 0.0
+        self._pace = _Pace("", 0)
+
+    def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
+        self._last, self._pace = 0.0, _Pace("", 0)
+        console.note(_started(stage, number, reason, resumed))
+
+    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
+        now = time.monotonic()
+        if label != self._pace.label:
+            self._pace, self._last = _Pace(label, done), 0.0
+        if now - self._last < _LINE_EVERY_S:
+            return
+        self._last = now
+        parts = [f"{done}/{total}", self._pace.text(done, total), console.figures(numbers)]
+        console.note(f"  {label or stage.name}: " + ", ".join(filter(None, parts)))
+
+    def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        console.note(f"{number}/7 {stage.name}: done in {console.duration(manifest.seconds)}")
+        warn(stage, manifest)
+
+    def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        console.note(f"{number}/7 {stage.name}: up to date")
+
+    def stopping(self) -> None:
+        console.note(STOPPING)
+
+
+def _started(stage: Stage, number: int, reason: str, resumed: bool) -> str:
+    how = "goes on" if resumed else "runs"
+    return f"{number}/7 {stage.name}: {how} ({reason})"
+
+
+class _Rate(ProgressColumn):
+    """Units a second, or seconds a unit."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(_rate(speed) if speed else "", style="dim")
+
+
+class Bars(Listener):
+    """A bar a stage, with rate, remaining time and the figures that matter."""
+
+    def __init__(self, screen: Console) -> None:
+        self._screen = screen
+        self._progress: Progress | None = None
+        self._label = ""
+
+    def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
+        self._close()
+        self._label = ""
+        self._progress = Progress(
+            TextColumn(f"[bold]{number}/7 {stage.name:<8}[/bold]"),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            _Rate(),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[figures]}", markup=False, style="cyan"),
+            console=self._screen,
+            transient=True,
+        )
+        waiting = "going on" if resumed else "starting"
+        self._task = self._progress.add_task(waiting, total=None, figures="")
+        self._progress.start()
+
+    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
+        if self._progress is None:
+            return
+        if label != self._label:  # another phase: another pace
+            self._label = label
+            self._progress.reset(self._task, total=total, completed=done)
+        self._progress.update(
+            self._task,
+            description=label,
+            completed=done,
+            total=total,
+            figures=console.figures(numbers),
+        )
+
+    def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        self._close()
+        line = f"{number}/7 {stage.name:<8} done in {console.duration(manifest.seconds)}"
+        self._screen.print(Text(line, style="green"))
+        warn(stage, manifest)
+
+    def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
+        self._screen.print(Text(f"{number}/7 {stage.name:<8} up to date", style="dim"))
+
+    def stopping(self) -> None:
+        self._screen.print(STOPPING)
+
+    def ended(self) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None

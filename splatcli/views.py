@@ -1,0 +1,202 @@
+"""`splat render` and `splat info`: a look at a run or at a splat file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli import console
+from splatcli.folders import find_run_folder
+from stages.run.atomic import replacing
+from stages.run.errors import Family, SplatError
+from stages.run.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from stages.scene import Camera, Splats, View
+
+_STAGES_WITH_SPLATS = ("quantise", "prune", "train", "seed")
+_PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+_WIDTH_WITHOUT_A_PHOTOGRAPH_PX = 960
+
+
+def render_to(
+    target: Path | None, out: Path, camera: str | None, width: int | None, backend: str
+) -> None:
+    """Write a picture of the splats. Raises SplatError."""
+    from stages.raster.api import render
+
+    if out.suffix.lower() not in _PICTURES:
+        raise SplatError(
+            "render-picture-type",
+            given=f"{out} is to hold the picture.",
+            wanted=f"A name that ends in one of {' '.join(_PICTURES)}.",
+            hint="For example --out view.png",
+            family=Family.USAGE,
+        )
+    splats, pipeline = load_splats(target)
+    views = _views(pipeline)
+    seen = _camera_for(splats, views, camera)
+    if width is not None:
+        seen = seen.resized(width, max(1, round(width * seen.height / seen.width)))
+    try:
+        picture = render(splats, seen, backend=backend)
+    except ValueError as error:
+        raise SplatError(
+            "render-backend",
+            given=f"{error}.",
+            wanted="A backend that this machine has.",
+            hint="Leave --backend away, or see `splat doctor`.",
+            family=Family.USAGE,
+        ) from error
+    _save(picture.image, out)
+    console.note(f"{out}: {seen.width} x {seen.height}, {len(splats):,} splats")
+
+
+def show_info(target: Path | None, as_json: bool) -> None:
+    """Print counts, degrees and bounds of a file or of a run's newest splats."""
+    splats, pipeline = load_splats(target)
+    facts = describe(splats)
+    if pipeline is None and target is not None:
+        facts = {"file": str(target), "size": console.size(target.stat().st_size), **facts}
+    if pipeline is not None:
+        facts = {**_about_run(pipeline), **facts}
+    if as_json:
+        console.emit("info", **facts)
+    else:
+        rows = [(console.label(k), console.figure(k, _flat(v))) for k, v in facts.items()]
+        console.table(("", ""), rows)
+
+
+def load_splats(target: Path | None) -> tuple[Splats, Pipeline | None]:
+    """(splats, the pipeline if `target` is a run): from a file, or a run's newest stage."""
+    if target is not None and target.is_file():
+        from stages.formats import read
+
+        return read(target), None
+    if target is not None and not target.exists():
+        raise SplatError(
+            "file-missing",
+            given=f"{target} does not exist.",
+            wanted="A run folder or a splat file.",
+            hint="Check the path.",
+        )
+    pipeline = Pipeline(find_run_folder(target))
+    name = newest_with_splats(pipeline)
+    output = pipeline.load(name)
+    return (output.splats if name == "quantise" else output), pipeline
+
+
+def newest_with_splats(pipeline: Pipeline) -> str:
+    """The last finished stage whose output is splats. Raises SplatError (no-splats-yet)."""
+    for name in _STAGES_WITH_SPLATS:
+        if pipeline.manifest(name) is not None:
+            return name
+    raise SplatError(
+        "no-splats-yet",
+        given=f"No stage of {pipeline.run_folder} has made splats yet.",
+        wanted="A run in which at least `seed` has finished.",
+        hint="Run `splat process` to go on.",
+        family=Family.USAGE,
+    )
+
+
+def describe(splats: Splats) -> dict[str, Any]:
+    """Plain facts: count, SH degrees, bounds of the centres, typical size and opacity."""
+    import numpy as np
+
+    facts: dict[str, Any] = {"splats": len(splats), "sh_degree": splats.sh_degree}
+    if len(splats) == 0:
+        return facts
+    degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
+    facts["splats_by_degree"] = {str(int(d)): int(n) for d, n in zip(degrees, counts, strict=True)}
+    finite = np.isfinite(splats.means).all(axis=1)
+    facts["not_finite"] = int((~finite).sum())
+    if finite.any():
+        low, middle, high = np.percentile(splats.means[finite], (0, 50, 100), axis=0)
+        facts["bounds_low"] = _rounded(low)
+        facts["bounds_high"] = _rounded(high)
+        facts["median_centre"] = _rounded(middle)
+        facts["median_scale"] = float(np.exp(np.median(splats.log_scales[finite])))
+    facts["median_opacity"] = float(np.median(splats.opacities))
+    facts["origin"] = _rounded(splats.origin)
+    return facts
+
+
+def _about_run(pipeline: Pipeline) -> dict[str, Any]:
+    name = newest_with_splats(pipeline)
+    facts: dict[str, Any] = {"run": str(pipeline.run_folder), "splats_from": name}
+    if pipeline.manifest("sfm") is not None:
+        reconstruction = pipeline.load("sfm")
+        facts["photographs"] = len(reconstruction.views)
+        facts["units"] = reconstruction.units
+        facts["levelled"] = bool(reconstruction.levelled)
+    manifest = pipeline.manifest("export")
+    if manifest is not None:
+        folder = pipeline.stage_folder("export")
+        facts["assets"] = {
+            str(folder / file.path): console.size(file.size_bytes)
+            for file in pipeline.load("export").files
+        }
+    return facts
+
+
+def _rounded(values: Any) -> list[float]:
+    return [float(f"{value:.5g}") for value in values]
+
+
+def _flat(value: Any) -> Any:
+    if isinstance(value, dict):
+        return ", ".join(f"{key}: {item}" for key, item in value.items())
+    return " ".join(map(str, value)) if isinstance(value, list) else value
+
+
+def _views(pipeline: Pipeline | None) -> tuple[View, ...]:
+    if pipeline is None or pipeline.manifest("sfm") is None:
+        return ()
+    return tuple(sorted(pipeline.load("sfm").views, key=lambda view: view.name))
+
+
+def _camera_for(splats: Splats, views: tuple[View, ...], wanted: str | None) -> Camera:
+    if wanted is None:
+        return views[0].camera if views else _in_front_of(splats)
+    by_name = {view.name: view.camera for view in views}
+    if wanted in by_name:
+        return by_name[wanted]
+    if wanted.isdigit() and int(wanted) < len(views):
+        return views[int(wanted)].camera
+    known = f"{views[0].name} ... {views[-1].name}" if views else "none: a file has no cameras"
+    raise SplatError(
+        "render-camera",
+        given=f"There is no camera {wanted}.",
+        wanted=f"A photograph's name, or a number from 0 to {max(0, len(views) - 1)} ({known}).",
+        hint="Leave --camera away, or name a run folder whose photographs you want to see.",
+        family=Family.USAGE,
+    )
+
+
+def _in_front_of(splats: Splats) -> Camera:
+    """A camera that sees the middle nine tenths of the splats, from -z and a little above."""
+    import numpy as np
+
+    from stages.scene import Camera, look_at
+
+    means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
+    if len(means) == 0:
+        means = np.zeros((1, 3))
+    low, high = np.percentile(means, (5, 95), axis=0)
+    middle = (low + high) / 2
+    distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
+    eye = middle + distance * np.array([0.0, -0.3, -1.0])
+    side = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX
+    height = side * 3 // 4
+    view = look_at(eye, middle)
+    return Camera(side, height, side, side, side / 2, height / 2, view)
+
+
+def _save(image: Any, out: Path) -> None:
+    import numpy as np
+    from PIL import Image
+
+    pixels = np.rint(np.clip(np.nan_to_num(image), 0.0, 1.0) * 255.0).astype(np.uint8)
+    with replacing(out) as temporary:
+        Image.fromarray(pixels).save(temporary)
