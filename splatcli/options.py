@@ -59,7 +59,8 @@ def _parameter(field: Field[Any], hint: Any) -> inspect.Parameter:
 def _help(field: Field[Any], kind: Any) -> str:
     """The field's help, with the choices if it does not name them itself."""
     text = str(field.metadata.get("help", ""))
-    words = [member.value for member in kind] if isinstance(kind, enum.EnumMeta) else []
+    members: Iterable[enum.Enum] = kind if isinstance(kind, enum.EnumMeta) else ()
+    words = [str(member.value) for member in members]
     if all(word in text for word in words):
         return text
     return f"{text.rstrip('.')}: {', '.join(words)}."

@@ -1,0 +1,158 @@
+"""Imports run downward only. Read from the source, imports inside functions included."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+STAGE_FILES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
+
+# Lowest first; a module may import from its own row (but not in a circle) and from those above it
+# in this list. The longest matching name counts.
+FLOORS: tuple[tuple[str, ...], ...] = (
+    (
+        "stages.scene",
+        "stages.run.errors",
+        "stages.run.stage",
+        "stages.run.threads",
+        "stages.run.atomic",
+        "stages.run.memory",
+        "stages.run.libraries",
+        "stages",
+    ),
+    (
+        "stages.raster",
+        "stages.formats",
+        "stages.measure",
+        "stages.photos",
+        "stages.structure",
+    ),
+    ("stages.training",),
+    tuple(f"stages.{name}" for name in STAGE_FILES),
+    ("stages.run",),
+    ("splatcli",),
+)
+
+
+def sources() -> dict[str, Path]:
+    """Path by module name."""
+    found = {}
+    for top in ("stages", "splatcli"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = sources()
+
+
+def imports_of(name: str, source: str, when: str = "ever") -> set[str]:
+    """Our own modules that `source` imports, by absolute name.
+
+    when: "ever" (anywhere), "running" (not those for type checkers alone), "loading" (only those
+    that run when the module is loaded).
+    """
+    tree = ast.parse(source)
+    skipped: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        typing = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        later = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        if (typing and when != "ever") or (later and when == "loading"):
+            skipped |= {child for line in node.body for child in ast.walk(line)}
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if node in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name}: relative imports hide where they lead"
+            base = node.module or ""
+            for alias in node.names:
+                whole = f"{base}.{alias.name}"
+                found.add(whole if whole in MODULES else base)
+    return {module for module in found if module.split(".")[0] in ("stages", "splatcli")}
+
+
+def floor_of(module: str) -> int:
+    """The floor whose name is the longest match of `module`."""
+    best, length = -1, -1
+    for number, names in enumerate(FLOORS):
+        for name in names:
+            fits = module == name or module.startswith(name + ".")
+            if fits and len(name) > length:
+                best, length = number, len(name)
+    assert best >= 0, f"{module} has no floor"
+    return best
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_run_downward_only(name: str) -> None:
+    upward = {
+        other
+        for other in imports_of(name, MODULES[name].read_text(encoding="utf-8"))
+        if floor_of(other) > floor_of(name)
+    }
+    assert not upward, f"{name} imports from a higher floor: {sorted(upward)}"
+
+
+def left_in_cycles(graph: dict[str, set[str]]) -> set[str]:
+    """What remains when everything that imports nothing of the rest is taken away."""
+    while True:
+        free = {name for name, wanted in graph.items() if not (wanted - {name}) & graph.keys()}
+        if not free:
+            return set(graph)
+        graph = {name: wanted for name, wanted in graph.items() if name not in free}
+
+
+def test_modules_have_no_cycles_while_they_load() -> None:
+    graph = {
+        name: {
+            other
+            for other in imports_of(name, path.read_text(encoding="utf-8"), "loading")
+            if not name.startswith(other + ".")  # a package is loaded before its modules
+        }
+        for name, path in MODULES.items()
+    }
+    assert not left_in_cycles(graph)
+
+
+def test_packages_have_no_cycles_at_all() -> None:
+    graph: dict[str, set[str]] = {}
+    for name, path in MODULES.items():
+        reached = imports_of(name, path.read_text(encoding="utf-8"), "running")
+        graph.setdefault(part_of(name), set()).update(map(part_of, reached))
+    assert not left_in_cycles(graph)
+
+
+def part_of(module: str) -> str:
+    """ "stages.raster" for "stages.raster.cpu". In `run`, the bottom floor is a part of its own."""
+    part = ".".join(module.split(".")[:2])
+    return f"{part} (bottom)" if part == "stages.run" and floor_of(module) == 0 else part
+
+
+def test_cycle_is_found() -> None:
+    assert left_in_cycles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == set("abcd")
+    assert left_in_cycles({"a": {"b"}, "b": set()}) == set()
+
+
+@pytest.mark.parametrize("stage", STAGE_FILES)
+def test_stages_never_import_each_other(stage: str) -> None:
+    others = {f"stages.{other}" for other in STAGE_FILES if other != stage}
+    assert not imports_of(stage, MODULES[f"stages.{stage}"].read_text("utf-8")) & others
+
+
+def test_nothing_below_imports_the_command() -> None:
+    for name, path in MODULES.items():
+        if not name.startswith("splatcli"):
+            reached = imports_of(name, path.read_text(encoding="utf-8"))
+            assert not {m for m in reached if m.startswith("splatcli")}, name
+
+
+def test_reader_sees_imports_inside_functions() -> None:
+    source = "def f():\n    from stages.scene import Camera\n    import stages.raster.api\n"
+    assert imports_of("x", source) == {"stages.scene", "stages.raster.api"}
