@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import enum
 import inspect
+import sys
 import types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, fields, replace
@@ -125,10 +126,18 @@ def _word(value: Any) -> Any:
 
 
 def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
-    """`settings` with the typed fields that it has. Raises SplatError (option-value)."""
+    """`settings` with the typed fields that it has, checked.
+
+    A stage's file may have `check(settings)`, which raises SplatError: better now than after the
+    stages before it have run. Raises SplatError (option-value, or what `check` raises).
+    """
     names = {field.name for field in fields(settings)}
+    check = getattr(sys.modules[type(settings).__module__], "check", None)
     try:
-        return replace(settings, **{k: v for k, v in typed.items() if k in names})
+        new = replace(settings, **{k: v for k, v in typed.items() if k in names})
+        if check is not None:
+            check(new)
+        return new
     except (ValueError, TypeError) as error:
         raise SplatError(
             "option-value",

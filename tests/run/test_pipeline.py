@@ -36,17 +36,17 @@ class Heard(Listener):
         return [name for kind, name in self.events if kind != "skipped"]
 
 
-@pytest.fixture()
+@pytest.fixture
 def photos(tmp_path: Path) -> Path:
     return photographs(tmp_path / "photos")
 
 
-@pytest.fixture()
+@pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-@pytest.fixture()
+@pytest.fixture
 def finished(photos: Path, run_folder: Path) -> Pipeline:
     pipeline = Pipeline(run_folder, photos, fake_stages())
     pipeline.run()
@@ -76,7 +76,8 @@ def test_run_makes_one_finished_folder_a_stage(finished: Pipeline, run_folder: P
 
 def test_manifest_says_what_was_made_from_what(finished: Pipeline, run_folder: Path) -> None:
     copied, counted = finished.manifest("copy"), finished.manifest("count")
-    assert copied and counted
+    assert copied
+    assert counted
     assert counted.inputs == {"copy": copied.output_digest}
     assert counted.settings == {"iterations": 7000, "seed": 0}
     assert counted.seed == 0

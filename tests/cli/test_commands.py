@@ -1,0 +1,249 @@
+"""What a person types, and what comes back: words and exit status."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+
+import pytest
+
+from stages.run.errors import Interrupted, SplatError
+
+STAGES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
+
+
+def events(result) -> list[dict]:
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+def states(splat, *words: str) -> dict[str, str]:
+    (event,) = events(splat("status", "--json", *words))
+    return {row["stage"]: row["state"] for row in event["stages"]}
+
+
+def reasons(splat) -> dict[str, str]:
+    (event,) = events(splat("status", "--json"))
+    return {row["stage"]: row["reason"] for row in event["stages"]}
+
+
+def started(result) -> list[str]:
+    return [e["stage"] for e in events(result) if e["event"] == "started"]
+
+
+def test_process_makes_everything_and_says_where(splat) -> None:
+    result = splat("process", "photos")
+    assert result.exit_code == 0, result.output
+    assert str(Path("run/7-export/out.ply")) in result.stdout
+    assert "peak memory" in result.stdout
+    assert "PSNR 27.12 dB" in result.stdout
+    assert "Do it yourself" in result.stderr
+
+
+def test_process_twice_does_nothing(splat) -> None:
+    splat("process", "photos")
+    result = splat("process", "photos", "--json")
+    assert started(result) == []
+    assert [e["stage"] for e in events(result) if e["event"] == "skipped"] == list(STAGES)
+
+
+def test_quiet_prints_only_paths_and_warnings(splat) -> None:
+    result = splat("process", "photos", "--quiet")
+    assert result.stdout == f"{Path('run/7-export/out.ply')}\n"
+    assert all(line.startswith("Warning") for line in result.stderr.splitlines())
+
+
+def test_json_is_lines_of_json_ending_in_the_result(splat) -> None:
+    last = events(splat("process", "photos", "--json", "--out", "elsewhere"))[-1]
+    assert last["event"] == "result"
+    assert last["run_folder"] == "elsewhere"
+    assert set(last["stages"]) == set(STAGES)
+    assert last["stages"]["train"]["seconds"] >= 0
+    assert last["assets"] == [{"path": str(Path("elsewhere/7-export/out.ply")), "bytes": 12}]
+
+
+def test_changed_steps_are_named_by_status(splat, pretend) -> None:
+    splat("process", "photos", "--steps", "700")
+
+    def stop(inputs, settings, folder, report) -> None:
+        raise Interrupted
+
+    pretend["train"] = stop
+    assert splat("train", "--steps", "900").exit_code == 130
+    assert reasons(splat)["train"] == "steps 700 -> 900"
+    assert reasons(splat)["prune"] == "train runs again first"
+    assert "steps 700 -> 900" in splat("status").stdout
+
+
+def test_stop_says_how_to_go_on_and_exits_130(splat, pretend, monkeypatch) -> None:
+    def stop(inputs, settings, folder, report) -> None:
+        raise Interrupted
+
+    pretend["sfm"] = stop
+    monkeypatch.setattr("sys.argv", ["splat", "process", "my photos"])
+    result = splat("process", "photos")
+    assert result.exit_code == 130
+    assert "splat process 'my photos'" in result.stderr
+    assert states(splat)["ingest"] == "finished"
+    assert states(splat)["sfm"] == "interrupted"
+    del pretend["sfm"]
+    assert splat("process").exit_code == 0  # with nothing named: what was asked before
+
+
+def test_preset_gives_the_training_settings(splat) -> None:
+    from stages.train import PRESETS
+
+    splat("process", "photos", "--preset", "preview")
+    assert repr(PRESETS["preview"]) == Path("run/4-train/out.ply").read_text()
+    splat("train", "--preset", "best", "--steps", "77")
+    text = Path("run/4-train/out.ply").read_text()
+    assert "steps=77" in text
+
+
+def test_seed_reaches_every_stage_that_has_one(splat) -> None:
+    splat("process", "photos", "--seed", "5")
+    seeds = {}
+    for folder in Path("run").glob("[1-7]-*"):
+        seeds[folder.name] = json.loads((folder / "manifest.json").read_text())["seed"]
+    assert seeds["2-sfm"] == seeds["4-train"] == 5
+    assert set(seeds.values()) <= {5, None}
+
+
+def test_format_is_repeatable(splat) -> None:
+    result = splat("process", "photos", "--format", "ply", "--format", "usdz")
+    assert result.exit_code == 0, result.output
+    assert "('ply', 'usdz')" in Path("run/7-export/out.ply").read_text()
+
+
+def test_one_stage_after_the_other(splat) -> None:
+    assert splat("ingest", "photos", "--out", "run").exit_code == 0
+    for name in STAGES[1:]:
+        assert splat(name).exit_code == 0, name
+    assert set(states(splat).values()) == {"finished"}
+
+
+def test_export_before_train_names_the_command_to_run(splat) -> None:
+    splat("ingest", "photos")
+    result = splat("export", "--format", "gltf")
+    assert result.exit_code == 2
+    assert "splat sfm" in result.stderr
+    assert states(splat)["ingest"] == "finished"
+
+
+def test_export_after_train_runs_the_cheap_stages_between(splat) -> None:
+    for name in ("ingest", "sfm", "seed", "train"):
+        splat(name, *(["photos"] if name == "ingest" else []))
+    result = splat("export", "--format", "gltf", "--json")
+    assert result.exit_code == 0, result.output
+    assert started(result) == ["prune", "quantise", "export"]
+
+
+def test_run_folder_is_found_from_inside_beside_and_alone(splat, tmp_path, monkeypatch) -> None:
+    splat("process", "photos", "--out", "only")
+    assert splat("status").exit_code == 0
+    monkeypatch.chdir(tmp_path / "only")
+    assert splat("status").exit_code == 0
+    monkeypatch.chdir(tmp_path)
+    splat("process", "photos", "--out", "second")
+    unclear = splat("status")
+    assert unclear.exit_code == 2
+    assert "only, second" in unclear.stderr
+    splat("process", "photos")  # run/ is the default among several
+    assert splat("status").exit_code == 0
+
+
+def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
+    result = splat("train")
+    assert result.exit_code == 5
+    assert "splat process PHOTOS" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["process", "photos", "--steps", "-4"], "--steps"),
+        (["process", "photos", "--steps", "many"], "--steps"),
+        (["process", "photos", "--preset", "fastest"], "preview"),
+        (["process", "photos", "--backend", "cuda"], "--backend"),
+        (["process", "photos", "--format", "obj"], "--format"),
+        (["process", "photos", "--stepz", "4"], "--stepz"),
+        (["proces", "photos"], "process"),
+        (["render", "--width", "0"], "--width"),
+    ],
+)
+def test_wrong_words_are_named_and_exit_2(splat, words: list[str], said: str) -> None:
+    result = splat(*words)
+    assert result.exit_code == 2, result.output
+    assert said in result.stderr
+    assert "Traceback" not in result.output
+    assert not Path("run").exists()
+
+
+def test_every_splat_error_shows_given_wanted_next_and_code(splat, pretend) -> None:
+    def refuse(inputs, settings, folder, report) -> None:
+        raise SplatError("ingest-x", given="Two cats.", wanted="A dog.", hint="Bark [loudly].")
+
+    pretend["ingest"] = refuse
+    result = splat("process", "photos")
+    assert result.exit_code == 3
+    for words in ("Two cats.", "A dog.", "Bark [loudly].", "ingest-x"):
+        assert words in result.stderr
+    last = events(splat("process", "photos", "--json"))[-1]
+    assert last == {
+        "event": "error",
+        "code": "ingest-x",
+        "given": "Two cats.",
+        "wanted": "A dog.",
+        "hint": "Bark [loudly].",
+        "family": 3,
+    }
+
+
+def test_full_disk_exits_6_and_keeps_what_is_finished(splat, pretend) -> None:
+    def full(inputs, settings, folder, report) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    pretend["train"] = full
+    result = splat("process", "photos")
+    assert result.exit_code == 6
+    assert "Free some space" in result.stderr
+    assert states(splat)["seed"] == "finished"
+
+
+def test_bug_is_called_a_bug_and_its_traceback_is_in_a_file(splat, pretend) -> None:
+    def broken(inputs, settings, folder, report) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    pretend["seed"] = broken
+    result = splat("process", "photos")
+    assert result.exit_code == 1
+    assert "This is a bug" in result.stderr
+    assert "Traceback" not in result.stderr
+    log = Path(result.stderr.split("report it with ")[1].strip())
+    assert "ZeroDivisionError" in log.read_text()
+    log.unlink()
+
+
+def test_debug_shows_the_traceback(splat, pretend, monkeypatch) -> None:
+    def broken(inputs, settings, folder, report) -> None:
+        raise ZeroDivisionError
+
+    pretend["seed"] = broken
+    monkeypatch.setenv("SPLAT_DEBUG", "1")
+    assert isinstance(splat("process", "photos").exception, ZeroDivisionError)
+
+
+def test_render_refuses_what_is_not_a_picture_or_a_run(splat) -> None:
+    assert splat("render", "nowhere.ply").exit_code == 3
+    assert splat("render", "--out", "x.ply").exit_code == 2
+    splat("ingest", "photos")
+    early = splat("render")
+    assert early.exit_code == 2
+    assert "splat process" in early.stderr
+
+
+def test_option_out_of_two_run_folders_is_refused(splat) -> None:
+    splat("process", "photos")
+    result = splat("process", "run", "--out", "other")
+    assert result.exit_code == 2
+    assert "--out" in result.stderr

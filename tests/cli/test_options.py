@@ -1,0 +1,85 @@
+"""Options made from settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from splatcli import console, options
+from stages.run.errors import SplatError
+
+
+@dataclass(frozen=True)
+class Settings:
+    long_side: int = field(default=1600, metadata={"help": "Long side (px)."})
+    rate: float | None = field(default=None, metadata={"help": "Rate (1/s).", "max": 2})
+    kind: Literal["a", "b"] = field(default="a", metadata={"help": "Kind."})
+    names: tuple[str, ...] = field(default=(), metadata={"help": "A name."})
+    loud: bool = field(default=False, metadata={"help": "Shout."})
+
+    def __post_init__(self) -> None:
+        if self.long_side == 13:
+            raise ValueError("13 is unlucky")
+
+
+def parse(*words: str) -> dict:
+    app = typer.Typer()
+    seen = {}
+
+    def command(**given) -> None:
+        seen.update(options.given_only(given))
+
+    app.command()(options.with_parameters(command, options.parameters(Settings)))
+    result = CliRunner().invoke(app, list(words))
+    assert result.exit_code == 0, result.output
+    return seen
+
+
+def test_only_what_was_typed_is_given() -> None:
+    assert parse() == {}
+    assert parse("--long-side", "0") == {"long_side": 0}
+    assert parse("--no-loud", "--kind", "b") == {"loud": False, "kind": "b"}
+    assert parse("--name", "x", "--name", "y") == {"names": ("x", "y")}
+    assert parse("--rate", "1.5") == {"rate": 1.5}
+
+
+def test_values_out_of_bounds_are_refused() -> None:
+    for words in (["--rate", "3"], ["--rate", "-1"], ["--long-side", "-1"], ["--kind", "c"]):
+        with pytest.raises(AssertionError):
+            parse(*words)
+
+
+def test_settings_that_refuse_a_value_are_a_usage_error() -> None:
+    with pytest.raises(SplatError, match="unlucky") as caught:
+        options.changed(Settings(), {"long_side": 13})
+    assert caught.value.family == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("psnr_db", 27.1234, "27.12 dB"),
+        ("splats", 36700, "36,700"),
+        ("reprojection_error_px", 0.34, "0.34 px"),
+        ("levelled", True, "yes"),
+        ("points", 1e6, "1,000,000"),
+    ],
+)
+def test_figures_have_units_from_their_names(name: str, value: object, text: str) -> None:
+    assert console.figure(name, value) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(4.21, "4.2 s"), (59.96, "60.0 s"), (185.0, "3:05"), (3723, "1:02:03")]
+)
+def test_durations_read_well(seconds: float, text: str) -> None:
+    assert console.duration(seconds) == text
+
+
+@pytest.mark.parametrize(("count", "text"), [(12, "12 B"), (1300, "1.3 kB"), (2.5e9, "2.5 GB")])
+def test_sizes_read_well(count: float, text: str) -> None:
+    assert console.size(count) == text
