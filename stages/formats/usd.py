@@ -10,30 +10,26 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import (
-    checked,
-    joined,
     kept_rows,
     linear_opacities,
     linear_scales,
-    logits_of,
-    logs_of,
     unit_quaternions,
 )
 from stages.formats.turn import turned
+from stages.formats.usd_read import read
 from stages.run.atomic import replacing
 from stages.scene import Splats
 
+__all__ = ["read", "write"]
+
 _ROOT, _PRIM = "/Scene", "/Scene/Splats"
-_TYPE = "ParticleField3DGaussianSplat"
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
@@ -116,7 +112,7 @@ def _export(layer: Any, path: Path) -> None:
     try:
         done = layer.Export(str(path))
     except Tf.ErrorException as error:
-        raise OSError(_first_line(error)) from error
+        raise OSError(" ".join(str(error).split())[:160]) from error
     if not done:
         raise OSError("the USD library could not write it")
 
@@ -142,106 +138,3 @@ def _archive_name(name: str) -> str:
     """Plain ASCII: brackets separate names inside packages, and zip has several encodings."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in name)
     return plain.lstrip(".") or "scene.usdc"
-
-
-def read(path: Path) -> Splats:
-    """All Gaussian splats of a USD file, turned to y down, float32.
-
-    Prims may be moved and scaled evenly; up axis y. Raises SplatError "splats-unreadable" for a
-    damaged file, one without splats, one that refers to other files, or one with rotated prims.
-    """
-    path = Path(path)
-    with reading(path):
-        stage = _open(path)
-        parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
-        if not parts:
-            raise BadFileError(f"it holds no {_TYPE}")
-        origin = _origin(stage)
-        return checked(turned(replace(joined(parts), origin=origin)))
-
-
-def _open(path: Path) -> Any:
-    from pxr import Sdf, Tf, Usd, UsdGeom
-
-    try:
-        # Anonymous: not from the library's cache, which may hold an older file of that name.
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-    except Tf.ErrorException as error:
-        raise BadFileError(f"it is damaged ({_first_line(error)})") from error
-    if layer is None:
-        raise BadFileError("it is not USD")
-    if layer.GetCompositionAssetDependencies():
-        raise BadFileError("it refers to other files, which are not read")
-    try:
-        stage = Usd.Stage.Open(layer)
-    except Tf.ErrorException as error:
-        raise BadFileError(f"it is damaged ({_first_line(error)})") from error
-    if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
-        raise BadFileError("its up axis is not y, which is not read")
-    return stage
-
-
-def _first_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text[:160]
-
-
-def _origin(stage: Any) -> NDArray[np.float64]:
-    note = stage.GetRootLayer().customLayerData.get("splat", {})
-    origin = note.get("origin") if isinstance(note, dict) else None
-    return np.zeros(3) if origin is None else np.array(origin, np.float64).reshape(3)
-
-
-def _splats(prim: Any) -> Splats:
-    """One particle field, in the file's axes."""
-    from pxr import Tf
-
-    try:
-        means = _array(prim, "positions", 3)
-        n = len(means)
-        orientations = _array(prim, "orientations", 4)
-        scales = _array(prim, "scales", 3)
-        opacities = _array(prim, "opacities", 1)[:, 0]
-        degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
-        coefficients = _array(prim, "radiance:sphericalHarmonicsCoefficients", 3)
-    except Tf.ErrorException as error:
-        raise BadFileError(f"it is damaged ({_first_line(error)})") from error
-    if degree not in (0, 1, 2, 3):
-        raise BadFileError(f"its SH degree is {degree}, not 0 to 3")
-    wanted = {"orientations": n, "scales": n, "opacities": n, "coefficients": n * (degree + 1) ** 2}
-    lengths = (len(orientations), len(scales), len(opacities), len(coefficients))
-    for (name, length), given in zip(wanted.items(), lengths, strict=True):
-        if given != length:
-            raise BadFileError(f"it has {given} {name} for {n} splats, wanted {length}")
-    scale, offset = _placement(prim)
-    return Splats(
-        means=(means * scale + offset).astype(np.float32),
-        quaternions=orientations[:, [3, 0, 1, 2]],
-        log_scales=logs_of(scales.astype(np.float64) * scale),
-        opacity_logits=logits_of(opacities),
-        sh=coefficients.reshape(n, (degree + 1) ** 2, 3),
-        sh_degrees=np.full(n, degree, np.uint8),
-    )
-
-
-def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
-    """[N, width] float32: the attribute, or its twin in half precision where only that is set."""
-    for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
-        value = attribute.Get() if attribute else None
-        if value is not None:
-            array = np.array(value, np.float32)
-            return array.reshape(-1, width)
-    raise BadFileError(f"its splats have no {name}")
-
-
-def _placement(prim: Any) -> tuple[float, NDArray[np.float64]]:
-    """(scale, offset) of the prim in the world."""
-    from pxr import Usd, UsdGeom
-
-    matrix = np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim))
-    scale = float(matrix[0, 0])
-    if not (np.isfinite(matrix).all() and scale > 0):
-        raise BadFileError("its splats are mirrored or have no size")
-    if np.abs(matrix[:3, :3] / scale - np.eye(3)).max() > 1e-6:
-        raise BadFileError("its splats are rotated or stretched, which is not read")
-    return scale, matrix[3, :3]

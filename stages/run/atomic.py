@@ -22,6 +22,8 @@ def replacing(path: Path) -> Iterator[Path]:
     path = Path(path)
     temporary = path.with_name(f".partial-{os.getpid()}-{path.name}")
     try:
+        if not path.parent.is_dir():  # said here, because some writers would make the folder
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())

@@ -1,0 +1,174 @@
+"""Reading Gaussian splats from USD, in a process of its own.
+
+The USD library ends the whole process when it meets some kinds of damage in a .usdc, so the file
+is opened by a child: `python -m stages.formats.usd_read FILE OUTPUT` leaves the splats in OUTPUT
+(see stages.scene.storage) or says on its standard output why not.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import checked, joined, logits_of, logs_of
+from stages.formats.turn import turned
+from stages.scene import Splats, load_splats, save_splats
+
+_TYPE = "ParticleField3DGaussianSplat"
+_REFUSED = 3  # exit status of the child when it found what is wrong
+_TIMEOUT_SECONDS = 600
+# Address space of the child: the library's own, and per byte of file (arrays may be compressed).
+_BASE_BYTES, _BYTES_PER_BYTE = 4 << 30, 64
+
+
+def read(path: Path) -> Splats:
+    """All Gaussian splats of a USD file, turned to y down, float32.
+
+    Prims may be moved and scaled evenly; up axis y. Raises SplatError "splats-unreadable" for a
+    damaged file, one without splats, one that refers to other files, or one with rotated prims.
+    """
+    path = Path(path)
+    with reading(path), tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "splats.bin"
+        command = [
+            sys.executable,
+            "-m",
+            "stages.formats.usd_read",
+            str(path.resolve()),
+            str(output),
+        ]
+        try:
+            child = subprocess.run(
+                command,
+                capture_output=True,
+                # The library writes its crash reports there: let them go with the folder.
+                env={**os.environ, "TMPDIR": folder},
+                cwd=Path(__file__).resolve().parents[2],
+                timeout=_TIMEOUT_SECONDS,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise BadFileError(f"it was not read within {_TIMEOUT_SECONDS} s") from error
+        if child.returncode == _REFUSED:
+            raise BadFileError(child.stdout.decode("utf-8", "replace").strip()[:300])
+        if child.returncode != 0:
+            raise BadFileError("it is damaged: the USD library gave up on it")
+        return load_splats(output)
+
+
+def parse(path: Path) -> Splats:
+    """`read`, in this process. Raises BadFileError, or what the USD library raises."""
+    stage = _open(path)
+    parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
+    if not parts:
+        raise BadFileError(f"it holds no {_TYPE}")
+    return checked(turned(replace(joined(parts), origin=_origin(stage))))
+
+
+def _open(path: Path) -> Any:
+    from pxr import Sdf, Usd, UsdGeom
+
+    layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    if layer is None:
+        raise BadFileError("it is not USD")
+    if layer.GetCompositionAssetDependencies():
+        raise BadFileError("it refers to other files, which are not read")
+    stage = Usd.Stage.Open(layer)
+    if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
+        raise BadFileError("its up axis is not y, which is not read")
+    return stage
+
+
+def _origin(stage: Any) -> NDArray[np.float64]:
+    note = stage.GetRootLayer().customLayerData.get("splat", {})
+    origin = note.get("origin") if isinstance(note, dict) else None
+    return np.zeros(3) if origin is None else np.array(origin, np.float64).reshape(3)
+
+
+def _splats(prim: Any) -> Splats:
+    """One particle field, in the file's axes."""
+    means = _array(prim, "positions", 3)
+    n = len(means)
+    orientations = _array(prim, "orientations", 4)
+    scales = _array(prim, "scales", 3)
+    opacities = _array(prim, "opacities", 1)[:, 0]
+    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+    coefficients = _array(prim, "radiance:sphericalHarmonicsCoefficients", 3)
+    if degree not in (0, 1, 2, 3):
+        raise BadFileError(f"its SH degree is {degree}, not 0 to 3")
+    wanted = {"orientations": n, "scales": n, "opacities": n, "coefficients": n * (degree + 1) ** 2}
+    lengths = (len(orientations), len(scales), len(opacities), len(coefficients))
+    for (name, length), given in zip(wanted.items(), lengths, strict=True):
+        if given != length:
+            raise BadFileError(f"it has {given} {name} for {n} splats, wanted {length}")
+    scale, offset = _placement(prim)
+    return Splats(
+        means=(means * scale + offset).astype(np.float32),
+        quaternions=orientations[:, [3, 0, 1, 2]],
+        log_scales=logs_of(scales.astype(np.float64) * scale),
+        opacity_logits=logits_of(opacities),
+        sh=coefficients.reshape(n, (degree + 1) ** 2, 3),
+        sh_degrees=np.full(n, degree, np.uint8),
+    )
+
+
+def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
+    """[N, width] float32: the attribute, or its twin in half precision where only that is set."""
+    for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
+        value = attribute.Get() if attribute else None
+        if value is not None:
+            array = np.array(value, np.float32)
+            return array.reshape(-1, width)
+    raise BadFileError(f"its splats have no {name}")
+
+
+def _placement(prim: Any) -> tuple[float, NDArray[np.float64]]:
+    """(scale, offset) of the prim in the world."""
+    from pxr import Usd, UsdGeom
+
+    matrix = np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim))
+    scale = float(matrix[0, 0])
+    if not (np.isfinite(matrix).all() and scale > 0):
+        raise BadFileError("its splats are mirrored or have no size")
+    if np.abs(matrix[:3, :3] / scale - np.eye(3)).max() > 1e-6:
+        raise BadFileError("its splats are rotated or stretched, which is not read")
+    return scale, matrix[3, :3]
+
+
+def _limit_memory(path: Path) -> None:
+    with suppress(ImportError, ValueError, OSError):  # not on Windows; or limited already
+        import resource
+
+        wanted = _BASE_BYTES + _BYTES_PER_BYTE * path.stat().st_size
+        resource.setrlimit(resource.RLIMIT_AS, (wanted, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def main(arguments: list[str]) -> int:
+    """The child: exit status 0 with the splats in the second file, or 3 with the reason said."""
+    source, output = map(Path, arguments)
+    _limit_memory(source)
+    try:
+        splats = parse(source)
+    except BadFileError as error:
+        print(error)
+        return _REFUSED
+    except Exception as error:  # the library's errors, and what its damaged values lead to
+        print(f"it is damaged ({' '.join(str(error).split())[:160]})")
+        return _REFUSED
+    save_splats(output, splats)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
