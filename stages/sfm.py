@@ -92,7 +92,7 @@ def run(
     )
     best = climbed.best
     report.metric("rungs", [_rung_figures(attempt) for attempt in climbed.attempts])
-    model = _accepted(best, settings)
+    model = _accepted(best, settings, capture)
     _tell(best, climbed, capture, report)
     reconstruction = finish.finish(model, capture, folder, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
@@ -185,7 +185,7 @@ def _reuse_or_clear(work: Path, base: Job) -> None:
         described.write_text(wanted, encoding="utf-8")
 
 
-def _accepted(best: Attempt, settings: SfmSettings) -> SparseModel:
+def _accepted(best: Attempt, settings: SfmSettings, capture: Capture) -> SparseModel:
     """The model to go on with, or the error that says why there is none."""
     model = best.result.model if best.result is not None else None
     usable = model is not None and len(model.names) >= _FEWEST_PHOTOGRAPHS
@@ -195,12 +195,18 @@ def _accepted(best: Attempt, settings: SfmSettings) -> SparseModel:
     if model is not None and usable and enough and settings.allow_partial:
         return model
     worst = best.failures[0]
+    groups = best.result.groups if best.result is not None else ()
+    code, given = worst.code, worst.given
+    if code == "sfm-too-few-registered" and len(groups) > 1:
+        code = "sfm-separate-groups"
+        names = {photo.image: photo.name for photo in capture.photos}
+        described = "; ".join(
+            f"{len(group)} ({_listed(sorted(names[image] for image in group), 3)})"
+            for group in groups[:4]
+        )
+        given += f" The largest groups that hang together: {described}."
     raise SplatError(
-        worst.code,
-        given=worst.given,
-        wanted=worst.wanted,
-        hint=worst.hint,
-        family=Family.RECONSTRUCTION,
+        code, given=given, wanted=worst.wanted, hint=worst.hint, family=Family.RECONSTRUCTION
     )
 
 
@@ -234,9 +240,9 @@ def _tell(best: Attempt, climbed: Climb, capture: Capture, report: Report) -> No
         report.warn(failure.code, f"Accepted all the same: {failure.given} {failure.wanted}")
 
 
-def _listed(names: list[str]) -> str:
-    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + rest
+def _listed(names: list[str], most: int = _NAMED) -> str:
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + rest
 
 
 def _rung_figures(attempt: Attempt) -> dict[str, Any]:

@@ -67,7 +67,7 @@ class Limits:
     weak_share: float = 0.25
     distortion: float = 1.0
     focal_ratio: float = 2.0
-    rotation_disagreement_deg: float = 10.0
+    rotation_disagreement_deg: float = 5.0
     same_place_share: float = 0.9
 
 
@@ -162,6 +162,9 @@ def check_model(figures: Figures, limits: Limits | None = None) -> list[Failure]
     limits = limits or Limits()
     if figures.timed_out:
         return [_timed_out(figures)]
+    if figures.models and not figures.points:
+        # Photographs were placed, but every ray to a point ran parallel and was thrown away.
+        return [_no_parallax("No depth could be measured: photographs")]
     if figures.registered < limits.fewest_views or not figures.points:
         return [_no_model(figures)]
     checks = (_check_geometry, _check_camera, _check_registered, _check_support, _check_rotations)

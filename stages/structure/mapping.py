@@ -19,6 +19,8 @@ from stages.structure.sparse_model import SparseModel, save_model
 SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without a word
 MOST_MODELS = 8
 LOOSE_INLIERS = 15
+PAIR_INLIERS = 50  # a relative rotation from fewer matches is too rough to check another by
+CHECKED_PAIRS = 3  # a photograph
 
 
 def map_photographs(job: Job) -> None:
@@ -132,7 +134,7 @@ def _plain(model: pycolmap.Reconstruction, job: Job) -> SparseModel:
     point_ids = sorted(model.point3D_ids())
     points = [model.points3D[point_id] for point_id in point_ids]
     observations = _observations(model, points, position)
-    rotations = _two_view_rotations(Path(job.database), position)
+    rotations = _two_view_rotations(Path(job.database), model, position)
     cameras = [
         model.cameras[camera_id + 1]
         for camera_id in range(len(job.cameras))
@@ -181,22 +183,42 @@ def _observations(
     }
 
 
-def _two_view_rotations(path: Path, position: dict[int, int]) -> dict[str, np.ndarray]:
-    """Relative rotations that the matches of two photographs alone gave, for checking."""
+def _two_view_rotations(
+    path: Path, model: pycolmap.Reconstruction, position: dict[int, int]
+) -> dict[str, np.ndarray]:
+    """Relative rotations that the matches of two photographs alone give, for checking.
+
+    Estimated anew with the cameras that the model found: with the focal length guessed before,
+    rotations are wrong by ten degrees and more. Strongest pairs only, evenly many a photograph.
+    """
     database = pycolmap.Database.open(path)
     pair_ids, geometries = database.read_two_view_geometries()
-    database.close()
-    pairs, rotations, inliers = [], [], []
+    found = []
     for pair_id, geometry in zip(pair_ids, geometries, strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        pose = geometry.cam2_from_cam1
-        if pose is None or first not in position or second not in position:
+        inliers = len(geometry.inlier_matches)
+        if first in position and second in position and inliers >= PAIR_INLIERS:
+            found.append((-inliers, first, second, geometry))
+    found.sort(key=lambda pair: pair[:3])
+    pairs, rotations, inliers_of = [], [], []
+    for inliers, first, second, geometry in found[: CHECKED_PAIRS * len(position)]:
+        camera1, camera2 = (model.cameras[model.images[i].camera_id] for i in (first, second))
+        points1 = database.read_keypoints(first)[:, :2].astype(np.float64)
+        points2 = database.read_keypoints(second)[:, :2].astype(np.float64)
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = 0
+        options.compute_relative_pose = True
+        again = pycolmap.estimate_calibrated_two_view_geometry(
+            camera1, points1, camera2, points2, geometry.inlier_matches, options
+        )
+        if again.cam2_from_cam1 is None:
             continue
         pairs.append((position[first], position[second]))
-        rotations.append(pose.rotation.matrix())
-        inliers.append(len(geometry.inlier_matches))
+        rotations.append(again.cam2_from_cam1.rotation.matrix())
+        inliers_of.append(-inliers)
+    database.close()
     return {
         "pairs": np.array(pairs, np.int32).reshape(-1, 2),
         "pair_rotations": np.array(rotations, np.float64).reshape(-1, 3, 3),
-        "pair_inliers": np.array(inliers, np.int32),
+        "pair_inliers": np.array(inliers_of, np.int32),
     }

@@ -17,7 +17,6 @@ _SAMPLED_POINTS = 4000  # angles need every pair of rays of a point: a sample is
 _SAMPLED_RAYS = 24
 FEWEST_OBSERVATIONS = 15
 _WEAK_OBSERVATIONS = 30
-_PAIR_INLIERS = 50  # a relative rotation from fewer matches is too rough to check another by
 
 
 @dataclass(frozen=True)
@@ -176,11 +175,10 @@ def triangulation_angles(model: SparseModel, index: NDArray[np.integer]) -> NDAr
 
 def rotation_disagreements(model: SparseModel) -> NDArray[np.float64]:
     """Angles in degrees between the model's relative rotations and those of well-matched pairs."""
-    strong = model.pair_inliers >= _PAIR_INLIERS
-    first, second = model.pairs[strong].T
+    first, second = model.pairs.T
     rotations = model.world_to_camera[:, :3, :3]
     relative = rotations[second] @ np.swapaxes(rotations[first], 1, 2)
-    cosine = (np.einsum("qij,qij->q", relative, model.pair_rotations[strong]) - 1.0) / 2.0
+    cosine = (np.einsum("qij,qij->q", relative, model.pair_rotations) - 1.0) / 2.0
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
