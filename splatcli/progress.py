@@ -107,6 +107,11 @@ def _rate(per_second: float) -> str:
     return f"{per_second:.1f}/s" if per_second >= 1 else f"{1 / per_second:.1f} s each"
 
 
+def _figures(done: int, numbers: Numbers) -> str:
+    """The figures in words, less those that the count already says."""
+    return console.figures({name: value for name, value in numbers.items() if value != done})
+
+
 class Lines(Listener):
     """A line now and then: output that is read later, or goes to a file."""
 
@@ -125,7 +130,7 @@ class Lines(Listener):
         if now - self._last < _LINE_EVERY_S:
             return
         self._last = now
-        parts = [f"{done}/{total}", self._pace.text(done, total), console.figures(numbers)]
+        parts = [f"{done}/{total}", self._pace.text(done, total), _figures(done, numbers)]
         console.note(f"  {label or stage.name}: " + ", ".join(filter(None, parts)))
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
@@ -189,7 +194,7 @@ class Bars(Listener):
             description=label,
             completed=done,
             total=total,
-            figures=console.figures(numbers),
+            figures=_figures(done, numbers),
         )
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:

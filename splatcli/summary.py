@@ -13,8 +13,8 @@ from stages.run.pipeline import Pipeline, Step
 
 # The figures worth a line in the final table, by stage; whatever of them a stage reports is shown.
 _HEADLINES = {
-    "ingest": ("photos_usable", "photos", "left_out"),
-    "sfm": ("registered", "photos", "reprojection_error_px", "points"),
+    "ingest": ("photographs", "left_out"),
+    "sfm": ("registered", "photographs", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
     "train": ("splats", "psnr_db", "ssim"),
     "prune": ("splats", "floaters_removed", "psnr_db"),
@@ -57,7 +57,9 @@ def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -
 def headline(manifest: Manifest) -> str:
     """The figures of one stage that matter most."""
     names = _HEADLINES.get(manifest.stage, ())
-    return console.figures({n: manifest.metrics[n] for n in names if n in manifest.metrics})
+    chosen = {n: manifest.metrics[n] for n in names if n in manifest.metrics}
+    counts = {n: len(v) if isinstance(v, (list, dict)) else v for n, v in chosen.items()}
+    return console.figures(counts)
 
 
 def _assets(pipeline: Pipeline) -> list[tuple[str, int, str]]:

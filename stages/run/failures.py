@@ -11,6 +11,7 @@ from stages.run.errors import Family, SplatError
 _DISK = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _FULL_BELOW_BYTES = 4 * 1024 * 1024  # libraries that report a full disk as something else
+_USER = (Family.USAGE, Family.INPUT, Family.RUN_FOLDER)
 _MEMORY_WORDS = ("can't allocate memory", "out of memory", "not enough memory")
 
 
@@ -23,16 +24,16 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
     chain = _chain(error)
     if any(isinstance(link, OSError) and link.errno in _DISK for link in chain):
         return disk_full(doing, folder)
+    full = isinstance(error, Exception) and _free_bytes(folder) < _FULL_BELOW_BYTES
     for link in chain:
         if isinstance(link, SplatError):
-            return link
+            # What ended in a process of its own cannot say why: a full disk explains it.
+            return disk_full(doing, folder) if full and link.family not in _USER else link
         if isinstance(link, OSError) and link.errno in _DENIED:
             return not_writable(Path(link.filename or folder), link)
         if isinstance(link, MemoryError) or any(w in str(link).lower() for w in _MEMORY_WORDS):
             return out_of_memory(doing, link)
-    if isinstance(error, Exception) and _free_bytes(folder) < _FULL_BELOW_BYTES:
-        return disk_full(doing, folder)
-    return None
+    return disk_full(doing, folder) if full else None
 
 
 def _chain(error: BaseException) -> list[BaseException]:

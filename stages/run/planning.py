@@ -73,7 +73,7 @@ class Planner:
         ]
         if manifest is None:
             first = "was interrupted" if interrupted else "has not run yet"
-            return Step(stage, number, True, ", ".join([first, *waiting]), None, interrupted)
+            return Step(stage, number, True, first, None, interrupted)
         reasons = why_again(
             self._request_if_known(stage, settings, manifest, bool(waiting)),
             manifest,
