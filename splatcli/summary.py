@@ -18,8 +18,8 @@ _HEADLINES = {
     "seed": ("splats",),
     "train": ("splats", "psnr_db", "ssim"),
     "prune": ("splats", "floaters_removed", "psnr_db"),
-    "quantise": ("sh_degree", "psnr_db"),
-    "export": ("files",),
+    "quantise": ("sh_degree", "psnr_kept_db", "kept_mib"),
+    "export": ("files", "splats"),
 }
 
 
@@ -47,7 +47,7 @@ def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -
     if assets:
         console.out.print()
         console.table(
-            ("asset", "size", "how near to what was trained"),
+            ("asset", "size", "read back and drawn again, PSNR"),
             [(path, console.size(count), quality) for path, count, quality in assets],
         )
     else:
@@ -76,8 +76,9 @@ def _assets(pipeline: Pipeline) -> list[tuple[str, int, str]]:
 
 
 def _quality(manifest: Manifest, name: str) -> str:
+    """How near pictures of the file are to pictures of the splats before export."""
     figures = manifest.metrics.get("formats", {}).get(name, {})
-    return console.figures({key: value for key, value in figures.items() if key.endswith("_db")})
+    return console.figure("verify_db", figures["verify_db"]) if "verify_db" in figures else ""
 
 
 def _as_data(
