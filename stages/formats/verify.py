@@ -33,16 +33,7 @@ class FileContent:
 def read_back(path: Path) -> FileContent:
     """What another program would find in the file. Raises whatever its parser raises: a file that
     was just written has no excuse."""
-    reader = {
-        ".ply": _ply,
-        ".splat": _splat,
-        ".glb": _gltf,
-        ".gltf": _gltf,
-        ".usda": _usd,
-        ".usdc": _usd,
-        ".usdz": _usd,
-    }[path.suffix.lower()]
-    return reader(path)
+    return _READERS[path.suffix.lower()](path)
 
 
 def _ply(path: Path) -> FileContent:
@@ -172,3 +163,14 @@ def _concatenated(parts: list[Splats]) -> Splats:
         return _splats(**empty, opacity_logits=np.zeros(0), sh=np.zeros((0, 1, 3)))
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
     return _splats(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+
+
+_READERS = {
+    ".ply": _ply,
+    ".splat": _splat,
+    ".glb": _gltf,
+    ".gltf": _gltf,
+    ".usda": _usd,
+    ".usdc": _usd,
+    ".usdz": _usd,
+}

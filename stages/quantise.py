@@ -1,0 +1,222 @@
+"""Splats + photographs -> QuantisedSplats: what to keep at which precision, by measurement.
+
+View-dependent colour takes up to three quarters of a file. It is cut, for all splats and then for
+each, as far as the held-out photographs do not show it; and what the 8-bit .splat costs is
+measured, so that nobody has to guess.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.run.errors import Family, SplatError
+from stages.run.stage import Report, Stage
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stages.scene import Camera, QuantisedSplats, Reconstruction, Splats
+
+_DECISIONS = "decisions.json"
+_CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
+# Colour that a splat may lose with its higher bands, in steps of 8 bits; the largest that passes.
+_THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
+
+
+@dataclass(frozen=True)
+class QuantiseSettings:
+    """Settings of the choice of precision."""
+
+    max_loss_db: float = field(
+        default=0.02,
+        metadata={"help": "Held-out PSNR that smaller files may cost (dB)."},
+    )
+    measure_side: int = field(
+        default=640,
+        metadata={"help": "Longer side of the photographs to measure on (pixels).", "min": 16},
+    )
+    max_views: int = field(
+        default=12, metadata={"help": "Photographs to measure on, at most.", "min": 1}
+    )
+    backend: str = field(
+        default="auto",
+        metadata={
+            "help": "What draws: auto, cpu or reference.",
+            "choices": ("auto", "cpu", "reference"),
+        },
+    )
+
+
+def check(settings: QuantiseSettings) -> None:
+    """Raises ValueError for settings that cannot be used."""
+    if not settings.max_loss_db >= 0:
+        raise ValueError("max_loss_db must be 0 or more")
+
+
+def run(
+    inputs: Mapping[str, Any], settings: QuantiseSettings, folder: Path, report: Report
+) -> QuantisedSplats:
+    """Decide on the splats of inputs["prune"], measured on the views of inputs["sfm"].
+
+    Metrics: psnr_raw_db, psnr_kept_db, psnr_splat32_db (means over the held-out views, or over
+    training views where none are held out), sh_degree, splats_by_sh_degree, raw_mib, kept_mib.
+    Raises SplatError if a photograph cannot be read.
+    """
+    from stages.formats import splat32
+    from stages.formats.rows import kept_rows
+    from stages.scene import QuantisedSplats, save_splats
+
+    check(settings)
+    splats: Splats = inputs["prune"]
+    judge = _Judge.on(inputs["sfm"], settings, report)
+    raw_db = judge.psnr(splats)
+    by_degree = {splats.sh_degree: raw_db}
+    degree, kept = splats.sh_degree, splats
+    for lower in range(splats.sh_degree):
+        candidate = splats.with_sh_degree(lower)
+        by_degree[lower] = judge.psnr(candidate)
+        if raw_db - by_degree[lower] < settings.max_loss_db:
+            degree, kept = lower, candidate
+            break
+    kept, kept_db, threshold = _cut_each(kept, by_degree[degree], raw_db, settings, judge)
+    drawn, _ = kept_rows(kept)
+    splat32_db = judge.psnr(splat32.decode(splat32.encode(drawn)))
+
+    counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
+    decisions: dict[str, object] = {
+        "sh_degree": kept.sh_degree,
+        "splats_by_sh_degree": counts,
+        "max_loss_db": settings.max_loss_db,
+        "colour_loss_of_255": threshold,
+        "measured_on": judge.what,
+        "views": len(judge.pairs),
+        "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
+        "psnr_raw_db": raw_db,
+        "psnr_kept_db": kept_db,
+        "psnr_splat32_db": splat32_db,
+    }
+    for name in ("psnr_raw_db", "psnr_kept_db", "psnr_splat32_db", "sh_degree"):
+        report.metric(name, decisions[name])
+    report.metric("splats_by_sh_degree", counts)
+    report.metric("raw_mib", round(_bytes(splats.sh_degrees) / 2**20, 3))
+    report.metric("kept_mib", round(_bytes(kept.sh_degrees) / 2**20, 3))
+    report.metric("measured_on", judge.what)
+    save_splats(folder, kept)
+    (folder / _DECISIONS).write_text(json.dumps(decisions, indent=1) + "\n", encoding="utf-8")
+    return QuantisedSplats(kept, kept.sh_degree, decisions)
+
+
+def _cut_each(
+    kept: Splats, kept_db: float, raw_db: float, settings: QuantiseSettings, judge: _Judge
+) -> tuple[Splats, float, float]:
+    """(splats with each one's negligible bands cut, their PSNR, the threshold that passed)."""
+    import numpy as np
+
+    from stages.measure.sh import cut, degrees_at
+
+    if kept.sh_degree == 0:
+        return kept, kept_db, 0.0
+    for steps in _THRESHOLDS_OF_255:
+        degrees = degrees_at(kept, steps / 255)
+        if np.array_equal(degrees, kept.sh_degrees):
+            continue
+        candidate = cut(kept, degrees)
+        candidate_db = judge.psnr(candidate)
+        if raw_db - candidate_db < settings.max_loss_db:
+            return candidate, candidate_db, steps
+    return kept, kept_db, 0.0
+
+
+def _bytes(degrees: NDArray[np.uint8]) -> int:
+    """Of all splats as float32, each with the bands that it uses (and 11 numbers besides)."""
+    coefficients = (degrees.astype(int) + 1) ** 2
+    return int(4 * (11 * len(degrees) + 3 * coefficients.sum()))
+
+
+@dataclass
+class _Judge:
+    """Measures splats on photographs that are loaded once."""
+
+    pairs: list[tuple[Camera, NDArray[np.float32]]]
+    what: str
+    backend: str
+    report: Report
+    done: int = 0
+
+    @classmethod
+    def on(
+        cls, reconstruction: Reconstruction, settings: QuantiseSettings, report: Report
+    ) -> _Judge:
+        from stages.photos.load import load_image
+        from stages.scene import split_held_out
+
+        training, held = split_held_out(reconstruction.views)
+        chosen = held or training
+        if not chosen:
+            raise SplatError(
+                "quantise-no-views",
+                given="The reconstruction has no photographs.",
+                wanted="At least one, to measure on.",
+                hint="Run `splat sfm` again.",
+                family=Family.RUN_FOLDER,
+            )
+        # Spread over the capture: views next to each other say the same.
+        count = min(settings.max_views, len(chosen))
+        chosen = tuple(chosen[i * len(chosen) // count] for i in range(count))
+        pairs = []
+        for view in chosen:
+            camera = view.camera.fitted(settings.measure_side)
+            image = load_image(reconstruction.folder / view.image, camera.width, camera.height)
+            pairs.append((camera, image))
+        return cls(pairs, "held out" if held else "training", settings.backend, report)
+
+    def psnr(self, splats: Splats) -> float:
+        """Mean PSNR over the photographs (dB), at most 99."""
+        import numpy as np
+
+        from stages.measure.images import psnr
+        from stages.raster import render
+
+        values = []
+        for camera, image in self.pairs:
+            drawn = render(splats, camera, backend=self.backend).image
+            values.append(min(psnr(np.clip(drawn, 0, 1), image), _CAP_DB))
+        self.done += 1
+        mean = round(float(np.mean(values)), 4)
+        # At most: raw, three lower degrees, each threshold, .splat.
+        total = 5 + len(_THRESHOLDS_OF_255)
+        self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
+        return mean
+
+
+def load(folder: Path) -> QuantisedSplats:
+    """The decision in a finished folder. Raises SplatError if it is damaged."""
+    from stages.scene import QuantisedSplats, load_splats
+
+    splats = load_splats(folder)
+    try:
+        decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
+        return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SplatError(
+            "quantise-folder-damaged",
+            given=f"{folder / _DECISIONS} cannot be read: {error}.",
+            wanted="The file that the stage wrote.",
+            hint="Delete the stage's folder and run the command again.",
+            family=Family.RUN_FOLDER,
+        ) from error
+
+
+STAGE = Stage(
+    name="quantise",
+    version=1,
+    reads=("sfm", "prune"),
+    settings_type=QuantiseSettings,
+    run=run,
+    load=load,
+)

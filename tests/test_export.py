@@ -1,0 +1,182 @@
+"""Files for other programs, checked before they count."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stages import export, formats
+from stages.export import FORMATS, ExportSettings
+from stages.formats import verify
+from stages.run.errors import Family, SplatError
+from stages.run.stage import Report
+from stages.scene import ExportedAssets, QuantisedSplats, Splats
+from tests.small_scene import SmallScene, small_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
+    return small_scene(tmp_path_factory.mktemp("photos"))
+
+
+def exported(
+    scene: SmallScene, folder: Path, splats: Splats | None = None, **settings: Any
+) -> tuple[ExportedAssets, Report]:
+    report = Report()
+    splats = scene.splats if splats is None else splats
+    inputs = {
+        "sfm": scene.reconstruction,
+        "quantise": QuantisedSplats(splats, splats.sh_degree, {}),
+    }
+    return export.run(inputs, ExportSettings(**settings), folder, report), report
+
+
+def test_every_format_draws_the_same_picture_again(scene: SmallScene, tmp_path: Path) -> None:
+    assets, report = exported(scene, tmp_path, formats=FORMATS)
+    assert [file.format for file in assets.files] == list(FORMATS)
+    for file in assets.files:
+        figures = report.metrics["formats"][file.format]
+        assert (tmp_path / file.path).is_file()
+        if file.format == "splat":
+            assert 20 < figures["verify_db"] < 60
+            assert figures["bytes_per_splat"] == 32
+        else:
+            assert figures["verify_db"] > 80
+            assert figures["max_position_error"] == 0
+            assert figures["max_rotation_error_degrees"] < 1e-4
+            assert figures["max_sh_error"] == 0
+    assert report.metrics["files"] == len(FORMATS)
+
+
+def test_the_capture_units_and_origin_travel_with_the_files(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    exported(scene, tmp_path)
+    for name in ("ply", "glb", "usdz"):
+        back = formats.read(tmp_path / f"scene.{name}")
+        np.testing.assert_array_equal(back.origin, [5e5, 0, -4])
+    assert b"units: metres" in (tmp_path / "scene.ply").read_bytes()
+
+
+def test_equal_inputs_give_equal_files_and_load_gives_the_list(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    contents = []
+    for name in ("a", "b"):
+        folder = tmp_path / name
+        folder.mkdir()
+        assets, _ = exported(scene, folder, formats=FORMATS)
+        contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+        assert export.load(folder) == assets
+    assert contents[0] == contents[1]
+
+
+def test_what_a_killed_export_left_is_gone(scene: SmallScene, tmp_path: Path) -> None:
+    (tmp_path / ".partial-1-scene.ply").write_bytes(b"half")
+    (tmp_path / ".partial-x").mkdir()
+    (tmp_path / ".partial-x" / "scene.usdc").write_bytes(b"half")
+    exported(scene, tmp_path, formats=("ply",))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["assets.json", "scene.ply"]
+
+
+@pytest.mark.parametrize("name", ["ply", "glb", "usdc"])
+@pytest.mark.parametrize("damage", ["quaternion order", "sh", "handedness", "one missing"])
+def test_a_wrong_file_does_not_pass(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, damage: str
+) -> None:
+    """As if the writer had made a common mistake: the check must see each of them."""
+
+    def wrong(path: Path) -> verify.FileContent:
+        content = verify._READERS[path.suffix](path)
+        splats = content.splats
+        if damage == "quaternion order":
+            splats = replace(splats, quaternions=np.roll(splats.quaternions, 1, axis=1))
+        elif damage == "sh":
+            sh = splats.sh.copy()
+            sh[:, 1:] = sh[:, 1:].reshape(len(sh), 3, -1).transpose(0, 2, 1)
+            splats = replace(splats, sh=sh)
+        elif damage == "handedness":
+            splats = replace(splats, means=splats.means * np.array([-1, 1, 1], np.float32))
+        else:
+            splats = splats.take(np.arange(1, len(splats)))
+        return replace(content, splats=splats)
+
+    monkeypatch.setattr(verify, "read_back", wrong)
+    with pytest.raises(SplatError) as caught:
+        exported(scene, tmp_path, formats=(name,))
+    assert caught.value.code == "export-verify-failed"
+    assert caught.value.family == Family.QUALITY
+    assert f"scene.{name}" in caught.value.given
+
+
+def test_a_file_that_another_parser_refuses_does_not_pass(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut_short(path: Path, splats: Splats, *, units: str) -> int:
+        path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\n")
+        return 0
+
+    monkeypatch.setattr(formats, "write", cut_short)
+    with pytest.raises(SplatError) as caught:
+        exported(scene, tmp_path, formats=("ply",))
+    assert caught.value.code == "export-verify-failed"
+
+
+def test_a_bad_8_bit_copy_is_a_warning(scene: SmallScene, tmp_path: Path) -> None:
+    sh = scene.splats.sh.copy()
+    sh[:, 1:] = np.random.default_rng(0).normal(0, 1.5, sh[:, 1:].shape)
+    gaudy = replace(scene.splats, sh=sh)
+    _, report = exported(scene, tmp_path, gaudy, formats=("splat", "ply"))
+    assert [code for code, _ in report.warnings] == ["export-splat-lossy"]
+
+
+def test_splats_that_cannot_be_drawn_are_left_out_and_counted(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    bad = scene.splats.take(np.arange(len(scene.splats)))
+    bad.means[0] = np.nan
+    bad.sh[1, 0, 2] = np.inf
+    _, report = exported(scene, tmp_path, bad)
+    assert report.metrics["dropped"] == 2
+    assert report.metrics["splats"] == len(bad) - 2
+    assert [code for code, _ in report.warnings] == ["export-splats-dropped"]
+
+
+def test_a_scene_without_splats_is_exported_with_a_warning(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    nothing = scene.splats.take(np.zeros(len(scene.splats), bool))
+    _, report = exported(scene, tmp_path, nothing, formats=FORMATS)
+    assert [code for code, _ in report.warnings] == ["export-empty"]
+
+
+@pytest.mark.parametrize("chosen", [("obj",), ("ply", "spz"), (), ("PLY",)])
+def test_an_unknown_format_is_refused_before_anything_is_written(
+    scene: SmallScene, tmp_path: Path, chosen: tuple[str, ...]
+) -> None:
+    with pytest.raises(SplatError) as caught:
+        exported(scene, tmp_path, formats=chosen)
+    assert caught.value.code == "export-format-unknown"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "name", ["", "../up", "a/b", "a\\b", "con:", " a", "a.", "x" * 200, "a[b]"]
+)
+def test_a_name_that_is_no_file_name_is_refused(name: str) -> None:
+    with pytest.raises(SplatError) as caught:
+        export.check(ExportSettings(name=name))
+    assert caught.value.family == Family.USAGE
+
+
+def test_a_name_with_spaces_and_accents_is_fine(scene: SmallScene, tmp_path: Path) -> None:
+    assets, _ = exported(scene, tmp_path, name="Café du Nord", formats=("gltf", "usdz"))
+    assert len(assets.files) == 2
+
+
+def test_formats_named_twice_are_written_once(scene: SmallScene, tmp_path: Path) -> None:
+    assert len(exported(scene, tmp_path, formats=("ply", "ply"))[0].files) == 1

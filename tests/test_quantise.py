@@ -1,0 +1,155 @@
+"""What is kept at which precision, and what it costs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stages import quantise
+from stages.measure.sh import cut, degrees_at, tail_rms
+from stages.quantise import QuantiseSettings
+from stages.run.errors import Family, SplatError
+from stages.run.stage import Report
+from stages.scene import QuantisedSplats
+from tests.formats.truth import colour, many_splats
+from tests.small_scene import SmallScene, small_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
+    return small_scene(tmp_path_factory.mktemp("photos"))
+
+
+def decide(
+    scene: SmallScene, folder: Path, **settings: Any
+) -> tuple[QuantisedSplats, dict[str, Any]]:
+    report = Report()
+    inputs = {"sfm": scene.reconstruction, "prune": scene.splats}
+    result = quantise.run(inputs, QuantiseSettings(**settings), folder, report)
+    return result, report.metrics
+
+
+def test_matt_splats_lose_their_bands_and_shiny_ones_keep_them(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    result, metrics = decide(scene, tmp_path)
+    shiny = np.arange(len(scene.splats)) % 10 == 0
+    assert result.degree == 2
+    assert (result.splats.sh_degrees[~shiny] == 0).all()
+    assert result.splats.sh_degrees[shiny].mean() > 1
+    assert metrics["psnr_raw_db"] - metrics["psnr_kept_db"] < 0.02
+    assert metrics["kept_mib"] < 0.6 * metrics["raw_mib"]
+    assert result.splats.sh_degrees.tolist() == [
+        int(np.sqrt(np.flatnonzero(row.any(axis=1)).max(initial=0))) for row in result.splats.sh
+    ]
+
+
+def test_the_cost_of_8_bits_without_view_dependence_is_told(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    _, metrics = decide(scene, tmp_path)
+    assert 25 < metrics["psnr_splat32_db"] < metrics["psnr_raw_db"] - 0.05
+    assert 32 < metrics["psnr_raw_db"] < 36  # noise of 0.02 is 34.0 dB
+
+
+def test_a_scene_without_view_dependence_keeps_no_bands(scene: SmallScene, tmp_path: Path) -> None:
+    matt = replace(scene.splats.with_sh_degree(0).with_sh_degree(2))
+    flat = SmallScene(matt, scene.reconstruction)
+    result, metrics = decide(flat, tmp_path)
+    assert result.degree == result.splats.sh_degree == metrics["sh_degree"] == 0
+
+
+def test_no_allowance_keeps_what_shows(scene: SmallScene, tmp_path: Path) -> None:
+    result, metrics = decide(scene, tmp_path, max_loss_db=0.0)
+    assert metrics["psnr_kept_db"] >= metrics["psnr_raw_db"]
+    assert result.degree == 2
+
+
+def test_a_large_allowance_keeps_nothing(scene: SmallScene, tmp_path: Path) -> None:
+    assert decide(scene, tmp_path, max_loss_db=50.0)[0].degree == 0
+
+
+def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    folders = [tmp_path / "a", tmp_path / "b"]
+    contents = []
+    for folder in folders:
+        folder.mkdir()
+        result, _ = decide(scene, folder)
+        contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert contents[0] == contents[1]
+    loaded = quantise.load(folders[0])
+    np.testing.assert_array_equal(loaded.splats.sh, result.splats.sh)
+    assert (loaded.degree, loaded.decisions) == (result.degree, result.decisions)
+
+
+def test_too_few_photographs_to_hold_out_are_measured_on_themselves(
+    tmp_path: Path, scene: SmallScene
+) -> None:
+    few = replace(scene.reconstruction, views=scene.reconstruction.views[:3])
+    _, metrics = decide(SmallScene(scene.splats, few), tmp_path)
+    assert metrics["measured_on"] == "training"
+
+
+def test_splats_that_cannot_be_drawn_do_not_stop_it(scene: SmallScene, tmp_path: Path) -> None:
+    bad = scene.splats.take(np.arange(len(scene.splats)))
+    bad.sh[3] = np.nan
+    bad.means[4] = np.inf
+    result, metrics = decide(SmallScene(bad, scene.reconstruction), tmp_path)
+    assert np.isfinite(metrics["psnr_kept_db"])
+    assert len(result.splats) == len(bad)
+
+
+def test_no_splats_at_all_do_not_stop_it(scene: SmallScene, tmp_path: Path) -> None:
+    nothing = scene.splats.take(np.zeros(len(scene.splats), bool))
+    assert decide(SmallScene(nothing, scene.reconstruction), tmp_path)[0].degree == 0
+
+
+def test_a_missing_photograph_is_named(scene: SmallScene, tmp_path: Path) -> None:
+    moved = replace(scene.reconstruction, folder=tmp_path)
+    with pytest.raises(SplatError) as caught:
+        decide(SmallScene(scene.splats, moved), tmp_path)
+    assert "00.png" in caught.value.given
+
+
+def test_a_damaged_decision_is_an_error_of_the_run_folder(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    decide(scene, tmp_path)
+    (tmp_path / "decisions.json").write_text(json.dumps({"sh_degree": "x"}))
+    with pytest.raises(SplatError) as caught:
+        quantise.load(tmp_path)
+    assert caught.value.family == Family.RUN_FOLDER
+
+
+def test_tail_rms_is_what_colours_lose_over_all_directions() -> None:
+    splats = many_splats(4)
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(20000, 3))
+    sh = splats.sh[3].astype(float)
+    for degree in (1, 2, 3):
+        tail = sh.copy()
+        tail[: degree * degree] = 0
+        channel = np.square(tail).max(axis=1)  # the bound takes the worst channel of each term
+        seen = np.array([colour(tail, d) - 0.5 for d in directions[:4000]])
+        measured = np.sqrt(np.mean(seen**2, axis=0)).max()
+        told = tail_rms(splats)[3, degree - 1]
+        assert told == pytest.approx(np.sqrt(channel.sum() / (4 * np.pi)), rel=1e-6)
+        assert 0.97 * measured <= told <= 2.0 * measured
+
+
+def test_cutting_takes_whole_bands_and_no_others() -> None:
+    splats = many_splats()
+    degrees = degrees_at(splats, 0.1)
+    assert (degrees <= splats.sh_degrees).all()
+    after = cut(splats, degrees)
+    for i in range(0, len(splats), 7):
+        kept = (int(degrees[i]) + 1) ** 2
+        np.testing.assert_array_equal(after.sh[i, :kept], splats.sh[i, :kept])
+        assert not after.sh[i, kept:].any()
