@@ -118,8 +118,10 @@ def _gltf(path: Path) -> FileContent:
 
 
 def _usd(path: Path) -> FileContent:
-    from pxr import Usd
+    from pxr import Gf, Usd, Vt
 
+    # In which column each of w, x, y, z arrives, found out and not assumed.
+    columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
     stage = Usd.Stage.Open(str(path))
     stage.Reload()  # the library's cache may hold an older file of the same name
     parts = []
@@ -130,11 +132,10 @@ def _usd(path: Path) -> FileContent:
         degree = get("radiance:sphericalHarmonicsDegree").Get()
         coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
         sh = coefficients.reshape(-1, (degree + 1) ** 2, 3)
-        turns = get("orientations").Get()
         parts.append(
             _splats(
                 means=np.array(get("positions").Get(), np.float32),
-                quaternions=np.array([(q.real, *q.imaginary) for q in turns], np.float32),
+                quaternions=np.array(get("orientations").Get(), np.float32)[:, columns],
                 log_scales=np.log(np.array(get("scales").Get(), np.float64)),
                 opacity_logits=_logits(np.array(get("opacities").Get())),
                 sh=sh,
