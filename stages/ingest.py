@@ -1,0 +1,199 @@
+"""Photographs -> Capture: every usable photograph as upright 8-bit sRGB, with what EXIF knows.
+
+Reads JPEG, PNG, TIFF, WebP, HEIC, AVIF and BMP from a folder and its sub-folders, which are only
+ever read. Says in warnings what a photographer should change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.run import threads
+from stages.run.errors import Family, Interrupted, SplatError
+from stages.run.stage import Report, Stage
+
+if TYPE_CHECKING:
+    from stages.photos.decode import PixelBudget
+    from stages.photos.find import Findings, Source
+    from stages.photos.quality import Measures
+    from stages.scene import Capture, Photo
+
+FEWEST_PHOTOGRAPHS = 3
+_SMALLEST_MAX_SIDE_PX = 64
+_PIXELS_AT_ONCE = 250_000_000  # over all threads; about 4 bytes each while they are decoded
+
+
+@dataclass(frozen=True)
+class IngestSettings:
+    """Settings of reading photographs."""
+
+    max_side: int = field(
+        default=1600,
+        metadata={
+            "help": "Longer side of the photographs used for structure from motion and, at most, "
+            "for training (px)."
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A photograph that was read, or `unusable`: why it was not."""
+
+    photo: Photo | None = None
+    measures: Measures | None = None
+    unusable: str = ""
+    alpha: bool = False
+    hdr: bool = False
+    bad_profile: bool = False
+
+
+def run(
+    inputs: Mapping[str, Any], settings: IngestSettings, folder: Path, report: Report
+) -> Capture:
+    """Read the photographs in the folder inputs["photos"]; see the module's docstring.
+
+    Leaves in `folder`: photos/ (the normalised pictures) and capture.json (`load` reads it).
+    Raises SplatError for a folder without at least 3 usable photographs, and Interrupted.
+    """
+    from stages.photos import advice, capture_file, find
+    from stages.scene import Capture
+
+    if settings.max_side < _SMALLEST_MAX_SIDE_PX:
+        raise _bad_max_side(settings.max_side)
+    root = Path(inputs["photos"])
+    found = find.find(root)
+    folder.mkdir(parents=True, exist_ok=True)
+    taken = _take_all(found, settings.max_side, folder, report)
+    names = [source.name for source in found.sources]
+    reasons = [(n, t.unusable) for n, t in zip(names, taken, strict=True) if t.photo is None]
+    advice.about_files(found, report.warn)
+    advice.about_left_out(reasons, report.warn)
+    photos = tuple(t.photo for t in taken if t.photo is not None)
+    if len(photos) < FEWEST_PHOTOGRAPHS:
+        raise _too_few(root, len(photos), reasons)
+    advice.about_conversions(
+        [n for n, t in zip(names, taken, strict=True) if t.alpha],
+        [n for n, t in zip(names, taken, strict=True) if t.hdr],
+        [n for n, t in zip(names, taken, strict=True) if t.bad_profile],
+        report.warn,
+    )
+    _report_capture(photos, [t.measures for t in taken if t.measures is not None], report)
+    report.metric("left_out", len(reasons))
+    report.metric("files_ignored", found.others)
+    capture = Capture(folder, photos)
+    capture_file.save_capture(capture)
+    return capture
+
+
+def load(folder: Path) -> Capture:
+    """The capture of a finished folder; pictures are not opened."""
+    from stages.photos.capture_file import load_capture
+
+    return load_capture(folder)
+
+
+def _take_all(found: Findings, max_side: int, folder: Path, report: Report) -> list[_Taken]:
+    """Each source read, measured and written, in order, a few at a time."""
+    from stages.photos.decode import PixelBudget, readers_set_up
+
+    budget = PixelBudget(_PIXELS_AT_ONCE)
+    taken: list[_Taken] = []
+    total = len(found.sources)
+    report.progress(0, total, "reading photographs")
+    with readers_set_up(), ThreadPoolExecutor(threads.count()) as pool:
+        futures: list[Future[_Taken]] = [
+            pool.submit(_take, source, max_side, folder, budget) for source in found.sources
+        ]
+        try:
+            for done, (source, future) in enumerate(zip(found.sources, futures, strict=True), 1):
+                taken.append(future.result())
+                report.progress(done, total, source.name)
+                if report.stop_requested.is_set() and done < total:
+                    raise Interrupted(f"stopped after {done} of {total} photographs")
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    return taken
+
+
+def _take(source: Source, max_side: int, folder: Path, budget: PixelBudget) -> _Taken:
+    """Read one photograph, write its normalised picture and measure it."""
+    from stages.photos.decode import Unusable, decode
+    from stages.photos.quality import measure
+    from stages.photos.write import write_picture
+    from stages.scene import Photo
+
+    try:
+        decoded = decode(source.path, max_side, budget)
+    except Unusable as finding:
+        return _Taken(unusable=str(finding))
+    target = folder / source.image
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(target, decoded)
+    measures = measure(decoded.pixels)
+    height, width = decoded.pixels.shape[:2]
+    exif = decoded.exif
+    focal = exif.focal_px(decoded.stored, width, height)
+    photo = Photo(
+        name=source.name,
+        image=source.image,
+        width=width,
+        height=height,
+        focal_px=round(focal, 3) if focal is not None else None,
+        camera=exif.camera_key(width, height),
+        sharpness=measures.sharpness,
+        log2_luminance=measures.log2_luminance,
+        exposure_ev=round(exif.exposure_ev, 3) if exif.exposure_ev is not None else None,
+    )
+    return _Taken(photo, measures, "", decoded.alpha, decoded.hdr, decoded.bad_profile)
+
+
+def _report_capture(photos: tuple[Photo, ...], measures: list[Measures], report: Report) -> None:
+    import numpy as np
+
+    from stages.photos import advice
+    from stages.photos.quality import near_duplicates
+
+    duplicates = near_duplicates([measure.thumbnail for measure in measures])
+    blurred = advice.about_capture(photos, duplicates, report.warn)
+    known = [photo.exposure_ev for photo in photos if photo.exposure_ev is not None]
+    report.metric("photographs", len(photos))
+    report.metric("with_focal_length", sum(photo.focal_px is not None for photo in photos))
+    report.metric("cameras", len({photo.camera for photo in photos}))
+    report.metric("blurred", len(blurred))
+    report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))
+    report.metric("exposure_range_stops", round(max(known) - min(known), 2) if known else None)
+    medians = np.median([[p.sharpness, p.log2_luminance] for p in photos], axis=0)
+    report.metric("median_sharpness", round(float(medians[0]), 3))
+    report.metric("median_log2_luminance", round(float(medians[1]), 3))
+
+
+def _bad_max_side(given: int) -> SplatError:
+    return SplatError(
+        "ingest-bad-max-side",
+        given=f"--max-side {given}.",
+        wanted=f"At least {_SMALLEST_MAX_SIDE_PX} pixels; 1600 is a good choice.",
+        hint="Leave it out to use the default.",
+        family=Family.USAGE,
+    )
+
+
+def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatError:
+    given = f"{root} holds {usable} usable photograph{'' if usable == 1 else 's'}."
+    if reasons:
+        few = "; ".join(f"{name}: {why}" for name, why in reasons[:3])
+        more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
+        given = f"{given[:-1]}; {len(reasons)} could not be read ({few}{more})."
+    return SplatError(
+        "ingest-too-few-photographs",
+        given=given,
+        wanted=f"At least {FEWEST_PHOTOGRAPHS}; 20 to 50 do an object or a room well.",
+        hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
+    )
+
+
+STAGE = Stage(name="ingest", version=1, reads=(), settings_type=IngestSettings, run=run, load=load)

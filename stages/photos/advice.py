@@ -1,0 +1,184 @@
+"""What a photographer should change, from what was measured: warnings with stable codes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from stages.photos.find import RAW_ADVICE, VIDEO_ADVICE, Findings
+from stages.scene import Photo
+
+Warn = Callable[[str, str], None]
+
+FEWEST_WITHOUT_WARNING = 20
+BLURRED_BELOW = 0.6  # of the capture's median; a blur of 1.5 px at 1600 px gives about 0.55
+SOFT_BELOW = 2.5  # median sharpness; enlarged four times or blurred by 3 px, pictures fall below
+EV_RANGE_STOPS = 1.0
+LUMINANCE_RANGE_STOPS = 2.0  # without EXIF, and what is in the picture changes it too
+DARK_BELOW = -6.5  # log2 of linear luminance: about 30 of 255
+SMALL_BELOW_PX = 640
+_NAMED = 8
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for a sentence, the first few in full."""
+    shown = ", ".join(names[:_NAMED])
+    return shown + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+
+
+def about_files(found: Findings, warn: Warn) -> None:
+    """Files that look like the user's material but are not read."""
+    if found.videos:
+        warn(
+            "ingest-video-not-read",
+            f"Videos and animations are not read: {listed(found.videos)}. {VIDEO_ADVICE}",
+        )
+    if found.raws:
+        warn("ingest-raw-not-read", f"Raw files are not read: {listed(found.raws)}. {RAW_ADVICE}")
+    if found.other_pictures:
+        warn(
+            "ingest-format-not-read",
+            f"These formats are not read: {listed(found.other_pictures)}. "
+            "Save the pictures as JPEG, PNG or TIFF if they belong to the capture.",
+        )
+
+
+def about_left_out(reasons: Sequence[tuple[str, str]], warn: Warn) -> None:
+    """reasons: (name, why) of photographs that could not be used."""
+    for name, why in reasons[:_NAMED]:
+        warn("ingest-left-out", f"{name} is left out: {why}. Copy it from the camera again.")
+    rest = [name for name, _ in reasons[_NAMED:]]
+    if rest:
+        warn("ingest-left-out", f"Left out too, for like reasons: {listed(rest)}.")
+
+
+def about_conversions(
+    alpha: Sequence[str], hdr: Sequence[str], bad_profiles: Sequence[str], warn: Warn
+) -> None:
+    """Names of photographs of which something was lost on the way to 8-bit sRGB."""
+    if alpha:
+        warn(
+            "ingest-transparency",
+            f"Transparent parts were laid over white: {listed(alpha)}. "
+            "Photographs with their background serve better: it helps to find the cameras.",
+        )
+    if hdr:
+        warn(
+            "ingest-hdr",
+            f"High dynamic range is not used and colours may look pale: {listed(hdr)}. "
+            "Switch HDR off in the camera, or export as SDR.",
+        )
+    if bad_profiles:
+        warn(
+            "ingest-colour-profile",
+            f"The colour profile is damaged, so sRGB was assumed: {listed(bad_profiles)}. "
+            "Export these photographs again if their colours look wrong.",
+        )
+
+
+def about_capture(
+    photos: Sequence[Photo], duplicates: Sequence[tuple[int, ...]], warn: Warn
+) -> list[str]:
+    """Warns about the capture as a whole; returns the names of blurred photographs."""
+    if len(photos) < FEWEST_WITHOUT_WARNING:
+        warn(
+            "ingest-few-photographs",
+            f"There are {len(photos)} usable photographs. 20 to 50 do an object or a room well: "
+            "take more, in small steps around the scene, with 60-80 % overlap.",
+        )
+    blurred = _about_sharpness(photos, warn)
+    _about_light(photos, warn)
+    _about_cameras(photos, warn)
+    if duplicates:
+        groups = "; ".join(listed([photos[i].name for i in group]) for group in duplicates[:_NAMED])
+        extra = sum(len(group) - 1 for group in duplicates)
+        warn(
+            "ingest-near-duplicates",
+            f"{extra} of {len(photos)} photographs show nearly the same as another: {groups}. "
+            "They add no depth: take a step sideways between photographs.",
+        )
+    return blurred
+
+
+def _about_sharpness(photos: Sequence[Photo], warn: Warn) -> list[str]:
+    median = float(np.median([photo.sharpness for photo in photos]))
+    blurred = [photo.name for photo in photos if photo.sharpness < BLURRED_BELOW * median]
+    if blurred:
+        warn(
+            "ingest-blurred",
+            f"Blurred, compared with the others: {listed(blurred)}. "
+            "Take these again or remove them; more light or a shorter exposure helps.",
+        )
+    if median < SOFT_BELOW:
+        warn(
+            "ingest-soft",
+            "Most photographs are blurred or have been enlarged: they hold little fine detail. "
+            "Use the camera's original files, hold it still and check the focus.",
+        )
+    small = [photo.name for photo in photos if max(photo.width, photo.height) < SMALL_BELOW_PX]
+    if small:
+        warn(
+            "ingest-small",
+            f"Smaller than {SMALL_BELOW_PX} pixels: {listed(small)}. "
+            "Use the camera's original files; 1600 pixels and more are best.",
+        )
+    return blurred
+
+
+def _about_light(photos: Sequence[Photo], warn: Warn) -> None:
+    known = [photo.exposure_ev for photo in photos if photo.exposure_ev is not None]
+    luminance = [photo.log2_luminance for photo in photos]
+    advice = (
+        "Lock exposure and white balance before the first photograph; "
+        "otherwise the scene gets patches of different brightness."
+    )
+    if len(known) > 1 and max(known) - min(known) > EV_RANGE_STOPS:
+        warn(
+            "ingest-exposure-not-locked",
+            f"The camera changed its exposure by {max(known) - min(known):.1f} stops. {advice}",
+        )
+    elif len(known) < len(photos):
+        low, high = np.percentile(luminance, [5, 95])
+        if high - low > LUMINANCE_RANGE_STOPS:
+            warn(
+                "ingest-brightness-varies",
+                f"Brightness differs by {high - low:.1f} stops between photographs. {advice}",
+            )
+    dark = [photo.name for photo in photos if photo.log2_luminance < DARK_BELOW]
+    if dark:
+        warn(
+            "ingest-dark",
+            f"Very dark: {listed(dark)}. Use more light, or a tripod and a longer exposure.",
+        )
+
+
+def _about_cameras(photos: Sequence[Photo], warn: Warn) -> None:
+    """Photo.camera is "name, 4.4 mm, 26 mm equivalent, 1600x1200"."""
+    names = Counter(photo.camera.split(", ")[0] for photo in photos)
+    lenses = Counter(", ".join(photo.camera.split(", ")[1:-1]) for photo in photos)
+    sizes = Counter(tuple(sorted((photo.width, photo.height))) for photo in photos)
+    if len(names) > 1:
+        warn(
+            "ingest-mixed-cameras",
+            f"Several cameras took these photographs ({_counted(names)}). "
+            "One camera for the whole capture gives even colours.",
+        )
+    elif len(lenses) > 1:
+        warn(
+            "ingest-mixed-zooms",
+            f"The focal length changes ({_counted(lenses)}). Do not zoom within a capture.",
+        )
+    if len(sizes) > 1 and len(names) == 1:
+        text = _counted(Counter({f"{w} x {h}": count for (w, h), count in sizes.items()}))
+        warn(
+            "ingest-mixed-sizes",
+            f"Photographs have different proportions or sizes ({text}). "
+            "Use the camera's original files, not cropped or resized ones.",
+        )
+
+
+def _counted(kinds: Counter[str]) -> str:
+    parts = [f"{count} x {kind or 'unknown'}" for kind, count in kinds.most_common(4)]
+    return ", ".join(parts) + (", ..." if len(kinds) > 4 else "")

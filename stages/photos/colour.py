@@ -1,0 +1,107 @@
+"""Pictures in other colour spaces, converted to sRGB."""
+
+from __future__ import annotations
+
+import io
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageCms
+
+_P3_PRIMARIES = 12  # ITU-T H.273: SMPTE EG 432-1 (Display P3)
+_HDR_TRANSFERS = (16, 18)  # PQ, HLG
+# Linear RGB to linear sRGB; both spaces have the white point D65. From the primaries in
+# SMPTE EG 432-1 and in Adobe RGB (1998) Color Image Encoding, section 4.3.
+_P3_TO_SRGB = np.array(
+    [[1.22494018, -0.22494018, 0.0], [-0.04205695, 1.04205695, 0.0],
+     [-0.01963755, -0.07863605, 1.09827360]]
+)  # fmt: skip
+_ADOBE_TO_SRGB = np.array(
+    [[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292899, 1.04292899]]
+)
+_ADOBE_GAMMA = 563 / 256
+
+
+def icc_to_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, bool]:
+    """(`image` in sRGB, whether that changed it). Grey and CMYK pictures become RGB.
+
+    Raises ImageCms.PyCMSError for a profile that is damaged or of another kind of picture.
+    """
+    transform = _transform(profile, image.mode)
+    if transform is None:
+        return image, False
+    converted = ImageCms.applyTransform(image, transform)
+    assert converted is not None
+    converted.info.pop("icc_profile", None)
+    return converted, True
+
+
+@lru_cache(maxsize=32)
+def _transform(profile: bytes, mode: str) -> Any:
+    """The transform to sRGB, or None if it moves no colour by more than one step in 255."""
+    source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+    transform = ImageCms.buildTransform(
+        source,
+        ImageCms.createProfile("sRGB"),
+        mode,
+        "RGB",
+        ImageCms.Intent.RELATIVE_COLORIMETRIC,
+        ImageCms.Flags.BLACKPOINTCOMPENSATION,
+    )
+    if mode not in ("RGB", "L"):
+        return transform
+    steps = np.linspace(0, 255, 9).round().astype(np.uint8)
+    patches: NDArray[np.uint8]
+    if mode == "RGB":
+        patches = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(9, 81, 3)
+    else:
+        patches = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    moved = ImageCms.applyTransform(Image.fromarray(patches), transform)
+    before = patches if mode == "RGB" else patches[..., None]
+    shift = np.abs(np.asarray(moved, np.int16) - before.astype(np.int16))
+    return transform if shift.max() > 1 else None
+
+
+def nclx_is_p3(nclx: dict[str, Any] | None) -> bool:
+    """Whether a HEIC file without ICC profile declares Display P3 by code points."""
+    return nclx is not None and int(nclx.get("color_primaries", 1)) == _P3_PRIMARIES
+
+
+def nclx_is_hdr(nclx: dict[str, Any] | None) -> bool:
+    """Whether the declared transfer function is one of high dynamic range."""
+    return nclx is not None and int(nclx.get("transfer_characteristics", 13)) in _HDR_TRANSFERS
+
+
+def p3_to_srgb(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Display P3 [H, W, 3] to sRGB; colours outside sRGB are clipped."""
+    return _convert(pixels, _srgb_decoded(np.arange(256) / 255), _P3_TO_SRGB)
+
+
+def adobe_to_srgb(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Adobe RGB (1998) [H, W, 3] to sRGB; colours outside sRGB are clipped."""
+    return _convert(pixels, (np.arange(256) / 255) ** _ADOBE_GAMMA, _ADOBE_TO_SRGB)
+
+
+def _convert(
+    pixels: NDArray[np.uint8], decoded: NDArray[np.floating], matrix: NDArray[np.floating]
+) -> NDArray[np.uint8]:
+    out = np.empty_like(pixels)
+    table, weights = decoded.astype(np.float32), matrix.T.astype(np.float32)
+    for top in range(0, len(pixels), 256):  # strips: a float copy of it all would be large
+        linear = np.clip(table[pixels[top : top + 256]] @ weights, 0, 1)
+        encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        out[top : top + 256] = np.round(encoded * 255)
+    return out
+
+
+def _srgb_decoded(value: NDArray[np.floating]) -> NDArray[np.floating]:
+    """IEC 61966-2-1."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def luminance(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[H, W] relative linear luminance of sRGB pixels (ITU-R BT.709 weights)."""
+    linear = _srgb_decoded(np.arange(256) / 255).astype(np.float32)[pixels]
+    return linear @ np.array([0.2126, 0.7152, 0.0722], np.float32)

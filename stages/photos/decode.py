@@ -1,0 +1,257 @@
+"""A photograph of any supported format as upright 8-bit sRGB, no larger than asked for."""
+
+from __future__ import annotations
+
+import io
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pillow_heif
+from numpy.typing import NDArray
+from PIL import Image, ImageCms, ImageFile, UnidentifiedImageError
+
+from stages.photos import colour
+from stages.photos.exif import Exif, read_exif
+from stages.photos.jpeg import ends_properly
+from stages.scene import fitted_size
+
+MAX_MEGAPIXELS = 200
+MAX_FILE_BYTES = 2**31
+FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP")
+_SMALLEST_SIDE_PX = 16
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+
+
+class Unusable(Exception):  # noqa: N818 - a finding about a file, not a failure
+    """A file that cannot be used; the message says why, to be put after its name."""
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """pixels: [H, W, 3] uint8 sRGB, upright, fitted to the size asked for.
+
+    stored: (width, height) in the file, before turning. as_it_was: the bytes of the file, if it is
+    a JPEG that already is what `pixels` says. alpha, hdr, bad_profile: what was met on the way.
+    """
+
+    pixels: NDArray[np.uint8]
+    stored: tuple[int, int]
+    exif: Exif
+    as_it_was: bytes | None = None
+    alpha: bool = False
+    hdr: bool = False
+    bad_profile: bool = False
+
+
+class PixelBudget:
+    """Lets threads decode side by side only as long as their pictures fit a budget of pixels."""
+
+    def __init__(self, pixels: int) -> None:
+        self._free = self._all = pixels
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def spend(self, pixels: int) -> Iterator[None]:
+        """Waits until `pixels` are free; a picture larger than the budget goes alone."""
+        pixels = min(pixels, self._all)
+        with self._changed:
+            self._changed.wait_for(lambda: self._free >= pixels)
+            self._free -= pixels
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._free += pixels
+                self._changed.notify_all()
+
+
+@contextmanager
+def readers_set_up() -> Iterator[None]:
+    """HEIC support on, Pillow's own size limit off (ours applies), truncated files refused.
+
+    To be entered once, around all threads: these are settings of the whole process.
+    """
+    Image.init()
+    pillow_heif.register_heif_opener()
+    before = Image.MAX_IMAGE_PIXELS, ImageFile.LOAD_TRUNCATED_IMAGES
+    Image.MAX_IMAGE_PIXELS, ImageFile.LOAD_TRUNCATED_IMAGES = None, False
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # damaged tags; what matters is found anyway
+            yield
+    finally:
+        Image.MAX_IMAGE_PIXELS, ImageFile.LOAD_TRUNCATED_IMAGES = before
+
+
+def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
+    """Read the photograph at `path`, its longer side at most `max_side` pixels.
+
+    Raises Unusable for a file that is damaged, truncated, of another kind, too large or too small.
+    """
+    data = _read(path)
+    try:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+            stored = _check_size(image.size)
+            with budget.spend(stored[0] * stored[1]):
+                return _decode(image, data, max_side)
+    except (Unusable, MemoryError):
+        raise
+    except UnidentifiedImageError as error:
+        raise Unusable(_what_it_is(data)) from error
+    except Exception as error:  # decoders raise whatever the damage leads to
+        raise Unusable(f"it does not decode ({_first_line(error)})") from error
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise Unusable("the file is larger than 2 GiB")
+        data = path.read_bytes()
+    except OSError as error:
+        raise Unusable(f"it cannot be opened ({error.strerror or error})") from error
+    if not data:
+        raise Unusable("the file is empty")
+    if data[:3] == b"\xff\xd8\xff" and not ends_properly(data):
+        raise Unusable("the file is truncated")
+    return data
+
+
+def _check_size(size: tuple[int, int]) -> tuple[int, int]:
+    if size[0] * size[1] > MAX_MEGAPIXELS * 1_000_000:
+        raise Unusable(f"{size[0]} x {size[1]} is more than {MAX_MEGAPIXELS} megapixels")
+    if min(size) < _SMALLEST_SIDE_PX:
+        raise Unusable(f"{size[0]} x {size[1]} pixels are too few")
+    return size
+
+
+def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
+    stored, exif, info = image.size, read_exif(image), dict(image.info)
+    size = fitted_size(*stored, max_side)
+    jpeg = image.format in ("JPEG", "MPO")
+    if jpeg and size != stored and image.mode in ("RGB", "L"):
+        image.draft(None, (2 * size[0], 2 * size[1]))  # lets the decoder average for us
+    if image.format == "HEIF":
+        exif = replace(exif, orientation=1)  # the decoder has turned the pixels already
+    native_mode = image.mode
+    shown, alpha = _without_alpha(_loaded(image, data))
+    shown = _resized(shown, size, stored)
+    shown, converted, bad_profile = _in_srgb(shown, info.get("icc_profile"))
+    upright = exif.orientation == 1
+    if not upright:
+        shown = shown.transpose(_UPRIGHT[exif.orientation])
+    pixels = np.array(shown if shown.mode == "RGB" else shown.convert("RGB"))
+    declared = None if info.get("icc_profile") else _declared_space(exif, info)
+    if declared is not None:
+        pixels, converted = declared(pixels), True
+    unchanged = jpeg and size == stored and native_mode in ("RGB", "L") and upright
+    return Decoded(
+        pixels=pixels,
+        stored=stored,
+        exif=exif,
+        as_it_was=data if unchanged and not converted else None,
+        alpha=alpha,
+        hdr=colour.nclx_is_hdr(info.get("nclx_profile")),
+        bad_profile=bad_profile,
+    )
+
+
+def _declared_space(exif: Exif, info: dict[Any, Any]) -> Any:
+    """The conversion for a colour space that is declared without an ICC profile, or None."""
+    if exif.adobe_rgb:
+        return colour.adobe_to_srgb
+    return colour.p3_to_srgb if colour.nclx_is_p3(info.get("nclx_profile")) else None
+
+
+def _loaded(image: Image.Image, data: bytes) -> Image.Image:
+    """The decoded picture with 8 bits a sample. Raises what Pillow and OpenCV raise."""
+    try:
+        image.load()
+    except OSError:
+        if image.format != "TIFF":
+            raise
+        return _loaded_by_opencv(data)
+    if image.mode.startswith("I"):  # 16-bit grey; older Pillows widen it to 32 bits
+        samples = np.asarray(image).astype(np.int64)
+        if samples.min() < 0 or samples.max() > 65535:
+            raise Unusable("its samples have more than 16 bits")
+        return Image.fromarray(_to_8_bit(samples))
+    if image.mode == "F":
+        raise Unusable("its samples are floating-point numbers; save it with 8 or 16 bits")
+    return image
+
+
+def _loaded_by_opencv(data: bytes) -> Image.Image:
+    """For the TIFF variants that Pillow does not read."""
+    samples = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if samples is None or samples.dtype not in (np.uint8, np.uint16):
+        raise Unusable("it does not decode, or its samples are not of 8 or 16 bits")
+    if samples.dtype == np.uint16:
+        samples = _to_8_bit(samples)
+    if samples.ndim == 3 and samples.shape[2] == 4:
+        return Image.fromarray(cv2.cvtColor(samples, cv2.COLOR_BGRA2RGBA))
+    if samples.ndim == 3:
+        return Image.fromarray(cv2.cvtColor(samples, cv2.COLOR_BGR2RGB))
+    return Image.fromarray(samples)
+
+
+def _to_8_bit(samples: NDArray[Any]) -> NDArray[np.uint8]:
+    return ((samples.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def _without_alpha(image: Image.Image) -> tuple[Image.Image, bool]:
+    """(the picture over white where it is transparent, whether it is anywhere)."""
+    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+        layered = image.convert("RGBA")
+        if layered.getchannel("A").getextrema() != (255, 255):
+            white = Image.new("RGBA", image.size, (255, 255, 255, 255))
+            return Image.alpha_composite(white, layered).convert("RGB"), True
+        return layered.convert("RGB"), False
+    if image.mode not in ("RGB", "L", "CMYK"):
+        return image.convert("RGB"), False
+    return image, False
+
+
+def _resized(image: Image.Image, size: tuple[int, int], stored: tuple[int, int]) -> Image.Image:
+    """Scaled to `size`. `image` may be a draft of `stored` that was rounded up to whole pixels."""
+    if image.size == size:
+        return image
+    factor = max(1, round(stored[0] / image.width))
+    box = (0.0, 0.0, min(stored[0] / factor, image.width), min(stored[1] / factor, image.height))
+    return image.resize(size, Image.Resampling.LANCZOS, box=box, reducing_gap=3.0)
+
+
+def _in_srgb(image: Image.Image, profile: bytes | None) -> tuple[Image.Image, bool, bool]:
+    """(the picture in sRGB, whether that changed it, whether its profile was unusable)."""
+    if profile:
+        try:
+            return (*colour.icc_to_srgb(image, profile), False)
+        except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+            return image, False, True
+    return image, False, False
+
+
+def _what_it_is(data: bytes) -> str:
+    if data[:6] in (b"GIF87a", b"GIF89a"):
+        return "it is a GIF"
+    if data[:1] == b"<" or data[:64].isascii():
+        return "it holds text, not a picture"
+    return "it is no picture, or a damaged one"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]

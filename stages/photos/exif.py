@@ -1,0 +1,145 @@
+"""What a photograph's EXIF says about camera, lens and exposure (Exif 2.32, CIPA DC-008)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+FULL_FRAME_WIDTH_MM = 36.0
+_EXIF_IFD, _INTEROPERABILITY_IFD = 0x8769, 0xA005
+_PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_SENSOR_WIDTHS_MM = (2.0, 70.0)  # smallest phone cameras to medium format
+_FOCAL_OVER_LONG_SIDE = (0.2, 30.0)  # from fisheye to long telephoto
+
+
+@dataclass(frozen=True)
+class Exif:
+    """The tags that matter here; None or "" where missing or senseless.
+
+    orientation: 1 to 8. focal_35mm: 35 mm equivalent. pixels: (width, height) that the camera
+    wrote. plane_px_per_mm: sensor pixels per millimetre along x. adobe_rgb: whether the colours are
+    declared as Adobe RGB without a profile, as cameras do (DCF "R03").
+    """
+
+    make: str = ""
+    model: str = ""
+    lens: str = ""
+    orientation: int = 1
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    exposure_s: float | None = None
+    f_number: float | None = None
+    iso: float | None = None
+    pixels: tuple[float, float] | None = None
+    plane_px_per_mm: float | None = None
+    adobe_rgb: bool = False
+
+    @property
+    def exposure_ev(self) -> float | None:
+        """EV at ISO 100: log2(N^2 / t) - log2(ISO / 100); a stop less light is one more."""
+        if self.exposure_s is None or self.f_number is None or self.iso is None:
+            return None
+        return math.log2(self.f_number**2 / self.exposure_s) - math.log2(self.iso / 100.0)
+
+    def focal_px(self, stored: tuple[int, int], width: int, height: int) -> float | None:
+        """Focal length in pixels of a picture of width x height (upright) made from `stored`.
+
+        stored: (width, height) in the file. From the 35 mm equivalent, taken along the longer side
+        (36 mm); else from the sensor's resolution, but only if the file still has the size that the
+        camera wrote, since resizing programs leave that tag as it was. None for a cropped file.
+        """
+        longer = max(width, height)
+        if self._cropped(stored):
+            return None
+        focal = None
+        if self.focal_35mm is not None:
+            focal = self.focal_35mm / FULL_FRAME_WIDTH_MM * longer
+        elif self.focal_mm is not None and self._plane_is_trustworthy(stored):
+            assert self.plane_px_per_mm is not None
+            focal = self.focal_mm * self.plane_px_per_mm * longer / max(stored)
+        low, high = _FOCAL_OVER_LONG_SIDE
+        return focal if focal is not None and low < focal / longer < high else None
+
+    def camera_key(self, width: int, height: int) -> str:
+        """Equal for photographs of the same camera, lens setting and picture size."""
+        name = " ".join(part for part in (self.make, self.model, self.lens) if part)
+        name = name.replace(",", " ")  # the comma divides the parts of the key
+        focal = f"{self.focal_mm:.1f} mm" if self.focal_mm else ""
+        equivalent = f"{self.focal_35mm:.0f} mm equivalent" if self.focal_35mm else ""
+        size = f"{width}x{height}"
+        return ", ".join(part for part in (name or "unknown", focal, equivalent, size) if part)
+
+    def _cropped(self, stored: tuple[int, int]) -> bool:
+        """Whether the proportions are no longer those that the camera wrote."""
+        if self.pixels is None:
+            return False
+        was = max(self.pixels) / min(self.pixels)
+        return abs(was / (max(stored) / min(stored)) - 1.0) > 0.02
+
+    def _plane_is_trustworthy(self, stored: tuple[int, int]) -> bool:
+        if self.pixels is None or self.plane_px_per_mm is None:
+            return False
+        low, high = _SENSOR_WIDTHS_MM
+        same_size = sorted(self.pixels) == sorted(stored)
+        return same_size and low < max(stored) / self.plane_px_per_mm < high
+
+
+def read_exif(image: Any) -> Exif:
+    """The tags of an open PIL image. Damaged EXIF counts as none: cameras' makers err a lot."""
+    try:
+        main = image.getexif()
+        details = main.get_ifd(_EXIF_IFD)
+        interoperability = main.get_ifd(_INTEROPERABILITY_IFD)
+    except Exception:  # Pillow's parsers raise whatever the damage leads to
+        return Exif()
+    tags = {**dict(main), **dict(details)}
+    orientation = _number(tags.get(0x0112))
+    width, height = _number(tags.get(0xA002)), _number(tags.get(0xA003))
+    return Exif(
+        make=_text(tags.get(0x010F)),
+        model=_text(tags.get(0x0110)),
+        lens=_text(tags.get(0xA434)),
+        orientation=int(orientation) if orientation and orientation in range(1, 9) else 1,
+        focal_mm=_number(tags.get(0x920A)),
+        focal_35mm=_number(tags.get(0xA405)),
+        exposure_s=_number(tags.get(0x829A)),
+        f_number=_number(tags.get(0x829D)),
+        iso=_iso(tags),
+        pixels=(width, height) if width and height else None,
+        plane_px_per_mm=_plane_px_per_mm(tags),
+        adobe_rgb=_text(interoperability.get(1)) == "R03",
+    )
+
+
+def _iso(tags: dict[int, Any]) -> float | None:
+    """PhotographicSensitivity; where it is full (65535), RecommendedExposureIndex says more."""
+    iso = _number(tags.get(0x8827))
+    return _number(tags.get(0x8832)) if iso == 65535 else iso
+
+
+def _plane_px_per_mm(tags: dict[int, Any]) -> float | None:
+    resolution = _number(tags.get(0xA20E))
+    unit = _PLANE_UNIT_MM.get(int(_number(tags.get(0xA210)) or 2))
+    return resolution / unit if resolution and unit else None
+
+
+def _number(value: Any) -> float | None:
+    """A positive finite number, or None."""
+    if isinstance(value, tuple | list):
+        value = value[0] if value else None
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _text(value: Any) -> str:
+    """Printable text on one line, at most 80 characters."""
+    if isinstance(value, bytes):
+        value = value.decode("ascii", "ignore")
+    if not isinstance(value, str):
+        return ""
+    kept = "".join(c if c.isprintable() else " " for c in value.split("\0")[0])
+    return " ".join(kept.split())[:80]

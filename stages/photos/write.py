@@ -1,0 +1,33 @@
+"""Normalised pictures on disk."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+from PIL import Image
+
+from stages.photos.decode import Decoded
+from stages.run.atomic import replacing
+
+_JPEG_QUALITY = 95
+
+
+def write_picture(path: Path, decoded: Decoded) -> None:
+    """Write the picture as the suffix of `path` says: JPEG (4:4:4) or PNG.
+
+    A JPEG that needed no change keeps its bytes: encoding it again would only lose detail. Raises
+    SplatError if the disk refuses.
+    """
+    as_png = path.suffix.lower() == ".png"
+    data = None if as_png else decoded.as_it_was
+    if data is None:
+        encoded = io.BytesIO()
+        picture = Image.fromarray(decoded.pixels)
+        if as_png:
+            picture.save(encoded, "PNG", compress_level=3)
+        else:
+            picture.save(encoded, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+        data = encoded.getvalue()
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
