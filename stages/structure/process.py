@@ -47,10 +47,9 @@ def run_worker(
         "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     }
     with log.open("wb") as output:
-        # -P: a folder of photographs may hold anything, also a file named numpy.py. A session of
-        # its own: Ctrl-C goes to the parent alone, which then decides.
+        # A session of its own: Ctrl-C goes to the parent alone, which then decides.
         worker = subprocess.Popen(
-            [sys.executable, "-P", "-m", "stages.structure.worker", str(path)],
+            _command(path),
             stdin=subprocess.PIPE,
             stdout=output,
             stderr=subprocess.STDOUT,
@@ -70,6 +69,11 @@ def run_worker(
             raise _disk_full(folder)
         raise WorkerCrashed(job.step, worker.returncode, tail)
     tick()
+
+
+def _command(job: Path) -> list[str]:
+    # -P: the current folder may hold anything, also photographs beside a file named numpy.py.
+    return [sys.executable, "-P", "-m", "stages.structure.worker", str(job)]
 
 
 def _watch(

@@ -33,7 +33,7 @@ def undistort(uv: NDArray[np.float64], k: float) -> NDArray[np.float64]:
     beyond the largest radius that this lens model can show (k < 0)."""
     wanted = np.linalg.norm(uv, axis=-1)
     limit = np.inf if k >= 0 else 1.0 / np.sqrt(-3.0 * k)
-    reachable = wanted <= (np.inf if k >= 0 else limit * (1.0 + k * limit**2))
+    reachable = wanted <= 2.0 / 3.0 * limit  # k limit^2 = -1/3
     radius = np.minimum(wanted, limit)
     for _ in range(_ROUNDS):  # Newton on r + k r^3 = wanted, kept on the monotonous branch
         slope = np.maximum(1.0 + 3.0 * k * radius**2, 1e-9)

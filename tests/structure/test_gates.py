@@ -1,0 +1,178 @@
+"""Gates: the bad captures that were measured are caught, the good ones pass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from stages.structure.gates import (
+    CALIBRATED,
+    PANORAMIC,
+    PLANAR,
+    Figures,
+    check_keypoints,
+    check_model,
+    check_pairs,
+    groups_of,
+)
+
+# Measured with pycolmap 4.2.1 on photographs 1600 px wide.
+BANANA = Figures(
+    photographs=16,
+    registered=15,
+    models=(15,),
+    points=7133,
+    mean_reprojection_error_px=0.34,
+    long_side_px=1600,
+    mean_track_length=3.6,
+    median_triangulation_angle_deg=16.5,
+    baseline_over_depth=1.63,
+    distortion=0.0098,
+    focal_over_prior=1.04,
+    rotation_disagreement_deg=0.4,
+)
+PLUSH = replace(
+    BANANA,
+    photographs=97,
+    registered=97,
+    models=(97,),
+    points=24619,
+    mean_reprojection_error_px=1.02,
+)
+DRONE = replace(BANANA, median_triangulation_angle_deg=5.0, baseline_over_depth=0.4)
+
+
+def codes(figures: Figures) -> list[str]:
+    return [failure.code for failure in check_model(figures)]
+
+
+@pytest.mark.parametrize("figures", [BANANA, PLUSH, DRONE], ids=["banana", "plush", "drone"])
+def test_good_captures_pass(figures: Figures) -> None:
+    assert codes(figures) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        # two scenes in one folder: models of 15 and 11
+        ({"photographs": 26, "registered": 15, "models": (15, 11)}, "sfm-too-few-registered"),
+        # pure rotation, incremental: 7 of 20 registered, no points
+        (
+            {"photographs": 20, "registered": 7, "models": (7,), "points": 0},
+            "sfm-no-parallax",
+        ),
+        # pure rotation, global: everything registered, 0.22 px, 2.2 degrees
+        (
+            {
+                "photographs": 20,
+                "registered": 20,
+                "mean_reprojection_error_px": 0.22,
+                "median_triangulation_angle_deg": 2.2,
+                "mapper": "global",
+            },
+            "sfm-no-parallax",
+        ),
+        # zoom only, global: everything registered at 0.17 px, the camera never moved
+        (
+            {"photographs": 16, "registered": 16, "baseline_over_depth": 0.01, "mapper": "global"},
+            "sfm-no-parallax",
+        ),
+        # near-duplicates, darkness: nothing
+        ({"registered": 0, "models": (), "points": 0}, "sfm-no-model"),
+        # strong blur: 2 registered
+        ({"registered": 2, "models": (2,), "points": 40}, "sfm-no-model"),
+        # blank wall: 20 of 20 at 0.13 px with 301 points
+        (
+            {"photographs": 20, "registered": 20, "points": 301, "weak_photographs": 12},
+            "sfm-too-few-points",
+        ),
+        ({"photographs": 20, "registered": 20, "weak_photographs": 12}, "sfm-weak-photographs"),
+        # date stamp: focal 2693 for 694, k = -8.6
+        ({"distortion": -8.6, "focal_over_prior": 2693 / 694}, "sfm-implausible-distortion"),
+        ({"focal_over_prior": 2693 / 694}, "sfm-implausible-focal"),
+        ({"focal_over_prior": 694 / 2693}, "sfm-implausible-focal"),
+        # forward motion along a street: 2 of 29, k = 5.8
+        (
+            {"photographs": 29, "registered": 2, "models": (2,), "distortion": 5.8, "points": 90},
+            "sfm-no-model",
+        ),
+        # the global mapper, 36 to 113 degrees off, everything else plausible
+        ({"mapper": "global", "rotation_disagreement_deg": 36.0}, "sfm-rotations-disagree"),
+        ({"mapper": "global", "rotation_disagreement_deg": None}, "sfm-rotations-disagree"),
+        ({"mean_reprojection_error_px": 2.6}, "sfm-high-error"),
+        ({"mean_reprojection_error_px": float("nan")}, "sfm-high-error"),
+        ({"mean_track_length": 2.1}, "sfm-short-tracks"),
+        ({"timed_out": True}, "sfm-timed-out"),
+    ],
+)
+def test_measured_bad_captures_are_caught(changes: dict[str, object], code: str) -> None:
+    assert code in codes(replace(BANANA, **changes))  # type: ignore[arg-type]
+
+
+def test_one_photograph_of_sixteen_may_be_left_out_but_not_four() -> None:
+    assert codes(BANANA) == []
+    assert codes(replace(BANANA, registered=12)) == ["sfm-too-few-registered"]
+
+
+def test_error_limit_grows_with_the_photographs() -> None:
+    coarse = replace(BANANA, mean_reprojection_error_px=3.5)
+    assert codes(coarse) == ["sfm-high-error"]
+    assert codes(replace(coarse, long_side_px=4000)) == []
+
+
+@pytest.mark.parametrize(
+    ("counts", "passes"),
+    [
+        ([76] * 20, False),
+        ([257] * 20, True),
+        ([], False),
+        ([0] * 6, False),
+        ([9000] * 9 + [0], True),
+    ],
+)
+def test_keypoints_tell_strong_blur_from_mild(counts: list[int], passes: bool) -> None:
+    assert (check_keypoints(counts) == []) == passes
+
+
+def chain(count: int, config: int = CALIBRATED) -> list[tuple[int, int, int, int]]:
+    return [(i, i + 1, 100, config) for i in range(count - 1)]
+
+
+def test_pairs_that_only_turn_are_no_parallax_but_a_flat_field_is_fine() -> None:
+    assert [f.code for f in check_pairs(chain(10, PANORAMIC), 10)] == ["sfm-no-parallax"]
+    assert check_pairs(chain(10, PLANAR), 10) == []
+    assert check_pairs(chain(10), 10) == []
+
+
+def test_unconnected_groups_are_named_by_size() -> None:
+    pairs = [*chain(6), (6, 7, 50, CALIBRATED)]
+    assert groups_of(pairs, 9) == [[0, 1, 2, 3, 4, 5], [6, 7], [8]]
+    (failure,) = check_pairs(pairs, 9)
+    assert failure.code == "sfm-separate-groups"
+    assert "6, 2" in failure.given
+    assert "1 photographs match no other" in failure.given
+
+
+def test_no_pairs_at_all() -> None:
+    assert [f.code for f in check_pairs([], 4)] == ["sfm-no-matches"]
+
+
+def test_every_failure_is_three_plain_sentences() -> None:
+    bad = replace(
+        BANANA,
+        registered=4,
+        points=3,
+        distortion=2.0,
+        focal_over_prior=5.0,
+        weak_photographs=4,
+        mean_track_length=2.0,
+        mean_reprojection_error_px=9.0,
+    )
+    failures = check_model(bad)
+    assert len(failures) == 7
+    for failure in failures:
+        assert failure.code.startswith("sfm-")
+        for text in (failure.given, failure.wanted, failure.hint):
+            assert text[0].isupper() or text[0].isdigit()
+            assert text.endswith(".")

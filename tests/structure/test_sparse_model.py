@@ -1,0 +1,107 @@
+"""Figures of a model whose every number is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.structure.sparse_model import (
+    MappingResult,
+    load_result,
+    measure,
+    reprojection_errors,
+    save_model,
+    triangulation_angles,
+    without_weak_views,
+)
+from tests.structure.synthetic import orbit_model, random_rotation
+
+
+def test_exact_observations_have_no_error_and_a_shift_is_measured_in_pixels() -> None:
+    model = orbit_model(views=6, points=50)
+    assert reprojection_errors(model).max() < 1e-9
+    shifted = replace(model, observed_px=model.observed_px + np.array([3.0, 4.0]))
+    assert np.allclose(reprojection_errors(shifted), 5.0)
+
+
+def test_points_behind_a_camera_have_infinite_error() -> None:
+    model = orbit_model(views=4, points=5)
+    behind = replace(model, points=model.points + 100 * model.centres[0])
+    assert np.isinf(reprojection_errors(behind)).any()
+
+
+def test_figures_of_a_half_circle() -> None:
+    model = orbit_model(views=7, points=200)
+    result = MappingResult(model, (model.names,), timed_out=False)
+    figures = measure(result, 8, "incremental")
+    assert (figures.photographs, figures.registered, figures.points) == (8, 7, 200)
+    assert figures.mean_track_length == 7
+    # Opposite ends, 4 away and 1 up: 2 atan(4) = 152 degrees in the middle, less around it.
+    assert figures.median_triangulation_angle_deg == pytest.approx(152.0, abs=6)
+    assert figures.focal_over_prior == pytest.approx(1.05)
+    assert figures.distortion == -0.05
+    assert figures.weak_photographs == 0
+    assert figures.rotation_disagreement_deg == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_wrong_rotation_shows_against_the_pairs() -> None:
+    model = orbit_model(views=6, points=40)
+    poses = model.world_to_camera.copy()
+    for i in range(1, 6):
+        poses[i, :3, :3] = random_rotation(i) @ poses[i, :3, :3]
+    wrong = MappingResult(replace(model, world_to_camera=poses), (model.names,), timed_out=False)
+    found = measure(wrong, 6, "global").rotation_disagreement_deg
+    assert found is not None
+    assert found > 30
+
+
+def test_cameras_in_one_place_have_no_baseline_and_no_angle() -> None:
+    model = orbit_model(views=6, points=40)
+    poses = model.world_to_camera.copy()
+    centre = model.centres[0]
+    poses[:, :3, 3] = -np.einsum("vij,j->vi", poses[:, :3, :3], centre)
+    still = replace(model, world_to_camera=poses)
+    assert triangulation_angles(still, np.arange(40)).max() < 1e-5
+    figures = measure(MappingResult(still, (model.names,), timed_out=False), 6, "incremental")
+    assert figures.baseline_over_depth < 1e-9
+
+
+def test_views_with_hardly_any_points_go_and_the_rest_stays_consistent() -> None:
+    model = orbit_model(views=6, points=100)
+    # View 2 sees points 0-9 only; points 90-99 are seen by views 2 and 5 only... and so by one.
+    keep = (model.observing_views != 2) | (model.observed_points < 10)
+    keep &= (model.observed_points < 90) | (model.observing_views == 5)
+    thin = replace(
+        model,
+        observed_points=model.observed_points[keep],
+        observing_views=model.observing_views[keep],
+        observed_px=model.observed_px[keep],
+    )
+    kept = without_weak_views(thin, fewest=15)
+    assert kept.names == ("00.jpg", "01.jpg", "03.jpg", "04.jpg", "05.jpg")
+    assert len(kept.points) == 90
+    assert reprojection_errors(kept).max() < 1e-9
+    assert (kept.tracks == 5).all()
+    assert kept.pairs.max() == 4
+    assert without_weak_views(model) is model
+
+
+def test_a_saved_result_comes_back_equal(tmp_path: Path) -> None:
+    model = orbit_model(views=3, points=20)
+    save_model(tmp_path / "m", model, groups=[["a", "ü"], ["b"]], timed_out=True)
+    result = load_result(tmp_path / "m")
+    assert result.groups == (("a", "ü"), ("b",))
+    assert result.timed_out
+    assert result.model is not None
+    assert result.model.names == model.names
+    assert (result.model.observed_px == model.observed_px).all()
+
+
+def test_nothing_found_is_a_result_too(tmp_path: Path) -> None:
+    save_model(tmp_path / "m", None, groups=[], timed_out=False)
+    result = load_result(tmp_path / "m")
+    assert result.model is None
+    assert measure(result, 5, "incremental").registered == 0
