@@ -20,9 +20,9 @@ from stages.run.stage import Report
 from stages.structure import database as sqlite
 from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
 from stages.structure.job import Job
-from stages.structure.ladder import Attempt, Rung
+from stages.structure.ladder import LADDER, Attempt, Rung
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
-from stages.structure.sparse_model import load_result, measure, without_weak_views
+from stages.structure.sparse_model import load_result, measure, without_odd_views
 
 MORE_FEATURES = 2.0  # times as many, at most
 LOWER_PEAK = 0.4  # times SIFT's peak threshold
@@ -77,7 +77,7 @@ class Workbench:
 
     def _mapped(self, job: Job, attempt: Attempt, before: list[Failure]) -> Attempt:
         try:
-            self._mapping(job)
+            self._mapping(job, attempt.rung)
         except WorkerTimedOut:
             figures = replace(attempt.figures, timed_out=True)
             return replace(attempt, figures=figures, failures=tuple(check_model(figures)))
@@ -87,7 +87,7 @@ class Workbench:
             return replace(attempt, failures=(failure,))
         result = load_result(Path(job.out))
         if result.model is not None:
-            result = replace(result, model=without_weak_views(result.model))
+            result = replace(result, model=without_odd_views(result.model))
         figures = measure(result, len(self.base.names), attempt.rung.mapper)
         failures = tuple(before) + tuple(check_model(figures))
         return replace(attempt, figures=figures, failures=failures, result=result)
@@ -140,17 +140,20 @@ class Workbench:
         marker.touch()
         return job
 
-    def _mapping(self, job: Job) -> None:
-        if (Path(job.out) / "result.json").exists():
+    def _mapping(self, job: Job, rung: Rung) -> None:
+        if _finished(Path(job.out)):
             return
         Path(job.progress).unlink(missing_ok=True)
         total = len(job.names)
+        label = "placing photographs"
+        if rung is not LADDER[0]:
+            label += f" ({rung.name})"
         budget = min(self.seconds_left(), mapping_seconds(total))
         timed = replace(job, step="mapping", max_seconds=max(1, int(budget)))
 
         def tick() -> None:
             registered = _registered(Path(job.progress))
-            self.report.progress(registered, total, "placing photographs", registered=registered)
+            self.report.progress(registered, total, label, registered=registered)
 
         # COLMAP looks at its own clock only between photographs.
         self._run(timed, tick, timed.max_seconds + 60.0)
@@ -187,6 +190,14 @@ def _repair_or_delete(database: Path) -> None:
         sqlite.repair(database)
     except sqlite3.DatabaseError:
         sqlite.delete(database)
+
+
+def _finished(out: Path) -> bool:
+    """Whether an earlier run came to the end of this mapping, and not of its time."""
+    try:
+        return not load_result(out).timed_out
+    except (OSError, ValueError):
+        return False
 
 
 def _registered(progress: Path) -> int:

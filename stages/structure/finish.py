@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import posixpath
+import shutil
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,9 @@ from stages.structure.levelling import upright
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px
 
-IMAGES = "colmap/images"
-SPARSE = "colmap/sparse/0"
+COLMAP = "colmap"
+IMAGES = f"{COLMAP}/images"
+SPARSE = f"{COLMAP}/sparse/0"
 JPEG_QUALITY = 97
 
 
@@ -28,6 +30,7 @@ def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -
 
     Raises Interrupted, and SplatError "sfm-photo-unreadable" if a photograph has gone.
     """
+    shutil.rmtree(folder / COLMAP, ignore_errors=True)  # of an interrupted run, perhaps of others
     model, levelled = upright(model)
     photos = {photo.image: photo for photo in capture.photos}
     ordered = [photos[name] for name in model.names]
@@ -99,8 +102,6 @@ def _write_pictures(
             raise Interrupted
         report.progress(done, len(photos), "undistorting", photographs=done)
         target = folder / IMAGES / picture
-        if target.exists():  # written whole or not at all, so an interrupted run left it
-            continue
         camera = int(model.view_cameras[done])
         if camera not in made:
             made = {camera: maps(pinholes[camera], model.camera_params[camera])}

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure.gates import Figures
+from stages.structure.gates import Figures, Limits
 
 _SAMPLED_POINTS = 4000  # angles need every pair of rays of a point: a sample is enough
 _SAMPLED_RAYS = 24
 FEWEST_OBSERVATIONS = 15
+ODD_SHARE = 0.1  # of the photographs
 _WEAK_OBSERVATIONS = 30
 
 
@@ -56,8 +57,11 @@ class SparseModel:
 
     @property
     def tracks(self) -> NDArray[np.int32]:
-        """[P] photographs that see each point."""
-        return np.bincount(self.observed_points, minlength=len(self.points)).astype(np.int32)
+        """[P] photographs that see each point (COLMAP lets a photograph see one twice)."""
+        first = np.ones(len(self.observed_points), np.bool_)
+        first[1:] = (np.diff(self.observed_points) != 0) | (np.diff(self.observing_views) != 0)
+        seen = self.observed_points[first]
+        return np.bincount(seen, minlength=len(self.points)).astype(np.int32)
 
 
 @dataclass(frozen=True)
@@ -105,23 +109,43 @@ def load_result(folder: Path) -> MappingResult:
     return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
 
 
-def without_weak_views(model: SparseModel, fewest: int = FEWEST_OBSERVATIONS) -> SparseModel:
-    """The model less photographs that see fewer than `fewest` points: their poses are guesses.
-    Points that fewer than 2 of the others see go with them."""
-    keep_view = np.bincount(model.observing_views, minlength=len(model.names)) >= fewest
-    if keep_view.all():
-        return model
+def without_odd_views(model: SparseModel, limits: Limits | None = None) -> SparseModel:
+    """The model less photographs whose poses are guesses: those that see too few points, and the
+    few (a tenth at most) whose camera came out implausible. If more cameras are implausible, the
+    whole model is, and the gates shall see it."""
+    limits = limits or Limits()
+    seen = np.bincount(model.observing_views, minlength=len(model.names))
+    keep = seen >= FEWEST_OBSERVATIONS
+    with np.errstate(invalid="ignore"):
+        zoom = np.abs(np.log(model.camera_params[:, 0] / model.focal_priors_px))
+        odd = (np.abs(model.camera_params[:, 3]) > limits.distortion) | (
+            zoom > np.log(limits.focal_ratio)
+        )
+    odd_views = odd[model.view_cameras]
+    if odd_views.mean() <= ODD_SHARE:
+        keep &= ~odd_views
+    return model if keep.all() else _with_views(model, keep)
+
+
+def _with_views(model: SparseModel, keep_view: NDArray[np.bool_]) -> SparseModel:
+    """The views to keep; points that fewer than 2 of them see go, and cameras without a view."""
     kept = keep_view[model.observing_views]
     tracks = np.bincount(model.observed_points[kept], minlength=len(model.points))
     keep_point = tracks >= 2
     kept &= keep_point[model.observed_points]
     new_view = np.cumsum(keep_view, dtype=np.int32) - 1
     new_point = np.cumsum(keep_point, dtype=np.int32) - 1
+    keep_camera = np.zeros(len(model.camera_params), np.bool_)
+    keep_camera[model.view_cameras[keep_view]] = True
+    new_camera = np.cumsum(keep_camera, dtype=np.int32) - 1
     pairs = keep_view[model.pairs].all(axis=1)
     return replace(
         model,
         names=tuple(name for name, keep in zip(model.names, keep_view, strict=True) if keep),
-        view_cameras=model.view_cameras[keep_view],
+        view_cameras=new_camera[model.view_cameras[keep_view]].astype(np.int32),
+        camera_sizes=model.camera_sizes[keep_camera],
+        camera_params=model.camera_params[keep_camera],
+        focal_priors_px=model.focal_priors_px[keep_camera],
         world_to_camera=model.world_to_camera[keep_view],
         points=model.points[keep_point],
         colours=model.colours[keep_point],
@@ -152,8 +176,8 @@ def point_errors(model: SparseModel) -> NDArray[np.float64]:
     total = np.bincount(
         model.observed_points, weights=reprojection_errors(model), minlength=len(model.points)
     )
-    tracks = model.tracks
-    return np.where(tracks > 0, total / np.maximum(tracks, 1), np.inf)
+    count = np.bincount(model.observed_points, minlength=len(model.points))
+    return np.where(count > 0, total / np.maximum(count, 1), np.inf)
 
 
 def triangulation_angles(model: SparseModel, index: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -198,7 +222,7 @@ def measure(result: MappingResult, photographs: int, mapper: str) -> Figures:
     """The figures that the gates look at."""
     model = result.model
     sizes = tuple(len(group) for group in result.groups)
-    if model is None:
+    if model is None or not model.names:
         return Figures(
             photographs=photographs, models=sizes, mapper=mapper, timed_out=result.timed_out
         )

@@ -10,12 +10,13 @@ import pytest
 
 from stages.structure.sparse_model import (
     MappingResult,
+    SparseModel,
     load_result,
     measure,
     reprojection_errors,
     save_model,
     triangulation_angles,
-    without_weak_views,
+    without_odd_views,
 )
 from tests.structure.synthetic import orbit_model, random_rotation
 
@@ -80,13 +81,36 @@ def test_views_with_hardly_any_points_go_and_the_rest_stays_consistent() -> None
         observing_views=model.observing_views[keep],
         observed_px=model.observed_px[keep],
     )
-    kept = without_weak_views(thin, fewest=15)
+    kept = without_odd_views(thin)
     assert kept.names == ("00.jpg", "01.jpg", "03.jpg", "04.jpg", "05.jpg")
     assert len(kept.points) == 90
     assert reprojection_errors(kept).max() < 1e-9
     assert (kept.tracks == 5).all()
     assert kept.pairs.max() == 4
-    assert without_weak_views(model) is model
+    assert without_odd_views(model) is model
+
+
+def two_cameras(views: int, odd: int, k: float) -> SparseModel:
+    """The last `odd` views have a camera of their own with distortion k."""
+    model = orbit_model(views=views, points=40)
+    return replace(
+        model,
+        view_cameras=(np.arange(views) >= views - odd).astype(np.int32),
+        camera_sizes=np.repeat(model.camera_sizes, 2, axis=0),
+        camera_params=np.array([model.camera_params[0], [*model.camera_params[0, :3], k]]),
+        focal_priors_px=np.repeat(model.focal_priors_px, 2),
+    )
+
+
+def test_one_photograph_with_an_absurd_lens_goes_and_many_are_left_for_the_gates() -> None:
+    one = without_odd_views(two_cameras(12, 1, k=-3.0))
+    assert len(one.names) == 11
+    assert len(one.camera_params) == 1
+    assert one.view_cameras.max() == 0
+    assert len(without_odd_views(two_cameras(12, 1, k=0.1)).names) == 12
+    many = without_odd_views(two_cameras(12, 4, k=-3.0))
+    assert len(many.names) == 12
+    assert measure(MappingResult(many, (many.names,), False), 12, "incremental").distortion == -3.0
 
 
 def test_a_saved_result_comes_back_equal(tmp_path: Path) -> None:
