@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats.problems import BadFileError
+from stages.raster.api import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
 
-# Beyond these a scale no longer squares to a finite, or stays a normal, float32.
-LOG_SCALE_MIN, LOG_SCALE_MAX = -87.0, 44.0
+LOG_SCALE_MIN = -87.0  # below it a scale is no normal float32 any more
 # What linear 0 and 1 become: alpha is drawn between 1/255 and 0.99, so neither can be told from
 # the exact value.
 LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
@@ -19,7 +19,7 @@ LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
 
 def drawable(splats: Splats) -> NDArray[np.bool_]:
     """[N] true where every value is finite, the scales can be squared in float32 and the
-    quaternion has a direction: the others no viewer can draw."""
+    quaternion has a direction: the rule of our rasteriser. The others no viewer can draw."""
     with np.errstate(invalid="ignore", over="ignore"):
         good = np.isfinite(splats.means).all(axis=1)
         good &= np.abs(splats.means).max(axis=1, initial=0.0) <= np.finfo(np.float32).max
@@ -28,8 +28,8 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
         good &= np.isfinite(splats.opacity_logits)
         good &= np.isfinite(splats.sh).all(axis=(1, 2))
         good &= np.abs(splats.sh).max(axis=(1, 2), initial=0.0) <= np.finfo(np.float32).max
-        lengths = np.linalg.norm(splats.quaternions.astype(np.float64), axis=1)
-        good &= np.isfinite(lengths) & (lengths > 0)
+        largest = np.abs(splats.quaternions).max(axis=1, initial=0.0)
+        good &= np.isfinite(largest) & (largest >= QUATERNION_MIN)
     return np.asarray(good, bool)
 
 
@@ -42,7 +42,8 @@ def kept_rows(splats: Splats) -> tuple[Splats, int]:
 
 
 def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
-    """[N, 4] w, x, y, z of length 1; the norm is taken in float64, where 1e-23 squared is not 0."""
+    """[N, 4] w, x, y, z of length 1; the norm is taken in float64, where 1e-20 squared is
+    not 0."""
     exact = quaternions.astype(np.float64)
     return (exact / np.linalg.norm(exact, axis=1, keepdims=True)).astype(np.float32)
 

@@ -106,7 +106,7 @@ def test_valid_extremes_stay(tmp_path: Path, suffix: str) -> None:
     splats = many_splats(4).with_sh_degree(0)
     splats.log_scales[:] = [[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]]
     splats.opacity_logits[:] = [100, -100, 20, -20]
-    splats.quaternions[:2] = [[1e-23, 0, 0, 1e-23], [1e20, 0, 1e20, 0]]
+    splats.quaternions[:2] = [[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]]
     splats.means[3] = (7e8, -3e38, 1e-40)
     assert formats.write(tmp_path / f"a.{suffix}", splats) == 0
     back = formats.read(tmp_path / f"a.{suffix}")
