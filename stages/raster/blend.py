@@ -38,7 +38,7 @@ GRADIENTS = 9  # mean along the major axis, along the minor, A, B, K, opacity, r
 _LOG2E = 1.4426950408889634
 _F = np.float32
 _ALPHA_MIN, _ALPHA_MAX, _T_MIN = _F(ALPHA_MIN), _F(ALPHA_MAX), _F(TRANSMITTANCE_MIN)
-_CUT = _F(100.0)  # exponents beyond it (alpha 1e-30) would leave the range of `vexp2`
+_CUT = _F(80.0)  # exponents beyond it (alpha 2e-35) would leave the range of `vexp2`
 
 
 @kernel

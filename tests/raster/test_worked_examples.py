@@ -1,0 +1,138 @@
+"""Numbers worked by hand, on both backends."""
+
+import numpy as np
+import pytest
+import torch
+
+from stages.raster import RasterSettings, render
+from stages.raster.projection import WORK_ROW, A, B, C, camera_row, footprint
+from stages.raster.reference import parameters_of, project, sh_basis
+from stages.raster.sh import sh_basis as kernel_basis
+from stages.scene import Camera
+from tests.scenes import BACKENDS, camera, splats
+from tests.tolerances import WORKED
+
+VIEW = Camera(1600, 1200, 800.0, 800.0, 800.0, 600.0, np.eye(4))
+NO_DILATION = RasterSettings(dilation_px2=0.0)
+HALF_TURN = np.sqrt(0.5)
+
+
+def covariance(backend, scene, settings=NO_DILATION):
+    """[[a, b], [b, c]] of the only splat."""
+    if backend == "reference":
+        p = project(parameters_of(scene), VIEW, settings)
+        a, b, c = (float(t.detach()[0]) for t in (p.a, p.b, p.c))
+    else:
+        w = np.empty(WORK_ROW)
+        cam = camera_row(VIEW, settings)
+        assert footprint(
+            0, cam, scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits, w
+        )
+        a, b, c = w[A], w[B], w[C]
+    return np.array([[a, b], [b, c]])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("quaternion", "depth_scale", "wanted", "sigmas", "angle", "area"),
+    [
+        ((1, 0, 0, 0), 1, [[6401.56, 0.78], [0.78, 900.39]], (80.01, 30.01), 0.008, 7542),
+        (
+            (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0),
+            1,
+            [[4088.28, 222.27], [222.27, 912.70]],
+            (64.06, 29.95),
+            3.98,
+            6028,
+        ),
+    ],
+)
+def test_footprint_worked_by_hand(backend, quaternion, depth_scale, wanted, sigmas, angle, area):
+    scene = splats((0.5, 0.25, 4.0), scales=(0.4, 0.15, 0.05), quaternions=quaternion)
+    cov = covariance(backend, scene)
+    np.testing.assert_allclose(cov, wanted, rtol=WORKED, atol=0.006)
+    values, vectors = np.linalg.eigh(cov)
+    np.testing.assert_allclose(np.sqrt(values[::-1]), sigmas, atol=0.006)
+    along = vectors[:, 1]
+    assert np.degrees(np.arctan(along[1] / along[0])) == pytest.approx(angle, abs=0.006)
+    assert np.pi * np.sqrt(np.linalg.det(cov)) == pytest.approx(area, abs=0.6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_twice_the_depth_halves_the_footprint(backend):
+    scene = splats((1.0, 0.5, 8.0), scales=(0.4, 0.15, 0.05))
+    assert np.sqrt(covariance(backend, scene)[0, 0]) == pytest.approx(40.0, abs=0.01)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("alphas", "weights", "residual"),
+    [((0.6, 0.5, 0.2), (0.6, 0.2, 0.04), 0.16), ((0.5, 0.4, 0.25), (0.5, 0.2, 0.075), 0.225)],
+)
+def test_layers_blend_front_to_back(backend, alphas, weights, residual):
+    # wide splats centred on the pixel: their falloff there is 1
+    scene = splats([(0, 0, 2), (0, 0, 3), (0, 0, 4)], scales=1.0, opacities=alphas, rgb=np.eye(3))
+    view = camera(1, 1)
+    drawn = render(scene, view, RasterSettings(), backend)
+    np.testing.assert_allclose(drawn.image[0, 0], weights, atol=1e-6)
+    assert 1 - drawn.alpha[0, 0] == pytest.approx(residual, abs=1e-6)
+    depth = np.dot(weights, (2, 3, 4)) / np.sum(weights)
+    assert drawn.depth[0, 0] == pytest.approx(depth, rel=1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_three_sigma_is_drawn_and_worth_its_gaussian(backend):
+    """exp(-4.5) = 0.0111 at 3 sigma: a cut there would be visible for an opaque splat."""
+    view = camera(101, 1, focal=100.0)
+    scene = splats((0, 0, 1), scales=0.1, opacities=0.9, rgb=(1, 1, 1))
+    settings = RasterSettings(dilation_px2=0.0)
+    row = render(scene, view, settings, backend).image[0, :, 0]
+    assert row[50 + 30] == pytest.approx(0.9 * 0.0111, abs=2e-5)
+    assert row[50 + 32] > 0  # alpha reaches 1/255 at sqrt(2 ln(255 x 0.9)) = 3.297 sigma
+    assert row[50 + 33] == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("direction", "wanted"),
+    [((0, 0, 1), 0.526396), ((1, 0, 0), 0.159944), ((0, 1, 0), -0.206508)],
+)
+def test_spherical_harmonics_worked_by_hand(backend, direction, wanted):
+    coefficients = np.array([1, 1, 0.5, 0.25])
+    if backend == "reference":
+        basis = sh_basis(torch.tensor([direction], dtype=torch.float64), 1)[0].numpy()
+    else:
+        basis = np.empty(16)
+        kernel_basis(1, *map(float, direction), basis)
+        basis = basis[:4]
+    assert basis @ coefficients == pytest.approx(wanted, abs=1e-6)
+
+
+def test_spherical_harmonics_are_orthonormal_and_alike_in_both_backends():
+    r = np.random.default_rng(0)
+    directions = r.normal(size=(200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    basis = sh_basis(torch.tensor(directions), 3).numpy()
+    # Monte Carlo: the standard error of a mean of 200,000 is about 0.003 x 4 pi / 4 pi
+    np.testing.assert_allclose(4 * np.pi * basis.T @ basis / len(basis), np.eye(16), atol=0.03)
+    row = np.empty(16)
+    for i in range(20):
+        kernel_basis(3, *directions[i], row)
+        np.testing.assert_allclose(row, basis[i], atol=1e-14)
+
+
+def test_a_picture_of_1080p_has_8160_tiles_and_an_aligned_box_covers_ten():
+    from stages.raster.cpu import CpuRasteriser, splat_arrays
+
+    view = Camera(1920, 1080, 1000.0, 1000.0, 0.0, 0.0, np.eye(4))
+    rasteriser = CpuRasteriser()
+    # reach is sqrt(2 ln(255 o)) sigmas; an 80 x 30 px box around the centre of tiles 0..4 x 0..1
+    reach = np.sqrt(2 * np.log(255 * 0.5))
+    sigma = np.array([39.0, 14.0]) / reach
+    scene = splats(
+        (0.040, 0.016, 1.0),
+        scales=(np.sqrt(sigma[0] ** 2) / 1000, np.sqrt(sigma[1] ** 2) / 1000, 1e-6),
+    )
+    forward = rasteriser.forward(splat_arrays(scene), view, RasterSettings(dilation_px2=1e-6))
+    assert forward.n_intersections == 10
+    assert len(rasteriser._tile_starts) - 1 == 120 * 68 == 8160

@@ -1,0 +1,155 @@
+"""Small scenes whose answers are known, and how to get gradients of any backend."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.raster import RasterSettings
+from stages.scene import Camera, Splats, logit, rgb_to_dc
+
+BACKENDS = ("reference", "cpu")
+
+
+def camera(width=64, height=48, focal=60.0, cx=None, cy=None, matrix=None):
+    """A pinhole camera, at the origin and looking along +z unless told otherwise."""
+    return Camera(
+        width,
+        height,
+        focal,
+        focal,
+        width / 2 if cx is None else cx,
+        height / 2 if cy is None else cy,
+        np.eye(4) if matrix is None else matrix,
+    )
+
+
+def splats(means, scales=0.1, opacities=0.5, rgb=(1.0, 0.5, 0.25), quaternions=(1, 0, 0, 0)):
+    """Splats of degree 0; everything but `means` is broadcast."""
+    means = np.atleast_2d(np.asarray(means, np.float32))
+    n = len(means)
+    with np.errstate(all="ignore"):
+        log_scales = np.log(np.broadcast_to(np.asarray(scales, np.float64), (n, 3)))
+    return Splats(
+        means=means,
+        quaternions=np.broadcast_to(np.asarray(quaternions, np.float32), (n, 4)).copy(),
+        log_scales=log_scales.astype(np.float32),
+        opacity_logits=logit(np.broadcast_to(np.asarray(opacities, np.float64), (n,))).astype(
+            np.float32
+        ),
+        sh=rgb_to_dc(np.broadcast_to(np.asarray(rgb, np.float32), (n, 3)))[:, None].astype(
+            np.float32
+        ),
+        sh_degrees=np.zeros(n, np.uint8),
+    )
+
+
+def cloud(n, width=64, height=48, degree=2, seed=0, size_px=3.0, spread=0.5):
+    """n random splats in and around the view of `camera(width, height)`."""
+    r = np.random.default_rng(seed)
+    focal = 60.0
+    z = r.uniform(2, 6, n)
+    u, v = r.uniform(-8, width + 8, n), r.uniform(-8, height + 8, n)
+    means = np.stack([(u - width / 2) * z / focal, (v - height / 2) * z / focal, z], 1)
+    scales = (size_px * z / focal)[:, None] * np.exp(r.normal(0, spread, (n, 3)))
+    return Splats(
+        means.astype(np.float32),
+        r.normal(size=(n, 4)).astype(np.float32),
+        np.log(scales).astype(np.float32),
+        r.normal(0, 2, n).astype(np.float32),
+        r.normal(0, 0.5, (n, (degree + 1) ** 2, 3)).astype(np.float32),
+        np.full(n, degree, np.uint8),
+    )
+
+
+def join(*parts):
+    """One set of splats from several."""
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
+    degree = max(p.sh_degree for p in parts)
+    parts = [p.with_sh_degree(degree) for p in parts]
+    return Splats(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+
+PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+def gradients(backend, scene, view, v_image, settings=None):
+    """{parameter: gradient of sum(image x v_image)}, each in the shape of its parameter."""
+    settings = settings or RasterSettings()
+    if backend == "reference":
+        return _reference_gradients(scene, view, v_image, settings)
+    from stages.raster.cpu import CpuRasteriser, splat_arrays
+
+    rasteriser = CpuRasteriser()
+    arrays = splat_arrays(scene)
+    forward = rasteriser.forward(arrays, view, settings)
+    # what the buffers held before must not matter
+    for name in ("gradients", "out"):
+        rasteriser.buffers.get(name, (4_000_000,), np.float32)[:] = np.nan
+    planar = np.ascontiguousarray(np.asarray(v_image, np.float32).transpose(2, 0, 1))
+    rows = rasteriser.backward(arrays, forward, planar)
+    full = np.zeros((len(scene), rows.shape[1]))
+    full[forward.visible] = rows
+    bands = (rows.shape[1] - 13) // 3
+    sh = np.zeros(scene.sh.shape)
+    sh[:, :bands] = full[:, 13:].reshape(len(scene), bands, 3)
+    return {
+        "means": full[:, 0:3],
+        "quaternions": full[:, 3:7],
+        "log_scales": full[:, 7:10],
+        "opacity_logits": full[:, 10],
+        "sh": sh,
+    }
+
+
+def _reference_gradients(scene, view, v_image, settings):
+    import torch
+
+    from stages.raster.reference import parameters_of, render_tensors
+
+    p = parameters_of(scene)
+    image, _, _ = render_tensors(p, view, settings)
+    if image.requires_grad:
+        image.backward(torch.tensor(np.asarray(v_image, np.float64)))
+    return {
+        name: np.zeros(t.shape) if t.grad is None else t.grad.numpy()
+        for name, t in zip(PARAMETERS, p.tensors(), strict=True)
+    }
+
+
+def relative(found, wanted):
+    """Largest difference over the largest wanted value."""
+    top = max(float(np.abs(wanted).max()), 1e-30) if wanted.size else 1.0
+    return float(np.abs(found - wanted).max() / top) if wanted.size else 0.0
+
+
+def textbook_alpha(scene, view, row=0, dilation=0.3):
+    """[H, W] opacity x exp(-1/2 d^T cov^-1 d) of one splat, by the textbook, in extended
+    precision: no Cholesky form, no minors, no tiles."""
+    L = np.longdouble
+    w, x, y, z = (scene.quaternions[row].astype(L)) / np.sqrt(
+        (scene.quaternions[row].astype(L) ** 2).sum()
+    )
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        L,
+    )
+    W, t = view.world_to_camera[:3, :3].astype(L), view.world_to_camera[:3, 3].astype(L)
+    at = W @ scene.means[row].astype(L) + t
+    fx, fy = L(view.fx), L(view.fy)
+    J = np.array(
+        [[fx / at[2], 0, -fx * at[0] / at[2] ** 2], [0, fy / at[2], -fy * at[1] / at[2] ** 2]], L
+    )
+    V = J @ W @ R @ np.diag(np.exp(scene.log_scales[row].astype(L)))
+    cov = V @ V.T + L(dilation) * np.eye(2, dtype=L)
+    det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
+    mean = np.array([fx * at[0] / at[2] + L(view.cx), fy * at[1] / at[2] + L(view.cy)])
+    ys, xs = np.mgrid[: view.height, : view.width].astype(L) + L(0.5)
+    dx, dy = xs - mean[0], ys - mean[1]
+    power = (cov[1, 1] * dx * dx - 2 * cov[0, 1] * dx * dy + cov[0, 0] * dy * dy) / det / 2
+    opacity = 1 / (1 + np.exp(-scene.opacity_logits[row].astype(L)))
+    alpha = np.minimum(opacity * np.exp(-power), L(0.99))
+    return np.where(alpha >= L(1) / 255, alpha, 0).astype(np.float64)
