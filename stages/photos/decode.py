@@ -24,7 +24,7 @@ from stages.scene import fitted_size
 
 MAX_MEGAPIXELS = 200
 MAX_FILE_BYTES = 2**31
-FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP")
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP")  # MPO opens as JPEG
 _SMALLEST_SIDE_PX = 16
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -104,8 +104,9 @@ def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
     Raises Unusable for a file that is damaged, truncated, of another kind, too large or too small.
     """
     data = _read(path)
+    readable = [name for name in FORMATS if name in Image.OPEN]  # builds of Pillow differ
     try:
-        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+        with Image.open(io.BytesIO(data), formats=readable) as image:
             stored = _check_size(image.size)
             with budget.spend(stored[0] * stored[1]):
                 return _decode(image, data, max_side)
@@ -248,7 +249,7 @@ def _in_srgb(image: Image.Image, profile: bytes | None) -> tuple[Image.Image, bo
 def _what_it_is(data: bytes) -> str:
     if data[:6] in (b"GIF87a", b"GIF89a"):
         return "it is a GIF"
-    if data[:1] == b"<" or data[:64].isascii():
+    if data[:64].isascii() and b"\0" not in data[:64]:
         return "it holds text, not a picture"
     return "it is no picture, or a damaged one"
 

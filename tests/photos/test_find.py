@@ -1,0 +1,70 @@
+"""Which files count as photographs, in which order, under which names."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stages.photos.find import find, natural_key, picture_names
+
+NAMES = st.lists(
+    st.builds(
+        "{}{}".format,
+        st.text("aAbé1_- ", min_size=1, max_size=3),
+        st.sampled_from([".jpg", ".JPG", ".jpeg", ".heic", ".webp", ".png", ".tif", ".TIFF"]),
+    ),
+    unique=True,
+    max_size=12,
+)
+
+
+@given(NAMES)
+def test_no_two_pictures_share_a_name_even_where_case_does_not_count(names: list[str]) -> None:
+    given_names = picture_names(names)
+    assert set(given_names) == set(names)
+    assert len({name.casefold() for name in given_names.values()}) == len(names)
+
+
+@given(NAMES)
+def test_names_do_not_depend_on_the_order_of_listing(names: list[str]) -> None:
+    assert picture_names(names) == picture_names(names[::-1])
+
+
+def test_a_name_that_can_stay_stays() -> None:
+    names = picture_names(["a.heic", "a.jpg", "B/c d.JPEG", "e.tiff"])
+    assert names == {
+        "a.heic": "photos/a-2.jpg",
+        "a.jpg": "photos/a.jpg",
+        "B/c d.JPEG": "photos/B/c d.JPEG",
+        "e.tiff": "photos/e.png",
+    }
+
+
+def test_numbers_sort_as_numbers_and_folders_stay_together() -> None:
+    names = ["b10.jpg", "b9.jpg", "a 2/x.jpg", "a/2.jpg", "a/10.jpg", "B1.jpg"]
+    assert sorted(names, key=natural_key) == [
+        "a/2.jpg", "a/10.jpg", "a 2/x.jpg", "B1.jpg", "b9.jpg", "b10.jpg",
+    ]  # fmt: skip
+
+
+def test_links_to_folders_do_not_trap_the_search(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    try:
+        (tmp_path / "loop").symlink_to(tmp_path, target_is_directory=True)
+    except OSError:
+        pytest.skip("links are not allowed here")
+    assert [source.name for source in find(tmp_path).sources] == ["a.jpg"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only there are file names bytes")
+def test_names_that_are_no_utf8_are_spelt_out(tmp_path: Path) -> None:
+    for name in (b"\xff.jpg", b"\xfe.jpg"):
+        try:
+            Path(os.fsdecode(os.fsencode(tmp_path) + b"/" + name)).write_bytes(b"x")
+        except OSError:
+            pytest.skip("this disk wants UTF-8")
+    assert [source.name for source in find(tmp_path).sources] == ["\\xfe.jpg", "\\xff.jpg"]
