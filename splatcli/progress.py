@@ -24,6 +24,7 @@ from stages.run.stage import Numbers, Stage
 
 _LINE_EVERY_S = 10.0
 _EVENT_EVERY_S = 0.5
+_COUNTED = ("photographs", "pairs")
 STOPPING = "Stopping at the next safe place (Ctrl-C again stops at once)."
 
 
@@ -89,27 +90,37 @@ def _account(manifest: Manifest) -> dict[str, Any]:
 
 
 class _Pace:
-    """Rate and remaining time of one phase, over what was done since it was first seen."""
+    """Rate and remaining time of one phase, over what was done since it was first seen.
 
-    def __init__(self, label: str, done: int) -> None:
-        self.label = label
-        self._start, self._first = time.monotonic(), done
+    A phase ends when the count falls or has another end; labels may name each photograph.
+    """
 
-    def text(self, done: int, total: int) -> str:
+    def __init__(self) -> None:
+        self._start, self._first, self._done, self._total = 0.0, 0, 0, -1
+
+    def new_phase(self, done: int, total: int) -> bool:
+        """Take note of the count; True if it is the first of a phase."""
+        new = total != self._total or done < self._done
+        if new:
+            self._start, self._first = time.monotonic(), done
+        self._done, self._total = done, total
+        return new
+
+    def text(self) -> str:
         spent = time.monotonic() - self._start
-        if done <= self._first or spent <= 0:
+        if self._done <= self._first or spent <= 0:
             return ""
-        rate = (done - self._first) / spent
-        return f"{_rate(rate)}, {console.duration((total - done) / rate)} left"
+        rate = (self._done - self._first) / spent
+        return f"{_rate(rate)}, {console.duration((self._total - self._done) / rate)} left"
 
 
 def _rate(per_second: float) -> str:
     return f"{per_second:.1f}/s" if per_second >= 1 else f"{1 / per_second:.1f} s each"
 
 
-def _figures(done: int, numbers: Numbers) -> str:
+def _figures(numbers: Numbers) -> str:
     """The figures in words, less those that the count already says."""
-    return console.figures({name: value for name, value in numbers.items() if value != done})
+    return console.figures({name: value for name, value in numbers.items() if name not in _COUNTED})
 
 
 class Lines(Listener):
@@ -117,20 +128,18 @@ class Lines(Listener):
 
     def __init__(self) -> None:
         self._last = 0.0
-        self._pace = _Pace("", 0)
+        self._pace = _Pace()
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        self._last, self._pace = 0.0, _Pace("", 0)
+        self._pace = _Pace()
         console.note(_started(stage, number, reason, resumed))
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         now = time.monotonic()
-        if label != self._pace.label:
-            self._pace, self._last = _Pace(label, done), 0.0
-        if now - self._last < _LINE_EVERY_S:
+        if not self._pace.new_phase(done, total) and now - self._last < _LINE_EVERY_S:
             return
         self._last = now
-        parts = [f"{done}/{total}", self._pace.text(done, total), _figures(done, numbers)]
+        parts = [f"{done}/{total}", self._pace.text(), _figures(numbers)]
         console.note(f"  {label or stage.name}: " + ", ".join(filter(None, parts)))
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
@@ -163,11 +172,11 @@ class Bars(Listener):
     def __init__(self, screen: Console) -> None:
         self._screen = screen
         self._progress: Progress | None = None
-        self._label = ""
+        self._pace = _Pace()
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._close()
-        self._label = ""
+        self._pace = _Pace()
         self._progress = Progress(
             TextColumn(f"[bold]{number}/7 {stage.name:<8}[/bold]"),
             TextColumn("{task.description}", markup=False),
@@ -186,15 +195,14 @@ class Bars(Listener):
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         if self._progress is None:
             return
-        if label != self._label:  # another phase: another pace
-            self._label = label
+        if self._pace.new_phase(done, total):
             self._progress.reset(self._task, total=total, completed=done)
         self._progress.update(
             self._task,
             description=label,
             completed=done,
             total=total,
-            figures=_figures(done, numbers),
+            figures=_figures(numbers),
         )
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:

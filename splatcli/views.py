@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatcli import console
 from splatcli.folders import find_run_folder
+from stages.run import runfolder
 from stages.run.atomic import replacing
 from stages.run.errors import Family, SplatError
 from stages.run.pipeline import Pipeline
@@ -34,7 +35,7 @@ def render_to(
             family=Family.USAGE,
         )
     splats, pipeline = load_splats(target)
-    views = _views(pipeline)
+    views = _views(pipeline or _pipeline_around(target))
     seen = _camera_for(splats, views, camera)
     if width is not None:
         seen = seen.resized(width, max(1, round(width * seen.height / seen.width)))
@@ -148,6 +149,13 @@ def _flat(value: Any) -> Any:
     if isinstance(value, dict):
         return ", ".join(f"{key}: {item}" for key, item in value.items())
     return " ".join(map(str, value)) if isinstance(value, list) else value
+
+
+def _pipeline_around(file: Path | None) -> Pipeline | None:
+    """The run whose export folder a file lies in: its cameras fit the file."""
+    if file is None or not runfolder.is_run_folder(file.absolute().parent.parent):
+        return None
+    return Pipeline(file.absolute().parent.parent)
 
 
 def _views(pipeline: Pipeline | None) -> tuple[View, ...]:

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 PHOTOS = ROOT / "sample_captures" / "still_life" / "images"
 PHOTO_COUNT = 24
 FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz")
-SMALL = ("--preset", "preview", "--train-side", "160", "--steps", "300", "--max-splats", "8000")
+SMALL = ("--preset", "preview", "--train-side", "160", "--steps", "600", "--max-splats", "8000")
 
 
 def command(*words: str) -> list[str]:
@@ -21,12 +21,18 @@ def command(*words: str) -> list[str]:
     return [sys.executable, "-m", "splatcli", *words]
 
 
+def environment() -> dict[str, str]:
+    """So that the source tree is found from any folder."""
+    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
 def splat(*words: str, folder: Path, timeout_s: float = 600) -> subprocess.CompletedProcess[str]:
     """Run `splat WORDS` in `folder`; its output is kept, whatever its exit status."""
     return subprocess.run(
         command(*words),
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env=environment(),
         capture_output=True,
         text=True,
         timeout=timeout_s,

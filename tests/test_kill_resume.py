@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import random
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from tests.sample import ROOT, command, events, process_words, splat
+from tests.sample import environment, events, process_words, splat
 
 pytestmark = pytest.mark.slow
 
 KILLS = int(os.environ.get("SPLAT_TEST_KILLS", "4"))
 WORDS = process_words("--format", "ply", "--json")
+# Training writes checkpoints by the clock, more seldom than this small run lasts.
+IMPATIENT = (
+    "import stages.training.trainer as trainer; trainer.CHECKPOINT_SECONDS = 0.7; "
+    "from splatcli.app import main; main()"
+)
 
 
 def outputs(run: Path) -> dict[str, str]:
@@ -29,44 +36,85 @@ def outputs(run: Path) -> dict[str, str]:
     }
 
 
-def killed_after(seconds: float, folder: Path) -> bool:
-    """Start the run and kill it without warning; False if it ended before that."""
-    with (folder / "log").open("a") as log:
-        process = subprocess.Popen(
-            command(*WORDS),
+def finished(run: Path) -> dict[str, int]:
+    """Time of the manifest (ns) by finished stage."""
+    return {p.parent.name: p.stat().st_mtime_ns for p in run.glob("[1-7]-*/manifest.json")}
+
+
+def stages_by_seconds(run: Path) -> dict[str, float]:
+    """How long each stage took, by the name of its folder."""
+    manifests = sorted(run.glob("[1-7]-*/manifest.json"))
+    return {path.parent.name: json.loads(path.read_text())["seconds"] for path in manifests}
+
+
+def start(folder: Path) -> subprocess.Popen[bytes]:
+    with (folder / "log").open("ab") as log:
+        return subprocess.Popen(
+            [sys.executable, "-c", IMPATIENT, *WORDS],
             cwd=folder,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            env=environment(),
             stdout=log,
             stderr=log,
         )
-        try:
-            process.wait(seconds)
-            return False
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
+
+
+def stop_in(stage: str, after_s: float, folder: Path, how: int) -> int | None:
+    """Start the run and send a signal some time after `stage` began. Returns its exit status; 0
+    if it ended before that."""
+    process = start(folder)
+    try:
+        while not (folder / "run" / f".{stage}.partial").exists():
+            if process.poll() is not None:
+                return process.returncode
+            time.sleep(0.005)
+        process.wait(after_s)
+    except subprocess.TimeoutExpired:
+        process.send_signal(how)
+        process.wait(120)
+    finally:
+        if process.poll() is None:
+            process.kill()
             process.wait()
-            return True
+    return process.returncode
 
 
 def test_killed_run_ends_in_the_same_bytes(tmp_path: Path) -> None:
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir()
     broken.mkdir()
-    start = time.monotonic()
     events(splat(*WORDS, folder=whole))
-    whole_s = time.monotonic() - start
+    seconds = stages_by_seconds(whole / "run")
 
-    moments = random.Random(7)
-    finished_before: set[str] = set()
-    for _ in range(KILLS):
-        if not killed_after(moments.uniform(1.0, 0.6 * whole_s), broken):
-            break
-        finished = {path.parent.name for path in broken.glob("run/[1-7]-*/manifest.json")}
-        assert finished >= finished_before, "what was finished stays finished"
-        finished_before = finished
+    draw = random.Random(KILLS)
+    names = list(seconds)  # long stages are hit more often, short ones not never
+    chosen = draw.choices(names, [seconds[n] + 1.0 for n in names], k=KILLS)
+    before: dict[str, int] = {}
+    for stage in sorted(chosen):
+        status = stop_in(stage, draw.uniform(0.0, seconds[stage]), broken, signal.SIGKILL)
+        assert status in (-signal.SIGKILL, 0), (broken / "log").read_text()[-3000:]
+        now = finished(broken / "run")
+        assert before.items() <= now.items(), "what was finished stays finished"
+        before = now
     events(splat(*WORDS, folder=broken))
 
     assert outputs(broken / "run") == outputs(whole / "run")
     assert any(name.endswith(".ply") for name in outputs(whole / "run"))
     left = [path.name for path in (broken / "run").iterdir() if path.name.startswith(".")]
     assert left == [".lock"]
+
+    after_ctrl_c_training_goes_on(whole, seconds["4-train"])
+
+
+def after_ctrl_c_training_goes_on(folder: Path, train_s: float) -> None:
+    """On a run that is finished up to `seed`: Ctrl-C in training, then the same bytes again."""
+    run = folder / "run"
+    wanted = outputs(run)
+    for name in ("4-train", "5-prune", "6-quantise", "7-export"):
+        (run / name).rename(folder / f"was {name}")
+    assert stop_in("4-train", 0.6 * train_s, folder, signal.SIGINT) == 130
+    assert '"go_on"' in (folder / "log").read_text().splitlines()[-1]
+    done = events(splat(*WORDS, folder=folder))
+    assert [e["resumed"] for e in done if e["event"] == "started"] == [True, False, False, False]
+    resumed = next(e for e in done if e["event"] == "finished" and e["stage"] == "train")
+    assert resumed["metrics"]["resumed_from_step"] > 0
+    assert outputs(run) == wanted

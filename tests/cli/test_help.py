@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -39,15 +39,17 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.stderr.strip() == "[]"
 
 
-def test_help_answers_in_half_a_second() -> None:
-    command = [sys.executable, "-c", "from splatcli.app import main; main()", "--help"]
+@pytest.mark.skipif(not hasattr(os, "wait4"), reason="no account of a child's processor time")
+def test_help_takes_less_than_half_a_second() -> None:
+    """Processor time, the least of three: what the clock says depends on who else is working."""
+    code = "from splatcli.app import main; main()"
     times_s = []
-    for _ in range(5):  # the best of a few: other programs share the machine
-        start = time.perf_counter()
-        subprocess.run(command, capture_output=True, check=True, timeout=60)
-        times_s.append(time.perf_counter() - start)
-        if times_s[-1] < 0.5:
-            break
+    for _ in range(3):
+        child = subprocess.Popen([sys.executable, "-c", code, "--help"], stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        assert child.returncode == 0
+        times_s.append(usage.ru_utime + usage.ru_stime)
     assert min(times_s) < 0.5, times_s
 
 

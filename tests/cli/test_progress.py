@@ -1,0 +1,65 @@
+"""Progress as lines: seldom, with pace and figures."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from splatcli import console, progress
+
+STAGE = SimpleNamespace(name="train")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    now = SimpleNamespace(s=100.0)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now.s)
+    return now
+
+
+@pytest.fixture
+def lines(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    said: list[str] = []
+    monkeypatch.setattr(console, "note", lambda text, style="": said.append(text))
+    return said
+
+
+def test_lines_come_at_intervals_with_rate_and_time_left(clock, lines) -> None:
+    listener = progress.Lines()
+    listener.started(STAGE, 4, "has not run yet", False)
+    for step in range(101):
+        clock.s = 100.0 + step * 0.5  # 2 steps a second
+        listener.progressed(STAGE, "training", step, 100, {"splats": 12000, "psnr_db": 20.0})
+    assert lines[:3] == [
+        "4/7 train: runs (has not run yet)",
+        "  training: 0/100, splats 12,000, PSNR 20 dB",
+        "  training: 20/100, 2.0/s, 40.0 s left, splats 12,000, PSNR 20 dB",
+    ]
+    assert len(lines) == 7
+
+
+def test_label_that_names_each_photograph_is_one_phase(clock, lines) -> None:
+    listener = progress.Lines()
+    listener.started(STAGE, 1, "has not run yet", False)
+    for done in range(300):
+        clock.s += 0.01
+        listener.progressed(STAGE, f"IMG_{done}.jpg", done, 300, {})
+    assert len(lines) == 2
+
+
+def test_another_phase_speaks_at_once(clock, lines) -> None:
+    listener = progress.Lines()
+    listener.started(STAGE, 2, "has not run yet", False)
+    for label in ("finding features", "placing photographs"):
+        for done in range(25):
+            listener.progressed(STAGE, label, done, 24, {"photographs": done})
+    assert lines[1:] == ["  finding features: 0/24", "  placing photographs: 0/24"]
+
+
+def test_slow_units_are_seconds_each(clock, lines) -> None:
+    listener = progress.Lines()
+    listener.progressed(STAGE, "matching", 0, 3, {})
+    clock.s += 30
+    listener.progressed(STAGE, "matching", 2, 3, {})
+    assert lines[-1] == "  matching: 2/3, 15.0 s each, 15.0 s left"
