@@ -105,7 +105,8 @@ def show_status(pipeline: Pipeline, steps: list[Step], as_json: bool) -> None:
     busy = pipeline.busy()
     if as_json:
         rows = [
-            {"stage": s.stage.name, "state": _state(s), "reason": s.reason or None} for s in steps
+            {"stage": s.stage.name, "state": _state(s, busy), "reason": s.reason or None}
+            for s in steps
         ]
         console.emit("status", run_folder=str(pipeline.run_folder), busy=busy, stages=rows)
         return
@@ -114,7 +115,7 @@ def show_status(pipeline: Pipeline, steps: list[Step], as_json: bool) -> None:
         [
             (
                 f"{s.number}-{s.stage.name}",
-                _state(s),
+                _state(s, busy),
                 console.duration(s.manifest.seconds) if s.manifest else "-",
                 f"{s.manifest.peak_memory_mib:,.0f} MiB" if s.manifest else "-",
                 s.reason or (headline(s.manifest) if s.manifest else ""),
@@ -127,7 +128,9 @@ def show_status(pipeline: Pipeline, steps: list[Step], as_json: bool) -> None:
         console.out.print(f"\nProcess {busy} is working on it now.")
 
 
-def _state(step: Step) -> str:
+def _state(step: Step, busy: int | None) -> str:
+    if busy and step.interrupted:
+        return "running"
     if not step.will_run:
         return "finished"
     if step.manifest is not None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 from pathlib import Path
 
 import pytest
 
 from stages.run.errors import Interrupted, SplatError
+from stages.run.lock import locked
 
 STAGES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
 
@@ -88,6 +90,19 @@ def test_stop_says_how_to_go_on_and_exits_130(splat, pretend, monkeypatch) -> No
     assert states(splat)["sfm"] == "interrupted"
     del pretend["sfm"]
     assert splat("process").exit_code == 0  # with nothing named: what was asked before
+
+
+def test_status_says_who_is_at_work(splat, pretend) -> None:
+    def stop(inputs, settings, folder, report) -> None:
+        raise Interrupted
+
+    pretend["sfm"] = stop
+    splat("process", "photos")
+    assert states(splat)["sfm"] == "interrupted"
+    with locked(Path("run")):
+        assert states(splat)["sfm"] == "running"
+        assert f"Process {os.getpid()}" in splat("status").stdout
+        assert splat("process", "photos").exit_code == 5
 
 
 def test_preset_gives_the_training_settings(splat) -> None:
