@@ -34,7 +34,7 @@ def test_colours_keep_their_chromaticity(convert, green_xy, red_xy, gamma) -> No
         white = np.array([0.3127 / 0.3290, 1.0, (1 - 0.3127 - 0.3290) / 0.3290])
         return np.array(columns).T * np.linalg.solve(np.array(columns).T, white)
 
-    colours = np.array([[[200, 100, 50], [90, 160, 120], [60, 70, 200]]], np.uint8)
+    colours = np.array([[[200, 100, 50], [130, 160, 120], [60, 70, 200]]], np.uint8)
     value = colours[0] / 255
     linear = value**gamma if gamma else ((value + 0.055) / 1.055) ** 2.4
     ours = np.linalg.inv(to_xyz((0.64, 0.33), (0.30, 0.60))) @ to_xyz(red_xy, green_xy) @ linear.T

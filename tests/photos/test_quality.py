@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from stages.photos.advice import about_capture, listed
-from stages.photos.quality import measure, near_duplicates
 from stages.photos.load import load_image
+from stages.photos.quality import measure, near_duplicates
 from stages.scene import Photo
 from tests.photos.pictures import textured
 
