@@ -223,8 +223,6 @@ class _Checker:
             mine = turned(mine)
         if name == "splat":
             mine = mine.take(splat32.order(mine)).with_sh_degree(0)
-        elif name in ("glb", "gltf"):
-            mine = mine.take(np.argsort(mine.sh_degrees, kind="stable"))
         file = content.splats.with_sh_degree(mine.sh_degree)
 
         def largest(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:

@@ -1,8 +1,7 @@
 """glTF 2.0 with KHR_gaussian_splatting, as .glb or as .gltf with a .bin beside it.
 
 Linear scales and opacities, quaternions x, y, z, w, raw SH, y up: the splats are turned upright.
-One primitive for each SH degree in use, so that splats without view-dependent colour do not pay
-for it. The extension is used but not required: a viewer without it shows coloured points.
+The extension is used but not required: a viewer without it shows coloured points.
 Specification: KHR_gaussian_splatting in the Khronos glTF registry.
 """
 
@@ -12,6 +11,7 @@ import importlib.metadata
 import json
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -40,15 +40,26 @@ _ARRAY_BUFFER = 34962
 _POINTS = 0
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+def write(
+    path: Path, splats: Splats, *, units: str = "arbitrary", split_degrees: bool = False
+) -> int:
     """Write `splats` as `path` (.glb, or .gltf with its .bin); return how many could not be drawn
     and were left out.
 
     Positions stay relative to `splats.origin`, which float32 could not hold; asset.extras says it
-    in the file's axes. Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
+    in the file's axes.
+
+    split_degrees: one primitive for each SH degree in use, so that splats without view-dependent
+    colour do not pay for it. Smaller, but three.js 0.187 and Babylon.js 9.28 sort and draw each
+    primitive by itself, so that splats of different degrees are blended in the wrong order.
+
+    Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
     """
     path = Path(path)
     splats, dropped = kept_rows(splats)
+    if not split_degrees:
+        highest = int(splats.sh_degrees.max(initial=0))
+        splats = replace(splats, sh_degrees=np.full(len(splats), highest, np.uint8))
     attributes = list(_primitives(turned(splats)))
     document, arrays = _document(attributes, splats, units)
     size = sum(array.nbytes for array in arrays)

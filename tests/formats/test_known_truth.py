@@ -16,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stages import formats
+from stages.formats import gltf
 from stages.formats.verify import read_back
 from tests.formats.truth import (
     C0,
@@ -165,9 +166,23 @@ def test_glb_attributes_are_linear_upright_and_in_the_extensions_order(tmp_path:
     assert described["min"] == described["max"] == [1, -2, -3]
 
 
-def test_glb_splats_without_view_dependence_store_none(tmp_path: Path) -> None:
+def test_glb_is_one_primitive_of_the_highest_degree_in_use(tmp_path: Path) -> None:
+    """Viewers sort each primitive by itself: splats that overlap must share one."""
     splats = many_splats()
-    formats.write(tmp_path / "a.glb", splats)
+    formats.write(tmp_path / "a.glb", splats.take(splats.sh_degrees < 3))
+    document, _ = glb_parts(tmp_path / "a.glb")
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == 9
+
+
+def test_glb_split_by_degree_stores_no_bands_that_are_not_used(tmp_path: Path) -> None:
+    splats = many_splats()
+    gltf.write(tmp_path / "a.glb", splats, split_degrees=True)
+    back = formats.read(tmp_path / "a.glb")
+    order = np.argsort(splats.sh_degrees, kind="stable")
+    np.testing.assert_array_equal(back.sh, splats.sh[order])
+    np.testing.assert_array_equal(back.means, splats.means[order])
+    assert len(read_back(tmp_path / "a.glb").splats) == len(splats)
     document, _ = glb_parts(tmp_path / "a.glb")
     primitives = document["meshes"][0]["primitives"]
     counts = [sum("SH_DEGREE" in name for name in p["attributes"]) for p in primitives]
