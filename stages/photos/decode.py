@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import threading
 import warnings
 from collections.abc import Iterator
@@ -88,7 +89,10 @@ def readers_set_up() -> Iterator[None]:
     """
     Image.init()
     pillow_heif.register_heif_opener()
+    logging.getLogger("PIL").addHandler(logging.NullHandler())  # else errors go to the terminal
     before = Image.MAX_IMAGE_PIXELS, ImageFile.LOAD_TRUNCATED_IMAGES
+    log_level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     Image.MAX_IMAGE_PIXELS, ImageFile.LOAD_TRUNCATED_IMAGES = None, False
     try:
         with warnings.catch_warnings():
@@ -96,6 +100,7 @@ def readers_set_up() -> Iterator[None]:
             yield
     finally:
         Image.MAX_IMAGE_PIXELS, ImageFile.LOAD_TRUNCATED_IMAGES = before
+        cv2.utils.logging.setLogLevel(log_level)
 
 
 def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
@@ -149,8 +154,7 @@ def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
     if image.format == "HEIF":
         exif = replace(exif, orientation=1)  # the decoder has turned the pixels already
     native_mode = image.mode
-    shown, alpha = _without_alpha(_loaded(image, data))
-    shown = _resized(shown, size, stored)
+    shown, alpha = _without_alpha(_resized(_plain_mode(_loaded(image, data)), size, stored))
     shown, converted, bad_profile = _in_srgb(shown, info.get("icc_profile"))
     upright = exif.orientation == 1
     if not upright:
@@ -214,17 +218,22 @@ def _to_8_bit(samples: NDArray[Any]) -> NDArray[np.uint8]:
     return ((samples.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
+def _plain_mode(image: Image.Image) -> Image.Image:
+    """The picture as RGB, L, CMYK, RGBA or LA."""
+    if image.mode in ("PA", "RGBa", "La") or "transparency" in image.info:
+        return image.convert("RGBA")
+    return image if image.mode in ("RGB", "L", "CMYK", "RGBA", "LA") else image.convert("RGB")
+
+
 def _without_alpha(image: Image.Image) -> tuple[Image.Image, bool]:
     """(the picture over white where it is transparent, whether it is anywhere)."""
-    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
-        layered = image.convert("RGBA")
-        if layered.getchannel("A").getextrema() != (255, 255):
-            white = Image.new("RGBA", image.size, (255, 255, 255, 255))
-            return Image.alpha_composite(white, layered).convert("RGB"), True
+    if image.mode not in ("RGBA", "LA"):
+        return image, False
+    layered = image.convert("RGBA")
+    if layered.getchannel("A").getextrema() == (255, 255):
         return layered.convert("RGB"), False
-    if image.mode not in ("RGB", "L", "CMYK"):
-        return image.convert("RGB"), False
-    return image, False
+    white = Image.new("RGBA", image.size, (255, 255, 255, 255))
+    return Image.alpha_composite(white, layered).convert("RGB"), True
 
 
 def _resized(image: Image.Image, size: tuple[int, int], stored: tuple[int, int]) -> Image.Image:
@@ -247,6 +256,8 @@ def _in_srgb(image: Image.Image, profile: bytes | None) -> tuple[Image.Image, bo
 
 
 def _what_it_is(data: bytes) -> str:
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return "it is damaged, or a TIFF with other samples than integers of 8 or 16 bits"
     if data[:6] in (b"GIF87a", b"GIF89a"):
         return "it is a GIF"
     if data[:64].isascii() and b"\0" not in data[:64]:
