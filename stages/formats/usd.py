@@ -112,7 +112,7 @@ def _export(layer: Any, path: Path) -> None:
     try:
         done = layer.Export(str(path))
     except Tf.ErrorException as error:
-        raise OSError(" ".join(str(error).split())[:160]) from error
+        raise OSError("the USD library could not write it") from error
     if not done:
         raise OSError("the USD library could not write it")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -38,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def _refused(path: Path, error: OSError) -> SplatError:
     reason = error.strerror or str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or (error.errno is None and _is_full(path)):
         return SplatError(
             "disk-full",
             given=f"{path} could not be written: {reason}.",
@@ -53,3 +54,11 @@ def _refused(path: Path, error: OSError) -> SplatError:
         hint="Check the folder's permissions, or choose another one.",
         family=Family.RESOURCES,
     )
+
+
+def _is_full(path: Path) -> bool:
+    """NumPy and the USD library do not say why a write failed: look."""
+    try:
+        return shutil.disk_usage(path.parent).free < 1 << 20
+    except OSError:
+        return False
