@@ -18,7 +18,8 @@ class Figures:
     """What is known of one reconstruction.
 
     photographs: given; registered: in the largest model; models: sizes of all models found.
-    mean_reprojection_error_px: over observations; long_side_px: of the photographs.
+    mean_reprojection_error_px: over points, of each point's mean, as COLMAP counts it;
+    long_side_px: of the photographs.
     median_triangulation_angle_deg: over points, of the widest angle between two of its rays.
     baseline_over_depth: spread of the cameras over distance to the points.
     weak_photographs: registered with fewer than 30 points in view.

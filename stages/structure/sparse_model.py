@@ -228,7 +228,7 @@ def measure(result: MappingResult, photographs: int, mapper: str) -> Figures:
         )
     sample = np.arange(0, len(model.points), max(1, len(model.points) // _SAMPLED_POINTS))
     angles = triangulation_angles(model, sample)
-    errors = reprojection_errors(model)
+    errors = point_errors(model)
     seen = np.bincount(model.observing_views, minlength=len(model.names))
     turned = rotation_disagreements(model)
     return Figures(
