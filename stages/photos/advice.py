@@ -158,7 +158,9 @@ def _about_cameras(photos: Sequence[Photo], warn: Warn) -> None:
     """Photo.camera is "name, 4.4 mm, 26 mm equivalent, 1600x1200"."""
     names = Counter(photo.camera.split(", ")[0] for photo in photos)
     lenses = Counter(", ".join(photo.camera.split(", ")[1:-1]) for photo in photos)
-    sizes = Counter(tuple(sorted((photo.width, photo.height))) for photo in photos)
+    sizes = Counter(
+        (max(photo.width, photo.height), min(photo.width, photo.height)) for photo in photos
+    )
     if len(names) > 1:
         warn(
             "ingest-mixed-cameras",

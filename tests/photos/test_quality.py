@@ -81,7 +81,7 @@ def test_a_good_capture_gets_no_advice() -> None:
         ({"log2_luminance": -8.0}, "ingest-dark", "99.jpg"),
         ({"camera": "Other Y, 5.0 mm, 1600x1200"}, "ingest-mixed-cameras", "1 x Other Y"),
         ({"camera": "Maker X, 9.0 mm, 1600x1200"}, "ingest-mixed-zooms", "1 x 9.0 mm"),
-        ({"width": 1000}, "ingest-mixed-sizes", "1 x 1000 x 1200"),
+        ({"width": 1000}, "ingest-mixed-sizes", "1 x 1200 x 1000"),
         ({"width": 600, "height": 450}, "ingest-small", "99.jpg"),
     ],
 )
