@@ -103,8 +103,8 @@ def run(
     for name in ("psnr_raw_db", "psnr_kept_db", "psnr_splat32_db", "sh_degree"):
         report.metric(name, decisions[name])
     report.metric("splats_by_sh_degree", counts)
-    report.metric("raw_mib", round(_bytes(splats.sh_degrees) / 2**20, 3))
-    report.metric("kept_mib", round(_bytes(kept.sh_degrees) / 2**20, 3))
+    report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
+    report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("measured_on", judge.what)
     save_splats(folder, kept)
     (folder / _DECISIONS).write_text(json.dumps(decisions, indent=1) + "\n", encoding="utf-8")
@@ -132,10 +132,10 @@ def _cut_each(
     return kept, kept_db, 0.0
 
 
-def _bytes(degrees: NDArray[np.uint8]) -> int:
-    """Of all splats as float32, each with the bands that it uses (and 11 numbers besides)."""
-    coefficients = (degrees.astype(int) + 1) ** 2
-    return int(4 * (11 * len(degrees) + 3 * coefficients.sum()))
+def _bytes(splats: Splats) -> int:
+    """As float32 with the same bands for all, which is what most formats hold (and 11 numbers
+    besides); each splat's own degree only helps formats that compress zeros away."""
+    return 4 * len(splats) * (11 + 3 * splats.sh.shape[1])
 
 
 @dataclass
