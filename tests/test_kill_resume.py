@@ -58,12 +58,12 @@ def start(folder: Path) -> subprocess.Popen[bytes]:
         )
 
 
-def stop_in(stage: str, after_s: float, folder: Path, how: int) -> int | None:
-    """Start the run and send a signal some time after `stage` began. Returns its exit status; 0
-    if it ended before that."""
+def stop_in(sign: str, after_s: float, folder: Path, how: int) -> int | None:
+    """Start the run and send a signal some time after the file or folder `sign` appeared in the
+    run folder. Returns its exit status; 0 if it ended before that."""
     process = start(folder)
     try:
-        while not (folder / "run" / f".{stage}.partial").exists():
+        while not (folder / "run" / sign).exists():
             if process.poll() is not None:
                 return process.returncode
             time.sleep(0.005)
@@ -90,7 +90,8 @@ def test_killed_run_ends_in_the_same_bytes(tmp_path: Path) -> None:
     chosen = draw.choices(names, [seconds[n] + 1.0 for n in names], k=KILLS)
     before: dict[str, int] = {}
     for stage in sorted(chosen):
-        status = stop_in(stage, draw.uniform(0.0, seconds[stage]), broken, signal.SIGKILL)
+        moment = draw.uniform(0.0, seconds[stage])
+        status = stop_in(f".{stage}.partial", moment, broken, signal.SIGKILL)
         assert status in (-signal.SIGKILL, 0), (broken / "log").read_text()[-3000:]
         now = finished(broken / "run")
         assert before.items() <= now.items(), "what was finished stays finished"
@@ -102,16 +103,16 @@ def test_killed_run_ends_in_the_same_bytes(tmp_path: Path) -> None:
     left = [path.name for path in (broken / "run").iterdir() if path.name.startswith(".")]
     assert left == [".lock"]
 
-    after_ctrl_c_training_goes_on(whole, seconds["4-train"])
+    after_ctrl_c_training_goes_on(whole)
 
 
-def after_ctrl_c_training_goes_on(folder: Path, train_s: float) -> None:
+def after_ctrl_c_training_goes_on(folder: Path) -> None:
     """On a run that is finished up to `seed`: Ctrl-C in training, then the same bytes again."""
     run = folder / "run"
     wanted = outputs(run)
     for name in ("4-train", "5-prune", "6-quantise", "7-export"):
         (run / name).rename(folder / f"was {name}")
-    assert stop_in("4-train", 0.6 * train_s, folder, signal.SIGINT) == 130
+    assert stop_in(".4-train.partial/checkpoint.bin", 0.0, folder, signal.SIGINT) == 130
     assert '"go_on"' in (folder / "log").read_text().splitlines()[-1]
     done = events(splat(*WORDS, folder=folder))
     assert [e["resumed"] for e in done if e["event"] == "started"] == [True, False, False, False]
