@@ -17,8 +17,9 @@ _HEADLINES = {
     "sfm": ("registered", "photographs", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
     "train": ("splats", "psnr_db", "ssim"),
-    "prune": ("splats", "floaters_removed", "psnr_db"),
-    "quantise": ("sh_degree", "psnr_kept_db", "kept_mib"),
+    # Later stages measure at sizes of their own: their PSNR is no sequel of training's.
+    "prune": ("splats", "floaters_removed", "psnr_change_db"),
+    "quantise": ("sh_degree", "kept_mib"),
     "export": ("files", "splats"),
 }
 
@@ -58,6 +59,8 @@ def headline(manifest: Manifest) -> str:
     """The figures of one stage that matter most."""
     names = _HEADLINES.get(manifest.stage, ())
     chosen = {n: manifest.metrics[n] for n in names if n in manifest.metrics}
+    if "psnr_db" in chosen:  # always of photographs that training did not see
+        chosen = {("held_out_psnr_db" if n == "psnr_db" else n): v for n, v in chosen.items()}
     counts = {n: len(v) if isinstance(v, (list, dict)) else v for n, v in chosen.items()}
     return console.figures(counts)
 
