@@ -39,6 +39,10 @@ class SeedSettings:
         default=False,
         metadata={"help": "Also start splats at points that look misplaced or far away."},
     )
+    fill: bool = field(
+        default=True,
+        metadata={"help": "Also start splats where photographs show a surface without points."},
+    )
 
 
 def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report: Report) -> Splats:
@@ -64,23 +68,47 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     if len(points) < _FEWEST_SPLATS:
         raise _too_few(len(points), len(reconstruction.points))
     scales, clamped = _scales(points, reconstruction)
+    colours = reconstruction.colours[keep].astype(np.float64) / 255.0
+    report.metric("median_scale", float(np.median(scales)))
+    report.metric("scales_clamped", clamped)
+    if settings.fill:
+        points, colours, scales = _filled(reconstruction, points, colours, scales, report)
     report.progress(1, 1, "seeding", splats=len(points))
     splats = Splats(
         means=points.astype(np.float32),
         quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
         log_scales=np.repeat(np.log(scales)[:, None], 3, axis=1).astype(np.float32),
         opacity_logits=np.full(len(points), logit(OPACITY), np.float32),
-        sh=rgb_to_dc(reconstruction.colours[keep].astype(np.float64) / 255.0)[:, None, :].astype(
-            np.float32
-        ),
+        sh=rgb_to_dc(colours)[:, None, :].astype(np.float32),
         sh_degrees=np.zeros(len(points), np.uint8),
         origin=reconstruction.origin.copy(),
     )
     save_splats(folder, splats)
     report.metric("splats", len(splats))
-    report.metric("median_scale", float(np.median(scales)))
-    report.metric("scales_clamped", clamped)
     return splats
+
+
+def _filled(
+    reconstruction: Reconstruction,
+    points: NDArray[np.float64],
+    colours: NDArray[np.float64],
+    scales: NDArray[np.float64],
+    report: Report,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """With what `coverage` adds. Held-out photographs lend no colours: they are the judges."""
+    import numpy as np
+
+    from stages.scene import split_held_out
+    from stages.structure.coverage import fill_cells
+
+    training, _ = split_held_out(reconstruction.views)
+    more, more_colours, more_scales = fill_cells(reconstruction.folder, training, points)
+    report.metric("filled", len(more))
+    return (
+        np.concatenate([points, more]),
+        np.concatenate([colours, more_colours]),
+        np.concatenate([scales, more_scales]),
+    )
 
 
 def load(folder: Path) -> Splats:

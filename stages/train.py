@@ -56,7 +56,7 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     check(settings)
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
-    trainer = make_trainer(reconstruction, settings, folder, report)
+    trainer = make_trainer(reconstruction, len(start), settings, folder, report)
     report.metric("backend", "reference" if trainer.use_reference else "cpu")
     report.metric("splat_cap", trainer.cap)
     report.metric("train_photographs", len(trainer.train))
@@ -110,7 +110,11 @@ def check(settings: TrainSettings) -> None:
 
 
 def make_trainer(
-    reconstruction: Reconstruction, settings: TrainSettings, folder: Path, report: Report
+    reconstruction: Reconstruction,
+    n_start: int,
+    settings: TrainSettings,
+    folder: Path,
+    report: Report,
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
     from stages.run.memory import available_mib
@@ -141,6 +145,7 @@ def make_trainer(
             extent=scene_extent(reconstruction.views),
             sh_degree=settings.sh_degree,
             n_views=len(train),
+            n_start=n_start,
             seed=settings.seed,
         ),
         train=train,

@@ -86,12 +86,12 @@ def gradients(backend, scene, view, v_image, settings=None):
     for name in ("gradients", "out"):
         rasteriser.buffers.get(name, (4_000_000,), np.float32)[:] = np.nan
     planar = np.ascontiguousarray(np.asarray(v_image, np.float32).transpose(2, 0, 1))
-    rows = rasteriser.backward(arrays, forward, planar)
+    rows = rasteriser.backward(arrays, forward, planar).parameters
     full = np.zeros((len(scene), rows.shape[1]))
     full[forward.visible] = rows
-    bands = (rows.shape[1] - 13) // 3
+    bands = (forward.degree + 1) ** 2
     sh = np.zeros(scene.sh.shape)
-    sh[:, :bands] = full[:, 13:].reshape(len(scene), bands, 3)
+    sh[:, :bands] = full[:, 11 : 11 + 3 * bands].reshape(len(scene), bands, 3)
     return {
         "means": full[:, 0:3],
         "quaternions": full[:, 3:7],

@@ -127,13 +127,13 @@ def _span(low, high, along, across, cov, det, reach2):
 
 
 @kernel
-def _ellipse(record):
+def _ellipse(geometry, rank):
     """(cov_xx, cov_xy, cov_yy, det, squared reach in sigmas) of a geometry record."""
-    major = max(record[GVX], record[GVY])
-    det = 0.5 * major / record[GB]
+    major = max(geometry[rank, GVX], geometry[rank, GVY])
+    det = 0.5 * major / geometry[rank, GB]
     # a hair more, so that rounding never takes a pixel that the blending would draw
-    reach2 = 2.0 * math.log(max(record[GO] / ALPHA_MIN, 1.0)) * 1.00001 + 1e-5
-    return record[GVX], record[GK] * major, record[GVY], det, reach2
+    reach2 = 2.0 * math.log(max(geometry[rank, GO] / ALPHA_MIN, 1.0)) * 1.00001 + 1e-5
+    return geometry[rank, GVX], geometry[rank, GK] * major, geometry[rank, GVY], det, reach2
 
 
 @kernel
@@ -154,16 +154,17 @@ def count_tiles(ticket, geometry, n_visible, width, height, tile_counts, splat_t
         if chunk >= CHUNKS:
             break
         for rank in range(chunk * size, min((chunk + 1) * size, n_visible)):
-            record = geometry[rank]
-            a, b, c, det, reach2 = _ellipse(record)
+            a, b, c, det, reach2 = _ellipse(geometry, rank)
             y_reach = math.sqrt(reach2 * c)
-            y0, y1 = _pixel_range(record[GY] - y_reach, record[GY] + y_reach, height)
+            y0, y1 = _pixel_range(
+                geometry[rank, GY] - y_reach, geometry[rank, GY] + y_reach, height
+            )
             found = 0
             for tile_y in range(y0 // TILE, y1 // TILE + 1 if y1 >= y0 else 0):
-                low = max(tile_y * TILE, y0) + 0.5 - record[GY]
-                high = min(tile_y * TILE + TILE - 1, y1) + 0.5 - record[GY]
+                low = max(tile_y * TILE, y0) + 0.5 - geometry[rank, GY]
+                high = min(tile_y * TILE + TILE - 1, y1) + 0.5 - geometry[rank, GY]
                 left, right = _span(low, high, a, c, b, det, reach2)
-                x0, x1 = _pixel_range(record[GX] + left, record[GX] + right, width)
+                x0, x1 = _pixel_range(geometry[rank, GX] + left, geometry[rank, GX] + right, width)
                 if x1 >= x0 and right >= left:
                     for tile_x in range(x0 // TILE, x1 // TILE + 1):
                         tile_counts[chunk, tile_y * tiles_x + tile_x] += 1
@@ -208,22 +209,25 @@ def fill_tiles(
         if chunk >= CHUNKS:
             break
         for rank in range(chunk * size, min((chunk + 1) * size, n_visible)):
-            record = geometry[rank]
-            a, b, c, det, reach2 = _ellipse(record)
+            a, b, c, det, reach2 = _ellipse(geometry, rank)
             y_reach = math.sqrt(reach2 * c)
-            y0, y1 = _pixel_range(record[GY] - y_reach, record[GY] + y_reach, height)
+            y0, y1 = _pixel_range(
+                geometry[rank, GY] - y_reach, geometry[rank, GY] + y_reach, height
+            )
             slot = slot_starts[rank]
             for tile_y in range(y0 // TILE, y1 // TILE + 1 if y1 >= y0 else 0):
-                low = max(tile_y * TILE, y0) + 0.5 - record[GY]
-                high = min(tile_y * TILE + TILE - 1, y1) + 0.5 - record[GY]
+                low = max(tile_y * TILE, y0) + 0.5 - geometry[rank, GY]
+                high = min(tile_y * TILE + TILE - 1, y1) + 0.5 - geometry[rank, GY]
                 left, right = _span(low, high, a, c, b, det, reach2)
-                x0, x1 = _pixel_range(record[GX] + left, record[GX] + right, width)
+                x0, x1 = _pixel_range(geometry[rank, GX] + left, geometry[rank, GX] + right, width)
                 if x1 < x0 or right < left:
                     continue
                 for tile_x in range(x0 // TILE, x1 // TILE + 1):
-                    west = tile_x * TILE + 0.5 - record[GX]
+                    west = tile_x * TILE + 0.5 - geometry[rank, GX]
                     end, top = _span(west, west + TILE - 1, c, a, b, det, reach2)
-                    r0, r1 = _pixel_range(record[GY] + end, record[GY] + top, height)
+                    r0, r1 = _pixel_range(
+                        geometry[rank, GY] + end, geometry[rank, GY] + top, height
+                    )
                     first = max(r0 - tile_y * TILE, 0)
                     last = min(r1 - tile_y * TILE, TILE - 1)
                     tile = tile_y * tiles_x + tile_x

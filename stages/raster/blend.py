@@ -34,6 +34,9 @@ from stages.raster.simd import (
 )
 
 PIXELS = TILE * TILE
+# Planes of a tile's work row, and of the gradient's.
+LIGHT, RED, GREEN, BLUE, DEPTH, LAST = (k * PIXELS for k in range(6))
+V_RED, V_GREEN, V_BLUE, PASSING, BEHIND = (k * PIXELS for k in range(5))
 GRADIENTS = 9  # mean along the major axis, along the minor, A, B, K, opacity, red, green, blue
 _LOG2E = 1.4426950408889634
 _F = np.float32
@@ -42,19 +45,27 @@ _CUT = _F(80.0)  # exponents beyond it (alpha 2e-35) would leave the range of `v
 
 
 @kernel
-def tile_frame(record, tile_x, tile_y):
-    """The record around the tile's first pixel centre.
+def tile_frame(geometry, rank, tile_x, tile_y):
+    """The record of a rank around the tile's first pixel centre.
 
     Returns (wide, A, B, K, opacity, u, m): wide, whether the major axis is x; u: offset of the
     first pixel along the major axis; m: offset across less K u.
     """
-    dx = tile_x * TILE + 0.5 - record[GX]
-    dy = tile_y * TILE + 0.5 - record[GY]
-    k = record[GK]
-    wide = record[GVX] >= record[GVY]
+    dx = tile_x * TILE + 0.5 - geometry[rank, GX]
+    dy = tile_y * TILE + 0.5 - geometry[rank, GY]
+    k = geometry[rank, GK]
+    wide = geometry[rank, GVX] >= geometry[rank, GVY]
     u = dx if wide else dy
     m = dy - k * dx if wide else dx - k * dy
-    return wide, _F(record[GA]), _F(record[GB]), _F(k), _F(record[GO]), _F(u), _F(m)
+    return (
+        wide,
+        _F(geometry[rank, GA]),
+        _F(geometry[rank, GB]),
+        _F(k),
+        _F(geometry[rank, GO]),
+        _F(u),
+        _F(m),
+    )
 
 
 @kernel
@@ -96,26 +107,28 @@ def start_light(light, tile_x, tile_y, width, height):
 
 
 @kernel
-def _brightest(light):
-    most = vload(light, 0)
+def _light_is_left(work):
+    most = vload(work, 0)
     for j in range(1, TILE):
-        most = vmax(most, vload(light, j * TILE))
+        most = vmax(most, vload(work, j * TILE))
     return vany(vge(most, splat16(_T_MIN)))
 
 
 @kernel
 def blend_tile(tile_x, tile_y, start, end, ranks, rows, geometry, paint, work):
-    """Blend entries start..end into work[6, 256]: light, red, green, blue, depth, last entry.
+    """Blend entries start..end into work[6 x 256]: light, red, green, blue, depth, last entry.
+
+    Rows of arrays are reached by index, never sliced: a slice counts references, and threads would
+    fight over the counter.
 
     paint [visible, 4] float32: red, green, blue, depth of each splat.
     """
-    light, red, green, blue, depth, last = work[0], work[1], work[2], work[3], work[4], work[5]
     zero = splat16(_F(0.0))
     for entry in range(start, end):
-        if (entry - start) % 16 == 15 and not _brightest(light):
+        if (entry - start) % 16 == 15 and not _light_is_left(work):
             break
         rank = ranks[entry]
-        wide, a, b, k, opacity, u, m = tile_frame(geometry[rank], tile_x, tile_y)
+        wide, a, b, k, opacity, u, m = tile_frame(geometry, rank, tile_x, tile_y)
         _, columns_q, columns_m = column_parts(wide, a, k, u, m)
         number = splat16(_F(entry - start + 1))
         r, g = splat16(paint[rank, 0]), splat16(paint[rank, 1])
@@ -124,17 +137,17 @@ def blend_tile(tile_x, tile_y, start, end, ranks, rows, geometry, paint, work):
             at = j * TILE
             _, row_q, row_m = row_parts(wide, a, k, u, j)
             alpha, _, _ = alpha_row(b, opacity, columns_q, columns_m, row_q, row_m)
-            passing = vload(light, at)
+            passing = vload(work, LIGHT + at)
             drawn = vand(vge(alpha, splat16(_ALPHA_MIN)), vge(passing, splat16(_T_MIN)))
             if vany(drawn):
                 alpha = vselect(drawn, vmin(alpha, splat16(_ALPHA_MAX)), zero)
                 weight = alpha * passing
-                vstore(light, at, passing * (splat16(_F(1.0)) - alpha))
-                vstore(red, at, vfma(weight, r, vload(red, at)))
-                vstore(green, at, vfma(weight, g, vload(green, at)))
-                vstore(blue, at, vfma(weight, bl, vload(blue, at)))
-                vstore(depth, at, vfma(weight, z, vload(depth, at)))
-                vstore(last, at, vselect(drawn, number, vload(last, at)))
+                vstore(work, LIGHT + at, passing * (splat16(_F(1.0)) - alpha))
+                vstore(work, RED + at, vfma(weight, r, vload(work, RED + at)))
+                vstore(work, GREEN + at, vfma(weight, g, vload(work, GREEN + at)))
+                vstore(work, BLUE + at, vfma(weight, bl, vload(work, BLUE + at)))
+                vstore(work, DEPTH + at, vfma(weight, z, vload(work, DEPTH + at)))
+                vstore(work, LAST + at, vselect(drawn, number, vload(work, LAST + at)))
 
 
 @kernel
@@ -148,28 +161,29 @@ def blend_tiles(
     """
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
-    work = np.empty((6, PIXELS), np.float32)
+    work = np.empty(6 * PIXELS, np.float32)
     while True:
         tile = take_ticket(ticket)
         if tile >= tiles_x * tiles_y:
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        work[1:] = 0.0
-        start_light(work[0], tile_x, tile_y, width, height)
+        work[:] = 0.0
+        start_light(work, tile_x, tile_y, width, height)
         start, end = tile_starts[tile], tile_starts[tile + 1]
         blend_tile(tile_x, tile_y, start, end, ranks, rows, geometry, paint, work)
-        light[tile] = work[0]
-        last[tile] = work[5]
+        for at in range(PIXELS):
+            light[tile, at] = work[LIGHT + at]
+            last[tile, at] = work[LAST + at]
         for j in range(min(TILE, height - tile_y * TILE)):
             y = tile_y * TILE + j
             for i in range(min(TILE, width - tile_x * TILE)):
                 x, at = tile_x * TILE + i, j * TILE + i
-                passed = work[0, at]
-                image[0, y, x] = work[1, at] + passed * background[0]
-                image[1, y, x] = work[2, at] + passed * background[1]
-                image[2, y, x] = work[3, at] + passed * background[2]
+                passed = work[LIGHT + at]
+                image[0, y, x] = work[RED + at] + passed * background[0]
+                image[1, y, x] = work[GREEN + at] + passed * background[1]
+                image[2, y, x] = work[BLUE + at] + passed * background[2]
                 image[3, y, x] = _F(1.0) - passed
-                image[4, y, x] = work[4, at] / max(_F(1.0) - passed, _F(0.5) * _ALPHA_MIN)
+                image[4, y, x] = work[DEPTH + at] / max(_F(1.0) - passed, _F(0.5) * _ALPHA_MIN)
 
 
 @kernel
@@ -192,59 +206,71 @@ def blend_gradient_tiles(
     """gradients [intersections, 9] at each entry's slot, from v_image [3, H, W]."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
-    v = np.empty((3, PIXELS), np.float32)
-    passing = np.empty(PIXELS, np.float32)
-    behind = np.empty(PIXELS, np.float32)
+    work = np.empty(5 * PIXELS, np.float32)
     while True:
         tile = take_ticket(ticket)
         if tile >= tiles_x * tiles_y:
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        v[:] = 0.0
+        work[:] = 0.0
         furthest = _F(0.0)
         for j in range(min(TILE, height - tile_y * TILE)):
+            y = tile_y * TILE + j
             for i in range(min(TILE, width - tile_x * TILE)):
-                at = j * TILE + i
-                for channel in range(3):
-                    v[channel, at] = v_image[channel, tile_y * TILE + j, tile_x * TILE + i]
+                x, at = tile_x * TILE + i, j * TILE + i
+                vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
+                passed = light[tile, at]
+                work[V_RED + at], work[V_GREEN + at], work[V_BLUE + at] = vr, vg, vb
+                work[PASSING + at] = passed
+                work[BEHIND + at] = passed * (
+                    vr * background[0] + vg * background[1] + vb * background[2]
+                )
                 furthest = max(furthest, last[tile, at])
-        for at in range(PIXELS):
-            passing[at] = light[tile, at]
-            behind[at] = light[tile, at] * (
-                v[0, at] * background[0] + v[1, at] * background[1] + v[2, at] * background[2]
-            )
         start, end = tile_starts[tile], tile_starts[tile + 1]
         drawn_end = start + np.int64(furthest)
         for entry in range(drawn_end, end):
-            gradients[slots[entry]] = 0.0
+            for k in range(GRADIENTS):
+                gradients[slots[entry], k] = 0.0
         for entry in range(drawn_end - 1, start - 1, -1):
             entry_gradient(
                 tile_x,
                 tile_y,
                 _F(entry - start + 1),
                 rows[entry],
-                geometry[ranks[entry]],
-                paint[ranks[entry]],
-                v,
-                passing,
-                behind,
-                last[tile],
-                gradients[slots[entry]],
+                geometry,
+                paint,
+                ranks[entry],
+                work,
+                last,
+                tile * PIXELS,
+                gradients,
+                slots[entry],
             )
 
 
 @kernel
 def entry_gradient(
-    tile_x, tile_y, number, row_range, record, colour, v, passing, behind, last, out
+    tile_x,
+    tile_y,
+    number,
+    row_range,
+    geometry,
+    paint,
+    rank,
+    work,
+    last,
+    last_at,
+    gradients,
+    slot,
 ):
-    """Gradient of one splat in one tile into out[9]; moves `passing` and `behind` in front of it.
+    """Gradient of one splat in one tile into gradients[slot, :9].
 
-    behind: per pixel, what lies behind, weighted by the incoming gradient (a suffix sum).
+    work [5 x 256]: the incoming gradient, the light that passes behind the splat, and what lies
+    behind weighted by the incoming gradient (a suffix sum). The last two move in front of it.
     """
-    wide, a, b, k, opacity, u, m = tile_frame(record, tile_x, tile_y)
+    wide, a, b, k, opacity, u, m = tile_frame(geometry, rank, tile_x, tile_y)
     columns_u, columns_q, columns_m = column_parts(wide, a, k, u, m)
-    red, green, blue = v[0], v[1], v[2]
-    r, g, bl = splat16(colour[0]), splat16(colour[1]), splat16(colour[2])
+    r, g, bl = splat16(paint[rank, 0]), splat16(paint[rank, 1]), splat16(paint[rank, 2])
     zero, one = splat16(_F(0.0)), splat16(_F(1.0))
     s_u, s_uu, s_t, s_tt, s_ut = zero, zero, zero, zero, zero
     s_o, s_r, s_g, s_b = zero, zero, zero, zero
@@ -252,21 +278,21 @@ def entry_gradient(
         at = j * TILE
         row_u, row_q, row_m = row_parts(wide, a, k, u, j)
         raw, falloff, across = alpha_row(b, opacity, columns_q, columns_m, row_q, row_m)
-        drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, at), splat16(number)))
+        drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, last_at + at), splat16(number)))
         if not vany(drawn):
             continue
         alpha = vselect(drawn, vmin(raw, splat16(_ALPHA_MAX)), zero)
         inverse = one / (one - alpha)
-        before = vload(passing, at) * inverse
-        vstore(passing, at, before)
+        before = vload(work, PASSING + at) * inverse
+        vstore(work, PASSING + at, before)
         weight = alpha * before
-        vr, vg, vb = vload(red, at), vload(green, at), vload(blue, at)
+        vr, vg, vb = vload(work, V_RED + at), vload(work, V_GREEN + at), vload(work, V_BLUE + at)
         s_r = vfma(weight, vr, s_r)
         s_g = vfma(weight, vg, s_g)
         s_b = vfma(weight, vb, s_b)
         shade = vfma(vr, r, vfma(vg, g, vb * bl))
-        after = vload(behind, at)
-        vstore(behind, at, vfma(weight, shade, after))
+        after = vload(work, BEHIND + at)
+        vstore(work, BEHIND + at, vfma(weight, shade, after))
         v_alpha = before * shade - after * inverse
         free = vand(drawn, vgt(splat16(_ALPHA_MAX), raw))  # the cap passes nothing on
         v_alpha = vselect(free, v_alpha, zero)
@@ -280,10 +306,11 @@ def entry_gradient(
         s_tt = vfma(by_t, across, s_tt)
         s_ut = vfma(by_t, us, s_ut)
     t_sum = vsum(s_t)
-    out[0] = _F(2.0) * (b * k * t_sum - a * vsum(s_u))
-    out[1] = _F(-2.0) * b * t_sum
-    out[2] = vsum(s_uu)
-    out[3] = vsum(s_tt)
-    out[4] = _F(-2.0) * b * vsum(s_ut)
-    out[5] = vsum(s_o)
-    out[6], out[7], out[8] = vsum(s_r), vsum(s_g), vsum(s_b)
+    gradients[slot, 0] = _F(2.0) * (b * k * t_sum - a * vsum(s_u))
+    gradients[slot, 1] = _F(-2.0) * b * t_sum
+    gradients[slot, 2] = vsum(s_uu)
+    gradients[slot, 3] = vsum(s_tt)
+    gradients[slot, 4] = _F(-2.0) * b * vsum(s_ut)
+    gradients[slot, 5] = vsum(s_o)
+    gradients[slot, 6], gradients[slot, 7] = vsum(s_r), vsum(s_g)
+    gradients[slot, 8] = vsum(s_b)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster import binning, blend
+from stages.raster import binning, blend, contributions
 from stages.raster.api import RasterSettings, Rendering
 from stages.raster.pool import Pool, default_pool
 from stages.raster.projection import CAMERA_ROW, GEOMETRY_ROW, camera_row
@@ -56,6 +56,25 @@ class Forward:
     background: NDArray[np.float32]
     width: int
     height: int
+
+
+@dataclass
+class Backward:
+    """Gradients of the visible splats, nearest first.
+
+    rows [V] int32. parameters [V, gradient_columns]: mean 0:3, quaternion 3:7, log-scales 7:10,
+    opacity logit 10, then SH, basis function by basis function with RGB last, then zeros.
+    means2d [V, 2]: of the mean on the picture, per pixel.
+    """
+
+    rows: NDArray[np.int32]
+    parameters: NDArray[np.float32]
+    means2d: NDArray[np.float32]
+
+
+def gradient_columns(bands: int) -> int:
+    """Columns of a gradient row with room for `bands` of SH: whole vectors."""
+    return -(-(11 + 3 * bands) // 16) * 16
 
 
 class CpuRasteriser:
@@ -131,12 +150,8 @@ class CpuRasteriser:
         arrays: tuple[NDArray[np.float32], ...],
         forward: Forward,
         v_image: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
-        """[V, 13 + 3 (degree + 1)^2] gradients of the visible splats, from v_image [3, H, W].
-
-        Columns: mean 0:3, quaternion 3:7, log-scales 7:10, opacity logit 10, mean on the picture
-        (px) 11:13, then SH, basis function by basis function, RGB last.
-        """
+    ) -> Backward:
+        """Gradients of the visible splats, from v_image [3, H, W]."""
         n = len(forward.visible)
         get = self.buffers.get
         raw = get("gradients", (forward.n_intersections, blend.GRADIENTS), np.float32)
@@ -156,7 +171,8 @@ class CpuRasteriser:
             v_image,
             raw,
         )
-        out = get("out", (n, 13 + 3 * (forward.degree + 1) ** 2), np.float32)
+        out = get("out", (n, gradient_columns((forward.degree + 1) ** 2)), np.float32)
+        means2d = get("means2d", (n, 2), np.float32)
         self.pool.share(
             splat_gradients,
             CHUNK,
@@ -169,7 +185,36 @@ class CpuRasteriser:
             self._slot_starts,
             raw,
             out,
+            means2d,
         )
+        return Backward(forward.visible, out, means2d)
+
+    def contributions(self, forward: Forward, residual: NDArray[np.float32]) -> NDArray[np.float64]:
+        """[V, 3] for the visible splats: change of the squared error against the photograph if
+        the splat were removed, sum of its weights, its largest weight.
+
+        residual [3, H, W]: render less photograph.
+        """
+        shape = (forward.n_intersections, contributions.COLUMNS)
+        raw = self.buffers.get("contributions", shape, np.float32)
+        self.pool.share(
+            contributions.contribution_tiles,
+            forward.width,
+            forward.height,
+            self._tile_starts,
+            self._ranks,
+            self._slots,
+            self._rows,
+            self._geometry,
+            self._paint,
+            forward.background,
+            self._light,
+            self._last,
+            residual,
+            raw,
+        )
+        out = np.empty((len(forward.visible), contributions.COLUMNS))
+        contributions.gather_contributions(raw, self._slot_starts, out)
         return out
 
     def _project(

@@ -68,23 +68,17 @@ def is_drawable(i, means, quaternions, log_scales, opacity_logits, sh):
     if not math.isfinite(opacity_logits[i]):
         return False
     largest = 0.0
+    good = True
     for k in range(4):
-        value = abs(quaternions[i, k])
-        if not math.isfinite(value):
-            return False
-        largest = max(largest, value)
-    if not largest >= QUATERNION_MIN:
-        return False
+        largest = max(largest, abs(quaternions[i, k]))
+        good &= math.isfinite(quaternions[i, k])
     for k in range(3):
-        if not math.isfinite(means[i, k]) or not math.isfinite(log_scales[i, k]):
-            return False
-        if not log_scales[i, k] <= LOG_SCALE_MAX:
-            return False
+        good &= math.isfinite(means[i, k]) and math.isfinite(log_scales[i, k])
+        good &= log_scales[i, k] <= LOG_SCALE_MAX
     for band in range(sh.shape[1]):
         for channel in range(3):
-            if not math.isfinite(sh[i, band, channel]):
-                return False
-    return True
+            good &= math.isfinite(sh[i, band, channel])
+    return good and largest >= QUATERNION_MIN
 
 
 @kernel
@@ -153,8 +147,8 @@ def _axes(i, cam, quaternions, w):
 
 
 @kernel
-def geometry_record(cam, w, record):
-    """The record of a splat from its work row; False where it touches no pixel of the picture."""
+def geometry_record(cam, w, geometry, i):
+    """geometry[i] of a splat from its work row; False where it touches no pixel of the picture."""
     opacity = w[OPACITY] * w[COMPENSATION]
     if not opacity >= ALPHA_MIN:
         return False
@@ -170,12 +164,12 @@ def geometry_record(cam, w, record):
     if y + half_y < 0.5 or y - half_y > cam[27] - 0.5:
         return False
     major = max(a, c)
-    record[GX], record[GY] = x, y
-    record[GA] = 0.5 / major
-    record[GB] = 0.5 * major / det
-    record[GK] = b / major
-    record[GO] = opacity
-    record[GVX], record[GVY] = a, c
+    geometry[i, GX], geometry[i, GY] = x, y
+    geometry[i, GA] = 0.5 / major
+    geometry[i, GB] = 0.5 * major / det
+    geometry[i, GK] = b / major
+    geometry[i, GO] = opacity
+    geometry[i, GVX], geometry[i, GVY] = a, c
     return True
 
 
@@ -246,16 +240,15 @@ def _quaternion_gradient(cam, w, out):
     """out[3:7] from the gradient of W R that stands in the work row's AXES."""
     q0, q1 = w[QUATERNION], w[QUATERNION + 1]
     q2, q3 = w[QUATERNION + 2], w[QUATERNION + 3]
-    g = w[AXES : AXES + 9]
-    r00 = cam[0] * g[0] + cam[3] * g[3] + cam[6] * g[6]
-    r01 = cam[0] * g[1] + cam[3] * g[4] + cam[6] * g[7]
-    r02 = cam[0] * g[2] + cam[3] * g[5] + cam[6] * g[8]
-    r10 = cam[1] * g[0] + cam[4] * g[3] + cam[7] * g[6]
-    r11 = cam[1] * g[1] + cam[4] * g[4] + cam[7] * g[7]
-    r12 = cam[1] * g[2] + cam[4] * g[5] + cam[7] * g[8]
-    r20 = cam[2] * g[0] + cam[5] * g[3] + cam[8] * g[6]
-    r21 = cam[2] * g[1] + cam[5] * g[4] + cam[8] * g[7]
-    r22 = cam[2] * g[2] + cam[5] * g[5] + cam[8] * g[8]
+    r00 = cam[0] * w[AXES] + cam[3] * w[AXES + 3] + cam[6] * w[AXES + 6]
+    r01 = cam[0] * w[AXES + 1] + cam[3] * w[AXES + 4] + cam[6] * w[AXES + 7]
+    r02 = cam[0] * w[AXES + 2] + cam[3] * w[AXES + 5] + cam[6] * w[AXES + 8]
+    r10 = cam[1] * w[AXES] + cam[4] * w[AXES + 3] + cam[7] * w[AXES + 6]
+    r11 = cam[1] * w[AXES + 1] + cam[4] * w[AXES + 4] + cam[7] * w[AXES + 7]
+    r12 = cam[1] * w[AXES + 2] + cam[4] * w[AXES + 5] + cam[7] * w[AXES + 8]
+    r20 = cam[2] * w[AXES] + cam[5] * w[AXES + 3] + cam[8] * w[AXES + 6]
+    r21 = cam[2] * w[AXES + 1] + cam[5] * w[AXES + 4] + cam[8] * w[AXES + 7]
+    r22 = cam[2] * w[AXES + 2] + cam[5] * w[AXES + 5] + cam[8] * w[AXES + 8]
     n0 = 2.0 * (q1 * (r21 - r12) + q2 * (r02 - r20) + q3 * (r10 - r01))
     n1 = 2.0 * (q2 * (r01 + r10) + q3 * (r02 + r20) + q0 * (r21 - r12)) - 4.0 * q1 * (r11 + r22)
     n2 = 2.0 * (q1 * (r01 + r10) + q3 * (r12 + r21) + q0 * (r02 - r20)) - 4.0 * q2 * (r00 + r22)

@@ -214,11 +214,13 @@ vmin = _binary(_vector2, _min)  # the second where a lane holds NaN
 vmax = _binary(_vector2, _max)
 vexp2 = _unary(_vector1, _exp2)
 vabs = _unary(_vector1, lambda b, x: _call(b, "llvm.fabs.v16f32", _VECTOR, [x]))
+vsqrt = _unary(_vector1, lambda b, x: _call(b, "llvm.sqrt.v16f32", _VECTOR, [x]))
 vsum = _unary(lambda a: types.float32(a), _sum)
 vany = _unary(lambda a: types.boolean(a), _any)
 vge = _binary(_mask2, lambda b, x, y: b.fcmp_ordered(">=", x, y))  # False where a lane holds NaN
 vgt = _binary(_mask2, lambda b, x, y: b.fcmp_ordered(">", x, y))
 vand = _binary(_mask2, lambda b, x, y: b.and_(x, y))
+vnot = _unary(lambda a: mask16(a), lambda b, x: b.not_(x))
 _vadd = _binary(_vector2, lambda b, x, y: b.fadd(x, y))
 _vsub = _binary(_vector2, lambda b, x, y: b.fsub(x, y))
 _vmul = _binary(_vector2, lambda b, x, y: b.fmul(x, y))

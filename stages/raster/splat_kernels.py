@@ -8,6 +8,7 @@ import numpy as np
 
 from stages.raster.projection import (
     CAMERA_ROW,
+    GEOMETRY_ROW,
     GVX,
     GVY,
     WORK_ROW,
@@ -51,7 +52,7 @@ def project_splats(
                 status[i] = CULLED
             elif footprint(
                 i, cam, means, quaternions, log_scales, opacity_logits, w
-            ) and geometry_record(cam, w, geometry[i]):
+            ) and geometry_record(cam, w, geometry, i):
                 status[i] = VISIBLE
                 depth[i] = np.float32(w[2])
 
@@ -76,7 +77,8 @@ def shade_splats(ticket, chunk, order, all_geometry, cam, degree, means, sh, geo
             break
         for rank in range(start, min(start + chunk, n)):
             i = order[rank]
-            geometry[rank] = all_geometry[i]
+            for k in range(GEOMETRY_ROW):
+                geometry[rank, k] = all_geometry[i, k]
             x, y, z, _ = _direction(i, cam, means)
             sh_basis(degree, x, y, z, basis)
             for channel in range(3):
@@ -90,8 +92,10 @@ def shade_splats(ticket, chunk, order, all_geometry, cam, degree, means, sh, geo
 
 
 @kernel
-def _colour_gradient(i, cam, degree, means, sh, colour, total, basis, weights, row):
-    """SH gradients into row[13:], the direction's into row[0:3]."""
+def _colour_gradient(
+    i, cam, degree, means, sh, paint, rank, total, basis, weights, parameters, out
+):
+    """SH gradients into out[rank, 11:]; the direction's are added to parameters[0:3]."""
     bands = (degree + 1) * (degree + 1)
     x, y, z, distance = _direction(i, cam, means)
     sh_basis(degree, x, y, z, basis)
@@ -99,15 +103,15 @@ def _colour_gradient(i, cam, degree, means, sh, colour, total, basis, weights, r
         weights[band] = 0.0
         for channel in range(3):
             # a colour clamped at 0 passes nothing on
-            g = total[6 + channel] if colour[channel] > 0.0 else 0.0
-            row[13 + 3 * band + channel] = np.float32(g * basis[band])
+            g = total[6 + channel] if paint[rank, channel] > 0.0 else 0.0
+            out[rank, 11 + 3 * band + channel] = np.float32(g * basis[band])
             weights[band] += g * sh[i, band, channel]
     if degree > 0:
         gx, gy, gz = sh_direction_gradient(degree, x, y, z, weights)
         along = gx * x + gy * y + gz * z
-        row[0] += np.float32((gx - along * x) / distance)
-        row[1] += np.float32((gy - along * y) / distance)
-        row[2] += np.float32((gz - along * z) / distance)
+        parameters[0] += (gx - along * x) / distance
+        parameters[1] += (gy - along * y) / distance
+        parameters[2] += (gz - along * z) / distance
 
 
 @kernel
@@ -127,6 +131,7 @@ def splat_gradients(
     slot_starts,
     raw,
     out,
+    means2d,
 ):
     """Sum each splat's (splat, tile) gradients, in a fixed order, and take them to parameters."""
     n = len(visible)
@@ -136,24 +141,30 @@ def splat_gradients(
     parameters = np.empty(11, np.float64)
     basis = np.empty(16, np.float64)
     weights = np.empty(16, np.float64)
+    used = 11 + 3 * (degree + 1) * (degree + 1)
     while True:
         start = take_ticket(ticket) * chunk
         if start >= n:
             break
         for rank in range(start, min(start + chunk, n)):
             i = visible[rank]
-            total[:] = 0.0
+            for k in range(9):
+                total[k] = 0.0
             for slot in range(slot_starts[rank], slot_starts[rank + 1]):
                 for k in range(9):
                     total[k] += raw[slot, k]
             wide = geometry[rank, GVX] >= geometry[rank, GVY]
             g[0] = total[0] if wide else total[1]
             g[1] = total[1] if wide else total[0]
-            g[2:6] = total[2:6]
+            for k in range(2, 6):
+                g[k] = total[k]
             footprint(i, cam, means, quaternions, log_scales, opacity_logits, w)
             footprint_gradient(cam, w, g, parameters)
-            row = out[rank]
+            _colour_gradient(
+                i, cam, degree, means, sh, paint, rank, total, basis, weights, parameters, out
+            )
             for k in range(11):
-                row[k] = np.float32(parameters[k])
-            row[11], row[12] = np.float32(g[0]), np.float32(g[1])
-            _colour_gradient(i, cam, degree, means, sh, paint[rank], total, basis, weights, row)
+                out[rank, k] = np.float32(parameters[k])
+            for k in range(used, out.shape[1]):
+                out[rank, k] = np.float32(0.0)
+            means2d[rank, 0], means2d[rank, 1] = np.float32(g[0]), np.float32(g[1])

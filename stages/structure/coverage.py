@@ -4,11 +4,14 @@ Plain walls, carpets out of focus and the rim of a capture have no features, so 
 sparse cloud alone leaves holes that training fills slowly or never. Here each photograph is cut
 into cells; a cell in which no point lands gets one, at the depth that its neighbours in that
 photograph suggest and in the photograph's own colour. Photographs are taken in turn, and what one
-has filled counts for the next, so that a few thousand points cover everything that was seen.
+has filled counts for the next, so that a few thousand points cover everything that was seen. Beyond
+its rim a photograph is continued a little in the colours of the rim: what no photograph shows is
+better guessed than left as a hole.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +20,12 @@ from numpy.typing import NDArray
 from stages.photos.load import load_image
 from stages.scene import Camera, View
 
-CELLS = 32  # along the longer side of a photograph
+CELLS = 40  # along the longer side of a photograph
+MARGIN = 0.25  # of the longer side: how far beyond its rim a photograph is continued
 NEIGHBOURS = 4
+PLANE_POINTS = 12
+PLANE_MISFIT = 0.04  # of the inverse depth, root mean square
+PLANE_REACH = 1.5  # how far beyond its points' depths a plane is continued
 SCALE = 0.5  # of a cell's size, seen at the point's depth
 
 
@@ -32,19 +39,33 @@ def fill_cells(
     added = [np.zeros((0, 3))]
     colours, scales = [np.zeros((0, 3), np.float32)], [np.zeros(0)]
     for view in sorted(views, key=lambda v: v.name):
-        camera = view.camera.fitted(CELLS)
-        pixels, depths = _seen(camera, np.concatenate([points, *added]))
+        small = view.camera.fitted(CELLS)
+        margin = round(MARGIN * CELLS)
+        camera = _widened(small, margin)
+        pixels, _ = _seen(camera, np.concatenate([points, *added]))
         measured = _seen(camera, points)
         empty = _empty_cells(camera, pixels)
-        if len(measured[1]) < NEIGHBOURS or len(empty) == 0:
+        if len(measured[1]) < PLANE_POINTS or len(empty) == 0:
             continue
         depth = _interpolated(empty, *measured)
         added.append(_unprojected(camera, empty, depth))
-        picture = load_image(folder / view.image, camera.width, camera.height)
-        columns, rows = np.floor(empty).astype(int).T
+        picture = load_image(folder / view.image, small.width, small.height)
+        columns, rows = np.floor(empty).astype(int).T - margin
+        rows, columns = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
         colours.append(picture[rows, columns])
         scales.append(SCALE * depth / camera.fx)
     return np.concatenate(added), np.concatenate(colours), np.concatenate(scales)
+
+
+def _widened(camera: Camera, margin: int) -> Camera:
+    """The camera with `margin` more pixels on every side."""
+    return replace(
+        camera,
+        width=camera.width + 2 * margin,
+        height=camera.height + 2 * margin,
+        cx=camera.cx + margin,
+        cy=camera.cy + margin,
+    )
 
 
 def _seen(
@@ -70,12 +91,26 @@ def _empty_cells(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.floa
 def _interpolated(
     at: NDArray[np.float64], pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[K] depth at each place: the nearest measured points' inverse depths, weighted by 1/d^2."""
+    """[K] depth at each place, from the nearest measured points.
+
+    The inverse depth of a plane is affine in the picture: where the nearest points lie on a plane,
+    it is continued (a floor, a wall). Elsewhere the largest of the very nearest depths is taken:
+    what has no texture is more often behind than before, and a splat too far hides nothing.
+    """
     distance2 = ((at[:, None] - pixels[None]) ** 2).sum(2)
-    nearest = np.argsort(distance2, axis=1, kind="stable")[:, :NEIGHBOURS]
-    weights = 1.0 / (np.take_along_axis(distance2, nearest, 1) + 1e-3)
-    inverse = (weights / depths[nearest]).sum(1) / weights.sum(1)
-    return np.asarray(1.0 / inverse)
+    nearest = np.argsort(distance2, axis=1, kind="stable")[:, :PLANE_POINTS]
+    inverse = 1.0 / depths[nearest]
+    offset = pixels[nearest] - at[:, None]
+    design = np.concatenate([np.ones_like(offset[..., :1]), offset], 2)
+    weights = 1.0 / (1.0 + np.take_along_axis(distance2, nearest, 1))[..., None]
+    normal = np.einsum("kpi,kpj->kij", design * weights, design) + 1e-6 * np.eye(3)
+    right = np.einsum("kpi,kp->ki", design * weights, inverse)
+    plane = np.linalg.solve(normal, right[..., None])[..., 0]
+    misfit = np.einsum("kpi,ki->kp", design, plane) - inverse
+    flat = np.sqrt((misfit**2).mean(1)) < PLANE_MISFIT * inverse.mean(1)
+    low, high = inverse.min(1) / PLANE_REACH, inverse.max(1) * PLANE_REACH
+    far = inverse[:, :NEIGHBOURS].min(1)
+    return np.asarray(1.0 / np.where(flat, np.clip(plane[:, 0], low, high), far), np.float64)
 
 
 def _unprojected(
@@ -90,4 +125,4 @@ def _unprojected(
         1,
     )
     at = rays * depths[:, None] - camera.world_to_camera[:3, 3]
-    return np.asarray(at @ camera.world_to_camera[:3, :3])
+    return np.asarray(at @ camera.world_to_camera[:3, :3], np.float64)

@@ -12,51 +12,59 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.raster.cpu import Backward, gradient_columns
 from stages.raster.pool import Pool
-from stages.raster.simd import kernel, take_ticket
+from stages.raster.simd import (
+    kernel,
+    splat16,
+    take_ticket,
+    vabs,
+    vany,
+    vfma,
+    vge,
+    vload,
+    vnot,
+    vsqrt,
+    vstore,
+)
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
 # loss: 1e-15, as often used, turns rounding noise into whole steps.
 EPSILON = 1e-4
 CHUNK = 512
+_F = np.float32
 
 
 @dataclass(frozen=True)
 class LearningRates:
     """Step sizes, in the units of the parameters (means: world units)."""
 
-    means: float
+    means: float = 0.0
     quaternions: float = 1e-3
     log_scales: float = 5e-3
     opacity_logits: float = 5e-2
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
 
-    def row(self, bands: int) -> NDArray[np.float32]:
-        """[11 + 3 bands] one rate for each column of the moments."""
-        return np.array(
-            [self.means] * 3
-            + [self.quaternions] * 4
-            + [self.log_scales] * 3
-            + [self.opacity_logits]
-            + [self.sh_dc] * 3
-            + [self.sh_rest] * (3 * bands - 3),
-            np.float32,
+    def scaled(self, means: float, factor: float) -> LearningRates:
+        """All rates times `factor`, but for that of the means, which is given."""
+        return LearningRates(
+            means,
+            self.quaternions * factor,
+            self.log_scales * factor,
+            self.opacity_logits * factor,
+            self.sh_dc * factor,
+            self.sh_rest * factor,
         )
 
-
-@kernel
-def _move(parameters, row, gradient, moment1, moment2, rates, first, count, scale1, scale2):
-    """One splat's `count` values from column `first` on."""
-    for k in range(count):
-        column = first + k
-        g = gradient[column if column < 11 else column + 2]
-        m = np.float32(BETA1) * moment1[column] + np.float32(1.0 - BETA1) * g
-        v = np.float32(BETA2) * moment2[column] + np.float32(1.0 - BETA2) * g * g
-        moment1[column], moment2[column] = m, v
-        root = math.sqrt(v * scale2) + np.float32(EPSILON)
-        parameters[row, k] -= rates[column] * (m * scale1) / root
+    def row(self, bands: int) -> NDArray[np.float32]:
+        """One rate for each column of a gradient row with `bands` of SH."""
+        rates = np.zeros(gradient_columns(bands), np.float32)
+        rates[0:3], rates[3:7], rates[7:10] = self.means, self.quaternions, self.log_scales
+        rates[10], rates[11:14] = self.opacity_logits, self.sh_dc
+        rates[14 : 11 + 3 * bands] = self.sh_rest
+        return rates
 
 
 @kernel
@@ -65,6 +73,7 @@ def adam_step(
     chunk,
     visible,
     gradients,
+    means2d,
     means,
     quaternions,
     log_scales,
@@ -73,6 +82,7 @@ def adam_step(
     moment1,
     moment2,
     steps,
+    corrections,
     rates,
     ndc_x,
     ndc_y,
@@ -81,43 +91,68 @@ def adam_step(
 ):
     """Move the visible splats; add up the size of their mean's gradient on the picture.
 
-    gradients [V, 13 + 3 bands]: see CpuRasteriser.backward. rates [11 + 3 bands]. ndc_x, ndc_y:
-    factors that take a gradient per pixel to the units of the densification threshold.
-    sh [N, 3 bands allocated], opacity_logits [N, 1]: 2-D views of the parameters.
+    gradients, means2d: see `cpu.Backward`. corrections [T, 2]: 1 / (1 - beta^t) of both betas.
+    rates [columns of gradients]. ndc_x, ndc_y: factors that take a gradient per pixel to the units
+    of the densification threshold. sh [N, 3 bands]: a 2-D view. A splat with a gradient that is
+    not finite stays as it is.
     """
     n = len(visible)
-    bands3 = gradients.shape[1] - 13
+    columns = gradients.shape[1]
+    stride = moment1.shape[1]
+    last = len(corrections) - 1
+    shift = np.zeros(columns, np.float32)
+    b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
+    b2, c2 = splat16(_F(BETA2)), splat16(_F(1.0 - BETA2))
+    epsilon, huge = splat16(_F(EPSILON)), splat16(_F(1e30))
     while True:
         start = take_ticket(ticket) * chunk
         if start >= n:
             break
         for rank in range(start, min(start + chunk, n)):
             i = visible[rank]
-            g = gradients[rank]
-            finite = True
-            for k in range(len(g)):
-                finite = finite and math.isfinite(g[k])
-            if not finite:
+            bad = False
+            for k in range(0, columns, 16):
+                g = vload(gradients, rank * columns + k)
+                bad |= vany(vnot(vge(huge, vabs(g))))
+            if bad:
                 continue
             steps[i] += 1
-            scale1 = np.float32(1.0 / (1.0 - BETA1 ** np.float64(steps[i])))
-            scale2 = np.float32(1.0 / (1.0 - BETA2 ** np.float64(steps[i])))
-            m1, m2 = moment1[i], moment2[i]
-            _move(means, i, g, m1, m2, rates, 0, 3, scale1, scale2)
-            _move(quaternions, i, g, m1, m2, rates, 3, 4, scale1, scale2)
-            _move(log_scales, i, g, m1, m2, rates, 7, 3, scale1, scale2)
-            _move(opacity_logits, i, g, m1, m2, rates, 10, 1, scale1, scale2)
-            _move(sh, i, g, m1, m2, rates, 11, bands3, scale1, scale2)
-            gradient_sum[i] += math.sqrt((g[11] * ndc_x) ** 2 + (g[12] * ndc_y) ** 2)
+            t = min(np.int64(steps[i]), last)
+            scale1, scale2 = splat16(corrections[t, 0]), splat16(corrections[t, 1])
+            for k in range(0, columns, 16):
+                g = vload(gradients, rank * columns + k)
+                at = np.int64(i) * stride + k
+                m = vfma(b1, vload(moment1, at), c1 * g)
+                v = vfma(b2, vload(moment2, at), c2 * g * g)
+                vstore(moment1, at, m)
+                vstore(moment2, at, v)
+                step = vload(rates, k) * m * scale1 / (vsqrt(v * scale2) + epsilon)
+                vstore(shift, k, step)
+            for k in range(3):
+                means[i, k] -= shift[k]
+                log_scales[i, k] -= shift[7 + k]
+            for k in range(4):
+                quaternions[i, k] -= shift[3 + k]
+            opacity_logits[i] -= shift[10]
+            for k in range(min(columns - 11, sh.shape[1])):
+                sh[i, k] -= shift[11 + k]
+            gx, gy = means2d[rank, 0] * ndc_x, means2d[rank, 1] * ndc_y
+            gradient_sum[i] += math.sqrt(gx * gx + gy * gy)
             gradient_count[i] += 1
+
+
+def bias_corrections() -> NDArray[np.float32]:
+    """[T, 2] 1 / (1 - beta^t) for both betas, until it is 1 in float32; row 0 is never used."""
+    t = np.maximum(np.arange(20_000), 1)[:, None].astype(np.float64)
+    return (1.0 / (1.0 - np.array([BETA1, BETA2]) ** t)).astype(np.float32)
 
 
 @dataclass
 class Model:
     """The splats in training and all that their optimisation remembers.
 
-    Parameters as in `Splats`, float32. moment1, moment2 [N, 11 + 3 bands]: columns mean 0:3,
-    quaternion 3:7, log-scales 7:10, opacity 10, SH 11:. steps [N] int32: how often each was moved.
+    Parameters as in `Splats`, float32. moment1, moment2: columns as the
+    gradient's (`cpu.Backward`), for all bands. steps [N] int32: how often each was moved.
     gradient_sum, gradient_count [N]: since the last densification.
     """
 
@@ -166,7 +201,7 @@ def new_model(
     sh: NDArray[np.float32],
 ) -> Model:
     """A model whose optimiser has seen nothing."""
-    n, columns = len(means), 11 + 3 * sh.shape[1]
+    n, columns = len(means), gradient_columns(sh.shape[1])
     return Model(
         means,
         quaternions,
@@ -181,31 +216,35 @@ def new_model(
     )
 
 
+_CORRECTIONS = bias_corrections()
+
+
 def apply_gradients(
     pool: Pool,
     model: Model,
-    visible: NDArray[np.int32],
-    gradients: NDArray[np.float32],
+    backward: Backward,
+    bands: int,
     rates: LearningRates,
     width: int,
     height: int,
 ) -> None:
-    """One step of Adam on `model`, in place."""
-    bands = (gradients.shape[1] - 13) // 3
+    """One step of Adam on `model`, in place. bands: of SH that the gradients hold."""
     pixels = width * height
     pool.share(
         adam_step,
         CHUNK,
-        visible,
-        gradients,
+        backward.rows,
+        backward.parameters,
+        backward.means2d,
         model.means,
         model.quaternions,
         model.log_scales,
-        model.opacity_logits.reshape(-1, 1),
+        model.opacity_logits,
         model.sh.reshape(len(model), -1),
         model.moment1,
         model.moment2,
         model.steps,
+        _CORRECTIONS,
         rates.row(bands),
         np.float32(0.5 * width / pixels),
         np.float32(0.5 * height / pixels),

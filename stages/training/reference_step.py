@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from stages.raster.api import RasterSettings
+from stages.raster.cpu import Backward, gradient_columns
 from stages.raster.pool import Pool
 from stages.raster.reference import Parameters, project, render_projected
 from stages.scene import Camera
@@ -20,8 +21,8 @@ def reference_gradients(
     settings: RasterSettings,
     target: NDArray[np.float32],
     v_image: NDArray[np.float32],
-) -> tuple[NDArray[np.int32], NDArray[np.float32], float]:
-    """(rows of visible splats, their gradients as in CpuRasteriser.backward, loss), in float64."""
+) -> tuple[Backward, float]:
+    """(gradients as the kernels would give them, loss); computed in float64."""
     p = Parameters(*(torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in arrays))
     projected = project(p, camera, settings)
     projected.means2d.retain_grad()
@@ -33,9 +34,12 @@ def reference_gradients(
     index = projected.index.numpy()
     bands = (min(settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
     columns = [_gradient(t, index) for t in p.tensors()[:4]]
-    columns.append(_gradient(projected.means2d, np.arange(len(index))))
     columns.append(_gradient(p.sh, index)[:, : 3 * bands])
-    return index.astype(np.int32), np.concatenate(columns, 1).astype(np.float32), loss.value
+    values = np.concatenate(columns, 1)
+    parameters = np.zeros((len(index), gradient_columns(bands)), np.float32)
+    parameters[:, : values.shape[1]] = values
+    means2d = _gradient(projected.means2d, np.arange(len(index))).astype(np.float32)
+    return Backward(index.astype(np.int32), parameters, means2d), loss.value
 
 
 def _gradient(tensor: torch.Tensor, index: NDArray[np.integer]) -> NDArray[np.float64]:

@@ -8,24 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 
 RECIPE_STEPS = 30_000
-MEANS_LR = 1.6e-4  # x scene extent
+MEANS_LR = 1.6e-4  # x scene extent, in a run of 30,000 steps
 MEANS_LR_END = 0.01  # of the first
 THRESHOLD = 2e-4
-MIN_DENSIFY_INTERVAL = 25  # steps: fewer do not see enough of the scene to judge a splat by
+GROWTH_ENDS = 0.5  # share of the run in which the model grows
+BOOST_POWER, BOOST_MAX = 0.25, 2.0
+SETTLE_FROM, SETTLE_TO = 0.6, 0.1  # share of the run; share of the rate at its end
+MIN_DENSIFY_INTERVAL = 50  # steps: fewer do not see enough of the scene to judge a splat by
 MIN_STEPS_FOR_RESET = 15_000  # a shorter run does not recover from an opacity reset
 # (share of the run, scale of the picture): coarse pictures first, they are cheap and smooth
-RESOLUTIONS = ((0.25, 0.5), (1.0, 1.0))
+RESOLUTIONS = ((0.2, 0.25), (0.5, 0.5), (1.0, 1.0))
 
 
 @dataclass(frozen=True)
 class Schedule:
     """steps: of the whole run. extent: of the scene, world units. sh_degree: reached at the end.
-    n_views: photographs trained on."""
+    n_views: photographs trained on. n_start: splats at the start."""
 
     steps: int
     extent: float
     sh_degree: int
     n_views: int
+    n_start: int
     seed: int
 
     def _scaled(self, recipe_step: int) -> int:
@@ -35,15 +39,27 @@ class Schedule:
         """Exponential decay to 1 %."""
         return MEANS_LR * self.extent * MEANS_LR_END ** (step / max(self.steps - 1, 1))
 
+    def rate_factor(self, step: int) -> float:
+        """What all other rates are multiplied by: a short run strides, and settles at its end."""
+        boost = min(BOOST_MAX, (RECIPE_STEPS / self.steps) ** BOOST_POWER)
+        settling = max(0.0, (step / self.steps - SETTLE_FROM) / (1.0 - SETTLE_FROM))
+        return float(max(1.0, boost) * SETTLE_TO**settling)
+
     def active_sh_degree(self, step: int) -> int:
         """One degree more every 1000 steps of the recipe."""
-        return min(self.sh_degree, step // self._scaled(1000))
+        return min(self.sh_degree, step * RECIPE_STEPS // (1000 * self.steps))
 
     def densifies_after(self, step: int) -> bool:
         """Whether to densify once `step` is done."""
         interval = max(self._scaled(100), MIN_DENSIFY_INTERVAL)
         done = step + 1
-        return self._scaled(500) <= done <= self.steps // 2 and done % interval == 0
+        return self._scaled(500) <= done <= GROWTH_ENDS * self.steps and done % interval == 0
+
+    def budget(self, step: int, cap: int) -> int:
+        """Splats allowed after `step`: grows evenly to the cap, so that early, noisy gradients do
+        not spend what later, better ones will want."""
+        share = min(1.0, (step + 1) / (GROWTH_ENDS * self.steps))
+        return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
     def resets_after(self, step: int) -> bool:
         """Whether to reset opacities once `step` is done."""

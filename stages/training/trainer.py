@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,6 @@ from stages.training.views import TrainingView
 CHECKPOINT_SECONDS = 30.0
 EVALUATIONS = 10  # during a run, evenly spaced
 NEAR = 0.01  # of the scene's extent
-
-StepGradients = Callable[..., tuple[NDArray[np.int32], NDArray[np.float32], float]]
 
 
 @dataclass
@@ -79,6 +76,8 @@ class Trainer:
             self.report.metric("resumed_from_step", step)
             return model, step
         start = start.with_sh_degree(self.schedule.sh_degree)
+        if len(start) > self.cap:
+            start = start.take(np.linspace(0, len(start) - 1, self.cap).round().astype(np.int64))
         return new_model(
             *(
                 np.array(a, np.float32, order="C")
@@ -108,16 +107,18 @@ class Trainer:
         if self.use_reference:
             from stages.training.reference_step import reference_gradients
 
-            visible, gradients, value = reference_gradients(
+            backward, value = reference_gradients(
                 pool, model.arrays, camera, settings, target, self._v_image
             )
         else:
             forward = self.rasteriser.forward(model.arrays, camera, settings)
             loss = image_loss(pool, forward.image, target, self._v_image)
-            gradients = self.rasteriser.backward(model.arrays, forward, self._v_image)
-            visible, value = forward.visible, loss.value
-        rates = LearningRates(means=self.schedule.means_lr(step))
-        apply_gradients(pool, model, visible, gradients, rates, camera.width, camera.height)
+            backward = self.rasteriser.backward(model.arrays, forward, self._v_image)
+            value = loss.value
+        factor = self.schedule.rate_factor(step)
+        rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
+        bands = (settings.sh_degree + 1) ** 2
+        apply_gradients(pool, model, backward, bands, rates, camera.width, camera.height)
         return value
 
     def _adapt(self, model: Model, step: int) -> Model:
@@ -126,7 +127,7 @@ class Trainer:
                 model,
                 THRESHOLD,
                 self.schedule.extent,
-                self.cap,
+                self.schedule.budget(step, self.cap),
                 self.schedule.prunes_giants(step),
                 self.schedule.rng(step),
             )

@@ -1,0 +1,75 @@
+"""What each splat is worth to a set of photographs, and which splats are floaters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.raster.api import RasterSettings
+from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.scene import Camera, Splats
+
+SEEN = 1.0 / 255.0  # a weight below it cannot change an 8-bit picture
+NEAR_CAMERA = 0.25  # of the depth at which that camera sees the scene
+FEW_PHOTOGRAPHS = 2
+
+
+@dataclass(frozen=True)
+class Worth:
+    """Per splat [N]. sse_change: of the summed squared error over all photographs if it alone
+    were removed (negative: they would be better without it). weight: summed blend weight;
+    largest_weight: in any pixel. photographs: in how many it has a weight of 1/255 somewhere.
+    sse: summed squared error now. scene_depth [photographs]: median depth of each picture.
+    """
+
+    sse_change: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    largest_weight: NDArray[np.float64]
+    photographs: NDArray[np.int32]
+    sse: float
+    scene_depth: NDArray[np.float64]
+
+
+def measure_worth(
+    splats: Splats,
+    photographs: Iterable[tuple[Camera, NDArray[np.float32]]],
+    settings: RasterSettings,
+) -> Worth:
+    """photographs: (camera, [3, H, W] in 0..1)."""
+    n = len(splats)
+    change, weight, largest = np.zeros(n), np.zeros(n), np.zeros(n)
+    seen_in, sse, depths = np.zeros(n, np.int32), 0.0, []
+    rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
+    for camera, photograph in photographs:
+        forward = rasteriser.forward(arrays, camera, settings)
+        residual = np.ascontiguousarray(forward.image[:3] - photograph)
+        sse += float(np.sum(residual.astype(np.float64) ** 2))
+        solid = forward.image[4][forward.image[3] > 0.5]
+        depths.append(float(np.median(solid)) if solid.size else np.inf)
+        found = rasteriser.contributions(forward, residual)
+        rows = forward.visible
+        change[rows] += found[:, 0]
+        weight[rows] += found[:, 1]
+        largest[rows] = np.maximum(largest[rows], found[:, 2])
+        seen_in[rows] += found[:, 2] >= SEEN
+    return Worth(change, weight, largest, seen_in, sse, np.array(depths))
+
+
+def floaters(splats: Splats, worth: Worth, cameras: list[Camera]) -> NDArray[np.bool_]:
+    """[N] splats that hang in empty space: close before a camera, compared with what that camera
+    sees behind, and needed by at most two photographs."""
+    close = np.zeros(len(splats), bool)
+    for camera, depth in zip(cameras, worth.scene_depth, strict=True):
+        if np.isfinite(depth):
+            distance = np.linalg.norm(splats.means - camera.centre, axis=1)
+            close |= distance < NEAR_CAMERA * depth
+    return np.asarray(close & (worth.photographs <= FEW_PHOTOGRAPHS))
+
+
+def unneeded(worth: Worth) -> NDArray[np.bool_]:
+    """[N] splats that no photograph is better for: never seen, or the error does not grow
+    without them."""
+    return np.asarray((worth.photographs == 0) | (worth.sse_change <= 0.0))

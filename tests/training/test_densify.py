@@ -1,0 +1,123 @@
+"""Growing and shrinking."""
+
+import numpy as np
+import pytest
+
+from stages.scene import logit
+from stages.training.densify import BYTES_PER_SPLAT, densify, reset_opacities, splat_cap
+from stages.training.optimiser import new_model
+from stages.training.schedule import Schedule
+
+EXTENT = 10.0
+
+
+def model(n, scale=0.01, opacity=0.5):
+    r = np.random.default_rng(0)
+    return new_model(
+        r.normal(size=(n, 3)).astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.full((n, 3), np.log(scale), np.float32),
+        np.full(n, logit(opacity), np.float32),
+        r.normal(size=(n, 4, 3)).astype(np.float32),
+    )
+
+
+def pulled(m, rows, by=1.0):
+    m.gradient_sum[rows] = by
+    m.gradient_count[rows] = 1
+    return m
+
+
+def grow(m, cap=10**6, giants=True):
+    return densify(m, 2e-4, EXTENT, cap, giants, np.random.default_rng(0))
+
+
+def test_small_splats_that_are_pulled_are_cloned_in_place():
+    m = pulled(model(10), [2, 5])
+    grown, did = grow(m)
+    assert (did.cloned, did.split, did.pruned, len(grown)) == (2, 0, 0, 12)
+    np.testing.assert_array_equal(grown.means[10:], m.means[[2, 5]])
+    assert not grown.moment1[10:].any()
+
+
+def test_large_splats_that_are_pulled_make_way_for_two_smaller_ones():
+    m = pulled(model(10, scale=0.2), [3])
+    grown, did = grow(m)
+    assert (did.cloned, did.split, len(grown)) == (0, 1, 11)
+    np.testing.assert_allclose(np.exp(grown.log_scales[9:]), 0.2 / 1.6, rtol=1e-5)
+    assert np.linalg.norm(grown.means[9:] - m.means[3], axis=1).max() < 5 * 0.2
+    assert not (grown.means[9] == grown.means[10]).any()
+
+
+def test_faint_giant_and_broken_splats_go():
+    m = model(10)
+    m.opacity_logits[0] = logit(0.004)
+    m.log_scales[1] = np.log(0.11 * EXTENT)
+    m.means[2, 1] = np.nan
+    grown, did = grow(m)
+    assert did.pruned == 3
+    assert len(grown) == 7
+    assert grow(m, giants=False)[1].pruned == 2
+
+
+@pytest.mark.parametrize("room", [0, 1, 3])
+def test_the_cap_is_kept_and_the_strongest_go_first(room):
+    m = pulled(model(10), range(10))
+    m.gradient_sum[:] = np.arange(10) + 1.0
+    grown, did = grow(m, cap=10 + room)
+    assert len(grown) == 10 + room
+    assert did.refused == 10 - room
+    if room:
+        np.testing.assert_array_equal(grown.means[10:], m.means[10 - room :])
+
+
+def test_a_reset_only_ever_lowers_opacity():
+    m = model(4)
+    m.opacity_logits[:2] = logit(0.006)
+    m.moment1[:] = 1.0
+    before = m.opacity_logits.copy()
+    reset_opacities(m)
+    np.testing.assert_array_equal(m.opacity_logits[:2], before[:2])
+    np.testing.assert_allclose(m.opacity_logits[2:], logit(0.01), rtol=1e-6)
+    assert not m.moment1[:, 10].any()
+    assert m.moment1[:, :10].all()
+
+
+def test_the_cap_takes_half_of_the_free_memory():
+    assert splat_cap(8192.0) == pytest.approx(4096 * 1024 * 1024 / BYTES_PER_SPLAT, rel=1e-3)
+    assert splat_cap(1.0) == 10_000
+    assert splat_cap(None) > 10_000
+
+
+def schedule(steps):
+    return Schedule(steps=steps, extent=2.0, sh_degree=3, n_views=7, n_start=100, seed=3)
+
+
+@pytest.mark.parametrize("steps", [1, 10, 1500, 30_000])
+def test_the_recipe_scales_to_any_number_of_steps(steps):
+    s = schedule(steps)
+    assert s.means_lr(0) == pytest.approx(3.2e-4)
+    if steps > 1:
+        assert s.means_lr(steps - 1) == pytest.approx(3.2e-6)
+    assert s.active_sh_degree(0) == 0
+    assert s.active_sh_degree(steps) == 3
+    growing = [step for step in range(steps) if s.densifies_after(step)]
+    assert all(step + 1 <= steps * 0.7 for step in growing)
+    if steps >= 1500:
+        assert len(growing) >= 10
+    seen = [s.view(step) for step in range(min(steps, 70))]
+    if steps >= 70:
+        assert all(sorted(seen[k : k + 7]) == list(range(7)) for k in range(0, 70, 7))
+        assert seen[:7] != seen[7:14]
+
+
+def test_the_full_recipe_has_its_published_events():
+    s = schedule(30_000)
+    assert s.active_sh_degree(999) == 0
+    assert s.active_sh_degree(1000) == 1
+    assert s.densifies_after(499)
+    assert s.densifies_after(599)
+    assert not s.densifies_after(550)
+    assert not s.densifies_after(399)
+    assert s.resets_after(2999)
+    assert not s.resets_after(17_999)
