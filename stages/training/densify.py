@@ -71,7 +71,7 @@ def densify(
 def _worth_keeping(model: Model, extent: float, prune_giants: bool) -> NDArray[np.bool_]:
     keep = model.opacity_logits >= logit(OPACITY_MIN)
     for array in model.arrays:
-        keep &= np.isfinite(array.reshape(len(model), -1)).all(1)
+        keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
     if prune_giants:
         keep &= np.exp(model.log_scales.max(1)) <= GIANT * extent
     return np.asarray(keep)

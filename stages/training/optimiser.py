@@ -240,7 +240,7 @@ def apply_gradients(
         model.quaternions,
         model.log_scales,
         model.opacity_logits,
-        model.sh.reshape(len(model), -1),
+        model.sh.reshape(len(model), 3 * model.sh.shape[1]),
         model.moment1,
         model.moment2,
         model.steps,

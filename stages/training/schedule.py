@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 RECIPE_STEPS = 30_000
-MEANS_LR = 1.6e-4  # x scene extent, in a run of 30,000 steps
+MEANS_LR = 1.6e-4  # x scene extent
 MEANS_LR_END = 0.01  # of the first
 THRESHOLD = 2e-4
 GROWTH_ENDS = 0.5  # share of the run in which the model grows
@@ -35,15 +35,20 @@ class Schedule:
     def _scaled(self, recipe_step: int) -> int:
         return max(1, round(recipe_step * self.steps / RECIPE_STEPS))
 
+    @property
+    def boost(self) -> float:
+        """A short run takes longer strides: (30,000 / steps)^(1/4), at most 2."""
+        return float(min(BOOST_MAX, max(1.0, (RECIPE_STEPS / self.steps) ** BOOST_POWER)))
+
     def means_lr(self, step: int) -> float:
         """Exponential decay to 1 %."""
-        return MEANS_LR * self.extent * MEANS_LR_END ** (step / max(self.steps - 1, 1))
+        decay = MEANS_LR_END ** (step / max(self.steps - 1, 1))
+        return float(MEANS_LR * self.extent * self.boost * decay)
 
     def rate_factor(self, step: int) -> float:
-        """What all other rates are multiplied by: a short run strides, and settles at its end."""
-        boost = min(BOOST_MAX, (RECIPE_STEPS / self.steps) ** BOOST_POWER)
+        """What all other rates are multiplied by: the boost, and a settling at the end."""
         settling = max(0.0, (step / self.steps - SETTLE_FROM) / (1.0 - SETTLE_FROM))
-        return float(max(1.0, boost) * SETTLE_TO**settling)
+        return float(self.boost * SETTLE_TO**settling)
 
     def active_sh_degree(self, step: int) -> int:
         """One degree more every 1000 steps of the recipe."""
