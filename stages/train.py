@@ -167,7 +167,7 @@ def finished(model: Model, sh_degree: int, start: Splats) -> Splats:
     norms = np.linalg.norm(model.quaternions.astype(np.float64), axis=1, keepdims=True)
     good = np.isfinite(norms[:, 0]) & (norms[:, 0] > 0)
     for array in model.arrays:
-        good &= np.isfinite(array.reshape(len(model), -1)).all(1)
+        good &= np.isfinite(array).all(tuple(range(1, array.ndim)))
     quaternions = (model.quaternions[good] / norms[good]).astype(np.float32)
     return Splats(
         model.means[good],

@@ -16,6 +16,8 @@ from stages.run.stage import Report
 from stages.scene import Camera, Reconstruction, Splats, View, dc_to_rgb, look_at
 from stages.structure.neighbours import mean_neighbour_distance, nearest_distance
 
+BARE = seed.SeedSettings(fill=False)  # the scenes below have no photographs
+
 
 def grid(side: int = 8, spacing: float = 0.1) -> Reconstruction:
     """A plane of points `spacing` apart, seen by four cameras about 3 away."""
@@ -59,7 +61,7 @@ def with_points(reconstruction: Reconstruction, extra: list[list[float]], **chan
 
 def run(reconstruction: Reconstruction, folder: Path) -> tuple[Splats, Report]:
     report = Report()
-    return seed.run({"sfm": reconstruction}, seed.SeedSettings(), folder, report), report
+    return seed.run({"sfm": reconstruction}, BARE, folder, report), report
 
 
 def test_a_grid_gives_splats_as_large_as_its_spacing(tmp_path: Path) -> None:

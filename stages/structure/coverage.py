@@ -85,7 +85,7 @@ def _empty_cells(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.floa
     columns, rows = np.floor(pixels).astype(int).T
     hits[rows, columns] = True
     rows, columns = np.nonzero(~hits)
-    return np.stack([columns, rows], 1) + 0.5
+    return np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)
 
 
 def _interpolated(

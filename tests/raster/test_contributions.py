@@ -1,0 +1,89 @@
+"""What removing one splat would do to the squared error, against drawing without it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from stages.raster import RasterSettings
+from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.raster.reference import blend_weights, parameters_of, project, render_tensors
+from tests.scenes import camera, cloud, relative, splats
+
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9), sh_degree=2)
+
+
+def faint_cloud(seed=0, n=60):
+    """So faint that no pixel reaches the stopping rule."""
+    scene = cloud(n, 40, 30, seed=seed, size_px=5.0)
+    logits = np.random.default_rng(seed).uniform(-3, 0.5, n).astype(np.float32)
+    return replace(scene, opacity_logits=logits)
+
+
+def photograph(seed=5):
+    return np.random.default_rng(seed).uniform(0, 1, (3, 30, 40)).astype(np.float32)
+
+
+def measured(scene, picture, where, settings=SETTINGS):
+    """[N, 3] of `contributions`, zero for what is out of view."""
+    rasteriser = CpuRasteriser()
+    forward = rasteriser.forward(splat_arrays(scene), where, settings)
+    residual = np.ascontiguousarray(forward.image[:3] - picture)
+    full = np.zeros((len(scene), 3))
+    full[forward.visible] = rasteriser.contributions(forward, residual)
+    return full
+
+
+def squared_error(scene, picture, where):
+    """In float64, by the definition."""
+    image, _, _ = render_tensors(parameters_of(scene), where, SETTINGS)
+    return float(
+        ((image.detach().numpy().transpose(2, 0, 1) - picture.astype(np.float64)) ** 2).sum()
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_change_of_the_error_is_that_of_drawing_without_the_splat(seed):
+    scene, where, picture = faint_cloud(seed), camera(40, 30), photograph()
+    now = squared_error(scene, picture, where)
+    rows = np.arange(len(scene))
+    wanted = np.array([squared_error(scene.take(rows != i), picture, where) - now for i in rows])
+    assert (wanted < 0).any()
+    assert (wanted > 0).any()
+    assert relative(measured(scene, picture, where)[:, 0], wanted) < 1e-3
+
+
+def test_against_its_own_picture_no_splat_is_better_gone():
+    scene, where = faint_cloud(1), camera(40, 30)
+    forward = CpuRasteriser().forward(splat_arrays(scene), where, SETTINGS)
+    assert (measured(scene, forward.image[:3].copy(), where)[:, 0] >= 0).all()
+
+
+@pytest.mark.parametrize("opaque", [False, True])
+def test_weights_are_those_of_the_definition(opaque):
+    scene = cloud(200, 40, 30, size_px=8.0) if opaque else faint_cloud()
+    where = camera(40, 30)
+    projected = project(parameters_of(scene), where, SETTINGS)
+    ys, xs = torch.meshgrid(
+        torch.arange(30, dtype=torch.float64) + 0.5,
+        torch.arange(40, dtype=torch.float64) + 0.5,
+        indexing="ij",
+    )
+    pixels = torch.stack([xs, ys], -1).flatten(0, 1)
+    with torch.no_grad():
+        weights, _ = blend_weights(projected, torch.arange(len(projected.depths)), pixels)
+    wanted = np.zeros((len(scene), 2))
+    wanted[projected.index.numpy()] = np.stack([weights.sum(1), weights.amax(1)], 1)
+    found = measured(scene, photograph(), where)[:, 1:]
+    np.testing.assert_allclose(found[:, 1], wanted[:, 1], atol=5e-3)
+    assert relative(found[:, 0], wanted[:, 0]) < 1e-3
+
+
+def test_a_worked_pixel():
+    """A wide splat of opacity 1/2 and colour 1 on black, the photograph black as well: at its
+    centre the picture is 1/2, and taking it out takes (1/2)^2 a channel away."""
+    scene = splats([[0.0, 0.0, 1.0]], scales=1000.0, opacities=0.5, rgb=(1.0, 1.0, 1.0))
+    black = np.zeros((3, 1, 1), np.float32)
+    found = measured(scene, black, camera(1, 1), replace(SETTINGS, background=(0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(found, [[-0.75, 0.5, 0.5]], rtol=1e-4)
