@@ -117,7 +117,7 @@ def render(
     width: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Width of the picture (pixels).")
     ] = None,
-    backend: Annotated[str, typer.Option(help="auto, cpu, gpu or reference.")] = "auto",
+    backend: Annotated[str, typer.Option(help="auto, cpu or reference.")] = "auto",
 ) -> None:
     """Draw the splats as one of the photographs saw them."""
     from splatcli import views

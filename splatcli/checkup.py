@@ -62,14 +62,12 @@ def checks() -> Iterator[Check]:
     yield Check("python", f"{platform.python_version()} on {platform.platform()}")
     yield from map(_library, _MODULES)
     yield Check("threads", f"{threads.count()} of {os.cpu_count()} cores (SPLAT_THREADS sets it)")
-    for name in ("OMP_WAIT_POLICY", "NUMBA_THREADING_LAYER_PRIORITY"):
-        yield Check(name, os.environ.get(name, "not set"))
+    yield Check("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "not set"))
     yield _memory()
     yield _disk()
     yield _numba_cache()
-    yield Check("backend reference", "present")
+    yield _backend("reference")
     yield _backend("cpu")
-    yield _backend("gpu")
 
 
 def _library(distribution: str) -> Check:
@@ -114,14 +112,7 @@ def _backend(name: str) -> Check:
     label = f"backend {name}"
     try:
         importlib.import_module(f"stages.raster.{name}")
-        if name == "gpu":
-            import torch
-
-            if not torch.cuda.is_available():
-                return Check(label, "no GPU that torch can use; the CPU does the work")
-            return Check(label, torch.cuda.get_device_name())
     except Exception as error:
-        needed = name != "gpu"
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return Check(label, f"not present ({said})", ok=not needed)
+        return Check(label, f"not present ({said})", ok=False)
     return Check(label, "present")

@@ -144,11 +144,20 @@ def run_stage(
         base = pipeline.recorded_settings()
     typed = options.given_only(given)
     preset = typed.pop("preset", None)
+    if "formats" in typed:
+        typed["formats"] = _with_exported(pipeline, typed["formats"])
     settings = settings_for({name: base[name]}, typed, preset)
     if not runfolder.is_run_folder(pipeline.run_folder):
         settings = {**base, **settings}
     may_run = _may_run(name)
     run(pipeline, settings, until=name, may_run=may_run, quiet=quiet, as_json=as_json)
+
+
+def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:
+    """The formats asked for, after those that lie there already: asking for one more loses none."""
+    manifest = pipeline.manifest("export")
+    earlier = manifest.settings.get("formats", ()) if manifest is not None else ()
+    return tuple(dict.fromkeys((*earlier, *formats)))
 
 
 def _may_run(name: str) -> Collection[str]:

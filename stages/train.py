@@ -36,7 +36,7 @@ class TrainSettings:
     )
     seed: int = field(default=0, metadata={"help": "Seed of all random numbers."})
     backend: str = field(
-        default="auto", metadata={"help": "Rasteriser: auto, cpu, gpu or reference."}
+        default="auto", metadata={"help": "Rasteriser: auto, cpu or reference."}
     )
 
 

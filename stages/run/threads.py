@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 
@@ -29,8 +30,20 @@ def kernel_cache() -> Path:
     for source in sorted([*stages.glob("raster/*.py"), *stages.glob("training/*.py")]):
         digest.update(source.name.encode() + source.read_bytes())
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or ""
-    root = Path(base) if base else Path.home() / ".cache"
-    return root / "splat" / f"kernels-{digest.hexdigest()[:16]}"
+    root = Path(base) if base else Path("~/.cache").expanduser()
+    folder = root / "splat" / f"kernels-{digest.hexdigest()[:16]}"
+    if not _writable(folder):
+        folder = Path(tempfile.gettempdir()) / f"splat-{folder.name}"
+    return folder
+
+
+def _writable(folder: Path) -> bool:
+    """Numba stops the program when it can write nowhere; a home folder may be read-only."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
 
 
 def count() -> int:

@@ -49,6 +49,13 @@ def test_process_twice_does_nothing(splat) -> None:
     assert [e["stage"] for e in events(result) if e["event"] == "skipped"] == list(STAGES)
 
 
+def test_exporting_one_more_format_keeps_those_that_are_there(splat) -> None:
+    splat("process", "photos", "--format", "ply")
+    splat("export", "--format", "glb")
+    manifest = json.loads(Path("run/7-export/manifest.json").read_text())
+    assert manifest["settings"]["formats"] == ["ply", "glb"]
+
+
 def test_quiet_prints_only_paths_and_warnings(splat) -> None:
     result = splat("process", "photos", "--quiet")
     assert result.stdout == f"{Path('run/7-export/out.ply')}\n"
