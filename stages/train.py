@@ -35,9 +35,7 @@ class TrainSettings:
         metadata={"help": "Make up in opacity for the widening of splats under a pixel."},
     )
     seed: int = field(default=0, metadata={"help": "Seed of all random numbers."})
-    backend: str = field(
-        default="auto", metadata={"help": "Rasteriser: auto, cpu or reference."}
-    )
+    backend: str = field(default="auto", metadata={"help": "Rasteriser: auto, cpu or reference."})
 
 
 PRESETS: dict[str, TrainSettings] = {

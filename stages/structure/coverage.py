@@ -43,7 +43,7 @@ def fill_cells(
         margin = round(MARGIN * CELLS)
         camera = _widened(small, margin)
         pixels, _ = _seen(camera, np.concatenate([points, *added]))
-        measured = _seen(camera, points)
+        measured = _thinned(*_seen(camera, points))
         empty = _empty_cells(camera, pixels)
         if len(measured[1]) < PLANE_POINTS or len(empty) == 0:
             continue
@@ -79,6 +79,15 @@ def _seen(
     return pixels[inside], at[inside, 2]
 
 
+def _thinned(
+    pixels: NDArray[np.float64], depths: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """At most one point in each quarter of a cell: a depth wants no more, and 25,000 take long."""
+    quarter = np.floor(2 * pixels).astype(np.int64)
+    _, first = np.unique(quarter[:, 1] * 100_000 + quarter[:, 0], return_index=True)
+    return pixels[first], depths[first]
+
+
 def _empty_cells(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """[K, 2] centres of the cells (the camera's pixels) in which no point lands."""
     hits = np.zeros((camera.height, camera.width), bool)
@@ -98,7 +107,9 @@ def _interpolated(
     what has no texture is more often behind than before, and a splat too far hides nothing.
     """
     distance2 = ((at[:, None] - pixels[None]) ** 2).sum(2)
-    nearest = np.argsort(distance2, axis=1, kind="stable")[:, :PLANE_POINTS]
+    nearest = np.argpartition(distance2, PLANE_POINTS - 1, axis=1)[:, :PLANE_POINTS]
+    by_distance = np.argsort(np.take_along_axis(distance2, nearest, 1), axis=1, kind="stable")
+    nearest = np.take_along_axis(nearest, by_distance, 1)
     inverse = 1.0 / depths[nearest]
     offset = pixels[nearest] - at[:, None]
     design = np.concatenate([np.ones_like(offset[..., :1]), offset], 2)
