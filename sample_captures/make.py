@@ -31,6 +31,7 @@ JPEG_QUALITY = 90
 RINGS = ((-0.34, 1.42), (-0.86, 1.28))  # (y, distance from the axis) of the two heights, metres
 PHOTOGRAPHS = 24
 ARC_DEGREES = 230.0
+FIRST = 4  # place on the arc; so the 1st, 9th and 17th, often held out, have neighbours both sides
 TARGET = (0.0, -0.12, 0.0)
 
 
@@ -125,16 +126,17 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 
 
 def poses() -> list[NDArray[np.float64]]:
-    """Cameras on an arc, low and high in turn, held by hand: each strays a little."""
+    """Cameras on an arc, low and high in turn, held by hand: each strays a little. In the order of
+    the photographs, which begin within the arc, go on to its end and then take the rest."""
     rng = np.random.default_rng(7)
     matrices = []
-    for index in range(PHOTOGRAPHS):
-        height, distance = RINGS[index % 2]
-        angle = np.radians(-90 + ARC_DEGREES * (index / (PHOTOGRAPHS - 1) - 0.5))
+    for place in range(PHOTOGRAPHS):
+        height, distance = RINGS[place % 2]
+        angle = np.radians(-90 + ARC_DEGREES * (place / (PHOTOGRAPHS - 1) - 0.5))
         eye = np.array([distance * np.cos(angle), height, distance * np.sin(angle)])
         eye += rng.normal(0, 0.02, 3)
         matrices.append(look_at(eye, np.array(TARGET) + rng.normal(0, 0.03, 3)))
-    return matrices
+    return matrices[FIRST:] + matrices[:FIRST]
 
 
 def exif(index: int) -> bytes:
