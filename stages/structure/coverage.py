@@ -114,7 +114,7 @@ def _interpolated(
     offset = pixels[nearest] - at[:, None]
     design = np.concatenate([np.ones_like(offset[..., :1]), offset], 2)
     weights = 1.0 / (1.0 + np.take_along_axis(distance2, nearest, 1))[..., None]
-    normal = np.einsum("kpi,kpj->kij", design * weights, design) + 1e-6 * np.eye(3)
+    normal = np.einsum("kpi,kpj->kij", design * weights, design) + 1e-9 * np.eye(3)
     right = np.einsum("kpi,kp->ki", design * weights, inverse)
     plane = np.linalg.solve(normal, right[..., None])[..., 0]
     misfit = np.einsum("kpi,ki->kp", design, plane) - inverse
