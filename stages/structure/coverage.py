@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stages.photos.load import load_image
 from stages.scene import Camera, View
 
-CELLS = 40  # along the longer side of a photograph
+CELLS = 32  # along the longer side of a photograph
 MARGIN = 0.25  # of the longer side: how far beyond its rim a photograph is continued
 NEIGHBOURS = 4
 PLANE_POINTS = 12

@@ -26,6 +26,8 @@ CHECKED_PAIRS = 3  # a photograph
 def map_photographs(job: Job) -> None:
     """Write the largest model to `job.out`, with the names in each model that was found."""
     out = Path(job.out)
+    if not out.name:  # "" is the folder that the process happens to stand in
+        raise ValueError("the job names no folder to leave its model in")
     shutil.rmtree(out, ignore_errors=True)
     scratch = out.with_name(out.name + "-colmap")
     shutil.rmtree(scratch, ignore_errors=True)

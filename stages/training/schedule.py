@@ -12,12 +12,12 @@ MEANS_LR = 1.6e-4  # x scene extent
 MEANS_LR_END = 0.01  # of the first
 THRESHOLD = 2e-4
 GROWTH_ENDS = 0.5  # share of the run in which the model grows
-BOOST_POWER, BOOST_MAX = 0.25, 2.0
+BOOST_POWER, BOOST_MAX = 0.6, 6.0
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1  # share of the run; share of the rate at its end
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer do not see enough of the scene to judge a splat by
 MIN_STEPS_FOR_RESET = 15_000  # a shorter run does not recover from an opacity reset
 # (share of the run, scale of the picture): coarse pictures first, they are cheap and smooth
-RESOLUTIONS = ((0.2, 0.25), (0.5, 0.5), (1.0, 1.0))
+RESOLUTIONS = ((0.2, 0.5), (1.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Schedule:
 
     @property
     def boost(self) -> float:
-        """A short run takes longer strides: (30,000 / steps)^(1/4), at most 2."""
+        """A short run takes longer strides: (30,000 / steps)^0.6, at most 6."""
         return float(min(BOOST_MAX, max(1.0, (RECIPE_STEPS / self.steps) ** BOOST_POWER)))
 
     def means_lr(self, step: int) -> float:
