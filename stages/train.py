@@ -136,19 +136,19 @@ def make_trainer(
             f"{len(smaller)} photographs are smaller than --train-side {settings.train_side}; "
             "they are used at their own size. --max-side sets how large ingest keeps them.",
         )
-    memory_cap = splat_cap(available_mib())
+    cap = settings.max_splats or splat_cap(available_mib())
     return Trainer(
         schedule=Schedule(
             steps=settings.steps,
             extent=scene_extent(reconstruction.views),
             sh_degree=settings.sh_degree,
             n_views=len(train),
-            n_start=n_start,
+            n_start=min(n_start, cap),
             seed=settings.seed,
         ),
         train=train,
         held_out=held_out,
-        cap=settings.max_splats or memory_cap,
+        cap=cap,
         folder=folder,
         report=report,
         antialias=settings.antialias,
