@@ -102,7 +102,8 @@ def _filled(
     from stages.structure.coverage import fill_cells
 
     training, _ = split_held_out(reconstruction.views)
-    more, more_colours, more_scales = fill_cells(reconstruction.folder, training, points)
+    cameras = tuple(view.camera for view in reconstruction.views)
+    more, more_colours, more_scales = fill_cells(reconstruction.folder, training, points, cameras)
     report.metric("filled", len(more))
     return (
         np.concatenate([points, more]),

@@ -26,16 +26,22 @@ NEIGHBOURS = 4
 PLANE_POINTS = 12
 PLANE_MISFIT = 0.04  # of the inverse depth, root mean square
 PLANE_REACH = 1.5  # how far beyond its points' depths a plane is continued
+CLEARANCE = 0.5
 SCALE = 0.5  # of a cell's size, seen at the point's depth
 
 
 def fill_cells(
-    folder: Path, views: tuple[View, ...], points: NDArray[np.float64]
+    folder: Path,
+    views: tuple[View, ...],
+    points: NDArray[np.float64],
+    cameras: tuple[Camera, ...] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
     """(points [M, 3], colours [M, 3] in 0..1, scales [M] in world units) to add to `points`.
 
-    folder: where the views' image paths start.
+    folder: where the views' image paths start. cameras: all that were found, those of `views`
+    among them; the space before a camera is empty, and stays so.
     """
+    clear = [(camera.centre, _clearance(camera, points)) for camera in cameras]
     added = [np.zeros((0, 3))]
     colours, scales = [np.zeros((0, 3), np.float32)], [np.zeros(0)]
     for view in sorted(views, key=lambda v: v.name):
@@ -48,13 +54,25 @@ def fill_cells(
         if len(measured[1]) < PLANE_POINTS or len(empty) == 0:
             continue
         depth = _interpolated(empty, *measured)
-        added.append(_unprojected(camera, empty, depth))
+        places = _unprojected(camera, empty, depth)
+        free = np.ones(len(places), bool)
+        for centre, distance in clear:
+            free &= np.linalg.norm(places - centre, axis=1) > distance
+        places, empty, depth = places[free], empty[free], depth[free]
+        added.append(places)
         picture = load_image(folder / view.image, small.width, small.height)
         columns, rows = np.floor(empty).astype(int).T - margin
         rows, columns = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
         colours.append(picture[rows, columns])
         scales.append(SCALE * depth / camera.fx)
     return np.concatenate(added), np.concatenate(colours), np.concatenate(scales)
+
+
+def _clearance(camera: Camera, points: NDArray[np.float64]) -> float:
+    """How far around a camera nothing is to be guessed: half of the depth at which it begins to
+    see something (the fifth percentile: a few measured points are always misplaced)."""
+    _, depths = _seen(camera, points)
+    return CLEARANCE * float(np.percentile(depths, 5)) if len(depths) else 0.0
 
 
 def _widened(camera: Camera, margin: int) -> Camera:
