@@ -2,8 +2,6 @@
 
 All of it in float64: it costs next to nothing beside blending, and takes overflow, the loss of
 the determinant and far-away centres off the list of worries. Formulas as in `reference`.
-
-Work row (float64[40], one a thread), filled by `footprint`, read by `footprint_gradient`:
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from stages.scene import Camera
 # low y, high y), near 20, dilation 21, antialias 22, centre 23:26, width 26, height 27.
 CAMERA_ROW = 28
 
-# Work row.
+# Work row (float64[40], one a thread): filled by `footprint`, read by `footprint_gradient`.
 AT = 0  # 0:3 position in the camera
 V0, V1 = 3, 6  # rows of V = J W R diag(s)
 AXES = 9  # 9:18 W R

@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from stages.raster.projection import (
-    CAMERA_ROW,
     GEOMETRY_ROW,
     GVX,
     GVY,
@@ -19,8 +18,6 @@ from stages.raster.projection import (
 )
 from stages.raster.sh import sh_basis, sh_direction_gradient
 from stages.raster.simd import kernel, take_ticket
-
-assert CAMERA_ROW == 28
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
 
