@@ -107,7 +107,7 @@ def _reference_gradients(scene, view, v_image, settings):
     from stages.raster.reference import parameters_of, render_tensors
 
     p = parameters_of(scene)
-    image, _, _ = render_tensors(p, view, settings)
+    image, _, _, _ = render_tensors(p, view, settings)
     if image.requires_grad:
         image.backward(torch.tensor(np.asarray(v_image, np.float64)))
     return {

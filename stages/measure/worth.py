@@ -44,7 +44,7 @@ def measure_worth(
     seen_in, sse, depths = np.zeros(n, np.int32), 0.0, []
     rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
     for camera, photograph in photographs:
-        forward = rasteriser.forward(arrays, camera, settings)
+        forward = rasteriser.forward(arrays, camera, settings, depths=True)
         residual = np.ascontiguousarray(forward.image[:3] - photograph)
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]

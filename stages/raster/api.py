@@ -36,13 +36,18 @@ class RasterSettings:
 
 @dataclass(frozen=True)
 class Rendering:
-    """image [H, W, 3], alpha [H, W], depth [H, W] float32; depth is the expected z of what was hit
-    (world units, 0 where alpha is 0). culled: splats with values that cannot be drawn (NaN,
-    infinite, overflowing), which is not the same as out of view."""
+    """image [H, W, 3], alpha [H, W], depth and median_depth [H, W] float32.
+
+    depth: expected z of what was hit, world units; 0 where alpha is 0. median_depth: z of the splat
+    behind which less than half of the light passes; 0 where more than half passes to the end.
+    culled: splats with values that cannot be drawn (NaN, infinite, overflowing), which is not the
+    same as out of view.
+    """
 
     image: NDArray[np.float32]
     alpha: NDArray[np.float32]
     depth: NDArray[np.float32]
+    median_depth: NDArray[np.float32]
     culled: int
 
 
@@ -51,10 +56,14 @@ def render(
     camera: Camera,
     settings: RasterSettings | None = None,
     backend: str = "auto",
+    smoothing: NDArray[np.float32] | None = None,
 ) -> Rendering:
     """Draw `splats` as `camera` sees them.
 
     The camera is given in the frame of `splats.means`; `splats.local` moves one that is not.
+
+    smoothing [N]: width of the 3D smoothing filter of each splat, world units; None for none. See
+    `raster.smoothing`.
 
     backend: "auto" (the fastest that is present), "cpu" (Numba) or "reference" (torch).
     Raises ValueError for another name.
@@ -63,9 +72,9 @@ def render(
     if backend in ("auto", "cpu"):
         from stages.raster.cpu import render_cpu
 
-        return render_cpu(splats, camera, settings)
+        return render_cpu(splats, camera, settings, smoothing)
     if backend == "reference":
         from stages.raster.reference import render_reference
 
-        return render_reference(splats, camera, settings)
+        return render_reference(splats, camera, settings, smoothing)
     raise ValueError(f"backend {backend!r}, wanted auto, cpu or reference")

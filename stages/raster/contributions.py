@@ -14,7 +14,13 @@ import numpy as np
 
 from stages.raster.api import ALPHA_MAX, ALPHA_MIN
 from stages.raster.binning import TILE
-from stages.raster.blend import PIXELS, alpha_row, column_parts, row_parts, tile_frame
+from stages.raster.blend import (
+    PIXELS,
+    alpha_row,
+    exponent_parts,
+    furthest_entry,
+    tile_frame,
+)
 from stages.raster.simd import (
     kernel,
     splat16,
@@ -44,9 +50,9 @@ def contribution_tiles(
     width,
     height,
     tile_starts,
-    ranks,
+    members,
     slots,
-    rows,
+    spans,
     geometry,
     paint,
     background,
@@ -66,7 +72,6 @@ def contribution_tiles(
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
         work[:] = 0.0
-        furthest = _F(0.0)
         for j in range(min(TILE, height - tile_y * TILE)):
             for i in range(min(TILE, width - tile_x * TILE)):
                 at = j * TILE + i
@@ -75,9 +80,8 @@ def contribution_tiles(
                     r = residual[channel, tile_y * TILE + j, tile_x * TILE + i]
                     work[RESIDUAL + channel * PIXELS + at] = r
                     work[BEHIND + channel * PIXELS + at] = light[tile, at] * background[channel]
-                furthest = max(furthest, last[tile, at])
         start, end = tile_starts[tile], tile_starts[tile + 1]
-        drawn_end = start + np.int64(furthest)
+        drawn_end = start + furthest_entry(last, tile, width, height, end - start)
         for entry in range(drawn_end, end):
             for k in range(COLUMNS):
                 out[slots[entry], k] = 0.0
@@ -86,10 +90,10 @@ def contribution_tiles(
                 tile_x,
                 tile_y,
                 _F(entry - start + 1),
-                rows[entry],
+                spans[entry],
                 geometry,
                 paint,
-                ranks[entry],
+                members[entry],
                 work,
                 last,
                 tile * PIXELS,
@@ -104,10 +108,10 @@ def _entry(
     tile_x,
     tile_y,
     number,
-    row_range,
+    span,
     geometry,
     paint,
-    rank,
+    row,
     work,
     last,
     last_at,
@@ -115,14 +119,13 @@ def _entry(
     out,
     slot,
 ):
-    wide, a, b, k, opacity, u, m = tile_frame(geometry, rank, tile_x, tile_y)
-    _, columns_q, columns_m = column_parts(wide, a, k, u, m)
+    wide, a, b, k, log_opacity, u, m = tile_frame(geometry, row, tile_x, tile_y)
+    parts = exponent_parts(wide, a, k, log_opacity, u, m)
     zero, one, two = splat16(_F(0.0)), splat16(_F(1.0)), splat16(_F(2.0))
     change, total, largest = zero, zero, zero
-    for j in range(row_range & 15, (row_range >> 4) + 1):
+    for j in range(span & 15, (span >> 4) + 1):
         at = j * TILE
-        _, row_q, row_m = row_parts(wide, a, k, u, j)
-        raw, _, _ = alpha_row(b, opacity, columns_q, columns_m, row_q, row_m)
+        raw = alpha_row(parts, splat16(b), j)
         drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, last_at + at), splat16(number)))
         if not vany(drawn):
             continue
@@ -136,7 +139,7 @@ def _entry(
         ratio = alpha * inverse
         for channel in range(3):
             plane = channel * PIXELS + at
-            painted = weight * splat16(paint[rank, channel])
+            painted = weight * splat16(paint[row, channel])
             behind = vload(work, BEHIND + plane)
             shift = behind * ratio - painted
             change = vfma(shift, shift + two * vload(work, RESIDUAL + plane), change)
@@ -152,10 +155,10 @@ def _entry(
 @kernel
 def gather_contributions(raw, slot_starts, out):
     """out [V, 3] float64: sums (and the largest weight) over each visible splat's tiles."""
-    for rank in range(len(out)):
+    for place in range(len(out)):
         change, total, largest = 0.0, 0.0, 0.0
-        for slot in range(slot_starts[rank], slot_starts[rank + 1]):
+        for slot in range(slot_starts[place], slot_starts[place + 1]):
             change += raw[slot, 0]
             total += raw[slot, 1]
             largest = max(largest, np.float64(raw[slot, 2]))
-        out[rank, 0], out[rank, 1], out[rank, 2] = change, total, largest
+        out[place, 0], out[place, 1], out[place, 2] = change, total, largest

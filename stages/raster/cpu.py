@@ -11,11 +11,18 @@ from numpy.typing import NDArray
 from stages.raster import binning, blend, contributions
 from stages.raster.api import RasterSettings, Rendering
 from stages.raster.pool import Pool, default_pool
-from stages.raster.projection import CAMERA_ROW, GEOMETRY_ROW, camera_row
-from stages.raster.splat_kernels import project_splats, shade_splats, splat_gradients
+from stages.raster.projection import GEOMETRY_ROW, camera_row
+from stages.raster.splat_kernels import (
+    CULLED,
+    SUMS,
+    VISIBLE,
+    project_splats,
+    splat_gradients,
+)
 from stages.scene import Camera, Splats
 
-CHUNK = 512  # splats a ticket
+CHUNK = 512  # splats a ticket; whole vectors
+NO_SMOOTHING = np.zeros(0, np.float32)
 
 
 class Buffers:
@@ -38,29 +45,57 @@ class Buffers:
         return sum(array.nbytes for array in self._arrays.values())
 
 
-@dataclass
-class Forward:
-    """What a forward pass leaves for the way back. image [5, H, W]: RGB, alpha, depth.
+@dataclass(frozen=True)
+class TileLists:
+    """What each tile draws, nearest first: entries starts[t]..starts[t + 1].
 
-    visible [V] int32: rows of the splats that touch the picture, nearest first. n_tiles [V]: how
-    many tiles each touches. The arrays belong to the rasteriser's buffers: valid until its next
-    forward pass.
+    members [I]: row of the splat. slots [I]: where the entry's gradient goes; the entries of
+    visible splat number k have the slots slot_starts[k]..slot_starts[k + 1]. spans [I]: first + 16 x
+    last pixel row of the splat within the tile.
+    """
+
+    starts: NDArray[np.int64]
+    members: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    spans: NDArray[np.uint8]
+    slot_starts: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+
+@dataclass(frozen=True)
+class Forward:
+    """What a forward pass leaves for the way back.
+
+    image [4 or 6, H, W]: RGB, alpha, and if asked for expected and median depth. visible [V] int32:
+    rows of the splats that touch the picture, ascending. geometry, paint: of all rows (of visible
+    ones filled). light, last: see `blend.blend_tiles`. The arrays belong to the rasteriser's
+    buffers: valid until its next forward pass.
     """
 
     image: NDArray[np.float32]
     visible: NDArray[np.int32]
-    n_intersections: int
+    lists: TileLists
     culled: int
+    geometry: NDArray[np.float64]
+    paint: NDArray[np.float32]
+    light: NDArray[np.float32]
+    last: NDArray[np.float32]
     cam: NDArray[np.float64]
     degree: int
     background: NDArray[np.float32]
     width: int
     height: int
 
+    @property
+    def n_intersections(self) -> int:
+        return len(self.lists)
 
-@dataclass
+
+@dataclass(frozen=True)
 class Backward:
-    """Gradients of the visible splats, nearest first.
+    """Gradients of the visible splats, in the order of their rows.
 
     rows [V] int32. parameters [V, gradient_columns]: mean 0:3, quaternion 3:7, log-scales 7:10,
     opacity logit 10, then SH, basis function by basis function with RGB last, then zeros.
@@ -89,60 +124,60 @@ class CpuRasteriser:
         arrays: tuple[NDArray[np.float32], ...],
         camera: Camera,
         settings: RasterSettings,
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
+        depths: bool = False,
     ) -> Forward:
-        """arrays: means, quaternions, log_scales, opacity_logits, sh (C-contiguous)."""
+        """arrays: means, quaternions, log_scales, opacity_logits, sh (C-contiguous).
+
+        smoothing [N]: see `raster.smoothing`. depths: whether to draw the depth planes.
+        """
         cam = camera_row(camera, settings)
-        assert len(cam) == CAMERA_ROW
-        visible, keys = self._project(arrays, cam)
-        order = self._sort(keys, visible, arrays)
-        n = len(order)
-        get = self.buffers.get
+        degree = min(settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1)
+        width, height = camera.width, camera.height
+        n, get = len(arrays[0]), self.buffers.get
         geometry = get("geometry", (n, GEOMETRY_ROW), np.float64)
         paint = get("paint", (n, 4), np.float32)
-        degree = min(settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1)
+        status = get("status", (n,), np.uint8)
         self.pool.share(
-            shade_splats,
-            CHUNK,
-            order,
-            self._all_geometry,
-            cam,
-            degree,
-            arrays[0],
-            arrays[4],
-            geometry,
-            paint,
+            project_splats, CHUNK, cam, degree, *arrays, smoothing, geometry, paint, status
         )
-        n_intersections = self._bin(geometry, n, camera.width, camera.height)
+        visible = np.flatnonzero(status == VISIBLE).astype(np.int32)
+        order = self._order(visible, paint, arrays)
+        lists = self._lists(visible, order, geometry, width, height)
         background = np.asarray(settings.background, np.float32)
-        tiles = len(self._tile_starts) - 1
-        image = get("image", (5, camera.height, camera.width), np.float32)
-        self._light = get("light", (tiles, blend.PIXELS), np.float32)
-        self._last = get("last", (tiles, blend.PIXELS), np.float32)
+        tiles = len(lists.starts) - 1
+        image = get("image", (6 if depths else 4, height, width), np.float32)
+        light = get("light", (tiles, blend.PIXELS), np.float32)
+        last = get("last", (tiles, blend.PIXELS), np.float32)
         self.pool.share(
             blend.blend_tiles,
-            camera.width,
-            camera.height,
-            self._tile_starts,
-            self._ranks,
-            self._rows,
+            width,
+            height,
+            lists.starts,
+            lists.members,
+            lists.spans,
             geometry,
             paint,
             background,
+            depths,
             image,
-            self._light,
-            self._last,
+            light,
+            last,
         )
-        self._geometry, self._paint = geometry, paint
         return Forward(
             image,
-            order,
-            n_intersections,
-            self._culled,
+            visible,
+            lists,
+            int(np.count_nonzero(status == CULLED)),
+            geometry,
+            paint,
+            light,
+            last,
             cam,
             degree,
             background,
-            camera.width,
-            camera.height,
+            width,
+            height,
         )
 
     def backward(
@@ -150,27 +185,13 @@ class CpuRasteriser:
         arrays: tuple[NDArray[np.float32], ...],
         forward: Forward,
         v_image: NDArray[np.float32],
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
     ) -> Backward:
         """Gradients of the visible splats, from v_image [3, H, W]."""
         n = len(forward.visible)
         get = self.buffers.get
-        raw = get("gradients", (forward.n_intersections, blend.GRADIENTS), np.float32)
-        self.pool.share(
-            blend.blend_gradient_tiles,
-            forward.width,
-            forward.height,
-            self._tile_starts,
-            self._ranks,
-            self._slots,
-            self._rows,
-            self._geometry,
-            self._paint,
-            forward.background,
-            self._light,
-            self._last,
-            v_image,
-            raw,
-        )
+        raw = get("gradients", (forward.n_intersections, SUMS), np.float32)
+        self._over_tiles(blend.blend_gradient_tiles, forward, v_image, raw)
         out = get("out", (n, gradient_columns((forward.degree + 1) ** 2)), np.float32)
         means2d = get("means2d", (n, 2), np.float32)
         self.pool.share(
@@ -180,9 +201,10 @@ class CpuRasteriser:
             forward.cam,
             forward.degree,
             *arrays,
-            self._geometry,
-            self._paint,
-            self._slot_starts,
+            smoothing,
+            forward.geometry,
+            forward.paint,
+            forward.lists.slot_starts,
             raw,
             out,
             means2d,
@@ -197,80 +219,106 @@ class CpuRasteriser:
         """
         shape = (forward.n_intersections, contributions.COLUMNS)
         raw = self.buffers.get("contributions", shape, np.float32)
-        self.pool.share(
-            contributions.contribution_tiles,
-            forward.width,
-            forward.height,
-            self._tile_starts,
-            self._ranks,
-            self._slots,
-            self._rows,
-            self._geometry,
-            self._paint,
-            forward.background,
-            self._light,
-            self._last,
-            residual,
-            raw,
-        )
+        self._over_tiles(contributions.contribution_tiles, forward, residual, raw)
         out = np.empty((len(forward.visible), contributions.COLUMNS))
-        contributions.gather_contributions(raw, self._slot_starts, out)
+        contributions.gather_contributions(raw, forward.lists.slot_starts, out)
         return out
 
-    def _project(
-        self, arrays: tuple[NDArray[np.float32], ...], cam: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
-        n = len(arrays[0])
-        get = self.buffers.get
-        self._all_geometry = get("all_geometry", (n, GEOMETRY_ROW), np.float64)
-        depth = get("depth", (n,), np.float32)
-        status = get("status", (n,), np.uint8)
-        self.pool.share(project_splats, CHUNK, cam, *arrays, self._all_geometry, depth, status)
-        self._culled = int(np.count_nonzero(status == 2))
-        visible = np.flatnonzero(status == 1).astype(np.int32)
-        return visible, depth[visible].view(np.uint32)
-
-    def _sort(
+    def _over_tiles(
         self,
-        keys: NDArray[np.uint32],
+        kernel: Any,
+        forward: Forward,
+        planes: NDArray[np.float32],
+        out: NDArray[np.float32],
+    ) -> None:
+        """A pass from far to near over every tile's list; one row of `out` for each entry."""
+        self.pool.share(
+            kernel,
+            forward.width,
+            forward.height,
+            forward.lists.starts,
+            forward.lists.members,
+            forward.lists.slots,
+            forward.lists.spans,
+            forward.geometry,
+            forward.paint,
+            forward.background,
+            forward.light,
+            forward.last,
+            planes,
+            out,
+        )
+
+    def _order(
+        self,
         visible: NDArray[np.int32],
+        paint: NDArray[np.float32],
         arrays: tuple[NDArray[np.float32], ...],
     ) -> NDArray[np.int32]:
-        n = len(visible)
-        get = self.buffers.get
+        """[V] places in `visible`, nearest first."""
+        n, get = len(visible), self.buffers.get
         # depths are positive, so their bits sort as they do
+        keys = paint[visible, 3].view(np.uint32)
+        order = np.arange(n, dtype=np.int32)
         binning.radix_order(
-            keys, visible, get("keys2", (n,), np.uint32), get("order2", (n,), np.int32)
+            keys, order, get("keys2", (n,), np.uint32), get("order2", (n,), np.int32)
         )
-        binning.settle_ties(keys, visible, *arrays)
-        return visible
+        binning.settle_ties(keys, order, visible, *arrays)
+        return order
 
-    def _bin(self, geometry: NDArray[np.float64], n: int, width: int, height: int) -> int:
-        tiles = -(-width // binning.TILE) * -(-height // binning.TILE)
-        get = self.buffers.get
-        counts = get("tile_counts", (binning.CHUNKS, tiles), np.int64)
-        counts[:] = 0
-        splat_tiles = get("splat_tiles", (n,), np.int32)
-        self._tile_starts = get("tile_starts", (tiles + 1,), np.int64)
-        self._slot_starts = get("slot_starts", (n + 1,), np.int64)
-        self.pool.share(binning.count_tiles, geometry, n, width, height, counts, splat_tiles)
-        total = int(binning.scan_counts(counts, self._tile_starts, splat_tiles, self._slot_starts))
-        self._ranks = get("ranks", (total,), np.int32)
-        self._slots = get("slots", (total,), np.int64)
-        self._rows = get("rows", (total,), np.uint8)
-        self.pool.share(
-            binning.fill_tiles,
-            geometry,
-            n,
-            width,
-            height,
-            counts,
-            self._slot_starts,
-            self._ranks,
-            self._slots,
-            self._rows,
+    def _lists(
+        self,
+        visible: NDArray[np.int32],
+        order: NDArray[np.int32],
+        geometry: NDArray[np.float64],
+        width: int,
+        height: int,
+    ) -> TileLists:
+        n, get, share = len(visible), self.buffers.get, self.pool.share
+        bounds = get("bounds", (n,), np.int32)
+        share(binning.bound_tiles, visible, geometry, width, height, bounds)
+        found_starts = _running_total(bounds, get("found_starts", (n + 1,), np.int64))
+        most = int(found_starts[-1])
+        tiles, spans = get("tiles", (most,), np.int32), get("found_spans", (most,), np.uint8)
+        counts = get("counts", (n,), np.int32)
+        share(
+            binning.find_tiles, visible, geometry, width, height, found_starts, tiles, spans, counts
         )
-        return total
+        slot_starts = _running_total(counts, get("slot_starts", (n + 1,), np.int64))
+
+        n_tiles = -(-width // binning.TILE) * -(-height // binning.TILE)
+        tile_counts = get("tile_counts", (binning.CHUNKS, n_tiles), np.int64)
+        tile_counts[:] = 0
+        share(binning.count_tiles, order, found_starts, counts, tiles, tile_counts)
+        starts = get("tile_starts", (n_tiles + 1,), np.int64)
+        total = int(binning.scan_counts(tile_counts, starts))
+        lists = TileLists(
+            starts,
+            get("members", (total,), np.int32),
+            get("slots", (total,), np.int32),
+            get("spans", (total,), np.uint8),
+            slot_starts,
+        )
+        share(
+            binning.fill_tiles,
+            order,
+            visible,
+            found_starts,
+            slot_starts,
+            tiles,
+            spans,
+            tile_counts,
+            lists.members,
+            lists.slots,
+            lists.spans,
+        )
+        return lists
+
+
+def _running_total(counts: NDArray[np.int32], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+    starts[0] = 0
+    np.cumsum(counts, out=starts[1:])
+    return starts
 
 
 def splat_arrays(splats: Splats) -> tuple[NDArray[np.float32], ...]:
@@ -287,13 +335,20 @@ def splat_arrays(splats: Splats) -> tuple[NDArray[np.float32], ...]:
     )
 
 
-def render_cpu(splats: Splats, camera: Camera, settings: RasterSettings) -> Rendering:
+def render_cpu(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    smoothing: NDArray[np.float32] | None = None,
+) -> Rendering:
     """`render` by the kernels."""
-    forward = CpuRasteriser().forward(splat_arrays(splats), camera, settings)
+    widths = NO_SMOOTHING if smoothing is None else np.ascontiguousarray(smoothing, np.float32)
+    forward = CpuRasteriser().forward(splat_arrays(splats), camera, settings, widths, depths=True)
     image = forward.image
     return Rendering(
         np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
         image[3].copy(),
         image[4].copy(),
+        image[5].copy(),
         forward.culled,
     )

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.api import (
@@ -129,7 +130,20 @@ class Projected:
     depths: Tensor
 
 
-def project(p: Parameters, camera: Camera, settings: RasterSettings) -> Projected:
+def smooth(p: Parameters, widths: Tensor) -> tuple[Tensor, Tensor]:
+    """([N, 3] scales, [N] factor of the opacity) under 3D smoothing filters of `widths` [N].
+
+    A product of ratios per axis: a ratio of determinants underflows.
+    """
+    scales, f = p.log_scales.exp(), widths[:, None]
+    larger, smaller = torch.maximum(scales, f), torch.minimum(scales, f)
+    widened = larger * (1 + (smaller / larger).square()).sqrt()
+    return widened, (scales / widened).prod(1)
+
+
+def project(
+    p: Parameters, camera: Camera, settings: RasterSettings, smoothing: Tensor | None = None
+) -> Projected:
     """Footprints of the splats that can be seen at all, nearest first."""
     like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     world_to_camera = torch.tensor(camera.world_to_camera, **like)
@@ -137,6 +151,9 @@ def project(p: Parameters, camera: Camera, settings: RasterSettings) -> Projecte
     z = (p.means.detach() @ rotation.T + translation)[:, 2]
     index = (drawable(p) & (z > settings.near)).nonzero()[:, 0]
     p = p.rows(index)
+    scales, kept = p.log_scales.exp(), torch.ones_like(z[index])
+    if smoothing is not None:
+        scales, kept = smooth(p, smoothing[index])
     at = p.means @ rotation.T + translation
     z = at[:, 2]
     slope_x, slope_y = at[:, 0] / z, at[:, 1] / z
@@ -148,13 +165,13 @@ def project(p: Parameters, camera: Camera, settings: RasterSettings) -> Projecte
     jacobian[:, 0, 2] = -camera.fx * slope_x.clamp(low_x, high_x) / z
     jacobian[:, 1, 1] = camera.fy / z
     jacobian[:, 1, 2] = -camera.fy * slope_y.clamp(low_y, high_y) / z
-    v = jacobian @ rotation @ rotation_matrices(p.quaternions) * p.log_scales.exp()[:, None, :]
+    v = jacobian @ rotation @ rotation_matrices(p.quaternions) * scales[:, None, :]
     # By Cauchy-Binet det(V V^T) is the sum of the squared 2x2 minors: never negative.
     minors = torch.linalg.cross(v[:, 0], v[:, 1]).square().sum(1)
     a0, b, c0 = v[:, 0].square().sum(1), (v[:, 0] * v[:, 1]).sum(1), v[:, 1].square().sum(1)
     e = settings.dilation_px2
     det = minors + e * (a0 + c0) + e * e
-    opacities = p.opacity_logits.sigmoid()
+    opacities = p.opacity_logits.sigmoid() * kept
     if settings.antialias:
         opacities = opacities * (minors.clamp_min(1e-60) / det).sqrt()
     seen = (opacities >= ALPHA_MIN).nonzero()[:, 0]
@@ -186,8 +203,11 @@ def _order(p: Parameters, z: Tensor) -> Tensor:
     return torch.from_numpy(np.lexsort(table.T[::-1])).to(z.device)
 
 
-def blend_weights(projected: Projected, rows: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """([M, P] blend weights, [P] light that still passes) of splats `rows` at pixel centres [P, 2].
+def blend_weights(
+    projected: Projected, rows: Tensor, pixels: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """([M, P] blend weights, [P] light that still passes, [P] median depth) of splats `rows` at
+    pixel centres [P, 2].
 
     The exponent in Cholesky form: never negative, whatever the rounding.
     """
@@ -205,19 +225,21 @@ def blend_weights(projected: Projected, rows: Tensor, pixels: Tensor) -> tuple[T
     before = torch.cat([torch.ones_like(through[:1]), through[:-1]])
     alive = before >= TRANSMITTANCE_MIN
     passed = torch.where(alive, 1 - alpha, torch.ones_like(alpha)).prod(0)
-    return torch.where(alive, alpha * before, torch.zeros_like(alpha)), passed
+    halved = (before >= 0.5) & (through < 0.5)  # once at most
+    median = (halved * q.depths[:, None]).sum(0)
+    return torch.where(alive, alpha * before, torch.zeros_like(alpha)), passed, median
 
 
 def render_tensors(
-    p: Parameters, camera: Camera, settings: RasterSettings
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(image [H, W, 3], alpha [H, W], depth [H, W]), differentiable in all of `p`."""
-    return render_projected(p, project(p, camera, settings), camera, settings)
+    p: Parameters, camera: Camera, settings: RasterSettings, smoothing: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(image [H, W, 3], alpha, expected depth, median depth [H, W]), differentiable in `p`."""
+    return render_projected(p, project(p, camera, settings, smoothing), camera, settings)
 
 
 def render_projected(
     p: Parameters, projected: Projected, camera: Camera, settings: RasterSettings
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`render_tensors` from footprints already made (their means2d may be asked for gradients)."""
     like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     centre = torch.tensor(camera.centre, **like)
@@ -230,6 +252,7 @@ def render_projected(
     image = torch.zeros(camera.height, camera.width, 3, **like)
     alpha = torch.zeros(camera.height, camera.width, **like)
     depth = torch.zeros(camera.height, camera.width, **like)
+    median = torch.zeros(camera.height, camera.width, **like)
     for top in range(0, camera.height, BLOCK):
         for left in range(0, camera.width, BLOCK):
             bottom, right = min(top + BLOCK, camera.height), min(left + BLOCK, camera.width)
@@ -240,9 +263,8 @@ def render_projected(
                 torch.arange(left, right, **like) + 0.5,
                 indexing="ij",
             )
-            weights, passed = blend_weights(
-                projected, rows, torch.stack([xs, ys], -1).flatten(0, 1)
-            )
+            pixels = torch.stack([xs, ys], -1).flatten(0, 1)
+            weights, passed, halfway = blend_weights(projected, rows, pixels)
             shape = ys.shape
             colour = weights.T @ rgb[rows] + passed[:, None] * background
             image[top:bottom, left:right] = colour.reshape(*shape, 3)
@@ -250,14 +272,21 @@ def render_projected(
             alpha[top:bottom, left:right] = (1 - passed).reshape(shape)
             mean_depth = (weights.T @ projected.depths[rows]) / hit.clamp_min(ALPHA_MIN / 2)
             depth[top:bottom, left:right] = mean_depth.reshape(shape)
-    return image, alpha, depth
+            median[top:bottom, left:right] = halfway.reshape(shape)
+    return image, alpha, depth, median
 
 
-def render_reference(splats: Splats, camera: Camera, settings: RasterSettings) -> Rendering:
+def render_reference(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    smoothing: NDArray[np.float32] | None = None,
+) -> Rendering:
     """`render` in float64 by the definition itself."""
     p = parameters_of(splats)
+    widths = None if smoothing is None else torch.tensor(smoothing, dtype=torch.float64)
     with torch.no_grad():
-        image, alpha, depth = render_tensors(p, camera, settings)
+        planes = render_tensors(p, camera, settings, widths)
         culled = int((~drawable(p)).sum())
-    arrays = [t.numpy().astype(np.float32) for t in (image, alpha, depth)]
-    return Rendering(arrays[0], arrays[1], arrays[2], culled)
+    image, alpha, depth, median = (t.numpy().astype(np.float32) for t in planes)
+    return Rendering(image, alpha, depth, median, culled)

@@ -26,7 +26,7 @@ def reference_gradients(
     p = Parameters(*(torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in arrays))
     projected = project(p, camera, settings)
     projected.means2d.retain_grad()
-    image, _, _ = render_projected(p, projected, camera, settings)
+    image, _, _, _ = render_projected(p, projected, camera, settings)
     planar = np.ascontiguousarray(image.detach().numpy().astype(np.float32).transpose(2, 0, 1))
     loss = image_loss(pool, planar, target, v_image)
     image.backward(torch.tensor(v_image.transpose(1, 2, 0), dtype=torch.float64))

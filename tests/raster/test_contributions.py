@@ -37,7 +37,7 @@ def measured(scene, picture, where, settings=SETTINGS):
 
 def squared_error(scene, picture, where):
     """In float64, by the definition."""
-    image, _, _ = render_tensors(parameters_of(scene), where, SETTINGS)
+    image, _, _, _ = render_tensors(parameters_of(scene), where, SETTINGS)
     return float(
         ((image.detach().numpy().transpose(2, 0, 1) - picture.astype(np.float64)) ** 2).sum()
     )

@@ -112,7 +112,7 @@ def test_reference_gradients_are_finite_differences(antialias):
     settings = RasterSettings(background=(0.3, 0.2, 0.1), antialias=antialias)
     v = torch.tensor(r.normal(size=(10, 12, 3)))
     p = parameters_of(scene)
-    out, _, _ = render_tensors(p, view, settings)
+    out, _, _, _ = render_tensors(p, view, settings)
     (out * v).sum().backward()
     step = 1e-6
     for name, tensor in zip(PARAMETERS, p.tensors(), strict=True):
@@ -125,7 +125,7 @@ def test_reference_gradients_are_finite_differences(antialias):
                 moved[i] += sign * step
                 others = {n: t.detach() for n, t in zip(PARAMETERS, p.tensors(), strict=True)}
                 others[name] = moved.reshape(tensor.shape)
-                shifted, _, _ = render_tensors(Parameters(**others), view, settings)
+                shifted, _, _, _ = render_tensors(Parameters(**others), view, settings)
                 values.append(float((shifted * v).sum()))
             numeric[i] = (values[0] - values[1]) / (2 * step)
         top = tensor.grad.abs().max()

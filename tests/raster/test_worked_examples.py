@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from stages.raster import RasterSettings, render
-from stages.raster.projection import WORK_ROW, A, B, C, camera_row, footprint
+from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.raster.projection import A, B, C, camera_row, footprint_values
 from stages.raster.reference import parameters_of, project, sh_basis
-from stages.raster.sh import sh_basis as kernel_basis
+from stages.raster.splat_kernels import sh_basis_values as kernel_basis
 from stages.scene import Camera
 from tests.scenes import BACKENDS, camera, splats
 from tests.tolerances import WORKED
@@ -23,11 +24,7 @@ def covariance(backend, scene, settings=NO_DILATION):
         p = project(parameters_of(scene), VIEW, settings)
         a, b, c = (float(t.detach()[0]) for t in (p.a, p.b, p.c))
     else:
-        w = np.empty(WORK_ROW)
-        cam = camera_row(VIEW, settings)
-        assert footprint(
-            0, cam, scene.means, scene.quaternions, scene.log_scales, scene.opacity_logits, w
-        )
+        w = footprint_values(0, camera_row(VIEW, settings), splat_arrays(scene))
         a, b, c = w[A], w[B], w[C]
     return np.array([[a, b], [b, c]])
 
@@ -102,9 +99,7 @@ def test_spherical_harmonics_worked_by_hand(backend, direction, wanted):
     if backend == "reference":
         basis = sh_basis(torch.tensor([direction], dtype=torch.float64), 1)[0].numpy()
     else:
-        basis = np.empty(16)
-        kernel_basis(1, *map(float, direction), basis)
-        basis = basis[:4]
+        basis = kernel_basis(1, np.array([direction], float))[0]
     assert basis @ coefficients == pytest.approx(wanted, abs=1e-6)
 
 
@@ -115,15 +110,10 @@ def test_spherical_harmonics_are_orthonormal_and_alike_in_both_backends():
     basis = sh_basis(torch.tensor(directions), 3).numpy()
     # Monte Carlo: the standard error of a mean of 200,000 is about 0.003 x 4 pi / 4 pi
     np.testing.assert_allclose(4 * np.pi * basis.T @ basis / len(basis), np.eye(16), atol=0.03)
-    row = np.empty(16)
-    for i in range(20):
-        kernel_basis(3, *directions[i], row)
-        np.testing.assert_allclose(row, basis[i], atol=1e-14)
+    np.testing.assert_allclose(kernel_basis(3, directions[:20]), basis[:20], atol=1e-14)
 
 
 def test_a_picture_of_1080p_has_8160_tiles_and_an_aligned_box_covers_ten():
-    from stages.raster.cpu import CpuRasteriser, splat_arrays
-
     view = Camera(1920, 1080, 1000.0, 1000.0, 0.0, 0.0, np.eye(4))
     rasteriser = CpuRasteriser()
     # reach is sqrt(2 ln(255 o)) sigmas; an 80 x 30 px box around the centre of tiles 0..4 x 0..1
@@ -135,4 +125,4 @@ def test_a_picture_of_1080p_has_8160_tiles_and_an_aligned_box_covers_ten():
     )
     forward = rasteriser.forward(splat_arrays(scene), view, RasterSettings(dilation_px2=1e-6))
     assert forward.n_intersections == 10
-    assert len(rasteriser._tile_starts) - 1 == 120 * 68 == 8160
+    assert len(forward.lists.starts) - 1 == 120 * 68 == 8160

@@ -1,0 +1,58 @@
+"""The 3D smoothing filter (Yu et al. 2024, "Mip-Splatting"): no detail finer than any photograph
+could show.
+
+A splat is widened by a Gaussian whose variance is 0.2 x (the distance between two of its samples
+in the photograph that samples it most finely)^2, and loses as much opacity as it gains in volume:
+scales become sqrt(s^2 + f^2), the opacity is multiplied by the product of s / sqrt(s^2 + f^2).
+Seen from closer than any photograph was taken, splats then stay soft instead of turning into
+needles and dust.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Camera, Splats, logit
+
+VARIANCE = 0.2  # of a sampling interval squared, as in the paper
+RIM = 0.15  # of the picture on each side: a splat just outside still shows
+
+
+def smoothing_widths(
+    means: NDArray[np.floating], cameras: Sequence[Camera], near: float
+) -> NDArray[np.float32]:
+    """[N] standard deviation of each splat's filter, in units of `means` (whose frame the cameras
+    are given in). A splat that no camera sees gets the widest of all; 0 without any camera."""
+    finest = np.full(len(means), np.inf)
+    for camera in cameras:
+        at = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        z = at[:, 2]
+        with np.errstate(all="ignore"):
+            x = camera.fx * at[:, 0] / z + camera.cx
+            y = camera.fy * at[:, 1] / z + camera.cy
+        seen = (z > near) & (np.abs(x - camera.width / 2) < (0.5 + RIM) * camera.width)
+        seen &= np.abs(y - camera.height / 2) < (0.5 + RIM) * camera.height
+        interval = np.where(seen, z / max(camera.fx, camera.fy), np.inf)
+        finest = np.minimum(finest, interval)
+    known = np.isfinite(finest)
+    finest[~known] = finest[known].max() if known.any() else 0.0
+    return (np.sqrt(VARIANCE) * finest).astype(np.float32)
+
+
+def smoothed(splats: Splats, widths: NDArray[np.float32]) -> Splats:
+    """The same splats with the filter built in, as any viewer draws them."""
+    log_scales = splats.log_scales.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        log_widths = np.log(widths.astype(np.float64))[:, None]
+    widened = 0.5 * np.logaddexp(2 * log_scales, 2 * log_widths)
+    opacities = splats.opacities * np.exp((log_scales - widened).sum(1))
+    smallest = np.finfo(np.float32).tiny
+    return replace(
+        splats,
+        log_scales=widened.astype(np.float32),
+        opacity_logits=logit(np.clip(opacities, smallest, 1 - 1e-7)).astype(np.float32),
+    )

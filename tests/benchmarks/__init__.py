@@ -1,0 +1,1 @@
+"""Benchmarks: scripts that first show that the answer is right, then time."""
