@@ -41,3 +41,45 @@ SCALED_QUATERNION = 1e-6
 
 LOSS_GRADIENT = 2e-6
 """Gradient of L1 + SSIM, relative to the largest: the mean is removed before squares are taken."""
+
+FLOAT32_OUTPUT = 1e-6
+"""The reference's pictures: computed in float64, handed out in float32."""
+
+UNIT_ROTATION = 1e-6
+"""R^T R - I of a rotation from a quaternion of any length."""
+
+CLAMP_GRADIENT = 1e-4
+"""Beyond the clamp of x/z and y/z, relative: leaving out what the clamp does to z is 4x to 160x."""
+
+CAP_GRADIENT = 1e-4
+"""Gradient by opacity 1e-4 off the cap of alpha, relative."""
+
+FIRST_STEP = 0.01
+"""How far Adam's first step of a splat may be from its rate; without bias correction by splat it
+is 3.16 rates for one first seen late."""
+
+SSIM = 1e-6
+"""SSIM and its gradient (relative) by float32 kernels against float64, and SSIM beyond [-1, 1]:
+differences of squares without the mean removed are wrong by 1800 % at exposure x 100."""
+
+FAR_FROM_ORIGIN_PX = 1e-3
+"""Where a splat is drawn in a capture 6400 km from its origin; with world coordinates in float32
+it is 80 px at 1000 km."""
+
+ROBUST_EXTENT = 1.0
+"""Powers of two by which a scene's extent may change when one of its cameras strays: a few cameras
+are a small sample, but the others' spread still sets it."""
+
+PLACE_PX = 1e-4
+"""Where a splat is drawn, found from its picture: float32 offsets within a tile are good to
+1e-6 px."""
+
+RMS_45_DB = 10 ** (-45 / 20)
+"""Root of the mean squared error of pictures 45 dB apart: under 1.5 of 255 levels."""
+
+ASPECT_TIMES_ANGLE = 0.5
+"""Radians by which a file may turn a splat, times its aspect: half its width at its far end."""
+
+EIGHT_BIT_ANGLE = 0.02
+"""Radians by which 8 bits a component may turn a rotation: four errors of 1/256, doubled, and what
+bringing it back to length 1 adds."""

@@ -20,7 +20,7 @@ QUATERNION_MIN = 1e-20  # largest component; below it a rotation is lost to roun
 class RasterSettings:
     """How to draw.
 
-    near: splats whose centre is nearer (along z) are not drawn; world units.
+    near: a splat is drawn if the z of its centre is larger; world units.
     dilation_px2: added to both variances of a splat's footprint, as all viewers do; pixels^2.
     antialias: make up in opacity for what the dilation adds in area.
     background: RGB behind everything.

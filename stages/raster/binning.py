@@ -1,4 +1,8 @@
-"""Which splats touch which 16x16 tile, in blending order. Exact: ellipses, not boxes."""
+"""Which splats touch which 16x16 tile, in blending order. Exact to 4x4 pixels: ellipses, not boxes.
+
+Tiles are first found splat by splat, in the order of rows, then laid out tile by tile, nearest
+first.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,19 @@ import numpy as np
 
 from stages.raster.api import ALPHA_MIN
 from stages.raster.projection import GB, GK, GL, GVX, GVY, GX, GY
-from stages.raster.simd import kernel, take_ticket
+from stages.raster.simd import kernel, prefetch, take_ticket
+from stages.raster.simd64 import dceil, dfloor, dgt, dload, dmax, dmin, dselect, dsqrt, istore
 
-TILE = 16
+TILE = 16  # pixels across and down
+BLOCK = 4  # a tile is 4x4 blocks of 4x4 pixels
 CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
+# Columns of `places`, one line for each visible splat: its row, where its tiles were written, how
+# many they are, and the slot of its first gradient.
+ROW, FOUND, COUNT, SLOT = range(4)
 _LN2 = math.log(2.0)
 _FAINTEST = math.log2(ALPHA_MIN)
+_FAR = 1e9
+_EIGHT = np.arange(8.0)
 
 
 @kernel
@@ -37,6 +48,17 @@ def radix_order(keys, order, keys2, order2):
             keys2[to] = keys[i]
             order2[to] = order[i]
         keys[:], order[:] = keys2, order2
+
+
+@kernel
+def sort_by_depth(visible, paint, arrays, keys, order, keys2, order2):
+    """order [V]: places in `visible`, nearest first; see `_comes_before` for equal depths."""
+    for place in range(len(visible)):
+        keys[place] = paint[visible[place], 3]
+        order[place] = place
+    # depths are positive, so their bits sort as they do
+    radix_order(keys.view(np.uint32), order, keys2, order2)
+    settle_ties(keys.view(np.uint32), order, visible, *arrays)
 
 
 @kernel
@@ -107,27 +129,6 @@ def _heap_sort(run, visible, means, quaternions, log_scales, opacity_logits, sh)
 
 
 @kernel
-def _span(low, high, half_along, half_across, slope, along_at, rest, reach2, across):
-    """Range over one axis of the ellipse's part that lies in a slab of the other.
-
-    low, high: the slab, relative to the centre. half_along, half_across: the ellipse's half
-    extents on the axis asked for and on the slab's. slope: of its middle line over the slab's axis.
-    along_at: where in the slab's axis the far end lies. rest: variance along, given the place
-    across; across: variance of the slab's axis. (1, 0), an empty range, where they do not meet.
-    """
-    if low > half_across or high < -half_across:
-        return 1.0, 0.0
-    top, end = half_along, -half_along
-    at = min(max(along_at, low), high)
-    if at != along_at:
-        top = slope * at + math.sqrt(max(rest * (reach2 - at * at / across), 0.0))
-    at = min(max(-along_at, low), high)
-    if at != -along_at:
-        end = slope * at - math.sqrt(max(rest * (reach2 - at * at / across), 0.0))
-    return end, top
-
-
-@kernel
 def _pixel_range(low, high, n):
     """Indices of the first and last pixel whose centre lies in [low, high], within 0..n-1."""
     first = math.ceil(min(max(low, 0.0), n + 1.0) - 0.5)
@@ -164,54 +165,93 @@ def bound_tiles(ticket, visible, geometry, width, height, bounds):
 
 
 @kernel
-def find_tiles(ticket, visible, geometry, width, height, found_starts, tiles, spans, counts):
-    """The tiles that each visible splat touches, from found_starts[place] on, and how many.
+def _block_spans(geometry, row, width, y0, y1, reach2, top, firsts, lasts):
+    """firsts, lasts [8]: range of 4-pixel columns that a splat touches in each of the eight block
+    rows from pixel row `top` on; far..-1 where none. y0, y1: the pixel rows that it touches.
 
-    tiles: number of the tile. spans: first + 16 x last row of the splat within it.
+    In a slab of y the ellipse reaches furthest right where its right end lies, or as near to it as
+    the slab goes: at y there, to slope y + sqrt((reach^2 - y^2 / c) det / c).
+    """
+    x, y = geometry[row, GX], geometry[row, GY]
+    a, c = geometry[row, GVX], geometry[row, GVY]
+    major = max(a, c)
+    b, det = geometry[row, GK] * major, 0.5 * major / geometry[row, GB]
+    per_c = 1.0 / c
+    slope, rest = b * per_c, det * per_c
+    right_end = b * math.sqrt(reach2 / a)
+    first_row = BLOCK * dload(_EIGHT, 0) + top
+    low, high = dmax(first_row, y0), dmin(first_row + (BLOCK - 1), y1)
+    empty = dgt(low, high)
+    low, high = low + (0.5 - y), high + (0.5 - y)
+    at = dmin(dmax(low, right_end), high)
+    right = slope * at + dsqrt(dmax(rest * (reach2 - at * at * per_c), 0.0))
+    at = dmin(dmax(low, -right_end), high)
+    left = slope * at - dsqrt(dmax(rest * (reach2 - at * at * per_c), 0.0))
+    # first and last pixel whose centre lies within, then their blocks
+    first = dmax(dceil(dmin(left + (x - 0.5), width + 1.0)), 0.0)
+    last = dmin(dfloor(dmax(right + (x - 0.5), -2.0)), width - 1.0)
+    first_block, last_block = dfloor(first * (1.0 / BLOCK)), dfloor(last * (1.0 / BLOCK))
+    nothing = dgt(first, last)
+    istore(firsts, 0, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
+    istore(lasts, 0, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
+
+
+@kernel
+def _emit_tile_row(firsts, lasts, q0, tile_row, at, tiles, masks):
+    """Write the tiles of one tile row, whose block rows are q0..q0 + 3 of firsts and lasts, from
+    position `at` on; the position after them. tile_row: number of the row's first tile."""
+    least = min(min(firsts[q0], firsts[q0 + 1]), min(firsts[q0 + 2], firsts[q0 + 3]))
+    most = max(max(lasts[q0], lasts[q0 + 1]), max(lasts[q0 + 2], lasts[q0 + 3]))
+    for tile_x in range(least // 4, most // 4 + 1):
+        mask = 0
+        for q in range(4):
+            low = min(max(firsts[q0 + q] - 4 * tile_x, 0), 4)
+            end = max(min(lasts[q0 + q] - 4 * tile_x + 1, 4), low)
+            mask |= ((1 << end) - (1 << low)) << (4 * q)
+        tiles[at] = tile_row + tile_x
+        masks[at] = mask
+        at += mask != 0
+    return at
+
+
+@kernel
+def find_tiles(ticket, visible, geometry, width, height, places, tiles, masks):
+    """The tiles that each visible splat touches, from places[place, FOUND] on; ROW and COUNT.
+
+    tiles: number of the tile. masks: which of its 4x4-pixel blocks, bit 4 row + column.
     """
     tiles_x = (width + TILE - 1) // TILE
     n = len(visible)
     size = (n + CHUNKS - 1) // CHUNKS
+    firsts, lasts = np.empty(8, np.int64), np.empty(8, np.int64)
     while True:
         chunk = take_ticket(ticket)
         if chunk >= CHUNKS:
             break
         for place in range(chunk * size, min((chunk + 1) * size, n)):
             row = visible[place]
-            x, y = geometry[row, GX], geometry[row, GY]
-            a, c = geometry[row, GVX], geometry[row, GVY]
-            major = max(a, c)
-            b, det = geometry[row, GK] * major, 0.5 * major / geometry[row, GB]
             reach2 = _reach2(geometry[row, GL])
-            half_x, half_y = math.sqrt(reach2 * a), math.sqrt(reach2 * c)
-            far_x, far_y = b * half_x / a, b * half_y / c
-            slope_x, slope_y, rest_x, rest_y = b / c, b / a, det / c, det / a
+            y, half_y = geometry[row, GY], math.sqrt(reach2 * geometry[row, GVY])
             y0, y1 = _pixel_range(y - half_y, y + half_y, height)
-            at = found_starts[place]
-            for tile_y in range(y0 // TILE, y1 // TILE + 1 if y1 >= y0 else 0):
-                low = max(tile_y * TILE, y0) + 0.5 - y
-                high = min(tile_y * TILE + TILE - 1, y1) + 0.5 - y
-                left, right = _span(low, high, half_x, half_y, slope_x, far_x, rest_x, reach2, c)
-                x0, x1 = _pixel_range(x + left, x + right, width)
-                if x1 < x0 or right < left:
-                    continue
-                for tile_x in range(x0 // TILE, x1 // TILE + 1):
-                    west = tile_x * TILE + 0.5 - x
-                    end, top = _span(
-                        west, west + TILE - 1, half_y, half_x, slope_y, far_y, rest_y, reach2, a
-                    )
-                    r0, r1 = _pixel_range(y + end, y + top, height)
-                    first = max(r0 - tile_y * TILE, 0)
-                    last = min(r1 - tile_y * TILE, TILE - 1)
-                    if last >= first:
-                        tiles[at] = tile_y * tiles_x + tile_x
-                        spans[at] = first + 16 * last
-                        at += 1
-            counts[place] = at - found_starts[place]
+            at = np.int64(places[place, FOUND])
+            for tile_y in range(y0 // TILE, y1 // TILE + 1 if y1 >= y0 else 0, 2):
+                top = tile_y * TILE
+                _block_spans(geometry, row, width, y0, y1, reach2, top, firsts, lasts)
+                at = _emit_tile_row(firsts, lasts, 0, tile_y * tiles_x, at, tiles, masks)
+                at = _emit_tile_row(firsts, lasts, 4, (tile_y + 1) * tiles_x, at, tiles, masks)
+            places[place, ROW] = row
+            places[place, COUNT] = at - places[place, FOUND]
 
 
 @kernel
-def count_tiles(ticket, order, found_starts, counts, tiles, tile_counts):
+def _look_ahead(rank, last, order, places, tiles):
+    """Ask for what later ranks will read; it may lie anywhere."""
+    prefetch(places, 4 * np.int64(order[min(rank + 16, last)]))
+    prefetch(tiles, np.int64(places[order[min(rank + 8, last)], FOUND]))
+
+
+@kernel
+def count_tiles(ticket, order, places, tiles, tile_counts):
     """tile_counts[chunk, tile]: entries, by chunk of the blending order."""
     n = len(order)
     size = (n + CHUNKS - 1) // CHUNKS
@@ -220,8 +260,9 @@ def count_tiles(ticket, order, found_starts, counts, tiles, tile_counts):
         if chunk >= CHUNKS:
             break
         for rank in range(chunk * size, min((chunk + 1) * size, n)):
-            start = found_starts[order[rank]]
-            for at in range(start, start + counts[order[rank]]):
+            _look_ahead(rank, n - 1, order, places, tiles)
+            start = places[order[rank], FOUND]
+            for at in range(start, start + places[order[rank], COUNT]):
                 tile_counts[chunk, tiles[at]] += 1
 
 
@@ -243,21 +284,9 @@ def scan_counts(tile_counts, tile_starts):
 
 
 @kernel
-def fill_tiles(
-    ticket,
-    order,
-    visible,
-    found_starts,
-    slot_starts,
-    tiles,
-    found_spans,
-    positions,
-    members,
-    slots,
-    spans,
-):
+def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, slots, masks):
     """Write each tile's list, nearest first: the row, the slot where its gradient goes (splat by
-    splat, in the order of rows), first and last pixel row."""
+    splat, in the order of rows), the mask of its blocks."""
     n = len(order)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:
@@ -265,12 +294,14 @@ def fill_tiles(
         if chunk >= CHUNKS:
             break
         for rank in range(chunk * size, min((chunk + 1) * size, n)):
+            _look_ahead(rank, n - 1, order, places, tiles)
             place = order[rank]
-            row, start = visible[place], found_starts[place]
-            for slot in range(slot_starts[place], slot_starts[place + 1]):
-                at = start + slot - slot_starts[place]
-                position = positions[chunk, tiles[at]]
-                positions[chunk, tiles[at]] = position + 1
-                members[position] = row
-                slots[position] = slot
-                spans[position] = found_spans[at]
+            start, slot = places[place, FOUND], places[place, SLOT]
+            prefetch(found_masks, np.int64(places[order[min(rank + 8, n - 1)], FOUND]))
+            for k in range(places[place, COUNT]):
+                tile = tiles[start + k]
+                position = positions[chunk, tile]
+                positions[chunk, tile] = position + 1
+                members[position] = places[place, ROW]
+                slots[position] = slot + k
+                masks[position] = found_masks[start + k]

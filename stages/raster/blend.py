@@ -1,10 +1,12 @@
 """Blending the splats of a tile, near to far, and the gradient back through it, far to near.
 
-A tile is 16x16 pixels; a row of it is one vector. Per (splat, tile) the exponent is rewritten in
-float64 around the tile's first pixel, so that everything that runs in float32 is small:
-    log2 alpha(i, j) = log2 opacity - (A (u + i or j)^2 + B (M_i + m j)^2) / ln 2,
-u along the axis of the larger variance. `alpha_row` is the one function for both directions:
-alpha must be the same to the last bit, since the way back divides by 1 - alpha.
+A tile is 16x16 pixels in blocks of 4x4; a block is one vector. A splat is drawn in those blocks
+only that its ellipse touches. Per (splat, tile) the exponent is rewritten in float64 around the
+tile's first pixel, so that everything that runs in float32 is small:
+    log2 alpha = log2 opacity - (A u^2 + B t^2) / ln 2,
+u the pixel's offset along the axis of the larger variance, t across. `alpha_of` is the one
+function for both directions: alpha must be the same to the last bit, since the way back divides by
+1 - alpha.
 """
 
 from __future__ import annotations
@@ -12,11 +14,13 @@ from __future__ import annotations
 import numpy as np
 
 from stages.raster.api import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from stages.raster.binning import TILE
-from stages.raster.projection import GA, GB, GK, GL, GVX, GVY, GX, GY
+from stages.raster.binning import BLOCK, TILE
+from stages.raster.projection import GA, GB, GEOMETRY_ROW, GK, GL, GVX, GVY, GX, GY
 from stages.raster.simd import (
-    iota16,
+    bits16,
     kernel,
+    lowest_bit,
+    prefetch,
     splat16,
     store_sums8,
     take_ticket,
@@ -33,12 +37,19 @@ from stages.raster.simd import (
     vstore,
     vsum,
 )
+from stages.raster.tile import (
+    BLOCKS,
+    PIXELS,
+    last_of_blocks,
+    load_plane,
+    start_light,
+    store_plane,
+)
 
-PIXELS = TILE * TILE
 # Planes of a tile's work, forward and backward.
-LIGHT, RED, GREEN, BLUE, DEPTH, MEDIAN, LAST = (k * PIXELS for k in range(7))
+RED, GREEN, BLUE, ALPHA, DEPTH, MEDIAN, LIGHT, LAST = (k * PIXELS for k in range(8))
 V_RED, V_GREEN, V_BLUE, PASSING, BEHIND = (k * PIXELS for k in range(5))
-NEVER = np.float32(3e38)  # "last" of a pixel that is not finished
+AHEAD = 6  # entries: how early a splat's record is asked for
 _LOG2E = 1.4426950408889634
 _F = np.float32
 _ALPHA_MIN, _ALPHA_MAX, _T_MIN = _F(ALPHA_MIN), _F(ALPHA_MAX), _F(TRANSMITTANCE_MIN)
@@ -46,94 +57,84 @@ _FAINTEST = _F(-115.0)  # log2 of alpha: below it `vexp2` would leave its range
 _HALF = _F(0.5)
 
 
+def _offsets() -> tuple[np.ndarray, np.ndarray]:
+    """Offsets from a tile's first pixel of a block's pixels (lanes) and of the blocks, along and
+    across: [0] along x, [1] along y."""
+    k = np.arange(16)
+    lanes = np.stack([k % BLOCK, k // BLOCK]).astype(np.float32)
+    return lanes.ravel(), (BLOCK * lanes).ravel()
+
+
+_LANES, _STEPS = _offsets()
+
+
 @kernel
 def tile_frame(geometry, row, tile_x, tile_y):
     """The record of a row around the tile's first pixel centre.
 
-    Returns (wide, A', B', K, log2 opacity, u, m): wide, whether the major axis is x; A', B': of
-    the exponent to base 2, negative; u: offset of the first pixel along the major axis; m: offset
-    across less K u.
+    Returns (major, A', B', K, log2 opacity, U, T): major, 0 where the major axis is x, 16 where it
+    is y; A', B': of the exponent to base 2, negative; U, T: vectors of the first block's offsets
+    along the major axis and across it.
     """
     dx = tile_x * TILE + 0.5 - geometry[row, GX]
     dy = tile_y * TILE + 0.5 - geometry[row, GY]
     k = geometry[row, GK]
     wide = geometry[row, GVX] >= geometry[row, GVY]
+    major = 0 if wide else 16
     u = dx if wide else dy
-    m = dy - k * dx if wide else dx - k * dy
+    t = dy - k * dx if wide else dx - k * dy
+    along, across = vload(_LANES, major), vload(_LANES, 16 - major)
+    us = splat16(_F(u)) + along
+    ts = splat16(_F(t)) + across - splat16(_F(k)) * along
     return (
-        wide,
-        _F(geometry[row, GA] * -_LOG2E),
-        _F(geometry[row, GB] * -_LOG2E),
-        _F(k),
-        _F(geometry[row, GL]),
-        _F(u),
-        _F(m),
+        major,
+        splat16(_F(geometry[row, GA] * -_LOG2E)),
+        splat16(_F(geometry[row, GB] * -_LOG2E)),
+        splat16(_F(-k)),
+        splat16(_F(geometry[row, GL])),
+        us,
+        ts,
     )
 
 
 @kernel
-def exponent_parts(wide, a, k, log_opacity, u, m):
-    """The level log2 alpha is Q + P (U + j)^2 + B' (M + S j)^2 in row j of the tile.
-
-    Returns the vectors (Q, P, U, M, S).
-    """
-    i, zero = iota16(), splat16(_F(0.0))
-    level = splat16(log_opacity)
-    if wide:
-        us = splat16(u) + i
-        q = vfma(splat16(a) * us, us, level)
-        return q, zero, zero, splat16(m) - splat16(k) * i, splat16(_F(1.0))
-    return level, splat16(a), splat16(u), splat16(m) + i, splat16(-k)
+def alpha_of(frame, block):
+    """(alpha before the cap, u, t) of the 16 pixels of a block."""
+    major, a, b, slope, level, us, ts = frame
+    along = splat16(_STEPS[major + block])
+    u = us + along
+    t = vfma(slope, along, ts + splat16(_STEPS[16 - major + block]))
+    level = vfma(b * t, t, vfma(a * u, u, level))
+    return vexp2(vmax(level, splat16(_FAINTEST))), u, t
 
 
 @kernel
-def alpha_row(parts, b, j):
-    """Alpha, before the cap, of row j of pixels."""
-    q, p, u, m, s = parts
-    row = splat16(_F(j))
-    along, across = u + row, vfma(s, row, m)
-    level = vfma(b * across, across, vfma(p * along, along, q))
-    return vexp2(vmax(level, splat16(_FAINTEST)))
-
-
-@kernel
-def start_light(light, tile_x, tile_y, width, height):
-    """1 in the tile's pixels that lie in the picture, 0 in those beyond its rim."""
-    for j in range(TILE):
-        for i in range(TILE):
-            inside = tile_x * TILE + i < width and tile_y * TILE + j < height
-            light[j * TILE + i] = _F(1.0) if inside else _F(0.0)
-
-
-@kernel
-def _light_is_left(work):
-    most = vload(work, 0)
-    for j in range(1, TILE):
-        most = vmax(most, vload(work, j * TILE))
-    return vany(vge(most, splat16(_T_MIN)))
-
-
-@kernel
-def blend_tile(tile_x, tile_y, start, end, members, spans, geometry, paint, depths, work):
+def blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, paint, depths, work):
     """Blend entries start..end of the lists into `work` (planes as above).
 
+    alive: mask of the blocks that still want light. depths: whether the depth planes are wanted.
+
     Rows of arrays are reached by index, never sliced: a slice counts references, and threads would
-    fight over the counter. depths: whether the depth planes are wanted.
+    fight over the counter. Nothing is skipped for want of a drawn pixel: a wrongly guessed branch
+    costs more than a block.
     """
     zero, one = splat16(_F(0.0)), splat16(_F(1.0))
     for entry in range(start, end):
-        if (entry - start) % 16 == 15 and not _light_is_left(work):
-            break
+        blocks = np.int64(masks[entry]) & alive
+        ahead = members[min(entry + AHEAD, end - 1)]
+        prefetch(geometry, ahead * GEOMETRY_ROW)
+        prefetch(paint, ahead * 4)
+        if blocks == 0:
+            continue
         row = members[entry]
-        wide, a, b, k, log_opacity, u, m = tile_frame(geometry, row, tile_x, tile_y)
-        parts = exponent_parts(wide, a, k, log_opacity, u, m)
-        b_all = splat16(b)
+        frame = tile_frame(geometry, row, tile_x, tile_y)
         r, g = splat16(paint[row, 0]), splat16(paint[row, 1])
         bl, z = splat16(paint[row, 2]), splat16(paint[row, 3])
-        number = splat16(_F(entry - start + 1))
-        for j in range(spans[entry] & 15, (spans[entry] >> 4) + 1):
-            at = j * TILE
-            alpha = alpha_row(parts, b_all, j)
+        while blocks:
+            block = lowest_bit(blocks)
+            blocks &= blocks - 1
+            at = 16 * block
+            alpha, _, _ = alpha_of(frame, block)
             passing = vload(work, LIGHT + at)
             drawn = vand(vge(alpha, splat16(_ALPHA_MIN)), vge(passing, splat16(_T_MIN)))
             alpha = vselect(drawn, vmin(alpha, splat16(_ALPHA_MAX)), zero)
@@ -143,13 +144,34 @@ def blend_tile(tile_x, tile_y, start, end, members, spans, geometry, paint, dept
             vstore(work, RED + at, vfma(weight, r, vload(work, RED + at)))
             vstore(work, GREEN + at, vfma(weight, g, vload(work, GREEN + at)))
             vstore(work, BLUE + at, vfma(weight, bl, vload(work, BLUE + at)))
-            finished = vand(drawn, vgt(splat16(_T_MIN), left))
-            if vany(finished):
-                vstore(work, LAST + at, vselect(finished, number, vload(work, LAST + at)))
             if depths:
                 vstore(work, DEPTH + at, vfma(weight, z, vload(work, DEPTH + at)))
                 halved = vand(vge(passing, splat16(_HALF)), vgt(splat16(_HALF), left))
                 vstore(work, MEDIAN + at, vselect(halved, z, vload(work, MEDIAN + at)))
+            finished = vand(drawn, vgt(splat16(_T_MIN), left))
+            if vany(finished):
+                number = splat16(_F(entry - start + 1))
+                vstore(work, LAST + at, vselect(finished, number, vload(work, LAST + at)))
+                if not vany(vge(left, splat16(_T_MIN))):
+                    alive &= ~(np.int64(1) << block)
+        if alive == 0:
+            break
+
+
+@kernel
+def _finish_tile(background, depths, work):
+    """Background behind what was blended; alpha; sums of depths to means."""
+    one, least = splat16(_F(1.0)), splat16(_F(0.5) * _ALPHA_MIN)
+    for at in range(0, PIXELS, 16):
+        passed = vload(work, LIGHT + at)
+        alpha = one - passed
+        vstore(work, ALPHA + at, alpha)
+        for channel in range(3):
+            plane = channel * PIXELS + at
+            behind = splat16(background[channel])
+            vstore(work, plane, vfma(passed, behind, vload(work, plane)))
+        if depths:
+            vstore(work, DEPTH + at, vload(work, DEPTH + at) / vmax(alpha, least))
 
 
 @kernel
@@ -159,7 +181,7 @@ def blend_tiles(
     height,
     tile_starts,
     members,
-    spans,
+    masks,
     geometry,
     paint,
     background,
@@ -171,50 +193,40 @@ def blend_tiles(
     """Draw every tile. image [4 or 6, H, W] float32: red, green, blue, alpha; if `depths`, then
     expected and median depth.
 
-    light, last [tiles, 256] float32: what the way back needs: the light that passes at the end and
-    the number of the last entry drawn, NEVER where a pixel was not finished.
+    light, last [tiles, 256] float32, block by block: what the way back needs: the light that
+    passes at the end and the number of the last entry drawn, NEVER where a pixel was not finished.
     """
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
-    work = np.empty(7 * PIXELS, np.float32)
+    work = np.empty(8 * PIXELS, np.float32)
     while True:
         tile = take_ticket(ticket)
         if tile >= tiles_x * tiles_y:
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
         work[:] = 0.0
-        start_light(work, tile_x, tile_y, width, height)
-        for at in range(PIXELS):
-            work[LAST + at] = NEVER
+        alive = start_light(tile_x, tile_y, width, height, work, LIGHT, LAST)
         start, end = tile_starts[tile], tile_starts[tile + 1]
-        blend_tile(tile_x, tile_y, start, end, members, spans, geometry, paint, depths, work)
-        for at in range(PIXELS):
-            light[tile, at] = work[LIGHT + at]
-            last[tile, at] = work[LAST + at]
-        for j in range(min(TILE, height - tile_y * TILE)):
-            y = tile_y * TILE + j
-            for i in range(min(TILE, width - tile_x * TILE)):
-                x, at = tile_x * TILE + i, j * TILE + i
-                passed = work[LIGHT + at]
-                image[0, y, x] = work[RED + at] + passed * background[0]
-                image[1, y, x] = work[GREEN + at] + passed * background[1]
-                image[2, y, x] = work[BLUE + at] + passed * background[2]
-                image[3, y, x] = _F(1.0) - passed
-                if depths:
-                    hit = max(_F(1.0) - passed, _F(0.5) * _ALPHA_MIN)
-                    image[4, y, x] = work[DEPTH + at] / hit
-                    image[5, y, x] = work[MEDIAN + at]
+        blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, paint, depths, work)
+        for at in range(0, PIXELS, 16):
+            vstore(light, tile * PIXELS + at, vload(work, LIGHT + at))
+            vstore(last, tile * PIXELS + at, vload(work, LAST + at))
+        _finish_tile(background, depths, work)
+        for channel in range(image.shape[0]):
+            store_plane(image, channel, tile_x, tile_y, work, channel * PIXELS)
 
 
 @kernel
-def furthest_entry(last, tile, width, height, entries):
-    """How many of a tile's entries were drawn at all: none behind the last pixel's last."""
-    tiles_x = (width + TILE - 1) // TILE
-    furthest = _F(0.0)
-    for j in range(min(TILE, height - tile // tiles_x * TILE)):
-        for i in range(min(TILE, width - tile % tiles_x * TILE)):
-            furthest = max(furthest, last[tile, j * TILE + i])
-    return entries if furthest >= entries else np.int64(furthest)
+def _start_gradient(v_image, tile, tile_x, tile_y, background, light, work):
+    for channel in range(3):
+        load_plane(v_image, channel, tile_x, tile_y, work, channel * PIXELS)
+    for at in range(0, PIXELS, 16):
+        passed = vload(light, tile * PIXELS + at)
+        vstore(work, PASSING + at, passed)
+        behind = vload(work, V_RED + at) * splat16(background[0])
+        behind = vfma(vload(work, V_GREEN + at), splat16(background[1]), behind)
+        behind = vfma(vload(work, V_BLUE + at), splat16(background[2]), behind)
+        vstore(work, BEHIND + at, behind * passed)
 
 
 @kernel
@@ -225,7 +237,7 @@ def blend_gradient_tiles(
     tile_starts,
     members,
     slots,
-    spans,
+    masks,
     geometry,
     paint,
     background,
@@ -238,35 +250,30 @@ def blend_gradient_tiles(
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(5 * PIXELS, np.float32)
+    block_last = np.empty(BLOCKS, np.float32)
     while True:
         tile = take_ticket(ticket)
         if tile >= tiles_x * tiles_y:
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        work[:] = 0.0
-        for j in range(min(TILE, height - tile_y * TILE)):
-            y = tile_y * TILE + j
-            for i in range(min(TILE, width - tile_x * TILE)):
-                x, at = tile_x * TILE + i, j * TILE + i
-                vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
-                passed = light[tile, at]
-                work[V_RED + at], work[V_GREEN + at], work[V_BLUE + at] = vr, vg, vb
-                work[PASSING + at] = passed
-                work[BEHIND + at] = passed * (
-                    vr * background[0] + vg * background[1] + vb * background[2]
-                )
+        _start_gradient(v_image, tile, tile_x, tile_y, background, light, work)
+        furthest = last_of_blocks(last, tile, block_last)
         start, end = tile_starts[tile], tile_starts[tile + 1]
-        drawn_end = start + furthest_entry(last, tile, width, height, end - start)
-        for entry in range(drawn_end, end):
-            for k in range(9):
-                gradients[slots[entry], k] = 0.0
-        for entry in range(drawn_end - 1, start - 1, -1):
+        for entry in range(end - 1, start - 1, -1):
+            number = _F(entry - start + 1)
+            if number > furthest:
+                for k in range(9):
+                    gradients[slots[entry], k] = 0.0
+                continue
+            ahead = members[max(entry - AHEAD, start)]
+            prefetch(geometry, ahead * GEOMETRY_ROW)
+            prefetch(paint, ahead * 4)
+            prefetch(gradients, slots[max(entry - AHEAD, start)] * 9)
+            alive = bits16(vge(vload(block_last, 0), splat16(number)))
             entry_gradient(
-                tile_x,
-                tile_y,
-                _F(entry - start + 1),
-                spans[entry],
-                geometry,
+                tile_frame(geometry, members[entry], tile_x, tile_y),
+                number,
+                np.int64(masks[entry]) & alive,
                 paint,
                 members[entry],
                 work,
@@ -278,32 +285,25 @@ def blend_gradient_tiles(
 
 
 @kernel
-def entry_gradient(
-    tile_x, tile_y, number, span, geometry, paint, row, work, last, last_at, gradients, slot
-):
+def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradients, slot):
     """Gradient of one splat in one tile into gradients[slot, :9].
 
     With v the gradient that reaches the exponent of a pixel, u and t its offsets along and across
     the splat's major axis, the sums over pixels of: v u, v t, v u^2, v t^2, v u t, v, and of the
     gradients of red, green and blue.
 
-    Only sums of v, v j, v j^2 per column are carried through the rows, j counted from the middle
-    row: u and t are affine in j.
-
     work: the incoming gradient, the light that passes behind the splat, and what lies behind
     weighted by the incoming gradient (a suffix sum). The last two move in front of it.
     """
-    wide, a, b, k, log_opacity, u, m = tile_frame(geometry, row, tile_x, tile_y)
-    parts = exponent_parts(wide, a, k, log_opacity, u, m)
-    b_all = splat16(b)
     r, g, bl = splat16(paint[row, 0]), splat16(paint[row, 1]), splat16(paint[row, 2])
     zero, one = splat16(_F(0.0)), splat16(_F(1.0))
-    s_0, s_1, s_2 = zero, zero, zero
+    v_u, v_t, v_uu, v_tt, v_ut, v_1 = zero, zero, zero, zero, zero, zero
     s_r, s_g, s_b = zero, zero, zero
-    middle = ((span & 15) + (span >> 4)) // 2
-    for j in range(span & 15, (span >> 4) + 1):
-        at = j * TILE
-        raw = alpha_row(parts, b_all, j)
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - 1
+        at = 16 * block
+        raw, u, t = alpha_of(frame, block)
         drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, last_at + at), splat16(number)))
         alpha = vselect(drawn, vmin(raw, splat16(_ALPHA_MAX)), zero)
         inverse = one / (one - alpha)
@@ -319,24 +319,12 @@ def entry_gradient(
         vstore(work, BEHIND + at, vfma(weight, shade, after))
         v = alpha * (after * inverse - before * shade)
         v = vselect(vgt(splat16(_ALPHA_MAX), raw), v, zero)  # the cap passes nothing on
-        step = splat16(_F(j - middle))
-        s_0 = s_0 + v
-        s_1 = vfma(v, step, s_1)
-        s_2 = vfma(v * step, step, s_2)
-    i, centre = iota16(), _F(middle)
-    if wide:
-        us, ts = splat16(u) + i, parts[3] + splat16(centre)
-        v_u, v_uu = us * s_0, us * us * s_0
-        v_t = vfma(ts, s_0, s_1)
-        v_tt = vfma(ts, v_t + s_1, s_2)
-        v_ut = us * v_t
-    else:
-        us, ts = splat16(u + centre), parts[3] - splat16(k * centre)
-        slope = splat16(k)
-        v_u = vfma(us, s_0, s_1)
-        v_uu = vfma(us, v_u + s_1, s_2)
-        v_t = ts * s_0 - slope * s_1
-        v_tt = ts * (v_t - slope * s_1) + slope * slope * s_2
-        v_ut = ts * v_u - slope * vfma(us, s_1, s_2)
-    store_sums8(gradients, slot * 9, v_u, v_t, v_uu, v_tt, v_ut, s_0, s_r, s_g)
+        by_u, by_t = v * u, v * t
+        v_1 = v_1 + v
+        v_u = v_u + by_u
+        v_t = v_t + by_t
+        v_uu = vfma(by_u, u, v_uu)
+        v_tt = vfma(by_t, t, v_tt)
+        v_ut = vfma(by_u, t, v_ut)
+    store_sums8(gradients, slot * 9, v_u, v_t, v_uu, v_tt, v_ut, v_1, s_r, s_g)
     gradients[slot, 8] = vsum(s_b)

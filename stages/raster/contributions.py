@@ -13,20 +13,15 @@ from __future__ import annotations
 import numpy as np
 
 from stages.raster.api import ALPHA_MAX, ALPHA_MIN
-from stages.raster.binning import TILE
-from stages.raster.blend import (
-    PIXELS,
-    alpha_row,
-    exponent_parts,
-    furthest_entry,
-    tile_frame,
-)
+from stages.raster.binning import COUNT, SLOT, TILE
+from stages.raster.blend import alpha_of, tile_frame
 from stages.raster.simd import (
+    bits16,
     kernel,
+    lowest_bit,
     splat16,
     take_ticket,
     vand,
-    vany,
     vfma,
     vge,
     vload,
@@ -36,12 +31,25 @@ from stages.raster.simd import (
     vstore,
     vsum,
 )
+from stages.raster.tile import BLOCKS, PIXELS, last_of_blocks, load_plane
 
 COLUMNS = 3  # change of the squared error, sum of weights, largest weight
 _F = np.float32
 _ALPHA_MIN, _ALPHA_MAX = _F(ALPHA_MIN), _F(ALPHA_MAX)
-# Planes of the work row: residual, light behind the splat, colour behind it.
-RESIDUAL, PASSING, BEHIND = 0, 3 * PIXELS, 4 * PIXELS
+# Planes of the work: residual, colour behind the splat, light behind it.
+RESIDUAL, BEHIND, PASSING = 0, 3 * PIXELS, 6 * PIXELS
+
+
+@kernel
+def _start(residual, tile, tile_x, tile_y, background, light, work):
+    for channel in range(3):
+        load_plane(residual, channel, tile_x, tile_y, work, RESIDUAL + channel * PIXELS)
+    for at in range(0, PIXELS, 16):
+        passed = vload(light, tile * PIXELS + at)
+        vstore(work, PASSING + at, passed)
+        for channel in range(3):
+            behind = passed * splat16(background[channel])
+            vstore(work, BEHIND + channel * PIXELS + at, behind)
 
 
 @kernel
@@ -52,7 +60,7 @@ def contribution_tiles(
     tile_starts,
     members,
     slots,
-    spans,
+    masks,
     geometry,
     paint,
     background,
@@ -65,33 +73,23 @@ def contribution_tiles(
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(7 * PIXELS, np.float32)
+    block_last = np.empty(BLOCKS, np.float32)
     lanes = np.empty(16, np.float32)
     while True:
         tile = take_ticket(ticket)
         if tile >= tiles_x * tiles_y:
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        work[:] = 0.0
-        for j in range(min(TILE, height - tile_y * TILE)):
-            for i in range(min(TILE, width - tile_x * TILE)):
-                at = j * TILE + i
-                work[PASSING + at] = light[tile, at]
-                for channel in range(3):
-                    r = residual[channel, tile_y * TILE + j, tile_x * TILE + i]
-                    work[RESIDUAL + channel * PIXELS + at] = r
-                    work[BEHIND + channel * PIXELS + at] = light[tile, at] * background[channel]
+        _start(residual, tile, tile_x, tile_y, background, light, work)
+        last_of_blocks(last, tile, block_last)
         start, end = tile_starts[tile], tile_starts[tile + 1]
-        drawn_end = start + furthest_entry(last, tile, width, height, end - start)
-        for entry in range(drawn_end, end):
-            for k in range(COLUMNS):
-                out[slots[entry], k] = 0.0
-        for entry in range(drawn_end - 1, start - 1, -1):
+        for entry in range(end - 1, start - 1, -1):
+            number = _F(entry - start + 1)
+            alive = bits16(vge(vload(block_last, 0), splat16(number)))
             _entry(
-                tile_x,
-                tile_y,
-                _F(entry - start + 1),
-                spans[entry],
-                geometry,
+                tile_frame(geometry, members[entry], tile_x, tile_y),
+                number,
+                np.int64(masks[entry]) & alive,
                 paint,
                 members[entry],
                 work,
@@ -104,31 +102,15 @@ def contribution_tiles(
 
 
 @kernel
-def _entry(
-    tile_x,
-    tile_y,
-    number,
-    span,
-    geometry,
-    paint,
-    row,
-    work,
-    last,
-    last_at,
-    lanes,
-    out,
-    slot,
-):
-    wide, a, b, k, log_opacity, u, m = tile_frame(geometry, row, tile_x, tile_y)
-    parts = exponent_parts(wide, a, k, log_opacity, u, m)
+def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, slot):
     zero, one, two = splat16(_F(0.0)), splat16(_F(1.0)), splat16(_F(2.0))
     change, total, largest = zero, zero, zero
-    for j in range(span & 15, (span >> 4) + 1):
-        at = j * TILE
-        raw = alpha_row(parts, splat16(b), j)
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - 1
+        at = 16 * block
+        raw, _, _ = alpha_of(frame, block)
         drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, last_at + at), splat16(number)))
-        if not vany(drawn):
-            continue
         alpha = vselect(drawn, vmin(raw, splat16(_ALPHA_MAX)), zero)
         inverse = one / (one - alpha)
         before = vload(work, PASSING + at) * inverse
@@ -153,11 +135,12 @@ def _entry(
 
 
 @kernel
-def gather_contributions(raw, slot_starts, out):
+def gather_contributions(raw, places, out):
     """out [V, 3] float64: sums (and the largest weight) over each visible splat's tiles."""
     for place in range(len(out)):
         change, total, largest = 0.0, 0.0, 0.0
-        for slot in range(slot_starts[place], slot_starts[place + 1]):
+        first = places[place, SLOT]
+        for slot in range(first, first + places[place, COUNT]):
             change += raw[slot, 0]
             total += raw[slot, 1]
             largest = max(largest, np.float64(raw[slot, 2]))

@@ -49,16 +49,16 @@ class Buffers:
 class TileLists:
     """What each tile draws, nearest first: entries starts[t]..starts[t + 1].
 
-    members [I]: row of the splat. slots [I]: where the entry's gradient goes; the entries of
-    visible splat number k have the slots slot_starts[k]..slot_starts[k + 1]. spans [I]: first + 16 x
-    last pixel row of the splat within the tile.
+    members [I]: row of the splat. slots [I]: where the entry's gradient goes; the slots of a splat
+    follow each other. masks [I]: which 4x4 blocks of the tile the splat touches. places [V, 4]: for
+    each visible splat its row, its slots' number and first; see `binning`.
     """
 
     starts: NDArray[np.int64]
     members: NDArray[np.int32]
     slots: NDArray[np.int32]
-    spans: NDArray[np.uint8]
-    slot_starts: NDArray[np.int64]
+    masks: NDArray[np.uint16]
+    places: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.members)
@@ -142,8 +142,7 @@ class CpuRasteriser:
             project_splats, CHUNK, cam, degree, *arrays, smoothing, geometry, paint, status
         )
         visible = np.flatnonzero(status == VISIBLE).astype(np.int32)
-        order = self._order(visible, paint, arrays)
-        lists = self._lists(visible, order, geometry, width, height)
+        lists = self._lists(visible, arrays, geometry, paint, width, height)
         background = np.asarray(settings.background, np.float32)
         tiles = len(lists.starts) - 1
         image = get("image", (6 if depths else 4, height, width), np.float32)
@@ -155,7 +154,7 @@ class CpuRasteriser:
             height,
             lists.starts,
             lists.members,
-            lists.spans,
+            lists.masks,
             geometry,
             paint,
             background,
@@ -204,7 +203,7 @@ class CpuRasteriser:
             smoothing,
             forward.geometry,
             forward.paint,
-            forward.lists.slot_starts,
+            forward.lists.places,
             raw,
             out,
             means2d,
@@ -221,7 +220,7 @@ class CpuRasteriser:
         raw = self.buffers.get("contributions", shape, np.float32)
         self._over_tiles(contributions.contribution_tiles, forward, residual, raw)
         out = np.empty((len(forward.visible), contributions.COLUMNS))
-        contributions.gather_contributions(raw, forward.lists.slot_starts, out)
+        contributions.gather_contributions(raw, forward.lists.places, out)
         return out
 
     def _over_tiles(
@@ -239,7 +238,7 @@ class CpuRasteriser:
             forward.lists.starts,
             forward.lists.members,
             forward.lists.slots,
-            forward.lists.spans,
+            forward.lists.masks,
             forward.geometry,
             forward.paint,
             forward.background,
@@ -249,76 +248,71 @@ class CpuRasteriser:
             out,
         )
 
-    def _order(
-        self,
-        visible: NDArray[np.int32],
-        paint: NDArray[np.float32],
-        arrays: tuple[NDArray[np.float32], ...],
-    ) -> NDArray[np.int32]:
-        """[V] places in `visible`, nearest first."""
-        n, get = len(visible), self.buffers.get
-        # depths are positive, so their bits sort as they do
-        keys = paint[visible, 3].view(np.uint32)
-        order = np.arange(n, dtype=np.int32)
-        binning.radix_order(
-            keys, order, get("keys2", (n,), np.uint32), get("order2", (n,), np.int32)
-        )
-        binning.settle_ties(keys, order, visible, *arrays)
-        return order
-
     def _lists(
         self,
         visible: NDArray[np.int32],
-        order: NDArray[np.int32],
+        arrays: tuple[NDArray[np.float32], ...],
         geometry: NDArray[np.float64],
+        paint: NDArray[np.float32],
         width: int,
         height: int,
     ) -> TileLists:
         n, get, share = len(visible), self.buffers.get, self.pool.share
         bounds = get("bounds", (n,), np.int32)
         share(binning.bound_tiles, visible, geometry, width, height, bounds)
-        found_starts = _running_total(bounds, get("found_starts", (n + 1,), np.int64))
-        most = int(found_starts[-1])
-        tiles, spans = get("tiles", (most,), np.int32), get("found_spans", (most,), np.uint8)
-        counts = get("counts", (n,), np.int32)
+        places = get("places", (n, 4), np.int32)
+        most = _starts(bounds, places[:, binning.FOUND])
+        tiles, masks = get("tiles", (most,), np.int32), get("found_masks", (most,), np.uint16)
+        order = get("order", (n,), np.int32)
+        keys, keys2 = get("keys", (n,), np.float32), get("keys2", (n,), np.uint32)
+        order2 = get("order2", (n,), np.int32)
         share(
-            binning.find_tiles, visible, geometry, width, height, found_starts, tiles, spans, counts
+            *(binning.find_tiles, visible, geometry, width, height, places, tiles, masks),
+            beside=lambda: binning.sort_by_depth(
+                visible, paint, arrays, keys, order, keys2, order2
+            ),
         )
-        slot_starts = _running_total(counts, get("slot_starts", (n + 1,), np.int64))
+        total = _starts(places[:, binning.COUNT], places[:, binning.SLOT])
 
         n_tiles = -(-width // binning.TILE) * -(-height // binning.TILE)
-        tile_counts = get("tile_counts", (binning.CHUNKS, n_tiles), np.int64)
-        tile_counts[:] = 0
-        share(binning.count_tiles, order, found_starts, counts, tiles, tile_counts)
+        positions = get("tile_counts", (binning.CHUNKS, n_tiles), np.int64)
+        positions[:] = 0
+        share(binning.count_tiles, order, places, tiles, positions)
         starts = get("tile_starts", (n_tiles + 1,), np.int64)
-        total = int(binning.scan_counts(tile_counts, starts))
+        binning.scan_counts(positions, starts)
         lists = TileLists(
             starts,
             get("members", (total,), np.int32),
             get("slots", (total,), np.int32),
-            get("spans", (total,), np.uint8),
-            slot_starts,
+            get("masks", (total,), np.uint16),
+            places,
         )
         share(
             binning.fill_tiles,
             order,
-            visible,
-            found_starts,
-            slot_starts,
+            places,
             tiles,
-            spans,
-            tile_counts,
+            masks,
+            positions,
             lists.members,
             lists.slots,
-            lists.spans,
+            lists.masks,
         )
         return lists
 
 
-def _running_total(counts: NDArray[np.int32], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    starts[0] = 0
-    np.cumsum(counts, out=starts[1:])
-    return starts
+def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:
+    """starts: the sum of all counts before; returns the sum of all.
+
+    Raises MemoryError where it does not fit into 31 bits: 2 billion entries take 90 GB.
+    """
+    total = int(counts.sum(dtype=np.int64))
+    if total >= 2**31:
+        raise MemoryError(f"{total:,} splat-tile intersections; at most 2**31 - 1 can be drawn")
+    if len(counts):
+        starts[0] = 0
+        np.cumsum(counts[:-1], out=starts[1:])
+    return total
 
 
 def splat_arrays(splats: Splats) -> tuple[NDArray[np.float32], ...]:

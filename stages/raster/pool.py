@@ -28,15 +28,24 @@ class Pool:
         )
         self._ticket = np.zeros(1, np.int64)
 
-    def share(self, kernel: Callable[..., Any], *args: Any) -> None:
-        """kernel(counter, *args) in every thread; the kernel takes tickets from `counter`."""
+    def share(
+        self,
+        kernel: Callable[..., Any],
+        *args: Any,
+        beside: Callable[[], Any] | None = None,
+    ) -> None:
+        """kernel(counter, *args) in every thread; the kernel takes tickets from `counter`.
+
+        beside: something else that one thread does first, while the others begin.
+        """
         self._ticket[0] = 0
-        if self._others is None:
-            kernel(self._ticket, *args)
-            return
         futures = [
-            self._others.submit(kernel, self._ticket, *args) for _ in range(self.n_threads - 1)
+            self._others.submit(kernel, self._ticket, *args)
+            for _ in range(self.n_threads - 1)
+            if self._others is not None
         ]
+        if beside is not None:
+            beside()
         kernel(self._ticket, *args)
         for future in futures:
             future.result()

@@ -15,6 +15,7 @@ from stages.raster.api import ALPHA_MIN, LOG_SCALE_MAX, QUATERNION_MIN, RasterSe
 from stages.raster.simd import kernel
 from stages.raster.simd64 import (
     LANES,
+    bits8,
     dand,
     deq,
     dexp,
@@ -355,11 +356,18 @@ def _quaternion_gradient(cam, w, out):
     put(out, 6, (n3 - along * q3) / norm)
 
 
+@kernel
+def _fill(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w):
+    return bits8(
+        footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
+    )
+
+
 def footprint_values(
     row: int, cam: NDArray[np.float64], arrays: tuple[NDArray[np.float32], ...]
 ) -> NDArray[np.float64]:
     """[WORK_ROW] what `footprint` makes of one row, for looking at."""
     work = np.zeros(WORK_ROW * LANES)
     rows = np.full(LANES, row, np.int64)
-    footprint(rows, cam, *arrays[:4], np.zeros(0, np.float32), work)
+    _fill(rows, cam, *arrays[:4], np.zeros(0, np.float32), work)
     return work.reshape(WORK_ROW, LANES)[:, 0].copy()

@@ -96,6 +96,21 @@ def vload(typingctx: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
+def vload_levels(typingctx: Any, array: Any, index: Any) -> Any:
+    """16 elements of a flat array of float32 or of bytes, as float32."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if sig.args[0].dtype == types.float32:
+            return builder.load(_pointer(context, builder, sig.args[0], args[0], args[1]), align=4)
+        struct = context.make_array(sig.args[0])(context, builder, args[0])
+        bytes_ = ir.VectorType(ir.IntType(8), LANES)
+        address = builder.bitcast(builder.gep(struct.data, [args[1]]), bytes_.as_pointer())
+        return builder.uitofp(builder.load(address, align=1), _VECTOR)
+
+    return f32x16(array, types.intp), codegen
+
+
+@intrinsic
 def vstore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     """array[index : index + 16] = value; not bounds-checked."""
 
@@ -107,6 +122,66 @@ def vstore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, types.intp, f32x16), codegen
 
 
+_QUARTER = ir.VectorType(_F32, 4)
+
+
+def _row_of_four(context: Any, builder: Any, array_type: Any, args: Any, row: int) -> Any:
+    """Address of array[index + row * stride]."""
+    step = builder.mul(args[2], ir.Constant(ir.IntType(64), row))
+    struct = context.make_array(array_type)(context, builder, args[0])
+    address = builder.gep(struct.data, [builder.add(args[1], step)])
+    return builder.bitcast(address, _QUARTER.as_pointer())
+
+
+@intrinsic
+def vload4x4(typingctx: Any, array: Any, index: Any, stride: Any) -> Any:
+    """Four lanes from each of index, index + stride, + 2 stride, + 3 stride; not bounds-checked."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        rows = [
+            builder.load(_row_of_four(context, builder, sig.args[0], args, row), align=4)
+            for row in range(4)
+        ]
+        eight = ir.VectorType(_I32, 8)
+        pair = ir.Constant(eight, [ir.Constant(_I32, k) for k in range(8)])
+        halves = [builder.shuffle_vector(a, b, pair) for a, b in (rows[:2], rows[2:])]
+        whole = ir.Constant(_INTEGERS, [ir.Constant(_I32, k) for k in range(LANES)])
+        return builder.shuffle_vector(*halves, whole)
+
+    return f32x16(array, types.intp, types.intp), codegen
+
+
+@intrinsic
+def vstore4x4(typingctx: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
+    """The way back of `vload4x4`."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        four = ir.VectorType(_I32, 4)
+        for row in range(4):
+            lanes = ir.Constant(four, [ir.Constant(_I32, 4 * row + k) for k in range(4)])
+            part = builder.shuffle_vector(args[3], args[3], lanes)
+            address = _row_of_four(context, builder, sig.args[0], args, row)
+            builder.store(part, address, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, f32x16), codegen
+
+
+@intrinsic
+def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
+    """Ask for the cache line of the flat array[index], which will be read soon."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        struct = context.make_array(sig.args[0])(context, builder, args[0])
+        byte = ir.IntType(8).as_pointer()
+        address = builder.bitcast(builder.gep(struct.data, [args[1]]), byte)
+        flags = [ir.Constant(_I32, k) for k in (0, 3, 1)]  # read, keep, data
+        call_llvm(builder, "llvm.prefetch.p0", ir.VoidType(), [address, *flags])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen
+
+
 @intrinsic
 def splat16(typingctx: Any, scalar: Any) -> Any:
     """The same float32 in all lanes."""
@@ -115,16 +190,6 @@ def splat16(typingctx: Any, scalar: Any) -> Any:
         return _broadcast(builder, args[0])
 
     return f32x16(types.float32), codegen
-
-
-@intrinsic
-def iota16(typingctx: Any) -> Any:
-    """0, 1, ..., 15."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return ir.Constant(_VECTOR, [ir.Constant(_F32, float(i)) for i in range(LANES)])
-
-    return f32x16(), codegen
 
 
 @intrinsic
@@ -150,6 +215,14 @@ def vselect(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
 def _any(builder: Any, mask: Any) -> Any:
     bits = builder.bitcast(mask, ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
+
+def _bits(builder: Any, mask: Any) -> Any:
+    return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(64))
+
+
+def _lowest_bit(builder: Any, bits: Any) -> Any:
+    return builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
 def _sum(builder: Any, vector: Any) -> Any:
@@ -251,6 +324,8 @@ vexp2 = _unary(_vector1, _exp2)
 vabs = _unary(_vector1, lambda b, x: call_llvm(b, "llvm.fabs.v16f32", _VECTOR, [x]))
 vsqrt = _unary(_vector1, lambda b, x: call_llvm(b, "llvm.sqrt.v16f32", _VECTOR, [x]))
 vsum = _unary(lambda a: types.float32(a), _sum)
+bits16 = _unary(lambda a: types.int64(a), _bits)  # lane k in bit k
+lowest_bit = _unary(lambda a: types.int64(types.int64), _lowest_bit)  # of a number that is not 0
 vany = _unary(lambda a: types.boolean(a), _any)
 vge = _binary(_mask2, lambda b, x, y: b.fcmp_ordered(">=", x, y))  # False where a lane holds NaN
 vgt = _binary(_mask2, lambda b, x, y: b.fcmp_ordered(">", x, y))

@@ -130,6 +130,19 @@ def dstore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
+def istore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """array[index : index + 8] = value, rounded to zero, of an int64 array; not bounds-checked."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = _address(context, builder, sig.args[0], args[0], args[1])
+        whole = builder.fptosi(args[2], _INTEGERS)
+        builder.store(whole, builder.bitcast(address, _INTEGERS.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, f64x8), codegen
+
+
+@intrinsic
 def gather8(typingctx: Any, array: Any, rows: Any, stride: Any, column: Any) -> Any:
     """Lane k: element `rows[k] * stride + column` of a C-contiguous float array, as float64."""
 
@@ -224,6 +237,8 @@ def _neg(a):
 spread8 = _function(_vector, 1, lambda b, x: x)
 dsqrt = _function(_vector, 1, lambda b, x: call_llvm(b, "llvm.sqrt.v8f64", _VECTOR, [x]))
 dabs = _function(_vector, 1, lambda b, x: call_llvm(b, "llvm.fabs.v8f64", _VECTOR, [x]))
+dfloor = _function(_vector, 1, lambda b, x: call_llvm(b, "llvm.floor.v8f64", _VECTOR, [x]))
+dceil = _function(_vector, 1, lambda b, x: call_llvm(b, "llvm.ceil.v8f64", _VECTOR, [x]))
 # the second where a lane holds NaN
 dmin = _function(_vector, 2, lambda b, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
 dmax = _function(_vector, 2, lambda b, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))

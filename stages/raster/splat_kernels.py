@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from stages.raster.binning import COUNT, SLOT
 from stages.raster.projection import (
     GA,
     GB,
@@ -28,6 +29,7 @@ from stages.raster.simd64 import (
     dgt,
     dload,
     dmax,
+    dmin,
     dselect,
     dsqrt,
     dstore,
@@ -37,6 +39,7 @@ from stages.raster.simd64 import (
 )
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
+BRIGHTEST = 1e38  # an infinite colour would turn "none of it" into NaN
 SUMS = 9  # of a splat's gradients in a tile; see `blend.entry_gradient`
 
 
@@ -144,7 +147,7 @@ def _shade(rows, cam, degree, means, sh, basis, paint):
             value = value + dload(basis, LANES * band) * gather8(
                 sh, rows, stride, 3 * band + channel
             )
-        scatter8(paint, rows, 4, channel, dmax(value, 0.0))
+        scatter8(paint, rows, 4, channel, dmin(dmax(value, 0.0), BRIGHTEST))
     mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
     scatter8(paint, rows, 4, 3, cam[6] * mx + cam[7] * my + cam[8] * mz + cam[11])
 
@@ -201,12 +204,15 @@ def splat_gradients(
     smoothing,
     geometry,
     paint,
-    slot_starts,
+    splats,
     raw,
     out,
     means2d,
 ):
-    """Sum each splat's (splat, tile) gradients, in a fixed order, and take them to parameters."""
+    """Sum each splat's (splat, tile) gradients, in a fixed order, and take them to parameters.
+
+    splats [V, 4]: `TileLists.places`.
+    """
     n = len(visible)
     columns = out.shape[1]
     w = np.empty(WORK_ROW * LANES, np.float64)
@@ -227,7 +233,8 @@ def splat_gradients(
             for lane in range(LANES):
                 place = places[lane]
                 rows[lane] = visible[place]
-                _sum_slots(raw, slot_starts[place], slot_starts[place + 1], lane, by_lane)
+                slot = np.int64(splats[place, SLOT])
+                _sum_slots(raw, slot, slot + splats[place, COUNT], lane, by_lane)
                 for k in range(11 + 3 * (degree + 1) * (degree + 1), columns):
                     out[place, k] = np.float32(0.0)
             for k in range(SUMS):

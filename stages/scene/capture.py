@@ -91,7 +91,8 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
 def scene_extent(views: tuple[View, ...]) -> float:
     """The reference trainer's scale of a scene: 1.1 x the largest distance of a camera from the
     cameras' centre, with the median taken as centre and the 95th percentile as "largest" so that
-    one stray camera does not set it. Never 0."""
+    one stray camera does not set it: the percentile is a camera's own distance, not a mean of two,
+    which the stray one could be among. Never 0."""
     centres = np.array([view.camera.centre for view in views])
     distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-    return max(1.1 * float(np.percentile(distances, 95)), 1e-6)
+    return max(1.1 * float(np.percentile(distances, 95, method="lower")), 1e-6)

@@ -24,17 +24,31 @@ class Loss:
     v_image: NDArray[np.float32]
 
 
+def channel_means(target: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float32]:
+    """[3] mean of each channel of a picture [3, H, W], in 0..1."""
+    means = target.reshape(3, -1).mean(1, dtype=np.float64)
+    return (means * _scale(target)).astype(np.float32)
+
+
+def _scale(target: NDArray[np.float32] | NDArray[np.uint8]) -> np.float32:
+    return np.float32(1 / 255) if target.dtype == np.uint8 else np.float32(1)
+
+
 def image_loss(
     pool: Pool,
     image: NDArray[np.float32],
-    target: NDArray[np.float32],
+    target: NDArray[np.float32] | NDArray[np.uint8],
     v_image: NDArray[np.float32],
     ssim_weight: float = SSIM_WEIGHT,
+    means: NDArray[np.float32] | None = None,
 ) -> Loss:
-    """Compare image [>= 3, H, W] with target [3, H, W]; the gradient is written to v_image."""
+    """Compare image [>= 3, H, W] with target [3, H, W]; the gradient is written to v_image.
+
+    target: float32 in 0..1, or bytes. means: its `channel_means`, if they are known.
+    """
     _, height, width = target.shape
-    means = target.reshape(3, -1).mean(1, dtype=np.float64).astype(np.float32)
+    means = channel_means(target) if means is None else means
     sums = np.zeros((3 * (-(-height // BAND)), 2))
-    pool.share(loss_bands, image, target, means, ssim_weight, v_image, sums)
+    pool.share(loss_bands, image, target, _scale(target), means, ssim_weight, v_image, sums)
     l1, ssim = (float(s) for s in sums.sum(0) / (3 * height * width))
     return Loss((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim, v_image)

@@ -6,7 +6,9 @@ first: variances as E[x^2] - E[x]^2 then lose nothing in float32, however bright
 Beyond the rim both pictures are taken to have that mean.
 
 A band of rows streams through two rings of 11 filtered rows each, so that the working set stays in
-the cache and no map of the size of the picture is ever made.
+the cache and no map of the size of the picture is ever made. SSIM needs four filtered maps: x, y,
+x^2 + y^2 and x y. Rows of flat arrays are named by where they begin, never sliced: a slice counts
+references, and threads would fight over the counter.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from stages.raster.simd import (
     vfma,
     vgt,
     vload,
+    vload_levels,
     vselect,
     vstore,
     vsum,
@@ -38,176 +41,195 @@ _GAUSS = [math.exp(-((k - RADIUS) ** 2) / (2 * 1.5**2)) for k in range(TAPS)]
 WINDOW = np.array([g / sum(_GAUSS) for g in _GAUSS], np.float32)
 
 
-def padded_width(width: int) -> int:
-    """Floats a padded row takes: whole vectors, with room for the taps on both sides."""
-    return PAD + (width + 15) // 16 * 16 + PAD
+MAPS, SLOPES = 4, 3  # filtered maps; derivatives: by mean, by variance, by covariance
 
 
 @kernel
-def _load_row(picture, channel, y, mean, row):
-    """Row y less the mean, zero beyond the rim."""
+def _load_row(picture, scale, channel, y, mean, row, at):
+    """Row y, times `scale`, less the mean into row[at + PAD :]; zero beyond the rim."""
     height, width = picture.shape[1], picture.shape[2]
+    whole = width // 16 * 16
+    start, level = (channel * height + y) * width, splat16(mean)
     if y < 0 or y >= height:
-        row[:] = _F(0.0)
+        for x in range(width):
+            row[at + PAD + x] = _F(0.0)
         return
-    for x in range(width):
-        row[PAD + x] = picture[channel, y, x] - mean
+    for x in range(0, whole, 16):
+        value = vload_levels(picture, start + x) * splat16(scale)
+        vstore(row, at + PAD + x, value - level)
+    for x in range(whole, width):
+        row[at + PAD + x] = _F(picture[channel, y, x]) * scale - mean
 
 
 @kernel
-def _filter_products(xs, ys, out):
-    """Horizontal window sums of x, y, x^2, y^2, xy into out[5, :]."""
-    zero = splat16(_F(0.0))
-    for at in range(PAD, len(xs) - PAD, 16):
-        s_x, s_y, s_xx, s_yy, s_xy = zero, zero, zero, zero, zero
-        for k in range(TAPS):
-            weight = splat16(WINDOW[k])
-            x, y = vload(xs, at + k - RADIUS), vload(ys, at + k - RADIUS)
-            wx, wy = weight * x, weight * y
-            s_x, s_y = s_x + wx, s_y + wy
-            s_xx, s_yy, s_xy = vfma(wx, x, s_xx), vfma(wy, y, s_yy), vfma(wx, y, s_xy)
-        vstore(out[0], at, s_x)
-        vstore(out[1], at, s_y)
-        vstore(out[2], at, s_xx)
-        vstore(out[3], at, s_yy)
-        vstore(out[4], at, s_xy)
+def _multiply_rows(xs, x_at, ys, y_at, padded, products):
+    """x^2 + y^2 and x y of a row into products[: 2 padded]."""
+    for at in range(0, padded, 16):
+        x, y = vload(xs, x_at + at), vload(ys, y_at + at)
+        vstore(products, at, vfma(x, x, y * y))
+        vstore(products, padded + at, x * y)
 
 
 @kernel
-def _column_sum(ring, which, newest, at):
-    """Vertical window sum over a ring of rows whose newest row is number `newest`."""
-    total = splat16(_F(0.0))
-    for k in range(TAPS):
-        slot = (newest - 2 * RADIUS + k) % TAPS
-        total = vfma(splat16(WINDOW[k]), vload(ring[slot, which], at), total)
+def _filter_row(row, at, padded, out, out_at):
+    """Horizontal window sums of one padded row."""
+    for x in range(PAD, padded - PAD, 16):
+        middle = at + x
+        total = splat16(WINDOW[RADIUS]) * vload(row, middle)
+        for k in range(1, RADIUS + 1):
+            pair = vload(row, middle - k) + vload(row, middle + k)
+            total = vfma(splat16(WINDOW[RADIUS + k]), pair, total)
+        vstore(out, out_at + x, total)
+
+
+@kernel
+def _column_sum(ring, at, starts):
+    """Vertical window sum at offset `at` of 11 rows of a ring that begin at starts[0..10]."""
+    total = splat16(WINDOW[0]) * vload(ring, starts[0] + at)
+    for k in range(1, TAPS):
+        total = vfma(splat16(WINDOW[k]), vload(ring, starts[k] + at), total)
     return total
 
 
 @kernel
-def _similarity_row(ring, newest, mean, width, out):
-    """SSIM of one row; its derivatives by mean, variance and covariance into out[3, :].
+def _ring_starts(newest, row_size, starts):
+    """Where the 11 rows of a ring begin whose newest is row number `newest`, oldest first."""
+    for k in range(TAPS):
+        starts[k] = (newest - 2 * RADIUS + k) % TAPS * row_size
 
-    Returns the row's sum. Derivatives are those of the filtered sums of x, x^2 and xy.
+
+@kernel
+def _similarity_row(ring, starts, padded, mean, width, out):
+    """SSIM of one row; its derivatives by mean, variance and covariance into out[: 3 padded].
+
+    Returns the row's sum. Derivatives are those of the filtered maps of x, x^2 and xy.
     """
     two, mean_v = splat16(_F(2.0)), splat16(mean)
     c1, c2 = splat16(C1), splat16(C2)
     total = 0.0
     for at in range(PAD, PAD + width, 16):
-        m_x, m_y = _column_sum(ring, 0, newest, at), _column_sum(ring, 1, newest, at)
-        v_x = _column_sum(ring, 2, newest, at) - m_x * m_x
-        v_y = _column_sum(ring, 3, newest, at) - m_y * m_y
-        cov = _column_sum(ring, 4, newest, at) - m_x * m_y
+        m_x, m_y = _column_sum(ring, at, starts), _column_sum(ring, padded + at, starts)
+        squares = _column_sum(ring, 2 * padded + at, starts)
+        cov = _column_sum(ring, 3 * padded + at, starts) - m_x * m_y
         full_x, full_y = m_x + mean_v, m_y + mean_v
         a = full_x * full_x + full_y * full_y + c1
-        b = v_x + v_y + c2
+        b = (squares - m_x * m_x - m_y * m_y) + c2
         c = two * full_x * full_y + c1
         d = two * cov + c2
         inverse = splat16(_F(1.0)) / (a * b)
         score = c * d * inverse
-        by_variance = splat16(_F(0.0)) - score / b
+        by_variance = splat16(_F(0.0)) - score * a * inverse
         by_cov = two * c * inverse
-        by_mean = two * (full_y * d * inverse - full_x * score / a)
+        by_mean = two * (full_y * d - full_x * score * b) * inverse
         by_mean = by_mean - two * m_x * by_variance - m_y * by_cov
-        vstore(out[0], at, by_mean)
-        vstore(out[1], at, by_variance)
-        vstore(out[2], at, by_cov)
+        vstore(out, at, by_mean)
+        vstore(out, padded + at, by_variance)
+        vstore(out, 2 * padded + at, by_cov)
         if at + 16 <= PAD + width:
             total += vsum(score)
         else:
-            vstore(out[3], at, score)
+            vstore(out, 3 * padded + at, score)
             for x in range(at, PAD + width):
-                total += out[3, x]
-    for x in range(PAD + width, out.shape[1]):
-        out[0, x], out[1, x], out[2, x] = _F(0.0), _F(0.0), _F(0.0)
+                total += out[3 * padded + x]
+    for which in range(SLOPES):
+        for x in range(PAD + width, padded):
+            out[which * padded + x] = _F(0.0)
     return total
 
 
 @kernel
-def _filter_rows(rows, out):
-    """Horizontal window sums of three rows."""
-    for which in range(3):
-        row, target = rows[which], out[which]
-        for at in range(PAD, len(row) - PAD, 16):
-            total = splat16(_F(0.0))
-            for k in range(TAPS):
-                total = vfma(splat16(WINDOW[k]), vload(row, at + k - RADIUS), total)
-            vstore(target, at, total)
-
-
-@kernel
-def _gradient_row(ring, newest, xs, ys, weight, scratch, v_row):
-    """v_row[W] = gradient of one row; returns the row's sum of |x - y|."""
-    width = len(v_row)
+def _gradient_row(ring, starts, padded, xs, ys, own, weight, scratch, v_image, channel, y):
+    """Row y of v_image; returns the row's sum of |x - y|. own: where the row begins in xs, ys."""
+    height, width = v_image.shape[1], v_image.shape[2]
     zero, two = splat16(_F(0.0)), splat16(_F(2.0))
     absolute, similar = splat16(_F((1.0 - weight) / 3.0)), splat16(_F(-weight / 3.0))
     total = zero
-    for at in range(PAD, PAD + width, 16):
-        x, y = vload(xs, at), vload(ys, at)
-        by_mean = _column_sum(ring, 0, newest, at)
-        by_variance = _column_sum(ring, 1, newest, at)
-        by_cov = _column_sum(ring, 2, newest, at)
-        gradient = similar * (by_mean + two * x * by_variance + y * by_cov)
-        difference = x - y
+    to = (channel * height + y) * width
+    for x in range(0, width, 16):
+        at = PAD + x
+        x_v, y_v = vload(xs, own + at), vload(ys, own + at)
+        by_mean = _column_sum(ring, at, starts)
+        by_variance = _column_sum(ring, padded + at, starts)
+        by_cov = _column_sum(ring, 2 * padded + at, starts)
+        gradient = similar * (by_mean + two * x_v * by_variance + y_v * by_cov)
+        difference = x_v - y_v
         sign = vselect(
             vgt(difference, zero),
             absolute,
             vselect(vgt(zero, difference), zero - absolute, zero),
         )
-        vstore(scratch, at, gradient + sign)
         total = total + vabs(difference)  # beyond the rim both are zero
-    for x_at in range(width):
-        v_row[x_at] = scratch[PAD + x_at]
+        if x + 16 <= width:
+            vstore(v_image, to + x, gradient + sign)
+        else:
+            vstore(scratch, 0, gradient + sign)
+            for k in range(width - x):
+                v_image[channel, y, x + k] = scratch[k]
     return vsum(total)
 
 
 @kernel
-def loss_bands(ticket, image, target, means, weight, v_image, sums):
+def _filter_picture_row(
+    image, target, scale, channel, y, mean, padded, xs, ys, own, scratch, ring, to
+):
+    """Row y of both pictures into xs, ys and its four filtered maps into the ring."""
+    _load_row(image, _F(1.0), channel, y, mean, xs, own)
+    _load_row(target, scale, channel, y, mean, ys, own)
+    _multiply_rows(xs, own, ys, own, padded, scratch)
+    _filter_row(xs, own, padded, ring, to)
+    _filter_row(ys, own, padded, ring, to + padded)
+    _filter_row(scratch, 0, padded, ring, to + 2 * padded)
+    _filter_row(scratch, padded, padded, ring, to + 3 * padded)
+
+
+@kernel
+def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
     """Gradient of H x W x loss into v_image [3, H, W]; sums [tickets, 2]: L1 and SSIM, per band.
 
-    image [>= 3, H, W], target [3, H, W] float32; means [3] of the target; weight of the SSIM part.
-    A ticket is a band of one channel; sums are added up in order by the caller.
+    image [>= 3, H, W] float32; target [3, H, W] float32 or bytes, in units of `scale`; means [3] of
+    the target (or near them); weight of the SSIM part. A ticket is a band of one channel; sums are added up in order by the caller.
     """
     height, width = target.shape[1], target.shape[2]
     bands = (height + BAND - 1) // BAND
     padded = 2 * PAD + (width + 15) // 16 * 16
-    kept = 2 * RADIUS + 1
-    xs = np.zeros((kept, padded), np.float32)
-    ys = np.zeros((kept, padded), np.float32)
-    products = np.zeros((TAPS, 5, padded), np.float32)
-    derivatives = np.zeros((TAPS, 3, padded), np.float32)
-    rows = np.zeros((4, padded), np.float32)
+    xs, ys = np.zeros(TAPS * padded, np.float32), np.zeros(TAPS * padded, np.float32)
+    maps = np.zeros(TAPS * MAPS * padded, np.float32)
+    slopes = np.zeros(TAPS * SLOPES * padded, np.float32)
+    scratch = np.zeros(4 * padded, np.float32)
+    starts = np.zeros(TAPS, np.int64)
     while True:
         number = take_ticket(ticket)
         if number >= 3 * bands:
             break
         channel, top = number // bands, (number % bands) * BAND
         bottom = min(top + BAND, height)
+        mean = means[channel]
         l1, ssim = 0.0, 0.0
         for y in range(top - 2 * RADIUS, bottom + 2 * RADIUS):
-            slot = y % kept
-            _load_row(image, channel, y, means[channel], xs[slot])
-            _load_row(target, channel, y, means[channel], ys[slot])
-            _filter_products(xs[slot], ys[slot], products[slot])
+            slot = y % TAPS
+            own, to = slot * padded, slot * MAPS * padded
+            _filter_picture_row(
+                image, target, scale, channel, y, mean, padded, xs, ys, own, scratch, maps, to
+            )
             middle = y - RADIUS
             if middle < top - RADIUS:
                 continue
+            to = middle % TAPS * SLOPES * padded
             if 0 <= middle < height:
-                row_sum = _similarity_row(products, y, means[channel], width, rows)
+                _ring_starts(y, MAPS * padded, starts)
+                row_sum = _similarity_row(maps, starts, padded, mean, width, scratch)
                 if top <= middle < bottom:
                     ssim += row_sum
-                _filter_rows(rows, derivatives[middle % TAPS])
+                for which in range(SLOPES):
+                    _filter_row(scratch, which * padded, padded, slopes, to + which * padded)
             else:
-                derivatives[middle % TAPS] = _F(0.0)
+                for x in range(SLOPES * padded):
+                    slopes[to + x] = _F(0.0)
             out = middle - RADIUS
             if out >= top:
-                at = out % kept
+                _ring_starts(middle, SLOPES * padded, starts)
+                own = out % TAPS * padded
                 l1 += _gradient_row(
-                    derivatives,
-                    middle,
-                    xs[at],
-                    ys[at],
-                    weight,
-                    rows[3],
-                    v_image[channel, out],
+                    slopes, starts, padded, xs, ys, own, weight, scratch, v_image, channel, out
                 )
         sums[number, 0], sums[number, 1] = l1, ssim

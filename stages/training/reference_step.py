@@ -19,7 +19,7 @@ def reference_gradients(
     arrays: tuple[NDArray[np.float32], ...],
     camera: Camera,
     settings: RasterSettings,
-    target: NDArray[np.float32],
+    target: NDArray[np.uint8],
     v_image: NDArray[np.float32],
 ) -> tuple[Backward, float]:
     """(gradients as the kernels would give them, loss); computed in float64."""

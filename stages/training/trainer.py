@@ -99,7 +99,8 @@ class Trainer:
     def step(self, model: Model, step: int) -> float:
         """One step of Adam on one photograph; the loss before it."""
         view = self.train[self.schedule.view(step)]
-        camera, target = view.target(self.schedule.level(step))
+        level = view.levels[self.schedule.level(step)]
+        camera, target = level.camera, level.pixels
         settings = self.settings(self.schedule.active_sh_degree(step))
         if self._v_image.shape != target.shape:
             self._v_image = np.empty(target.shape, np.float32)
@@ -112,7 +113,7 @@ class Trainer:
             )
         else:
             forward = self.rasteriser.forward(model.arrays, camera, settings)
-            loss = image_loss(pool, forward.image, target, self._v_image)
+            loss = image_loss(pool, forward.image, target, self._v_image, means=level.means)
             backward = self.rasteriser.backward(model.arrays, forward, self._v_image)
             value = loss.value
         factor = self.schedule.rate_factor(step)
@@ -163,9 +164,9 @@ class Trainer:
         self, model: Model, view: TrainingView
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(render, photograph), [H, W, 3], what a viewer would show: clipped to [0, 1]."""
-        camera, target = view.target(len(view.levels) - 1)
+        level = view.levels[-1]
         forward = self.rasteriser.forward(
-            model.arrays, camera, self.settings(self.schedule.sh_degree)
+            model.arrays, level.camera, self.settings(self.schedule.sh_degree)
         )
         image = np.clip(forward.image[:3].transpose(1, 2, 0), 0.0, 1.0)
-        return image, target.transpose(1, 2, 0)
+        return image, level.pixels.transpose(1, 2, 0) * np.float32(1 / 255)

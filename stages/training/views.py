@@ -11,20 +11,25 @@ from numpy.typing import NDArray
 
 from stages.photos.load import load_image
 from stages.scene import Camera, View
+from stages.training.loss import channel_means
 from stages.training.schedule import RESOLUTIONS
 
 
 @dataclass(frozen=True)
+class Level:
+    """A photograph at one size: pixels [3, H, W] and the mean of each channel [3], in 0..1."""
+
+    camera: Camera
+    pixels: NDArray[np.uint8]
+    means: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class TrainingView:
-    """One photograph. levels: (camera, pixels [3, H, W] uint8) for each of RESOLUTIONS."""
+    """One photograph, at each of RESOLUTIONS."""
 
     name: str
-    levels: tuple[tuple[Camera, NDArray[np.uint8]], ...]
-
-    def target(self, level: int) -> tuple[Camera, NDArray[np.float32]]:
-        """The camera and its photograph [3, H, W] in [0, 1]."""
-        camera, pixels = self.levels[level]
-        return camera, np.multiply(pixels, np.float32(1 / 255), dtype=np.float32)
+    levels: tuple[Level, ...]
 
 
 def load_views(folder: Path, views: Iterable[View], train_side: int) -> list[TrainingView]:
@@ -36,6 +41,7 @@ def load_views(folder: Path, views: Iterable[View], train_side: int) -> list[Tra
             camera = view.camera.fitted(max(16, round(train_side * scale)))
             picture = load_image(folder / view.image, camera.width, camera.height)
             pixels = np.round(picture * 255).astype(np.uint8)
-            levels.append((camera, np.ascontiguousarray(pixels.transpose(2, 0, 1))))
+            planar = np.ascontiguousarray(pixels.transpose(2, 0, 1))
+            levels.append(Level(camera, planar, channel_means(planar)))
         loaded.append(TrainingView(view.name, tuple(levels)))
     return loaded

@@ -26,9 +26,11 @@ class TimedPool(Pool):
         super().__init__(n_threads)
         self.seconds: dict[str, float] = defaultdict(float)
 
-    def share(self, kernel: Callable[..., Any], *args: Any) -> None:
+    def share(
+        self, kernel: Callable[..., Any], *args: Any, beside: Callable[[], Any] | None = None
+    ) -> None:
         start = time.perf_counter()
-        super().share(kernel, *args)
+        super().share(kernel, *args, beside=beside)
         self.seconds[kernel.__name__] += time.perf_counter() - start
 
 

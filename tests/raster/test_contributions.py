@@ -72,7 +72,7 @@ def test_weights_are_those_of_the_definition(opaque):
     )
     pixels = torch.stack([xs, ys], -1).flatten(0, 1)
     with torch.no_grad():
-        weights, _ = blend_weights(projected, torch.arange(len(projected.depths)), pixels)
+        weights, _, _ = blend_weights(projected, torch.arange(len(projected.depths)), pixels)
     wanted = np.zeros((len(scene), 2))
     wanted[projected.index.numpy()] = np.stack([weights.sum(1), weights.amax(1)], 1)
     found = measured(scene, photograph(), where)[:, 1:]

@@ -1,0 +1,20 @@
+"""The listing of the extremes in the documentation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.extremes.table import ROWS, listing, promises
+
+LISTING = Path(__file__).parents[2] / "docs" / "extremes.md"
+
+
+def test_there_is_one_row_for_each_number_of_the_table() -> None:
+    assert [row.number for row in ROWS] == list(range(1, 30))
+    assert len({row.name for row in ROWS}) == len(ROWS)
+
+
+def test_the_documented_listing_has_every_row_and_its_bounds() -> None:
+    documented = promises(LISTING.read_text(encoding="utf-8"))
+    assert {row for row, _, _ in documented} == {str(row.number) for row in ROWS}
+    assert documented == promises(listing())
