@@ -28,7 +28,7 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
         good &= np.isfinite(splats.opacity_logits)
         good &= np.isfinite(splats.sh).all(axis=(1, 2))
         good &= np.abs(splats.sh).max(axis=(1, 2), initial=0.0) <= np.finfo(np.float32).max
-        largest = np.abs(splats.quaternions).max(axis=1, initial=0.0)
+        largest = np.abs(splats.quaternions.astype(np.float64)).max(axis=1, initial=0.0)
         good &= np.isfinite(largest) & (largest >= QUATERNION_MIN)
     return np.asarray(good, bool)
 

@@ -24,6 +24,7 @@ ROW, FOUND, COUNT, SLOT = range(4)
 _LN2 = math.log(2.0)
 _FAINTEST = math.log2(ALPHA_MIN)
 _FAR = 1e9
+BATCH = 16  # splats whose spans are found together
 _EIGHT = np.arange(8.0)
 
 
@@ -165,12 +166,13 @@ def bound_tiles(ticket, visible, geometry, width, height, bounds):
 
 
 @kernel
-def _block_spans(geometry, row, width, y0, y1, reach2, top, firsts, lasts):
-    """firsts, lasts [8]: range of 4-pixel columns that a splat touches in each of the eight block
-    rows from pixel row `top` on; far..-1 where none. y0, y1: the pixel rows that it touches.
+def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
+    """First (spans[at : at + 8]) and last (the 8 after) of the 4-pixel columns that a splat touches
+    in each of the eight block rows from pixel row `top` on; far and -1 where none.
 
-    In a slab of y the ellipse reaches furthest right where its right end lies, or as near to it as
-    the slab goes: at y there, to slope y + sqrt((reach^2 - y^2 / c) det / c).
+    y0, y1: the pixel rows that it touches. In a slab of y the ellipse reaches furthest right where
+    its right end lies, or as near to it as the slab goes: at y there, to
+    slope y + sqrt((reach^2 - y^2 / c) det / c).
     """
     x, y = geometry[row, GX], geometry[row, GY]
     a, c = geometry[row, GVX], geometry[row, GVY]
@@ -183,30 +185,30 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, firsts, lasts):
     low, high = dmax(first_row, y0), dmin(first_row + (BLOCK - 1), y1)
     empty = dgt(low, high)
     low, high = low + (0.5 - y), high + (0.5 - y)
-    at = dmin(dmax(low, right_end), high)
-    right = slope * at + dsqrt(dmax(rest * (reach2 - at * at * per_c), 0.0))
-    at = dmin(dmax(low, -right_end), high)
-    left = slope * at - dsqrt(dmax(rest * (reach2 - at * at * per_c), 0.0))
+    y_at = dmin(dmax(low, right_end), high)
+    right = slope * y_at + dsqrt(dmax(rest * (reach2 - y_at * y_at * per_c), 0.0))
+    y_at = dmin(dmax(low, -right_end), high)
+    left = slope * y_at - dsqrt(dmax(rest * (reach2 - y_at * y_at * per_c), 0.0))
     # first and last pixel whose centre lies within, then their blocks
     first = dmax(dceil(dmin(left + (x - 0.5), width + 1.0)), 0.0)
     last = dmin(dfloor(dmax(right + (x - 0.5), -2.0)), width - 1.0)
     first_block, last_block = dfloor(first * (1.0 / BLOCK)), dfloor(last * (1.0 / BLOCK))
     nothing = dgt(first, last)
-    istore(firsts, 0, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
-    istore(lasts, 0, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
+    istore(spans, at, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
+    istore(spans, at + 8, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
 
 
 @kernel
-def _emit_tile_row(firsts, lasts, q0, tile_row, at, tiles, masks):
-    """Write the tiles of one tile row, whose block rows are q0..q0 + 3 of firsts and lasts, from
+def _emit_tile_row(spans, q0, tile_row, at, tiles, masks):
+    """Write the tiles of one tile row, whose block rows are the four from spans[q0] on, from
     position `at` on; the position after them. tile_row: number of the row's first tile."""
-    least = min(min(firsts[q0], firsts[q0 + 1]), min(firsts[q0 + 2], firsts[q0 + 3]))
-    most = max(max(lasts[q0], lasts[q0 + 1]), max(lasts[q0 + 2], lasts[q0 + 3]))
+    least = min(min(spans[q0], spans[q0 + 1]), min(spans[q0 + 2], spans[q0 + 3]))
+    most = max(max(spans[q0 + 8], spans[q0 + 9]), max(spans[q0 + 10], spans[q0 + 11]))
     for tile_x in range(least // 4, most // 4 + 1):
         mask = 0
         for q in range(4):
-            low = min(max(firsts[q0 + q] - 4 * tile_x, 0), 4)
-            end = max(min(lasts[q0 + q] - 4 * tile_x + 1, 4), low)
+            low = min(max(spans[q0 + q] - 4 * tile_x, 0), 4)
+            end = max(min(spans[q0 + q + 8] - 4 * tile_x + 1, 4), low)
             mask |= ((1 << end) - (1 << low)) << (4 * q)
         tiles[at] = tile_row + tile_x
         masks[at] = mask
@@ -215,32 +217,57 @@ def _emit_tile_row(firsts, lasts, q0, tile_row, at, tiles, masks):
 
 
 @kernel
+def _span_batch(first, last, visible, geometry, width, height, places, groups, spans):
+    """Block spans of the places first..last, two tile rows a group; the number of groups.
+
+    groups [G, 2]: the place, and its upper tile row. spans [16 G]: see `_block_spans`.
+    """
+    n = 0
+    for place in range(first, last):
+        row = visible[place]
+        reach2 = _reach2(geometry[row, GL])
+        y, half_y = geometry[row, GY], math.sqrt(reach2 * geometry[row, GVY])
+        y0, y1 = _pixel_range(y - half_y, y + half_y, height)
+        for tile_y in range(y0 // TILE, y1 // TILE + 1 if y1 >= y0 else 0, 2):
+            top = tile_y * TILE
+            _block_spans(geometry, row, width, y0, y1, reach2, top, spans, 16 * n)
+            groups[n, 0], groups[n, 1] = place, tile_y
+            n += 1
+        places[place, ROW], places[place, COUNT] = row, 0
+    return n
+
+
+@kernel
 def find_tiles(ticket, visible, geometry, width, height, places, tiles, masks):
     """The tiles that each visible splat touches, from places[place, FOUND] on; ROW and COUNT.
 
     tiles: number of the tile. masks: which of its 4x4-pixel blocks, bit 4 row + column.
+
+    Spans are computed for a batch of splats before any is walked through: how many tiles a splat
+    has cannot be guessed, and a wrong guess is cheap only once the numbers are at hand.
     """
     tiles_x = (width + TILE - 1) // TILE
+    most = BATCH * ((height + TILE - 1) // TILE // 2 + 1)
+    groups, spans = np.empty((most, 2), np.int64), np.empty(16 * most, np.int64)
     n = len(visible)
     size = (n + CHUNKS - 1) // CHUNKS
-    firsts, lasts = np.empty(8, np.int64), np.empty(8, np.int64)
     while True:
         chunk = take_ticket(ticket)
         if chunk >= CHUNKS:
             break
-        for place in range(chunk * size, min((chunk + 1) * size, n)):
-            row = visible[place]
-            reach2 = _reach2(geometry[row, GL])
-            y, half_y = geometry[row, GY], math.sqrt(reach2 * geometry[row, GVY])
-            y0, y1 = _pixel_range(y - half_y, y + half_y, height)
-            at = np.int64(places[place, FOUND])
-            for tile_y in range(y0 // TILE, y1 // TILE + 1 if y1 >= y0 else 0, 2):
-                top = tile_y * TILE
-                _block_spans(geometry, row, width, y0, y1, reach2, top, firsts, lasts)
-                at = _emit_tile_row(firsts, lasts, 0, tile_y * tiles_x, at, tiles, masks)
-                at = _emit_tile_row(firsts, lasts, 4, (tile_y + 1) * tiles_x, at, tiles, masks)
-            places[place, ROW] = row
-            places[place, COUNT] = at - places[place, FOUND]
+        end = min((chunk + 1) * size, n)
+        for first in range(chunk * size, end, BATCH):
+            last = min(first + BATCH, end)
+            found = _span_batch(
+                first, last, visible, geometry, width, height, places, groups, spans
+            )
+            for group in range(found):
+                place, tile_y = groups[group, 0], groups[group, 1]
+                start = np.int64(places[place, FOUND])
+                at = start + places[place, COUNT]
+                at = _emit_tile_row(spans, 16 * group, tile_y * tiles_x, at, tiles, masks)
+                at = _emit_tile_row(spans, 16 * group + 4, (tile_y + 1) * tiles_x, at, tiles, masks)
+                places[place, COUNT] = at - start
 
 
 @kernel

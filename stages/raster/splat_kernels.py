@@ -22,7 +22,7 @@ from stages.raster.projection import (
     used_opacity,
 )
 from stages.raster.sh import sh_basis, sh_direction_gradient
-from stages.raster.simd import kernel, take_ticket
+from stages.raster.simd import kernel, splat16, take_ticket, vstore
 from stages.raster.simd64 import (
     LANES,
     bits8,
@@ -235,8 +235,7 @@ def splat_gradients(
                 rows[lane] = visible[place]
                 slot = np.int64(splats[place, SLOT])
                 _sum_slots(raw, slot, slot + splats[place, COUNT], lane, by_lane)
-                for k in range(11 + 3 * (degree + 1) * (degree + 1), columns):
-                    out[place, k] = np.float32(0.0)
+                vstore(out, place * columns + columns - 16, splat16(np.float32(0.0)))
             for k in range(SUMS):
                 dstore(sums, LANES * k, gather8(by_lane, lanes, 16, k))
             footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
