@@ -19,12 +19,12 @@ TILE = 16  # pixels across and down
 BLOCK = 4  # a tile is 4x4 blocks of 4x4 pixels
 CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
 # Columns of `places`, one line for each visible splat: its row, where its tiles were written, how
-# many they are, and the slot of its first gradient.
-ROW, FOUND, COUNT, SLOT = range(4)
+# many they are, and where in `entries` their places in the lists begin.
+ROW, FOUND, COUNT, FIRST = range(4)
 _LN2 = math.log(2.0)
 _FAINTEST = math.log2(ALPHA_MIN)
 _FAR = 1e9
-BATCH = 16  # splats whose spans are found together
+BATCH = 32  # splats whose spans are found together
 _EIGHT = np.arange(8.0)
 
 
@@ -146,7 +146,8 @@ def _reach2(level):
 
 @kernel
 def bound_tiles(ticket, visible, geometry, width, height, bounds):
-    """bounds[place]: tiles of a visible splat's bounding box, at least as many as it touches."""
+    """bounds[place]: tiles of a visible splat's bounding box and one more: what `find_tiles` may
+    write."""
     n = len(visible)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:
@@ -160,9 +161,9 @@ def bound_tiles(ticket, visible, geometry, width, height, bounds):
             y, half_y = geometry[row, GY], math.sqrt(reach2 * geometry[row, GVY])
             x0, x1 = _pixel_range(x - half_x, x + half_x, width)
             y0, y1 = _pixel_range(y - half_y, y + half_y, height)
-            bounds[place] = 0
+            bounds[place] = 1
             if x1 >= x0 and y1 >= y0:
-                bounds[place] = (x1 // TILE - x0 // TILE + 1) * (y1 // TILE - y0 // TILE + 1)
+                bounds[place] += (x1 // TILE - x0 // TILE + 1) * (y1 // TILE - y0 // TILE + 1)
 
 
 @kernel
@@ -199,19 +200,33 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
 
 
 @kernel
+def _mask(spans, q0, tile_x):
+    """Which blocks of tile column tile_x the four block rows from spans[q0] on touch."""
+    mask = 0
+    for q in range(4):
+        low = min(max(spans[q0 + q] - 4 * tile_x, 0), 4)
+        end = max(min(spans[q0 + q + 8] - 4 * tile_x + 1, 4), low)
+        mask |= ((1 << end) - (1 << low)) << (4 * q)
+    return mask
+
+
+@kernel
 def _emit_tile_row(spans, q0, tile_row, at, tiles, masks):
     """Write the tiles of one tile row, whose block rows are the four from spans[q0] on, from
-    position `at` on; the position after them. tile_row: number of the row's first tile."""
+    position `at` on; the position after them. tile_row: number of the row's first tile.
+
+    Two tiles are written without asking whether they are touched, and taken back if not.
+    """
     least = min(min(spans[q0], spans[q0 + 1]), min(spans[q0 + 2], spans[q0 + 3]))
     most = max(max(spans[q0 + 8], spans[q0 + 9]), max(spans[q0 + 10], spans[q0 + 11]))
-    for tile_x in range(least // 4, most // 4 + 1):
-        mask = 0
-        for q in range(4):
-            low = min(max(spans[q0 + q] - 4 * tile_x, 0), 4)
-            end = max(min(spans[q0 + q + 8] - 4 * tile_x + 1, 4), low)
-            mask |= ((1 << end) - (1 << low)) << (4 * q)
-        tiles[at] = tile_row + tile_x
-        masks[at] = mask
+    first = least // 4
+    for tile_x in (first, first + 1):
+        mask = _mask(spans, q0, tile_x)
+        tiles[at], masks[at] = tile_row + tile_x, mask
+        at += mask != 0
+    for tile_x in range(first + 2, most // 4 + 1):
+        mask = _mask(spans, q0, tile_x)
+        tiles[at], masks[at] = tile_row + tile_x, mask
         at += mask != 0
     return at
 
@@ -311,9 +326,9 @@ def scan_counts(tile_counts, tile_starts):
 
 
 @kernel
-def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, slots, masks):
-    """Write each tile's list, nearest first: the row, the slot where its gradient goes (splat by
-    splat, in the order of rows), the mask of its blocks."""
+def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, masks, entries):
+    """Write each tile's list, nearest first: the row and the mask of its blocks; and for each splat
+    where its entries went (from places[place, FIRST] on)."""
     n = len(order)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:
@@ -323,12 +338,12 @@ def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, sl
         for rank in range(chunk * size, min((chunk + 1) * size, n)):
             _look_ahead(rank, n - 1, order, places, tiles)
             place = order[rank]
-            start, slot = places[place, FOUND], places[place, SLOT]
+            start, first = places[place, FOUND], places[place, FIRST]
             prefetch(found_masks, np.int64(places[order[min(rank + 8, n - 1)], FOUND]))
             for k in range(places[place, COUNT]):
                 tile = tiles[start + k]
                 position = positions[chunk, tile]
                 positions[chunk, tile] = position + 1
                 members[position] = places[place, ROW]
-                slots[position] = slot + k
                 masks[position] = found_masks[start + k]
+                entries[first + k] = position

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from stages.raster.binning import COUNT, SLOT
+from stages.raster.binning import COUNT, FIRST
 from stages.raster.projection import (
     GA,
     GB,
@@ -22,7 +22,7 @@ from stages.raster.projection import (
     used_opacity,
 )
 from stages.raster.sh import sh_basis, sh_direction_gradient
-from stages.raster.simd import kernel, splat16, take_ticket, vstore
+from stages.raster.simd import kernel, prefetch, splat16, take_ticket, vstore
 from stages.raster.simd64 import (
     LANES,
     bits8,
@@ -40,6 +40,7 @@ from stages.raster.simd64 import (
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
 BRIGHTEST = 1e38  # an infinite colour would turn "none of it" into NaN
+AHEAD = 24  # entries: how early a row of gradients is asked for
 SUMS = 9  # of a splat's gradients in a tile; see `blend.entry_gradient`
 
 
@@ -179,13 +180,17 @@ def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, w
 
 
 @kernel
-def _sum_slots(raw, slot, end, lane, sums):
-    """Add up the entries slot..end of raw [intersections, 9], in order, into a lane of `sums`."""
-    first, rest = spread8(0.0), 0.0
-    for s in range(slot, end):
-        first = first + dload(raw, s * SUMS)
-        rest += raw[s, 8]
-    dstore(sums, lane * 16, first)
+def _sum_entries(raw, entries, first, end, lane, sums):
+    """Add up the rows entries[first:end] of raw [intersections, 9], in order, into a lane of
+    `sums`."""
+    most, rest, last = spread8(0.0), 0.0, len(entries) - 1
+    for at in range(first, end):
+        ahead = np.int64(entries[min(at + AHEAD, last)]) * SUMS
+        prefetch(raw, ahead)
+        prefetch(raw, ahead + 8)
+        most = most + dload(raw, np.int64(entries[at]) * SUMS)
+        rest += raw[entries[at], 8]
+    dstore(sums, lane * 16, most)
     sums[lane * 16 + 8] = rest
 
 
@@ -205,13 +210,14 @@ def splat_gradients(
     geometry,
     paint,
     splats,
+    entries,
     raw,
     out,
     means2d,
 ):
     """Sum each splat's (splat, tile) gradients, in a fixed order, and take them to parameters.
 
-    splats [V, 4]: `TileLists.places`.
+    splats [V, 4], entries [I]: of `TileLists`.
     """
     n = len(visible)
     columns = out.shape[1]
@@ -233,8 +239,8 @@ def splat_gradients(
             for lane in range(LANES):
                 place = places[lane]
                 rows[lane] = visible[place]
-                slot = np.int64(splats[place, SLOT])
-                _sum_slots(raw, slot, slot + splats[place, COUNT], lane, by_lane)
+                begin = np.int64(splats[place, FIRST])
+                _sum_entries(raw, entries, begin, begin + splats[place, COUNT], lane, by_lane)
                 vstore(out, place * columns + columns - 16, splat16(np.float32(0.0)))
             for k in range(SUMS):
                 dstore(sums, LANES * k, gather8(by_lane, lanes, 16, k))
