@@ -22,7 +22,7 @@ from stages.raster.projection import (
     used_opacity,
 )
 from stages.raster.sh import sh_basis, sh_direction_gradient
-from stages.raster.simd import kernel, prefetch, splat16, take_ticket, vstore
+from stages.raster.simd import kernel, prefetch, take_ticket
 from stages.raster.simd64 import (
     LANES,
     bits8,
@@ -34,6 +34,8 @@ from stages.raster.simd64 import (
     dsqrt,
     dstore,
     gather8,
+    lanes_to_rows,
+    rows_to_lanes,
     scatter8,
     spread8,
 )
@@ -92,7 +94,7 @@ def project_splats(
     """
     n = len(means)
     w = np.empty(WORK_ROW * LANES, np.float64)
-    basis = np.empty(16 * LANES, np.float64)
+    basis, colours = np.empty(16 * LANES, np.float64), np.empty(48 * LANES, np.float64)
     rows = np.empty(LANES, np.int64)
     seen = np.empty(chunk, np.int64)
     while True:
@@ -124,7 +126,7 @@ def project_splats(
         for start in range(0, n_seen, LANES):
             for lane in range(LANES):
                 rows[lane] = seen[min(start + lane, n_seen - 1)]
-            _shade(rows, cam, degree, means, sh, basis, paint)
+            _shade(rows, cam, degree, means, sh, basis, colours, paint)
 
 
 @kernel
@@ -138,28 +140,45 @@ def _direction(rows, cam, means):
 
 
 @kernel
-def _shade(rows, cam, degree, means, sh, basis, paint):
+def _colours_to_lanes(rows, sh, bands, lanes):
+    """Coefficient k (band by band, RGB last) of eight rows to lanes[8 k : 8 k + 8]."""
+    stride = 3 * sh.shape[1]
+    if stride < LANES:
+        for k in range(stride):
+            dstore(lanes, LANES * k, gather8(sh, rows, stride, k))
+        return
+    for k in range(0, 3 * bands, LANES):
+        column = min(k, stride - LANES)  # the last block may overlap the one before
+        rows_to_lanes(sh, rows, stride, column, lanes, LANES * column)
+
+
+@kernel
+def _shade(rows, cam, degree, means, sh, basis, colours, paint):
     x, y, z, _ = _direction(rows, cam, means)
     sh_basis(degree, x, y, z, basis)
-    stride = 3 * sh.shape[1]
-    for channel in range(3):
-        value = spread8(0.5)
-        for band in range((degree + 1) * (degree + 1)):
-            value = value + dload(basis, LANES * band) * gather8(
-                sh, rows, stride, 3 * band + channel
-            )
-        scatter8(paint, rows, 4, channel, dmin(dmax(value, 0.0), BRIGHTEST))
+    bands = (degree + 1) * (degree + 1)
+    _colours_to_lanes(rows, sh, bands, colours)
+    red, green, blue = spread8(0.5), spread8(0.5), spread8(0.5)
+    for band in range(bands):
+        b = dload(basis, LANES * band)
+        red = red + b * dload(colours, 3 * LANES * band)
+        green = green + b * dload(colours, 3 * LANES * band + LANES)
+        blue = blue + b * dload(colours, 3 * LANES * band + 2 * LANES)
+    scatter8(paint, rows, 4, 0, dmin(dmax(red, 0.0), BRIGHTEST))
+    scatter8(paint, rows, 4, 1, dmin(dmax(green, 0.0), BRIGHTEST))
+    scatter8(paint, rows, 4, 2, dmin(dmax(blue, 0.0), BRIGHTEST))
     mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
     scatter8(paint, rows, 4, 3, cam[6] * mx + cam[7] * my + cam[8] * mz + cam[11])
 
 
 @kernel
-def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out):
-    """SH gradients into out[places, 11:]; the direction's are added to the means' in `work`."""
+def _colour_gradient(rows, cam, degree, means, sh, paint, sums, basis, colours, weights, work):
+    """SH gradients into work from entry 11 on; the direction's are added to the means' (0:3)."""
     bands = (degree + 1) * (degree + 1)
     x, y, z, distance = _direction(rows, cam, means)
     sh_basis(degree, x, y, z, basis)
-    stride, columns = 3 * sh.shape[1], out.shape[1]
+    if degree > 0:
+        _colours_to_lanes(rows, sh, bands, colours)
     for band in range(bands):
         dstore(weights, LANES * band, spread8(0.0))
     for channel in range(3):
@@ -167,9 +186,10 @@ def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, w
         painted = dgt(gather8(paint, rows, 4, channel), 0.0)
         g = dselect(painted, dload(sums, LANES * (6 + channel)), 0.0)
         for band in range(bands):
-            scatter8(out, places, columns, 11 + 3 * band + channel, g * dload(basis, LANES * band))
+            k = LANES * (3 * band + channel)
+            dstore(work, 11 * LANES + k, g * dload(basis, LANES * band))
             if degree > 0:
-                added = g * gather8(sh, rows, stride, 3 * band + channel)
+                added = g * dload(colours, k)
                 dstore(weights, LANES * band, dload(weights, LANES * band) + added)
     if degree > 0:
         gx, gy, gz = sh_direction_gradient(degree, x, y, z, weights)
@@ -224,7 +244,8 @@ def splat_gradients(
     w = np.empty(WORK_ROW * LANES, np.float64)
     by_lane = np.zeros(16 * LANES, np.float64)
     sums = np.empty(SUMS * LANES, np.float64)
-    work = np.empty(11 * LANES, np.float64)
+    work = np.zeros(columns * LANES, np.float64)
+    colours = np.empty(48 * LANES, np.float64)
     basis = np.empty(16 * LANES, np.float64)
     weights = np.empty(16 * LANES, np.float64)
     rows, places = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
@@ -241,16 +262,15 @@ def splat_gradients(
                 rows[lane] = visible[place]
                 begin = np.int64(splats[place, FIRST])
                 _sum_entries(raw, entries, begin, begin + splats[place, COUNT], lane, by_lane)
-                vstore(out, place * columns + columns - 16, splat16(np.float32(0.0)))
-            for k in range(SUMS):
-                dstore(sums, LANES * k, gather8(by_lane, lanes, 16, k))
+            rows_to_lanes(by_lane, lanes, 16, 0, sums, 0)
+            dstore(sums, 8 * LANES, gather8(by_lane, lanes, 16, 8))
             footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
             _exponent_gradient(rows, cam, geometry, w, sums, len(smoothing) > 0, places, means2d, work)
             _colour_gradient(
-                rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out
+                rows, cam, degree, means, sh, paint, sums, basis, colours, weights, work
             )
-            for k in range(11):
-                scatter8(out, places, columns, k, dload(work, LANES * k))
+            for k in range(0, columns, LANES):
+                lanes_to_rows(out, places, columns, k, work, LANES * k)
 
 
 @kernel

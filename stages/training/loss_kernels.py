@@ -33,7 +33,7 @@ from stages.raster.simd import (
 
 RADIUS = 5
 TAPS = 2 * RADIUS + 1
-BAND = 64  # rows a ticket; each also filters 2 RADIUS rows on either side
+BAND = 108  # rows a ticket, about; each also filters 2 RADIUS rows on either side
 PAD = 16  # floats before a row's first pixel, so that taps to its left read zeros
 _F = np.float32
 C1, C2 = _F(0.01**2), _F(0.03**2)
@@ -42,6 +42,12 @@ WINDOW = np.array([g / sum(_GAUSS) for g in _GAUSS], np.float32)
 
 
 MAPS, SLOPES = 4, 3  # filtered maps; derivatives: by mean, by variance, by covariance
+
+
+@kernel
+def band_count(height):
+    """Into how many bands of about BAND rows a picture is cut."""
+    return max(1, (height + BAND // 2) // BAND)
 
 
 @kernel
@@ -190,7 +196,8 @@ def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
     the target (or near them); weight of the SSIM part. A ticket is a band of one channel; sums are added up in order by the caller.
     """
     height, width = target.shape[1], target.shape[2]
-    bands = (height + BAND - 1) // BAND
+    bands = band_count(height)
+    band = (height + bands - 1) // bands
     padded = 2 * PAD + (width + 15) // 16 * 16
     xs, ys = np.zeros(TAPS * padded, np.float32), np.zeros(TAPS * padded, np.float32)
     maps = np.zeros(TAPS * MAPS * padded, np.float32)
@@ -201,8 +208,8 @@ def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
         number = take_ticket(ticket)
         if number >= 3 * bands:
             break
-        channel, top = number // bands, (number % bands) * BAND
-        bottom = min(top + BAND, height)
+        channel, top = number // bands, (number % bands) * band
+        bottom = min(top + band, height)
         mean = means[channel]
         l1, ssim = 0.0, 0.0
         for y in range(top - 2 * RADIUS, bottom + 2 * RADIUS):
