@@ -19,8 +19,8 @@ TILE = 16  # pixels across and down
 BLOCK = 4  # a tile is 4x4 blocks of 4x4 pixels
 CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
 # Columns of `places`, one line for each visible splat: its row, where its tiles were written, how
-# many they are, and where in `entries` their places in the lists begin.
-ROW, FOUND, COUNT, FIRST = range(4)
+# many they are, and the slot of its first gradient.
+ROW, FOUND, COUNT, SLOT = range(4)
 _LN2 = math.log(2.0)
 _FAINTEST = math.log2(ALPHA_MIN)
 _FAR = 1e9
@@ -326,9 +326,9 @@ def scan_counts(tile_counts, tile_starts):
 
 
 @kernel
-def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, masks, entries):
-    """Write each tile's list, nearest first: the row and the mask of its blocks; and for each splat
-    where its entries went (from places[place, FIRST] on)."""
+def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, slots, masks):
+    """Write each tile's list, nearest first: the row, the slot where its gradient goes (splat by
+    splat, in the order of rows), the mask of its blocks."""
     n = len(order)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:
@@ -338,12 +338,12 @@ def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, ma
         for rank in range(chunk * size, min((chunk + 1) * size, n)):
             _look_ahead(rank, n - 1, order, places, tiles)
             place = order[rank]
-            start, first = places[place, FOUND], places[place, FIRST]
+            start, slot = places[place, FOUND], places[place, SLOT]
             prefetch(found_masks, np.int64(places[order[min(rank + 8, n - 1)], FOUND]))
             for k in range(places[place, COUNT]):
                 tile = tiles[start + k]
                 position = positions[chunk, tile]
                 positions[chunk, tile] = position + 1
                 members[position] = places[place, ROW]
+                slots[position] = slot + k
                 masks[position] = found_masks[start + k]
-                entries[first + k] = position

@@ -236,6 +236,7 @@ def blend_gradient_tiles(
     height,
     tile_starts,
     members,
+    slots,
     masks,
     geometry,
     paint,
@@ -245,7 +246,7 @@ def blend_gradient_tiles(
     v_image,
     gradients,
 ):
-    """gradients [intersections, 9] of each entry, from v_image [3, H, W]."""
+    """gradients [intersections, 9] at each entry's slot, from v_image [3, H, W]."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(5 * PIXELS, np.float32)
@@ -262,11 +263,12 @@ def blend_gradient_tiles(
             number = _F(entry - start + 1)
             if number > furthest:
                 for k in range(9):
-                    gradients[entry, k] = 0.0
+                    gradients[slots[entry], k] = 0.0
                 continue
             ahead = members[max(entry - AHEAD, start)]
             prefetch(geometry, ahead * GEOMETRY_ROW)
             prefetch(paint, ahead * 4)
+            prefetch(gradients, slots[max(entry - AHEAD, start)] * 9)
             alive = bits16(vge(vload(block_last, 0), splat16(number)))
             entry_gradient(
                 tile_frame(geometry, members[entry], tile_x, tile_y),
@@ -278,13 +280,13 @@ def blend_gradient_tiles(
                 last,
                 tile * PIXELS,
                 gradients,
-                entry,
+                slots[entry],
             )
 
 
 @kernel
-def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradients, entry):
-    """Gradient of one splat in one tile into gradients[entry, :9].
+def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradients, slot):
+    """Gradient of one splat in one tile into gradients[slot, :9].
 
     With v the gradient that reaches the exponent of a pixel, u and t its offsets along and across
     the splat's major axis, the sums over pixels of: v u, v t, v u^2, v t^2, v u t, v, and of the
@@ -324,5 +326,5 @@ def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradi
         v_uu = vfma(by_u, u, v_uu)
         v_tt = vfma(by_t, t, v_tt)
         v_ut = vfma(by_u, t, v_ut)
-    store_sums8(gradients, entry * 9, v_u, v_t, v_uu, v_tt, v_ut, v_1, s_r, s_g)
-    gradients[entry, 8] = vsum(s_b)
+    store_sums8(gradients, slot * 9, v_u, v_t, v_uu, v_tt, v_ut, v_1, s_r, s_g)
+    gradients[slot, 8] = vsum(s_b)

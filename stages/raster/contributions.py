@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.raster.api import ALPHA_MAX, ALPHA_MIN
-from stages.raster.binning import COUNT, FIRST, TILE
+from stages.raster.binning import COUNT, SLOT, TILE
 from stages.raster.blend import alpha_of, tile_frame
 from stages.raster.simd import (
     bits16,
@@ -59,6 +59,7 @@ def contribution_tiles(
     height,
     tile_starts,
     members,
+    slots,
     masks,
     geometry,
     paint,
@@ -68,7 +69,7 @@ def contribution_tiles(
     residual,
     out,
 ):
-    """out [intersections, 3] of each entry; residual [3, H, W]: render - photograph."""
+    """out [intersections, 3] at each entry's slot; residual [3, H, W]: render - photograph."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(7 * PIXELS, np.float32)
@@ -96,12 +97,12 @@ def contribution_tiles(
                 tile * PIXELS,
                 lanes,
                 out,
-                entry,
+                slots[entry],
             )
 
 
 @kernel
-def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, entry):
+def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, slot):
     zero, one, two = splat16(_F(0.0)), splat16(_F(1.0)), splat16(_F(2.0))
     change, total, largest = zero, zero, zero
     while blocks:
@@ -125,23 +126,22 @@ def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, e
             shift = behind * ratio - painted
             change = vfma(shift, shift + two * vload(work, RESIDUAL + plane), change)
             vstore(work, BEHIND + plane, behind + painted)
-    out[entry, 0], out[entry, 1] = vsum(change), vsum(total)
+    out[slot, 0], out[slot, 1] = vsum(change), vsum(total)
     vstore(lanes, 0, largest)
     top = lanes[0]
     for lane in range(1, 16):
         top = max(top, lanes[lane])
-    out[entry, 2] = top
+    out[slot, 2] = top
 
 
 @kernel
-def gather_contributions(raw, places, entries, out):
+def gather_contributions(raw, places, out):
     """out [V, 3] float64: sums (and the largest weight) over each visible splat's tiles."""
     for place in range(len(out)):
         change, total, largest = 0.0, 0.0, 0.0
-        first = places[place, FIRST]
-        for at in range(first, first + places[place, COUNT]):
-            entry = entries[at]
-            change += raw[entry, 0]
-            total += raw[entry, 1]
-            largest = max(largest, np.float64(raw[entry, 2]))
+        first = places[place, SLOT]
+        for slot in range(first, first + places[place, COUNT]):
+            change += raw[slot, 0]
+            total += raw[slot, 1]
+            largest = max(largest, np.float64(raw[slot, 2]))
         out[place, 0], out[place, 1], out[place, 2] = change, total, largest

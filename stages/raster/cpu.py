@@ -49,15 +49,15 @@ class Buffers:
 class TileLists:
     """What each tile draws, nearest first: entries starts[t]..starts[t + 1].
 
-    members [I]: row of the splat. masks [I]: which 4x4 blocks of the tile the splat touches.
-    entries [I]: the entries again, splat by splat; places [V, 4]: for each visible splat its row, and
-    which of `entries` are its own; see `binning`.
+    members [I]: row of the splat. slots [I]: where the entry's gradient goes; the slots of a splat
+    follow each other. masks [I]: which 4x4 blocks of the tile the splat touches. places [V, 4]: for
+    each visible splat its row, its slots' number and first; see `binning`.
     """
 
     starts: NDArray[np.int64]
     members: NDArray[np.int32]
+    slots: NDArray[np.int32]
     masks: NDArray[np.uint16]
-    entries: NDArray[np.int32]
     places: NDArray[np.int32]
 
     def __len__(self) -> int:
@@ -204,7 +204,6 @@ class CpuRasteriser:
             forward.geometry,
             forward.paint,
             forward.lists.places,
-            forward.lists.entries,
             raw,
             out,
             means2d,
@@ -221,8 +220,7 @@ class CpuRasteriser:
         raw = self.buffers.get("contributions", shape, np.float32)
         self._over_tiles(contributions.contribution_tiles, forward, residual, raw)
         out = np.empty((len(forward.visible), contributions.COLUMNS))
-        lists = forward.lists
-        contributions.gather_contributions(raw, lists.places, lists.entries, out)
+        contributions.gather_contributions(raw, forward.lists.places, out)
         return out
 
     def _over_tiles(
@@ -239,6 +237,7 @@ class CpuRasteriser:
             forward.height,
             forward.lists.starts,
             forward.lists.members,
+            forward.lists.slots,
             forward.lists.masks,
             forward.geometry,
             forward.paint,
@@ -273,7 +272,7 @@ class CpuRasteriser:
                 visible, paint, arrays, keys, order, keys2, order2
             ),
         )
-        total = _starts(places[:, binning.COUNT], places[:, binning.FIRST])
+        total = _starts(places[:, binning.COUNT], places[:, binning.SLOT])
 
         n_tiles = -(-width // binning.TILE) * -(-height // binning.TILE)
         positions = get("tile_counts", (binning.CHUNKS, n_tiles), np.int64)
@@ -284,8 +283,8 @@ class CpuRasteriser:
         lists = TileLists(
             starts,
             get("members", (total,), np.int32),
+            get("slots", (total,), np.int32),
             get("masks", (total,), np.uint16),
-            get("entries", (total,), np.int32),
             places,
         )
         share(
@@ -296,8 +295,8 @@ class CpuRasteriser:
             masks,
             positions,
             lists.members,
+            lists.slots,
             lists.masks,
-            lists.entries,
         )
         return lists
 

@@ -29,7 +29,7 @@ from stages.raster.simd64 import (
     dsqrt,
     dstore,
     gather8,
-    lanes_to_rows,
+    scatter8,
     spread8,
 )
 from stages.scene import Camera
@@ -52,8 +52,7 @@ SLOPE = 36  # 36:38 clamped x/z, y/z
 INSIDE = 38  # 38:40 1 where the slope is inside its limits, else 0
 SMOOTHING = 40  # opacity factor of the 3D smoothing filter
 RATIOS = 41  # 41:44 scale before that filter over scale after it
-RECORD = 44  # 44:52 the geometry record
-WORK_ROW = 52
+WORK_ROW = 44
 
 # Geometry record of a splat, float64[8]: mean in pixels, the three numbers of the exponent
 # A u^2 + B (v - K u)^2 (u along the axis of the larger variance), log2 of the opacity, variances.
@@ -244,15 +243,14 @@ def geometry_records(cam, w, rows, geometry):
     drawn = dand(drawn, dand(dge(x + half_x, 0.5), dge(cam[26] - 0.5, x - half_x)))
     drawn = dand(drawn, dand(dge(y + half_y, 0.5), dge(cam[27] - 0.5, y - half_y)))
     major = dmax(a, c)
-    put(w, RECORD + GX, x)
-    put(w, RECORD + GY, y)
-    put(w, RECORD + GA, 0.5 / major)
-    put(w, RECORD + GB, 0.5 * major / det)
-    put(w, RECORD + GK, b / major)
-    put(w, RECORD + GL, level * _LOG2E)
-    put(w, RECORD + GVX, a)
-    put(w, RECORD + GVY, c)
-    lanes_to_rows(geometry, rows, GEOMETRY_ROW, 0, w, LANES * RECORD)
+    scatter8(geometry, rows, GEOMETRY_ROW, GX, x)
+    scatter8(geometry, rows, GEOMETRY_ROW, GY, y)
+    scatter8(geometry, rows, GEOMETRY_ROW, GA, 0.5 / major)
+    scatter8(geometry, rows, GEOMETRY_ROW, GB, 0.5 * major / det)
+    scatter8(geometry, rows, GEOMETRY_ROW, GK, b / major)
+    scatter8(geometry, rows, GEOMETRY_ROW, GL, level * _LOG2E)
+    scatter8(geometry, rows, GEOMETRY_ROW, GVX, a)
+    scatter8(geometry, rows, GEOMETRY_ROW, GVY, c)
     return drawn
 
 

@@ -186,69 +186,6 @@ def _element(context: Any, builder: Any, sig: Any, args: Any, lane: int) -> Any:
     return _address(context, builder, sig.args[0], args[0], index)
 
 
-def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
-    """Eight rows of eight to eight columns: three perfect shuffles."""
-    eight = ir.VectorType(_I32, LANES)
-    low = ir.Constant(eight, [_lane(k // 2 + 8 * (k % 2)) for k in range(8)])
-    high = ir.Constant(eight, [_lane(4 + k // 2 + 8 * (k % 2)) for k in range(8)])
-    for _ in range(3):
-        pairs = [(rows[k], rows[k + 4]) for k in range(4)]
-        rows = [builder.shuffle_vector(a, b, half) for a, b in pairs for half in (low, high)]
-    return rows
-
-
-@intrinsic
-def rows_to_lanes(
-    typingctx: Any, array: Any, rows: Any, stride: Any, column: Any, lanes: Any, at: Any
-) -> Any:
-    """Eight columns from `column` on of eight rows: column c to lanes[at + 8 c : at + 8 c + 8].
-
-    array: C-contiguous float32 or float64; lanes: float64.
-    """
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        wide = sig.args[0].dtype == types.float64
-        row_type = ir.VectorType(_F64 if wide else ir.FloatType(), LANES)
-        loaded = []
-        for k in range(LANES):
-            address = _element(context, builder, sig, args, k)
-            pointer = builder.bitcast(address, row_type.as_pointer())
-            loaded.append(builder.load(pointer, align=8 if wide else 4))
-        for k, value in enumerate(_transposed(builder, loaded)):
-            index = builder.add(args[5], ir.Constant(_I64, LANES * k))
-            to = _address(context, builder, sig.args[4], args[4], index)
-            whole = value if wide else builder.fpext(value, _VECTOR)
-            builder.store(whole, builder.bitcast(to, _VECTOR.as_pointer()), align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, rows, types.intp, types.intp, lanes, types.intp), codegen
-
-
-@intrinsic
-def lanes_to_rows(
-    typingctx: Any, array: Any, rows: Any, stride: Any, column: Any, lanes: Any, at: Any
-) -> Any:
-    """The way back of `rows_to_lanes`; rounds to the array's type."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        wide = sig.args[0].dtype == types.float64
-        row_type = ir.VectorType(_F64 if wide else ir.FloatType(), LANES)
-        columns = []
-        for k in range(LANES):
-            index = builder.add(args[5], ir.Constant(_I64, LANES * k))
-            address = _address(context, builder, sig.args[4], args[4], index)
-            value = builder.load(builder.bitcast(address, _VECTOR.as_pointer()), align=8)
-            columns.append(value if wide else builder.fptrunc(value, row_type))
-        for k, value in enumerate(_transposed(builder, columns)):
-            to = _element(context, builder, sig, args, k)
-            builder.store(
-                value, builder.bitcast(to, row_type.as_pointer()), align=8 if wide else 4
-            )
-        return context.get_dummy_value()
-
-    return types.void(array, rows, types.intp, types.intp, lanes, types.intp), codegen
-
-
 # --- arithmetic ----------------------------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from stages.raster.binning import COUNT, FIRST
+from stages.raster.binning import COUNT, SLOT
 from stages.raster.projection import (
     GA,
     GB,
@@ -22,7 +22,7 @@ from stages.raster.projection import (
     used_opacity,
 )
 from stages.raster.sh import sh_basis, sh_direction_gradient
-from stages.raster.simd import kernel, prefetch, take_ticket
+from stages.raster.simd import kernel, splat16, take_ticket, vstore
 from stages.raster.simd64 import (
     LANES,
     bits8,
@@ -34,15 +34,12 @@ from stages.raster.simd64 import (
     dsqrt,
     dstore,
     gather8,
-    lanes_to_rows,
-    rows_to_lanes,
     scatter8,
     spread8,
 )
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
 BRIGHTEST = 1e38  # an infinite colour would turn "none of it" into NaN
-AHEAD = 24  # entries: how early a row of gradients is asked for
 SUMS = 9  # of a splat's gradients in a tile; see `blend.entry_gradient`
 
 
@@ -94,7 +91,7 @@ def project_splats(
     """
     n = len(means)
     w = np.empty(WORK_ROW * LANES, np.float64)
-    basis, colours = np.empty(16 * LANES, np.float64), np.empty(48 * LANES, np.float64)
+    basis = np.empty(16 * LANES, np.float64)
     rows = np.empty(LANES, np.int64)
     seen = np.empty(chunk, np.int64)
     while True:
@@ -126,7 +123,7 @@ def project_splats(
         for start in range(0, n_seen, LANES):
             for lane in range(LANES):
                 rows[lane] = seen[min(start + lane, n_seen - 1)]
-            _shade(rows, cam, degree, means, sh, basis, colours, paint)
+            _shade(rows, cam, degree, means, sh, basis, paint)
 
 
 @kernel
@@ -140,45 +137,28 @@ def _direction(rows, cam, means):
 
 
 @kernel
-def _colours_to_lanes(rows, sh, bands, lanes):
-    """Coefficient k (band by band, RGB last) of eight rows to lanes[8 k : 8 k + 8]."""
-    stride = 3 * sh.shape[1]
-    if stride < LANES:
-        for k in range(stride):
-            dstore(lanes, LANES * k, gather8(sh, rows, stride, k))
-        return
-    for k in range(0, 3 * bands, LANES):
-        column = min(k, stride - LANES)  # the last block may overlap the one before
-        rows_to_lanes(sh, rows, stride, column, lanes, LANES * column)
-
-
-@kernel
-def _shade(rows, cam, degree, means, sh, basis, colours, paint):
+def _shade(rows, cam, degree, means, sh, basis, paint):
     x, y, z, _ = _direction(rows, cam, means)
     sh_basis(degree, x, y, z, basis)
-    bands = (degree + 1) * (degree + 1)
-    _colours_to_lanes(rows, sh, bands, colours)
-    red, green, blue = spread8(0.5), spread8(0.5), spread8(0.5)
-    for band in range(bands):
-        b = dload(basis, LANES * band)
-        red = red + b * dload(colours, 3 * LANES * band)
-        green = green + b * dload(colours, 3 * LANES * band + LANES)
-        blue = blue + b * dload(colours, 3 * LANES * band + 2 * LANES)
-    scatter8(paint, rows, 4, 0, dmin(dmax(red, 0.0), BRIGHTEST))
-    scatter8(paint, rows, 4, 1, dmin(dmax(green, 0.0), BRIGHTEST))
-    scatter8(paint, rows, 4, 2, dmin(dmax(blue, 0.0), BRIGHTEST))
+    stride = 3 * sh.shape[1]
+    for channel in range(3):
+        value = spread8(0.5)
+        for band in range((degree + 1) * (degree + 1)):
+            value = value + dload(basis, LANES * band) * gather8(
+                sh, rows, stride, 3 * band + channel
+            )
+        scatter8(paint, rows, 4, channel, dmin(dmax(value, 0.0), BRIGHTEST))
     mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
     scatter8(paint, rows, 4, 3, cam[6] * mx + cam[7] * my + cam[8] * mz + cam[11])
 
 
 @kernel
-def _colour_gradient(rows, cam, degree, means, sh, paint, sums, basis, colours, weights, work):
-    """SH gradients into work from entry 11 on; the direction's are added to the means' (0:3)."""
+def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out):
+    """SH gradients into out[places, 11:]; the direction's are added to the means' in `work`."""
     bands = (degree + 1) * (degree + 1)
     x, y, z, distance = _direction(rows, cam, means)
     sh_basis(degree, x, y, z, basis)
-    if degree > 0:
-        _colours_to_lanes(rows, sh, bands, colours)
+    stride, columns = 3 * sh.shape[1], out.shape[1]
     for band in range(bands):
         dstore(weights, LANES * band, spread8(0.0))
     for channel in range(3):
@@ -186,10 +166,9 @@ def _colour_gradient(rows, cam, degree, means, sh, paint, sums, basis, colours, 
         painted = dgt(gather8(paint, rows, 4, channel), 0.0)
         g = dselect(painted, dload(sums, LANES * (6 + channel)), 0.0)
         for band in range(bands):
-            k = LANES * (3 * band + channel)
-            dstore(work, 11 * LANES + k, g * dload(basis, LANES * band))
+            scatter8(out, places, columns, 11 + 3 * band + channel, g * dload(basis, LANES * band))
             if degree > 0:
-                added = g * dload(colours, k)
+                added = g * gather8(sh, rows, stride, 3 * band + channel)
                 dstore(weights, LANES * band, dload(weights, LANES * band) + added)
     if degree > 0:
         gx, gy, gz = sh_direction_gradient(degree, x, y, z, weights)
@@ -200,17 +179,13 @@ def _colour_gradient(rows, cam, degree, means, sh, paint, sums, basis, colours, 
 
 
 @kernel
-def _sum_entries(raw, entries, first, end, lane, sums):
-    """Add up the rows entries[first:end] of raw [intersections, 9], in order, into a lane of
-    `sums`."""
-    most, rest, last = spread8(0.0), 0.0, len(entries) - 1
-    for at in range(first, end):
-        ahead = np.int64(entries[min(at + AHEAD, last)]) * SUMS
-        prefetch(raw, ahead)
-        prefetch(raw, ahead + 8)
-        most = most + dload(raw, np.int64(entries[at]) * SUMS)
-        rest += raw[entries[at], 8]
-    dstore(sums, lane * 16, most)
+def _sum_slots(raw, slot, end, lane, sums):
+    """Add up the entries slot..end of raw [intersections, 9], in order, into a lane of `sums`."""
+    first, rest = spread8(0.0), 0.0
+    for s in range(slot, end):
+        first = first + dload(raw, s * SUMS)
+        rest += raw[s, 8]
+    dstore(sums, lane * 16, first)
     sums[lane * 16 + 8] = rest
 
 
@@ -230,22 +205,20 @@ def splat_gradients(
     geometry,
     paint,
     splats,
-    entries,
     raw,
     out,
     means2d,
 ):
     """Sum each splat's (splat, tile) gradients, in a fixed order, and take them to parameters.
 
-    splats [V, 4], entries [I]: of `TileLists`.
+    splats [V, 4]: `TileLists.places`.
     """
     n = len(visible)
     columns = out.shape[1]
     w = np.empty(WORK_ROW * LANES, np.float64)
     by_lane = np.zeros(16 * LANES, np.float64)
     sums = np.empty(SUMS * LANES, np.float64)
-    work = np.zeros(columns * LANES, np.float64)
-    colours = np.empty(48 * LANES, np.float64)
+    work = np.empty(11 * LANES, np.float64)
     basis = np.empty(16 * LANES, np.float64)
     weights = np.empty(16 * LANES, np.float64)
     rows, places = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
@@ -260,17 +233,18 @@ def splat_gradients(
             for lane in range(LANES):
                 place = places[lane]
                 rows[lane] = visible[place]
-                begin = np.int64(splats[place, FIRST])
-                _sum_entries(raw, entries, begin, begin + splats[place, COUNT], lane, by_lane)
-            rows_to_lanes(by_lane, lanes, 16, 0, sums, 0)
-            dstore(sums, 8 * LANES, gather8(by_lane, lanes, 16, 8))
+                slot = np.int64(splats[place, SLOT])
+                _sum_slots(raw, slot, slot + splats[place, COUNT], lane, by_lane)
+                vstore(out, place * columns + columns - 16, splat16(np.float32(0.0)))
+            for k in range(SUMS):
+                dstore(sums, LANES * k, gather8(by_lane, lanes, 16, k))
             footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
             _exponent_gradient(rows, cam, geometry, w, sums, len(smoothing) > 0, places, means2d, work)
             _colour_gradient(
-                rows, cam, degree, means, sh, paint, sums, basis, colours, weights, work
+                rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out
             )
-            for k in range(0, columns, LANES):
-                lanes_to_rows(out, places, columns, k, work, LANES * k)
+            for k in range(11):
+                scatter8(out, places, columns, k, dload(work, LANES * k))
 
 
 @kernel
