@@ -170,6 +170,9 @@ def _camera_for(splats: Splats, views: tuple[View, ...], wanted: str | None) -> 
     by_name = {view.name: view.camera for view in views}
     if wanted in by_name:
         return by_name[wanted]
+    alike = [view.camera for view in views if view.name.rpartition("/")[2] == wanted]
+    if len(alike) == 1:
+        return alike[0]
     if wanted.isdigit() and int(wanted) < len(views):
         return views[int(wanted)].camera
     known = f"{views[0].name} ... {views[-1].name}" if views else "none: a file has no cameras"

@@ -30,9 +30,12 @@ class TrainSettings:
     max_splats: int = field(
         default=0, metadata={"help": "Splats at most; 0 takes what free memory allows."}
     )
-    antialias: bool = field(
+    smooth: bool = field(
         default=False,
-        metadata={"help": "Make up in opacity for the widening of splats under a pixel."},
+        metadata={
+            "help": "Allow no detail finer than a photograph shows: softer from close by, without "
+            "needles and dust."
+        },
     )
     seed: int = field(default=0, metadata={"help": "Seed of all random numbers."})
     backend: str = field(default="auto", metadata={"help": "Rasteriser: auto, cpu or reference."})
@@ -47,6 +50,7 @@ PRESETS: dict[str, TrainSettings] = {
 
 def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report: Report) -> Splats:
     """Train; write splats.bin, history.csv, a plot and a contact sheet of held-out photographs."""
+    from stages.raster.smoothing import smoothed
     from stages.scene.storage import save_splats
     from stages.training.checkpoint import remove_checkpoint
 
@@ -61,6 +65,8 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     report.metric("held_out_photographs", len(trainer.held_out))
     model = trainer.run(start)
     splats = finished(model, settings.sh_degree, start)
+    if settings.smooth:
+        splats = smoothed(splats, trainer.widths(splats.means))
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, model, folder, report)
@@ -151,7 +157,7 @@ def make_trainer(
         cap=cap,
         folder=folder,
         report=report,
-        antialias=settings.antialias,
+        smooth=settings.smooth,
         use_reference=settings.backend == "reference",
     )
 

@@ -83,8 +83,8 @@ def gradients(backend, scene, view, v_image, settings=None):
     arrays = splat_arrays(scene)
     forward = rasteriser.forward(arrays, view, settings)
     # what the buffers held before must not matter
-    for name in ("gradients", "out"):
-        rasteriser.buffers.get(name, (4_000_000,), np.float32)[:] = np.nan
+    rasteriser.buffers.get("out", (4_000_000,), np.float32)[:] = np.nan
+    rasteriser.buffers.carve(((4_000_000,), np.float32))[0][:] = np.nan
     planar = np.ascontiguousarray(np.asarray(v_image, np.float32).transpose(2, 0, 1))
     rows = rasteriser.backward(arrays, forward, planar).parameters
     full = np.zeros((len(scene), rows.shape[1]))

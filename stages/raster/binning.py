@@ -117,9 +117,8 @@ def _heap_sort(run, visible, means, quaternions, log_scales, opacity_logits, sh)
             child = 2 * root + 1
             if child >= size:
                 break
-            if child + 1 < size and _comes_before(
-                run[child], run[child + 1], visible, means, quaternions, log_scales, opacity_logits, sh
-            ):
+            a, b = run[child], run[min(child + 1, size - 1)]
+            if _comes_before(a, b, visible, means, quaternions, log_scales, opacity_logits, sh):
                 child += 1
             if not _comes_before(
                 run[root], run[child], visible, means, quaternions, log_scales, opacity_logits, sh

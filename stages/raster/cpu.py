@@ -36,13 +36,21 @@ class Buffers:
         size = int(np.prod(shape))
         have = self._arrays.get(name)
         if have is None or have.size < size or have.dtype != np.dtype(dtype):
-            have = np.empty(size + size // 4 + 16, dtype)
+            have = np.empty(size + size // 8 + 16, dtype)
             self._arrays[name] = have
         return have[:size].reshape(shape)
 
-    @property
-    def nbytes(self) -> int:
-        return sum(array.nbytes for array in self._arrays.values())
+    def carve(self, *wanted: tuple[tuple[int, ...], Any]) -> list[NDArray[Any]]:
+        """Uninitialised arrays of (shape, dtype) out of one buffer that all such calls share: what
+        the last call gave is overwritten by the next."""
+        sizes = [int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in wanted]
+        ends = np.cumsum([-(-size // 64) * 64 for size in sizes])
+        arena = self.get("scratch", (int(ends[-1]),), np.uint8)
+        parts = []
+        for (shape, dtype), size, end in zip(wanted, sizes, ends, strict=True):
+            start = int(end) + -(-size // 64) * -64
+            parts.append(arena[start : start + size].view(dtype).reshape(shape))
+        return parts
 
 
 @dataclass(frozen=True)
@@ -189,7 +197,7 @@ class CpuRasteriser:
         """Gradients of the visible splats, from v_image [3, H, W]."""
         n = len(forward.visible)
         get = self.buffers.get
-        raw = get("gradients", (forward.n_intersections, SUMS), np.float32)
+        (raw,) = self.buffers.carve(((forward.n_intersections, SUMS), np.float32))
         self._over_tiles(blend.blend_gradient_tiles, forward, v_image, raw)
         out = get("out", (n, gradient_columns((forward.degree + 1) ** 2)), np.float32)
         means2d = get("means2d", (n, 2), np.float32)
@@ -217,7 +225,7 @@ class CpuRasteriser:
         residual [3, H, W]: render less photograph.
         """
         shape = (forward.n_intersections, contributions.COLUMNS)
-        raw = self.buffers.get("contributions", shape, np.float32)
+        (raw,) = self.buffers.carve((shape, np.float32))
         self._over_tiles(contributions.contribution_tiles, forward, residual, raw)
         out = np.empty((len(forward.visible), contributions.COLUMNS))
         contributions.gather_contributions(raw, forward.lists.places, out)
@@ -262,10 +270,10 @@ class CpuRasteriser:
         share(binning.bound_tiles, visible, geometry, width, height, bounds)
         places = get("places", (n, 4), np.int32)
         most = _starts(bounds, places[:, binning.FOUND])
-        tiles, masks = get("tiles", (most,), np.int32), get("found_masks", (most,), np.uint16)
-        order = get("order", (n,), np.int32)
-        keys, keys2 = get("keys", (n,), np.float32), get("keys2", (n,), np.uint32)
-        order2 = get("order2", (n,), np.int32)
+        tiles, masks, order, keys, order2, keys2 = self.buffers.carve(
+            *(((most,), np.int32), ((most,), np.uint16), ((n,), np.int32), ((n,), np.float32)),
+            *(((n,), np.int32), ((n,), np.uint32)),
+        )
         share(
             *(binning.find_tiles, visible, geometry, width, height, places, tiles, masks),
             beside=lambda: binning.sort_by_depth(

@@ -358,9 +358,7 @@ def _quaternion_gradient(cam, w, out):
 
 @kernel
 def _fill(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w):
-    return bits8(
-        footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
-    )
+    return bits8(footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w))
 
 
 def footprint_values(

@@ -65,8 +65,9 @@ def sh_direction_gradient(degree, x, y, z, w):
     gz = C1 * _w(w, 2)
     if degree < 2:
         return gx, gy, gz
-    gx = gx + (C2[0] * (y * _w(w, 4) - z * _w(w, 7)) - 2.0 * C2[1] * x * _w(w, 6) + 2.0 * C2[2] * x * _w(w, 8))
-    gy = gy + (C2[0] * (x * _w(w, 4) - z * _w(w, 5)) - 2.0 * C2[1] * y * _w(w, 6) - 2.0 * C2[2] * y * _w(w, 8))
+    w6, w8 = 2.0 * C2[1] * _w(w, 6), 2.0 * C2[2] * _w(w, 8)
+    gx = gx + C2[0] * (y * _w(w, 4) - z * _w(w, 7)) - x * w6 + x * w8
+    gy = gy + C2[0] * (x * _w(w, 4) - z * _w(w, 5)) - y * w6 - y * w8
     gz = gz + (-C2[0] * (y * _w(w, 5) + x * _w(w, 7)) + 4.0 * C2[1] * z * _w(w, 6))
     if degree < 3:
         return gx, gy, gz

@@ -240,7 +240,7 @@ def _sum(builder: Any, vector: Any) -> Any:
 def _fold(builder: Any, a: Any, b: Any, group: int) -> Any:
     """Halve groups of `group` lanes: the sums of a's groups, then those of b's."""
     half = group // 2
-    starts = [g for g in range(0, 2 * LANES, group)]
+    starts = range(0, 2 * LANES, group)
     low = [ir.Constant(_I32, g + k) for g in starts for k in range(half)]
     high = [ir.Constant(_I32, g + half + k) for g in starts for k in range(half)]
     lows = builder.shuffle_vector(a, b, ir.Constant(_INTEGERS, low))
@@ -250,10 +250,19 @@ def _fold(builder: Any, a: Any, b: Any, group: int) -> Any:
 
 @intrinsic
 def store_sums8(
-    typingctx: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any,
+    typingctx: Any,
+    array: Any,
+    index: Any,
+    a: Any,
+    b: Any,
+    c: Any,
+    d: Any,
+    e: Any,
+    f: Any,
+    g: Any,
     h: Any,
 ) -> Any:
-    """array[index : index + 8] = the sums over lanes of eight vectors, in one tree of fixed shape."""
+    """array[index : index + 8] = the sums over the lanes of eight vectors, by one tree."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         vectors = list(args[2:])
@@ -292,7 +301,9 @@ def _exp2(builder: Any, x: Any) -> Any:
     rest = builder.fsub(x, whole)
     value = _constant(_EXP2[-1])
     for coefficient in _EXP2[-2::-1]:
-        value = call_llvm(builder, "llvm.fma.v16f32", _VECTOR, [value, rest, _constant(coefficient)])
+        value = call_llvm(
+            builder, "llvm.fma.v16f32", _VECTOR, [value, rest, _constant(coefficient)]
+        )
     bits = builder.bitcast(shifted, _INTEGERS)
     exponent = builder.shl(bits, ir.Constant(_INTEGERS, [ir.Constant(_I32, 23)] * LANES))
     return builder.bitcast(builder.add(builder.bitcast(value, _INTEGERS), exponent), _VECTOR)

@@ -160,9 +160,7 @@ def gather8(typingctx: Any, array: Any, rows: Any, stride: Any, column: Any) -> 
 
 
 @intrinsic
-def scatter8(
-    typingctx: Any, array: Any, rows: Any, stride: Any, column: Any, value: Any
-) -> Any:
+def scatter8(typingctx: Any, array: Any, rows: Any, stride: Any, column: Any, value: Any) -> Any:
     """The way back of `gather8`; rounds to the array's type."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:

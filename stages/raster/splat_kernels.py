@@ -12,9 +12,10 @@ from stages.raster.projection import (
     GB,
     GEOMETRY_ROW,
     GK,
-    GVX,
-    GVY,
     WORK_ROW,
+    A,
+    C,
+    at,
     drawable,
     footprint,
     footprint_gradient,
@@ -39,7 +40,7 @@ from stages.raster.simd64 import (
 )
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
-BRIGHTEST = 1e38  # an infinite colour would turn "none of it" into NaN
+BRIGHTEST = 3.4e38  # an infinite colour would turn "none of it" into NaN
 SUMS = 9  # of a splat's gradients in a tile; see `blend.entry_gradient`
 
 
@@ -104,9 +105,7 @@ def project_splats(
             _name_rows(rows, start, last)
             good = bits8(drawable(rows, means, quaternions, log_scales, opacity_logits))
             in_front = bits8(
-                footprint(
-                    rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w
-                )
+                footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
             )
             drawn = bits8(geometry_records(cam, w, rows, geometry)) & good & in_front
             whole = start + LANES <= n and _block_of_colours_is_finite(start, sh)
@@ -239,7 +238,9 @@ def splat_gradients(
             for k in range(SUMS):
                 dstore(sums, LANES * k, gather8(by_lane, lanes, 16, k))
             footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
-            _exponent_gradient(rows, cam, geometry, w, sums, len(smoothing) > 0, places, means2d, work)
+            _exponent_gradient(
+                rows, cam, geometry, w, sums, len(smoothing) > 0, places, means2d, work
+            )
             _colour_gradient(
                 rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out
             )
@@ -258,7 +259,7 @@ def _exponent_gradient(rows, cam, geometry, w, sums, smoothed, places, means2d, 
     s_ut, s_1 = dload(sums, 4 * LANES), dload(sums, 5 * LANES)
     along = 2.0 * (b * k * s_t - a * s_u)
     across = -2.0 * b * s_t
-    tall = dgt(gather8(geometry, rows, GEOMETRY_ROW, GVY), gather8(geometry, rows, GEOMETRY_ROW, GVX))
+    tall = dgt(at(w, C), at(w, A))  # whether the major axis is y
     g_x, g_y = dselect(tall, across, along), dselect(tall, along, across)
     g_opacity = -s_1 / used_opacity(w)
     footprint_gradient(cam, w, g_x, g_y, s_uu, s_tt, -2.0 * b * s_ut, g_opacity, smoothed, work)

@@ -193,7 +193,8 @@ def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
     """Gradient of H x W x loss into v_image [3, H, W]; sums [tickets, 2]: L1 and SSIM, per band.
 
     image [>= 3, H, W] float32; target [3, H, W] float32 or bytes, in units of `scale`; means [3] of
-    the target (or near them); weight of the SSIM part. A ticket is a band of one channel; sums are added up in order by the caller.
+    the target (or near them); weight of the SSIM part. A ticket is a band of one channel; sums are
+    added up in order by the caller.
     """
     height, width = target.shape[1], target.shape[2]
     bands = band_count(height)

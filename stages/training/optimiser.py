@@ -153,7 +153,8 @@ class Model:
 
     Parameters as in `Splats`, float32. moment1, moment2: columns as the
     gradient's (`cpu.Backward`), for all bands. steps [N] int32: how often each was moved.
-    gradient_sum, gradient_count [N]: since the last densification.
+    gradient_sum, gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D
+    smoothing filter, 0 for none.
     """
 
     means: NDArray[np.float32]
@@ -166,6 +167,7 @@ class Model:
     steps: NDArray[np.int32]
     gradient_sum: NDArray[np.float32]
     gradient_count: NDArray[np.int32]
+    smoothing: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.means)
@@ -213,6 +215,7 @@ def new_model(
         np.zeros(n, np.int32),
         np.zeros(n, np.float32),
         np.zeros(n, np.int32),
+        np.zeros(n, np.float32),
     )
 
 

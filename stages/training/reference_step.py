@@ -21,10 +21,12 @@ def reference_gradients(
     settings: RasterSettings,
     target: NDArray[np.uint8],
     v_image: NDArray[np.float32],
+    smoothing: NDArray[np.float32],
 ) -> tuple[Backward, float]:
     """(gradients as the kernels would give them, loss); computed in float64."""
     p = Parameters(*(torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in arrays))
-    projected = project(p, camera, settings)
+    widths = torch.tensor(smoothing, dtype=torch.float64) if len(smoothing) else None
+    projected = project(p, camera, settings, widths)
     projected.means2d.retain_grad()
     image, _, _, _ = render_projected(p, projected, camera, settings)
     planar = np.ascontiguousarray(image.detach().numpy().astype(np.float32).transpose(2, 0, 1))

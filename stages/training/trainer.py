@@ -12,25 +12,28 @@ from numpy.typing import NDArray
 
 from stages.measure.images import psnr, ssim
 from stages.raster.api import RasterSettings
-from stages.raster.cpu import CpuRasteriser
+from stages.raster.cpu import NO_SMOOTHING, CpuRasteriser
+from stages.raster.smoothing import smoothing_widths
 from stages.run.errors import Interrupted
 from stages.run.stage import Report
 from stages.scene import Splats
 from stages.training.checkpoint import load_checkpoint, save_checkpoint
-from stages.training.densify import densify, reset_opacities
+from stages.training.densify import densify, neighbours_together, reset_opacities
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, Model, apply_gradients, new_model
 from stages.training.schedule import THRESHOLD, Schedule
 from stages.training.views import TrainingView
 
 CHECKPOINT_SECONDS = 30.0
+SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
 NEAR = 0.01  # of the scene's extent
 
 
 @dataclass
 class Trainer:
-    """One run. cap: splats at most. folder: where checkpoints go."""
+    """One run. cap: splats at most. folder: where checkpoints go. smooth: under the 3D smoothing
+    filter."""
 
     schedule: Schedule
     train: list[TrainingView]
@@ -38,7 +41,7 @@ class Trainer:
     cap: int
     folder: Path
     report: Report
-    antialias: bool = False
+    smooth: bool = False
     use_reference: bool = False
 
     def __post_init__(self) -> None:
@@ -78,6 +81,7 @@ class Trainer:
         start = start.with_sh_degree(self.schedule.sh_degree)
         if len(start) > self.cap:
             start = start.take(np.linspace(0, len(start) - 1, self.cap).round().astype(np.int64))
+        start = start.take(neighbours_together(start.means))
         return new_model(
             *(
                 np.array(a, np.float32, order="C")
@@ -92,29 +96,37 @@ class Trainer:
         ), 0
 
     def settings(self, degree: int) -> RasterSettings:
-        return RasterSettings(
-            near=NEAR * self.schedule.extent, antialias=self.antialias, sh_degree=degree
-        )
+        return RasterSettings(near=NEAR * self.schedule.extent, sh_degree=degree)
+
+    def widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
+        """[N] of the smoothing filter, from all training photographs at full size."""
+        cameras = [view.levels[-1].camera for view in self.train]
+        return smoothing_widths(means, cameras, NEAR * self.schedule.extent)
+
+    def _smoothing(self, model: Model) -> NDArray[np.float32]:
+        return model.smoothing if self.smooth else NO_SMOOTHING
 
     def step(self, model: Model, step: int) -> float:
         """One step of Adam on one photograph; the loss before it."""
+        if self.smooth and step % SMOOTHING_INTERVAL == 0:
+            model.smoothing[:] = self.widths(model.means)
         view = self.train[self.schedule.view(step)]
         level = view.levels[self.schedule.level(step)]
         camera, target = level.camera, level.pixels
         settings = self.settings(self.schedule.active_sh_degree(step))
         if self._v_image.shape != target.shape:
             self._v_image = np.empty(target.shape, np.float32)
-        pool = self.rasteriser.pool
+        pool, smoothing = self.rasteriser.pool, self._smoothing(model)
         if self.use_reference:
             from stages.training.reference_step import reference_gradients
 
             backward, value = reference_gradients(
-                pool, model.arrays, camera, settings, target, self._v_image
+                pool, model.arrays, camera, settings, target, self._v_image, smoothing
             )
         else:
-            forward = self.rasteriser.forward(model.arrays, camera, settings)
+            forward = self.rasteriser.forward(model.arrays, camera, settings, smoothing)
             loss = image_loss(pool, forward.image, target, self._v_image, means=level.means)
-            backward = self.rasteriser.backward(model.arrays, forward, self._v_image)
+            backward = self.rasteriser.backward(model.arrays, forward, self._v_image, smoothing)
             value = loss.value
         factor = self.schedule.rate_factor(step)
         rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
@@ -132,6 +144,9 @@ class Trainer:
                 self.schedule.prunes_giants(step),
                 self.schedule.rng(step),
             )
+            model = model.take(neighbours_together(model.means))
+            if self.smooth:
+                model.smoothing[:] = self.widths(model.means)
         if self.schedule.resets_after(step):
             reset_opacities(model)
         return model
@@ -166,7 +181,10 @@ class Trainer:
         """(render, photograph), [H, W, 3], what a viewer would show: clipped to [0, 1]."""
         level = view.levels[-1]
         forward = self.rasteriser.forward(
-            model.arrays, level.camera, self.settings(self.schedule.sh_degree)
+            model.arrays,
+            level.camera,
+            self.settings(self.schedule.sh_degree),
+            self._smoothing(model),
         )
         image = np.clip(forward.image[:3].transpose(1, 2, 0), 0.0, 1.0)
         return image, level.pixels.transpose(1, 2, 0) * np.float32(1 / 255)

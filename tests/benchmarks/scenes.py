@@ -51,9 +51,7 @@ def equal_scene(n: int, side: int) -> tuple[Splats, Camera, np.ndarray]:
     r = np.random.default_rng(0)
     z, u, v = r.uniform(2, 6, n), r.uniform(0, side, n), r.uniform(0, side, n)
     means = np.stack([(u - side / 2) * z / side, (v - side / 2) * z / side, z], 1)
-    scales = (0.8 * np.sqrt(side * side / n) * z / side)[:, None] * np.exp(
-        r.normal(0, 0.4, (n, 3))
-    )
+    scales = (0.8 * np.sqrt(side * side / n) * z / side)[:, None] * np.exp(r.normal(0, 0.4, (n, 3)))
     quaternions = r.normal(size=(n, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     opacities, rgb = r.uniform(0.05, 0.95, n), r.uniform(0, 1, (n, 3))

@@ -15,6 +15,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from stages.raster.cpu import gradient_columns
 from stages.raster.pool import Pool
 from stages.run.stage import Report
 from stages.scene import Camera, Splats
@@ -112,6 +113,8 @@ def one_row(name: str, splats: Splats, camera: Camera) -> tuple[list[str], dict[
     fresh = Stepper(splats, camera, pool)
     first = peak_bytes(fresh)
     again = peak_bytes(fresh)
+    bands = stepper.model.sh.shape[1]
+    first -= 4 * gradient_columns(bands) * visible  # the gradients themselves
     allowed = 150 * visible + 24 * intersections + 60 * camera.width * camera.height
     row = [
         name,

@@ -35,7 +35,7 @@ class TimedPool(Pool):
 
 
 def interleaved(jobs: dict[str, Job], rounds: int) -> dict[str, float]:
-    """Median seconds of each job; all jobs run once in each round, after a first that is dropped."""
+    """Median seconds of each job; all run once in each round, and the first round is dropped."""
     taken: dict[str, list[float]] = {name: [] for name in jobs}
     for number in range(rounds + 1):
         for name, job in jobs.items():

@@ -14,18 +14,19 @@ from stages.run.stage import Report
 from stages.scene import Splats
 from stages.train import finished
 from stages.training.densify import densify
-from stages.training.loss import image_loss
+from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from stages.training.schedule import RESOLUTIONS, Schedule
 from stages.training.trainer import Trainer
-from stages.training.views import TrainingView
+from stages.training.views import Level, TrainingView
 from tests.scenes import camera, cloud, splats
 
 
 def view_of(name, picture, where):
     """A training view of one picture [H, W, 3] at all levels (the same size)."""
     pixels = np.ascontiguousarray((picture * 255).round().astype(np.uint8).transpose(2, 0, 1))
-    return TrainingView(name, tuple((where, pixels) for _ in RESOLUTIONS))
+    level = Level(where, pixels, channel_means(pixels))
+    return TrainingView(name, tuple(level for _ in RESOLUTIONS))
 
 
 def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, reference=False):
