@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatcli import console
 from splatcli.folders import find_run_folder
-from stages.run import runfolder
+from stages.run import runfolder, threads
 from stages.run.atomic import replacing
 from stages.run.errors import Family, SplatError
 from stages.run.pipeline import Pipeline
@@ -39,6 +39,8 @@ def render_to(
     seen = _camera_for(splats, views, camera)
     if width is not None:
         seen = seen.resized(width, max(1, round(width * seen.height / seen.width)))
+    if not threads.kernels_are_compiled():
+        console.note("Compiling the kernels; this is done once and takes about half a minute.")
     try:
         picture = render(splats, seen, backend=backend)
     except ValueError as error:

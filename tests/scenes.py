@@ -72,21 +72,22 @@ def join(*parts):
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
-def gradients(backend, scene, view, v_image, settings=None):
+def gradients(backend, scene, view, v_image, settings=None, smoothing=None):
     """{parameter: gradient of sum(image x v_image)}, each in the shape of its parameter."""
     settings = settings or RasterSettings()
     if backend == "reference":
-        return _reference_gradients(scene, view, v_image, settings)
-    from stages.raster.cpu import CpuRasteriser, splat_arrays
+        return _reference_gradients(scene, view, v_image, settings, smoothing)
+    from stages.raster.cpu import NO_SMOOTHING, CpuRasteriser, splat_arrays
 
+    widths = NO_SMOOTHING if smoothing is None else smoothing
     rasteriser = CpuRasteriser()
     arrays = splat_arrays(scene)
-    forward = rasteriser.forward(arrays, view, settings)
+    forward = rasteriser.forward(arrays, view, settings, widths)
     # what the buffers held before must not matter
     rasteriser.buffers.get("out", (4_000_000,), np.float32)[:] = np.nan
     rasteriser.buffers.carve(((4_000_000,), np.float32))[0][:] = np.nan
     planar = np.ascontiguousarray(np.asarray(v_image, np.float32).transpose(2, 0, 1))
-    rows = rasteriser.backward(arrays, forward, planar).parameters
+    rows = rasteriser.backward(arrays, forward, planar, widths).parameters
     full = np.zeros((len(scene), rows.shape[1]))
     full[forward.visible] = rows
     bands = (forward.degree + 1) ** 2
@@ -101,13 +102,14 @@ def gradients(backend, scene, view, v_image, settings=None):
     }
 
 
-def _reference_gradients(scene, view, v_image, settings):
+def _reference_gradients(scene, view, v_image, settings, smoothing):
     import torch
 
     from stages.raster.reference import parameters_of, render_tensors
 
     p = parameters_of(scene)
-    image, _, _, _ = render_tensors(p, view, settings)
+    widths = None if smoothing is None else torch.tensor(smoothing, dtype=torch.float64)
+    image, _, _, _ = render_tensors(p, view, settings, widths)
     if image.requires_grad:
         image.backward(torch.tensor(np.asarray(v_image, np.float64)))
     return {

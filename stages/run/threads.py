@@ -37,6 +37,11 @@ def kernel_cache() -> Path:
     return folder
 
 
+def kernels_are_compiled() -> bool:
+    """Whether an earlier run left compiled kernels; the first one compiles for half a minute."""
+    return any(Path(os.environ.get("NUMBA_CACHE_DIR", kernel_cache())).rglob("*.nbi"))
+
+
 def _writable(folder: Path) -> bool:
     """Numba stops the program when it can write nowhere; a home folder may be read-only."""
     try:

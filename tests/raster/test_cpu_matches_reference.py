@@ -22,6 +22,9 @@ def test_pictures_agree(size, antialias):
     np.testing.assert_allclose(a.image, b.image, atol=FLOAT32_IMAGE)
     np.testing.assert_allclose(a.alpha, b.alpha, atol=FLOAT32_IMAGE)
     np.testing.assert_allclose(a.depth, b.depth, atol=10 * FLOAT32_IMAGE)  # depths are up to 6
+    # where half of the light is left to a rounding, the median is one splat or the next
+    same = np.isclose(a.median_depth, b.median_depth, atol=10 * FLOAT32_IMAGE)
+    assert same.mean() > 0.999
 
 
 @pytest.mark.parametrize("antialias", [False, True])

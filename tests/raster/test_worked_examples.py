@@ -113,6 +113,18 @@ def test_spherical_harmonics_are_orthonormal_and_alike_in_both_backends():
     np.testing.assert_allclose(kernel_basis(3, directions[:20]), basis[:20], atol=1e-14)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_median_depth_is_where_half_of_the_light_is_gone(backend):
+    """Light after each of three splats: 0.7, 0.42, 0.21; and 0.7 after one alone."""
+    depths = [1.0, 2.0, 3.0]
+    scene = splats([(0, 0, z) for z in depths], scales=9.0, opacities=[0.3, 0.4, 0.5])
+    drawn = render(scene, camera(1, 1), RasterSettings(), backend)
+    assert drawn.median_depth[0, 0] == 2.0
+    assert drawn.depth[0, 0] == pytest.approx((0.3 * 1 + 0.28 * 2 + 0.21 * 3) / 0.79, rel=1e-4)
+    alone = render(scene.take(np.array([0])), camera(1, 1), RasterSettings(), backend)
+    assert alone.median_depth[0, 0] == 0.0
+
+
 def test_a_picture_of_1080p_has_8160_tiles_and_an_aligned_box_covers_ten():
     view = Camera(1920, 1080, 1000.0, 1000.0, 0.0, 0.0, np.eye(4))
     rasteriser = CpuRasteriser()

@@ -9,10 +9,11 @@ from stages import train
 from stages.measure.images import psnr
 from stages.raster import RasterSettings, render
 from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.raster.smoothing import smoothing_widths
 from stages.run.errors import Interrupted, SplatError
 from stages.run.stage import Report
-from stages.scene import Splats
-from stages.train import finished
+from stages.scene import Splats, split_held_out
+from stages.train import TrainSettings, finished
 from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -20,6 +21,7 @@ from stages.training.schedule import RESOLUTIONS, Schedule
 from stages.training.trainer import Trainer
 from stages.training.views import Level, TrainingView
 from tests.scenes import camera, cloud, splats
+from tests.small_scene import small_scene
 
 
 def view_of(name, picture, where):
@@ -204,3 +206,17 @@ def test_nothing_at_all_can_be_taken_grown_and_pruned():
     grown, growth = densify(empty, 2e-4, 1.0, 100, True, np.random.default_rng(0))
     assert len(grown) == len(empty.take(np.zeros(0, bool))) == 0
     assert (growth.cloned, growth.split, growth.pruned, growth.refused) == (0, 0, 0, 0)
+
+
+def test_under_the_smoothing_filter_no_trained_splat_is_finer_than_its_photographs(tmp_path):
+    scene = small_scene(tmp_path)
+    start = scene.splats.with_sh_degree(0)
+    settings = TrainSettings(steps=60, train_side=72, sh_degree=0, max_splats=400, smooth=True)
+    folder = tmp_path / "train"
+    folder.mkdir()
+    report = Report()
+    found = train.run({"sfm": scene.reconstruction, "seed": start}, settings, folder, report)
+    kept, _ = split_held_out(scene.reconstruction.views)
+    widths = smoothing_widths(found.means, [v.camera.fitted(72) for v in kept], near=0.01)
+    assert (np.exp(found.log_scales).min(1) >= 0.999 * widths).all()
+    assert report.metrics["psnr_db"] > 20
