@@ -15,11 +15,16 @@ _COUNTED = {"features": "descriptors", "matching": "two_view_geometries"}
 
 
 def count_done(database: Path, step: str) -> int | None:
-    """Photographs with features, or pairs matched and verified; None while it cannot be read."""
+    """Photographs with features, or pairs matched and verified, about; None while it cannot be
+    read.
+
+    Looks without taking a lock: a worker that meets one when it opens the database gives up. What
+    the worker has only written to SQLite's log is not counted yet.
+    """
     if not database.exists():
         return None
     try:
-        with closing(_open_read_only(database)) as connection:
+        with closing(_open_without_lock(database)) as connection:
             return int(connection.execute(f"SELECT COUNT(*) FROM {_COUNTED[step]}").fetchone()[0])
     except sqlite3.Error:
         return None
@@ -93,3 +98,7 @@ def forget_geometries(database: Path) -> None:
 
 def _open_read_only(database: Path) -> sqlite3.Connection:
     return sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=5.0)
+
+
+def _open_without_lock(database: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro&immutable=1", uri=True)

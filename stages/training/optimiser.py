@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) on the splats that a step has seen.
+"""Adam (Kingma and Ba 2015), sparse: on the splats that a step has seen; or dense, on all.
 
 A splat out of view keeps its moments and its own count of steps, and its bias correction follows
 that count: the first step of a splat first seen late is lr, not 3 lr.
@@ -230,15 +230,28 @@ def apply_gradients(
     rates: LearningRates,
     width: int,
     height: int,
+    dense: bool = False,
 ) -> None:
-    """One step of Adam on `model`, in place. bands: of SH that the gradients hold."""
+    """One step of Adam on `model`, in place. bands: of SH that the gradients hold.
+
+    dense: splats out of view take part with a gradient of 0, as in Adam on whole tensors: they
+    coast on, and their moments fade. It costs a pass over the whole model.
+    """
     pixels = width * height
+    rows, parameters, means2d = backward.rows, backward.parameters, backward.means2d
+    if dense:
+        unseen = np.ones(len(model), bool)
+        unseen[rows] = False
+        n = len(model)
+        parameters, means2d = _spread(parameters, rows, n), _spread(means2d, rows, n)
+        rows = np.arange(len(model), dtype=np.int32)
+        model.gradient_count[unseen] -= 1  # which the step below adds
     pool.share(
         adam_step,
         CHUNK,
-        backward.rows,
-        backward.parameters,
-        backward.means2d,
+        rows,
+        parameters,
+        means2d,
         model.means,
         model.quaternions,
         model.log_scales,
@@ -254,3 +267,10 @@ def apply_gradients(
         model.gradient_sum,
         model.gradient_count,
     )
+
+
+def _spread(values: NDArray[np.float32], rows: NDArray[np.int32], n: int) -> NDArray[np.float32]:
+    """[n, columns] `values` at `rows`, 0 elsewhere."""
+    full = np.zeros((n, values.shape[1]), np.float32)
+    full[rows] = values
+    return full

@@ -24,7 +24,7 @@ from tests.tolerances import FLOAT32_IMAGE
 
 # milliseconds, one thread, forward and backward: 20 times faster than OpenSplat 1.1.5 on a CPU
 EQUAL = {(1_000, 256): None, (10_000, 256): None, (10_000, 512): 17.0, (100_000, 512): 35.0}
-console = Console(width=140)
+console = Console(width=170)
 
 
 def check_pictures(name: str, found: np.ndarray, wanted: np.ndarray) -> None:

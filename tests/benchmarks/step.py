@@ -146,6 +146,7 @@ def table_of_sizes(largest: int, runs: list[Path]) -> None:
         title="One step, all threads",
     )
     exponents: list[str] = []
+    by_count: dict[int, list[float]] = {}
     for width, height in PICTURES:
         counts, times = [], []
         for n in (1_000, 10_000, 100_000, 1_000_000):
@@ -155,6 +156,7 @@ def table_of_sizes(largest: int, runs: list[Path]) -> None:
                     f"{n:,} at {width}x{height}", random_scene(n, camera), camera
                 )
                 table.add_row(*row)
+                by_count.setdefault(n, []).append(seconds["total"])
                 if n >= 10_000:
                     counts.append(float(n))
                     times.append(seconds["total"])
@@ -167,6 +169,11 @@ def table_of_sizes(largest: int, runs: list[Path]) -> None:
         table.add_row(*one_row(name, splats, camera)[0])
     console.print(table)
     console.print("growth of the step with splats, 10,000 and more: " + ", ".join(exponents))
+    pixels = [float(width * height) for width, height in PICTURES]
+    console.print(
+        "growth of the step with pixels: "
+        + ", ".join(f"{n:,} splats: {growth(pixels, t):.2f}" for n, t in by_count.items())
+    )
 
 
 def table_of_kernels(n: int, camera: Camera) -> None:

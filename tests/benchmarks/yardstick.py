@@ -10,13 +10,37 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.raster.binning import TILE
 from stages.raster.cpu import Forward
 from stages.raster.pool import Pool
-from stages.raster.projection import GL
+from stages.raster.projection import GA, GB, GK, GL, GVX, GVY, GX, GY
+from stages.raster.simd import kernel
 from tests.benchmarks.timing import Job
 
 SOURCE = Path(__file__).with_name("yardstick.cpp")
 FLAGS = ("-O3", "-march=native", "-shared", "-fPIC", "-pthread")
+
+
+@kernel
+def row_spans(width, starts, members, geometry, spans):
+    """spans [I]: first + 16 x last of the pixel rows in which a splat reaches 1/255, 1 (no rows)
+    where it does so in none: what a kernel that goes by rows wants to know."""
+    tiles_x = (width + TILE - 1) // TILE
+    for tile in range(len(starts) - 1):
+        left, top = tile % tiles_x * TILE + 0.5, tile // tiles_x * TILE + 0.5
+        for entry in range(starts[tile], starts[tile + 1]):
+            row = members[entry]
+            wide = geometry[row, GVX] >= geometry[row, GVY]
+            reach = np.log(2.0) * (geometry[row, GL] + np.log2(255.0)) * 1.0001
+            first, last = 1, 0
+            for j in range(TILE):
+                for i in range(TILE):
+                    dx, dy = left + i - geometry[row, GX], top + j - geometry[row, GY]
+                    u, t = (dx, dy) if wide else (dy, dx)
+                    t -= geometry[row, GK] * u
+                    if geometry[row, GA] * u * u + geometry[row, GB] * t * t <= reach:
+                        first, last = (j if last < first else first), j
+            spans[entry] = first + 16 * last
 
 
 class Yardstick:
@@ -34,8 +58,10 @@ class Yardstick:
         geometry = forward.geometry.copy()
         geometry[:, GL] = np.exp2(geometry[:, GL])  # the opacity itself, as the kernel wants it
         lists = forward.lists
+        spans = np.empty(len(lists), np.uint8)
+        row_spans(forward.width, lists.starts, lists.members, forward.geometry, spans)
         arrays = [
-            *(lists.starts.copy(), lists.members.copy(), lists.spans.copy(), geometry),
+            *(lists.starts.copy(), lists.members.copy(), spans, geometry),
             *(forward.paint.copy(), forward.background, image),
         ]
         pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]

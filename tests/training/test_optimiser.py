@@ -31,11 +31,13 @@ def backward(rows, bands, seed=1, scale=1.0):
     return Backward(np.asarray(rows, np.int32), values, means2d)
 
 
-def apply(m, b, bands=4):
-    apply_gradients(Pool(1), m, b, bands, RATES, 100, 50)
+def apply(m, b, bands=4, dense=False):
+    apply_gradients(Pool(1), m, b, bands, RATES, 100, 50, dense)
 
 
-def test_many_steps_are_those_of_torch():
+@pytest.mark.parametrize("dense", [False, True])
+def test_many_steps_are_those_of_torch(dense):
+    """Sparse with every splat in view; dense with every other splat in view only."""
     m = model()
     columns = 11 + 3 * 4
     start = np.concatenate([a.reshape(5, -1) for a in m.arrays], 1)
@@ -47,14 +49,17 @@ def test_many_steps_are_those_of_torch():
         eps=EPSILON,
     )
     for step in range(50):
-        b = backward(range(5), 4, seed=step)
+        b = backward(range(step % 2, 5, 2) if dense else range(5), 4, seed=step)
+        full = np.zeros((5, columns))
+        full[b.rows] = b.parameters[:, :columns]
         for k, g in enumerate(groups):
-            g.grad = torch.tensor(b.parameters[:, k], dtype=torch.float64)
+            g.grad = torch.tensor(full[:, k], dtype=torch.float64)
         adam.step()
-        apply(m, b)
+        apply(m, b, dense=dense)
     found = np.concatenate([a.reshape(5, -1) for a in m.arrays], 1)
     wanted = torch.stack(groups, 1).detach().numpy()
     np.testing.assert_allclose(found, wanted, atol=2e-5)  # 50 roundings of values up to 4
+    assert m.gradient_count.sum() == (125 if dense else 250)  # of splats in view
 
 
 def test_the_first_step_of_a_splat_first_seen_late_is_its_rate():

@@ -1,0 +1,34 @@
+"""The benchmarks run, and their gates hold; nothing is asserted about time."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from tests.sample import ROOT
+
+pytestmark = pytest.mark.slow
+
+
+def run(*words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", *words], cwd=ROOT, env=os.environ, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_step_benchmark_passes_its_gate_and_prints_every_kernel():
+    printed = run("tests.benchmarks.step", "--quick")
+    assert "a step moves the splats as the reference's step does" in printed
+    for kernel in ("project_splats", "blend_tiles", "loss_bands", "adam_step"):
+        assert kernel in printed
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ to build the yardstick with")
+def test_the_raster_benchmark_draws_what_its_yardstick_draws():
+    assert "1,000 at 1920x1080" in run("tests.benchmarks.raster", "--largest", "1000")
