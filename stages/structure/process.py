@@ -46,9 +46,9 @@ def run_worker(
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     }
-    if job.step == "mapping":
-        # a BLAS of several threads may add up in another order when its cores are busy
-        environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    # A BLAS of several threads may add up in another order when its cores are busy; COLMAP has
+    # threads of its own.
+    environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     with log.open("wb") as output:
         # A session of its own: Ctrl-C goes to the parent alone, which then decides.
         worker = subprocess.Popen(
