@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats import format_of
 from stages.scene import Splats
 
 _Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -33,7 +34,7 @@ class FileContent:
 def read_back(path: Path) -> FileContent:
     """What another program would find in the file. Raises whatever its parser raises: a file that
     was just written has no excuse."""
-    return _READERS[path.suffix.lower()](path)
+    return _READERS[format_of(path)](path)
 
 
 def _ply(path: Path) -> FileContent:
@@ -69,6 +70,51 @@ def _splat(path: Path) -> FileContent:
         sh=((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
     )
     return FileContent(splats, np.eye(4))
+
+
+def _compressed_ply(path: Path) -> FileContent:
+    from plyfile import PlyData
+
+    data = PlyData.read(str(path), mmap="c")
+    words, chunk = data["vertex"], np.arange(data["vertex"].count) // 256
+
+    def unpacked(name: str, columns: list[tuple[str, int, int]]) -> NDArray[np.float64]:
+        """columns: (suffix of the range's names, lowest bit, bits)."""
+        parts = []
+        for suffix, shift, bits in columns:
+            fraction = (words[name].astype(np.int64) >> shift) % 2**bits / (2**bits - 1)
+            low, high = (data["chunk"][e + suffix].astype(float)[chunk] for e in ("min_", "max_"))
+            parts.append(low * (1 - fraction) + high * fraction)
+        return np.stack(parts, axis=1)
+
+    axes = [("x", 21, 11), ("y", 11, 10), ("z", 0, 11)]
+    turns = words["packed_rotation"].astype(np.int64)
+    others = [((turns >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
+    colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
+    rest = data["sh"].data if "sh" in data else np.zeros((len(chunk), 0), np.uint8)
+    sh = np.zeros((len(chunk), len(rest.dtype.names or ()) // 3 + 1, 3))
+    sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
+    for i, name in enumerate(rest.dtype.names or ()):
+        per_channel = sh.shape[1] - 1
+        sh[:, 1 + i % per_channel, i // per_channel] = (rest[name] + 0.5) / 32 - 4
+    splats = _splats(
+        means=unpacked("packed_position", axes),
+        quaternions=_with_largest(turns >> 30, np.stack(others, axis=1)),
+        log_scales=unpacked("packed_scale", [("scale_" + s, low, n) for s, low, n in axes]),
+        opacity_logits=_logits(words["packed_color"].astype(np.int64) % 256 / 255),
+        sh=sh,
+    )
+    return FileContent(splats, np.eye(4))
+
+
+def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N, 4] where `others` [N, 3] leave out the component `column`, which is the largest."""
+    quaternions = np.zeros((len(others), 4))
+    for k in range(4):
+        rows = column == k
+        largest = np.sqrt(np.maximum(0, 1 - np.square(others[rows]).sum(axis=1)))
+        quaternions[rows] = np.insert(others[rows], k, largest, axis=1)
+    return quaternions
 
 
 def _gltf(path: Path) -> FileContent:
@@ -167,11 +213,12 @@ def _concatenated(parts: list[Splats]) -> Splats:
 
 
 _READERS = {
-    ".ply": _ply,
-    ".splat": _splat,
-    ".glb": _gltf,
-    ".gltf": _gltf,
-    ".usda": _usd,
-    ".usdc": _usd,
-    ".usdz": _usd,
+    "ply": _ply,
+    "splat": _splat,
+    "glb": _gltf,
+    "gltf": _gltf,
+    "usda": _usd,
+    "usdc": _usd,
+    "usdz": _usd,
+    "compressed.ply": _compressed_ply,
 }
