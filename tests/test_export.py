@@ -154,7 +154,7 @@ def test_a_scene_without_splats_is_exported_with_a_warning(
     assert [code for code, _ in report.warnings] == ["export-empty"]
 
 
-@pytest.mark.parametrize("chosen", [("obj",), ("ply", "spz"), (), ("PLY",)])
+@pytest.mark.parametrize("chosen", [("obj",), ("ply", "ksplat"), (), ("PLY",)])
 def test_an_unknown_format_is_refused_before_anything_is_written(
     scene: SmallScene, tmp_path: Path, chosen: tuple[str, ...]
 ) -> None:

@@ -26,9 +26,10 @@ FORMATS = {
     "usda": "usd",
     "usdc": "usd",
     "compressed.ply": "compressed_ply",
+    "spz": "spz",
 }
 # Those that hold less than float32: smaller, and not the same splats any more.
-LOSSY = ("splat", "compressed.ply")
+LOSSY = ("splat", "compressed.ply", "spz")
 
 
 def format_of(path: Path) -> str:

@@ -8,6 +8,7 @@ wrong turn of positions, rotations or SH shows in the picture.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,6 +106,36 @@ def _compressed_ply(path: Path) -> FileContent:
         sh=sh,
     )
     return FileContent(splats, np.eye(4))
+
+
+def _spz(path: Path) -> FileContent:
+    import gzip
+    import struct
+
+    content = gzip.decompress(path.read_bytes())
+    magic, version, n, degree, fraction = struct.unpack_from("<IIIBB", content)
+    assert (magic, version) == (0x5053474E, 3), "the header is not that of version 3"
+    k = (degree + 1) ** 2 - 1
+    ends = 16 + np.cumsum([0, 9 * n, n, 3 * n, 3 * n, 4 * n, 3 * k * n])
+    assert len(content) == ends[-1], "the length is not that of the header"
+    parts = [np.frombuffer(content[a:b], np.uint8) for a, b in itertools.pairwise(ends)]
+    low, middle, high = parts[0].reshape(n, 3, 3).astype(np.int64).transpose(2, 0, 1)
+    fixed = low + 256 * middle + 65536 * high
+    words = parts[4].view("<u4").astype(np.int64)
+    tens = [words >> shift & 1023 for shift in (20, 10, 0)]
+    others = [math.sqrt(0.5) / 511 * np.where(t < 512, t, 512 - t) for t in tens]
+    xyzw = _with_largest(words >> 30, np.stack(others, axis=1))
+    sh = np.zeros((n, k + 1, 3))
+    sh[:, 0] = (parts[2].reshape(n, 3) / 255 - 0.5) / 0.15
+    sh[:, 1:] = parts[5].reshape(n, k, 3) / 128 - 1
+    splats = _splats(
+        means=np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
+        quaternions=np.roll(xyzw, 1, axis=1),
+        log_scales=parts[3].reshape(n, 3) / 16 - 10,
+        opacity_logits=_logits(parts[1] / 255),
+        sh=sh,
+    )
+    return FileContent(splats, _Y_UP)
 
 
 def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -221,4 +252,5 @@ _READERS = {
     "usdc": _usd,
     "usdz": _usd,
     "compressed.ply": _compressed_ply,
+    "spz": _spz,
 }
