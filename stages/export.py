@@ -23,11 +23,12 @@ if TYPE_CHECKING:
 
     from stages.scene import Camera, ExportedAssets, QuantisedSplats, Reconstruction, Splats
 
-FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz", "compressed.ply", "spz")
+FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz", "compressed.ply", "spz", "sog")
 _LOSSES = {
     "splat": "has 8-bit colours that do not change with the view",
     "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
     "spz": "has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
+    "sog": "has 256 sizes and colours, and a palette of view-dependent colours",
 }
 _INDEX = "assets.json"
 _CHECK_SIDE_PX = 480

@@ -27,9 +27,10 @@ FORMATS = {
     "usdc": "usd",
     "compressed.ply": "compressed_ply",
     "spz": "spz",
+    "sog": "sog",
 }
 # Those that hold less than float32: smaller, and not the same splats any more.
-LOSSY = ("splat", "compressed.ply", "spz")
+LOSSY = ("splat", "compressed.ply", "spz", "sog")
 
 
 def format_of(path: Path) -> str:

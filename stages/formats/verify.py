@@ -138,6 +138,42 @@ def _spz(path: Path) -> FileContent:
     return FileContent(splats, _Y_UP)
 
 
+def _sog(path: Path) -> FileContent:
+    import json
+    import zipfile
+
+    from PIL import Image
+
+    with zipfile.ZipFile(path) as package:
+        meta = json.loads(package.read("meta.json"))
+
+        def pixels(part: str, number: int = 0) -> NDArray[np.int64]:
+            with package.open(meta[part]["files"][number]) as file:
+                return np.array(Image.open(file).convert("RGBA"), np.int64)
+
+        def a_splat(part: str, number: int = 0) -> NDArray[np.int64]:
+            return pixels(part, number).reshape(-1, 4)[: meta["count"]]
+
+        low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
+        part = (a_splat("means")[:, :3] + 256 * a_splat("means", 1)[:, :3]) / 65535
+        bent = low * (1 - part) + high * part
+        turns, colours = a_splat("quats"), a_splat("sh0")
+        sh = np.array(meta["sh0"]["codebook"])[colours[:, None, :3]]
+        if "shN" in meta:
+            k = (meta["shN"]["bands"] + 1) ** 2 - 1
+            halves, palette = a_splat("shN", 1), pixels("shN")[:, :, :3].reshape(-1, k, 3)
+            chosen = palette[halves[:, 0] + 256 * halves[:, 1]]
+            sh = np.concatenate([sh, np.array(meta["shN"]["codebook"])[chosen]], axis=1)
+        splats = _splats(
+            means=np.where(bent < 0, -1, 1) * (np.exp(np.abs(bent)) - 1),
+            quaternions=_with_largest(turns[:, 3] - 252, (turns[:, :3] / 127.5 - 1) / 2**0.5),
+            log_scales=np.array(meta["scales"]["codebook"])[a_splat("scales")[:, :3]],
+            opacity_logits=_logits(colours[:, 3] / 255),
+            sh=sh,
+        )
+    return FileContent(splats, np.eye(4))
+
+
 def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
     """[N, 4] where `others` [N, 3] leave out the component `column`, which is the largest."""
     quaternions = np.zeros((len(others), 4))
@@ -253,4 +289,5 @@ _READERS = {
     "usdz": _usd,
     "compressed.ply": _compressed_ply,
     "spz": _spz,
+    "sog": _sog,
 }

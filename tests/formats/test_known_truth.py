@@ -40,10 +40,12 @@ LOOKING = np.array([0.3, -0.8, 0.5])
 # (of the covariance's elements, of the colour): what each rounds. A step of SH is 1/32 in a packed
 # .ply; three of them and C1 make half a step 0.023 at most.
 # SPZ: sizes by 1/32, so squares of 0.4 by 0.01; SH of degree 1 by 1/32, which C1 halves thrice.
+# SOG: 8 bits of each component of a rotation; of one splat the codebooks hold every number.
 LOSSES = {
     "splat": (1e-3, 2e-3),
     "compressed.ply": (1e-3, 0.023),
     "spz": (6e-3, 0.04),
+    "sog": (2e-3, 1e-6),
 }
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
+import io
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -55,10 +58,32 @@ def read_or_refused(suffix: str, content: bytes) -> None:
         assert time.monotonic() - begun < LIMIT_S
 
 
+def meta_of(content: bytes) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(content)) as package:
+        return package.read("meta.json")
+
+
+@functools.cache
+def pictures() -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(written("sog"))) as package:
+        return {name: package.read(name) for name in package.namelist() if name != "meta.json"}
+
+
+def with_meta(meta: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as package:
+        package.writestr("meta.json", meta)
+        for name, content in pictures().items():
+            package.writestr(name, content)
+    return file.getvalue()
+
+
 # A changed byte inside gzip is found by its check sum: there the content is changed before packing.
 LAYERS: dict[str, tuple[str, Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
     "compressed.ply": ("compressed.ply", bytes, bytes),
     "spz": ("spz", bytes, bytes),
+    "sog": ("sog", bytes, bytes),
+    "sog, meta.json": ("sog", meta_of, with_meta),
     "spz, unpacked": ("spz", gzip.decompress, lambda content: gzip.compress(content, 1)),
 }
 
