@@ -126,7 +126,9 @@ def read(path: Path) -> Splats:
     path = Path(path)
     with reading(path), path.open("rb") as file:
         if file.read(4) == _MAGIC:
-            raise BadFileError("it is SPZ version 4 (or not gzipped), which is not read")
+            raise BadFileError(
+                "it is SPZ version 4 (packed with zstd), which is not read; save it as version 3"
+            )
         file.seek(0)
         stream = Inflated(file, path.stat().st_size)
         magic, version, count, degree, bits, _, _ = HEADER.unpack(stream.read(HEADER.size))
