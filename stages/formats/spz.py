@@ -1,4 +1,4 @@
-"""SPZ: about an eighth of a .ply, for the web and phones.
+"""SPZ: about an eighth of a .ply, for the web.
 
 Version 3 is written, 2 and 3 are read: gzip around a header of 16 bytes (magic "NGSP", version,
 count, SH degree, fractional bits of positions, flags, 0) and one array after the other:
