@@ -137,6 +137,21 @@ def info(
     views.show_info(target, as_json)
 
 
+def convert(
+    source: Annotated[Path, typer.Argument(help="Splat file to read; its name says the format.")],
+    target: Annotated[Path, typer.Argument(help="Splat file to write; its name says the format.")],
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a splat file into one of another format.
+
+    Endings: .ply .splat .glb .gltf .usda .usdc .usdz .compressed.ply .spz .sog
+    """
+    from splatcli import convert as work
+
+    work.convert(source, target, quiet, as_json)
+
+
 def doctor(as_json: AsJson = False) -> None:
     """Check what this machine has, and what is missing."""
     from splatcli import checkup
@@ -156,6 +171,7 @@ def _register() -> None:
         (status, "splat status run/"),
         (render, "splat render run/ --camera IMG_0042.jpg --out view.png"),
         (info, "splat info run/7-export/scene.ply"),
+        (convert, "splat convert scene.ply scene.sog"),
         (doctor, "splat doctor"),
     ):
         app.command(extra.__name__, epilog=_example(line))(guarded(extra))

@@ -23,8 +23,13 @@ if TYPE_CHECKING:
 
     from stages.scene import Camera, ExportedAssets, QuantisedSplats, Reconstruction, Splats
 
-FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz")
-_LOSSY = ("splat",)
+FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz", "compressed.ply", "spz", "sog")
+_LOSSES = {
+    "splat": "has 8-bit colours that do not change with the view",
+    "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
+    "spz": "has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
+    "sog": "has 256 sizes and colours, and a palette of view-dependent colours",
+}
 _INDEX = "assets.json"
 _CHECK_SIDE_PX = 480
 _CHECK_CAMERAS = 3
@@ -176,6 +181,7 @@ class _Checker:
 
     def check(self, path: Path, name: str, report: Report) -> dict[str, float]:
         """The file's figures. Raises SplatError "export-verify-failed"."""
+        from stages.formats.compare import largest_errors
         from stages.formats.verify import read_back
 
         try:
@@ -185,17 +191,16 @@ class _Checker:
         if len(content.splats) != len(self.splats):
             raise _failed(path, f"it holds {len(content.splats)} of {len(self.splats)} splats")
         worst = self._worst_db(content)
-        if name in _LOSSY:
+        if name in _LOSSES:
             if worst < _LOSSY_DB:
                 report.warn(
-                    "export-splat-lossy",
+                    f"export-{name.replace('.', '-')}-lossy",
                     f"{path.name} differs from the trained splats by {worst:.1f} dB: the format "
-                    "has 8-bit colours that do not change with the view. Where a viewer reads "
-                    "them, prefer .ply, .glb or .usdz.",
+                    f"{_LOSSES[name]}. Where a viewer reads them, prefer .ply, .glb or .usdz.",
                 )
         elif worst < _LOSSLESS_DB:
             raise _failed(path, f"drawn again it differs by {worst:.1f} dB")
-        return {"verify_db": round(worst, 2), **self._errors(content, name)}
+        return {"verify_db": round(worst, 2), **largest_errors(self.splats, content, name)}
 
     def _worst_db(self, content: Any) -> float:
         """The camera is moved into the file's axes, not the file's splats into ours: so the turn
@@ -210,38 +215,6 @@ class _Checker:
             decibels = psnr(drawn, picture)
             worst = min(worst, 0.0 if math.isnan(decibels) else decibels)
         return worst
-
-    def _errors(self, content: Any, name: str) -> dict[str, float]:
-        """Largest differences of the values, row by row."""
-        import numpy as np
-
-        from stages.formats import splat32
-        from stages.formats.turn import turned
-
-        mine = self.splats
-        if content.world_from_file[1, 1] < 0:
-            mine = turned(mine)
-        if name == "splat":
-            mine = mine.take(splat32.order(mine)).with_sh_degree(0)
-        file = content.splats.with_sh_degree(mine.sh_degree)
-
-        def largest(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-            difference = np.abs(a.astype(np.float64) - b.astype(np.float64))
-            return float(f"{difference.max(initial=0.0):.3g}")
-
-        a, b = (q.astype(np.float64) for q in (mine.quaternions, file.quaternions))
-        a /= np.linalg.norm(a, axis=1, keepdims=True)
-        b /= np.linalg.norm(b, axis=1, keepdims=True)
-        # |a - b| = 2 sin(angle / 4): exact for small angles, where the arc cosine is not
-        apart = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
-        degrees = np.degrees(4 * np.arcsin(np.minimum(apart / 2, 1)))
-        return {
-            "max_position_error": largest(mine.means, file.means),
-            "max_log_scale_error": largest(mine.log_scales, file.log_scales),
-            "max_opacity_error": largest(mine.opacities, file.opacities),
-            "max_rotation_error_degrees": float(f"{degrees.max(initial=0.0):.3g}"),
-            "max_sh_error": largest(mine.sh, file.sh),
-        }
 
 
 def _failed(path: Path, reason: str) -> SplatError:

@@ -41,9 +41,10 @@ def test_every_format_draws_the_same_picture_again(scene: SmallScene, tmp_path: 
     for file in assets.files:
         figures = report.metrics["formats"][file.format]
         assert (tmp_path / file.path).is_file()
-        if file.format == "splat":
-            assert 20 < figures["verify_db"] < 60
-            assert figures["bytes_per_splat"] == 32
+        if file.format in formats.LOSSY:
+            assert 20 < figures["verify_db"] < 70
+            if file.format == "splat":
+                assert figures["bytes_per_splat"] == 32
         else:
             assert figures["verify_db"] > 80
             assert figures["max_position_error"] == 0
@@ -91,7 +92,7 @@ def test_a_wrong_file_does_not_pass(
     """As if the writer had made a common mistake: the check must see each of them."""
 
     def wrong(path: Path) -> verify.FileContent:
-        content = verify._READERS[path.suffix](path)
+        content = verify._READERS[formats.format_of(path)](path)
         splats = content.splats
         if damage == "quaternion order":
             splats = replace(splats, quaternions=np.roll(splats.quaternions, 1, axis=1))
@@ -154,7 +155,7 @@ def test_a_scene_without_splats_is_exported_with_a_warning(
     assert [code for code, _ in report.warnings] == ["export-empty"]
 
 
-@pytest.mark.parametrize("chosen", [("obj",), ("ply", "spz"), (), ("PLY",)])
+@pytest.mark.parametrize("chosen", [("obj",), ("ply", "ksplat"), (), ("PLY",)])
 def test_an_unknown_format_is_refused_before_anything_is_written(
     scene: SmallScene, tmp_path: Path, chosen: tuple[str, ...]
 ) -> None:

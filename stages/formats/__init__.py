@@ -16,7 +16,7 @@ from stages.run.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.scene import Splats
 
-# Suffix without the dot -> module. The first four are what an export writes by default.
+# What a file's name ends in, without the dot -> module.
 FORMATS = {
     "ply": "ply",
     "splat": "splat32",
@@ -25,13 +25,19 @@ FORMATS = {
     "gltf": "gltf",
     "usda": "usd",
     "usdc": "usd",
+    "compressed.ply": "compressed_ply",
+    "spz": "spz",
+    "sog": "sog",
 }
+# Those that hold less than float32: smaller, and not the same splats any more.
+LOSSY = ("splat", "compressed.ply", "spz", "sog")
 
 
 def format_of(path: Path) -> str:
-    """The format that the suffix names. Raises SplatError "format-unknown" for another suffix."""
-    name = Path(path).suffix.lower().lstrip(".")
-    if name not in FORMATS:
+    """The format that the end of the name says. Raises SplatError "format-unknown" for another."""
+    name = Path(path).name.lower()
+    endings = [known for known in FORMATS if name.endswith("." + known)]
+    if not endings:
         raise SplatError(
             "format-unknown",
             given=f"{path} has the suffix {Path(path).suffix!r}.",
@@ -39,7 +45,7 @@ def format_of(path: Path) -> str:
             hint="Choose a name with one of these suffixes.",
             family=Family.USAGE,
         )
-    return name
+    return max(endings, key=len)
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:

@@ -7,7 +7,6 @@ The format records neither axes nor units; ours says them in comments. World: y 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,23 +15,14 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats import compressed_ply
+from stages.formats.ply_header import Header, binary_rows, read_header
 from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, kept_rows
 from stages.run.atomic import replacing
 from stages.scene import Splats
 
-HEADER_LIMIT_BYTES = 1 << 20
 _ROWS_AT_ONCE = 1 << 16
-_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -97,11 +87,14 @@ def read(path: Path) -> Splats:
     """The splats of a .ply, float32.
 
     Any order of properties, extra ones, ascii or either byte order, any numeric type, normals or
-    not, degree 0 to 3. Raises SplatError "splats-unreadable" for what is damaged or is not splats.
+    not, degree 0 to 3; packed ones too (see `compressed_ply`). Raises SplatError
+    "splats-unreadable" for what is damaged or is not splats.
     """
     path = Path(path)
     with reading(path), path.open("rb") as file:
-        header = _read_header(file)
+        header = read_header(file)
+        if header.is_compressed:
+            return compressed_ply.unpack(path, header)
         _check_is_splats(header)
         columns = _Columns(_read_rows(path, file, header), header.ascii_names)
         count = sum(1 for name in columns.names if name.startswith("f_rest_"))
@@ -123,86 +116,8 @@ def read(path: Path) -> Splats:
         )
 
 
-@dataclass(frozen=True)
-class _Element:
-    name: str
-    count: int
-    properties: tuple[tuple[str, str], ...]  # (name, numpy type without byte order)
-    has_lists: bool
-
-
-@dataclass(frozen=True)
-class _Header:
-    encoding: str
-    elements: tuple[_Element, ...]
-    origin: NDArray[np.float64]
-    data_starts: int
-
-    @property
-    def vertex(self) -> _Element:
-        for element in self.elements:
-            if element.name == "vertex":
-                return element
-        raise BadFileError("it has no element vertex")
-
-    @property
-    def ascii_names(self) -> list[str] | None:
-        """The columns' names where rows are a plain table; None where NumPy knows them."""
-        if self.encoding != "ascii":
-            return None
-        return [name for name, _ in self.vertex.properties]
-
-
-def _read_header(file: BinaryIO) -> _Header:
-    start = file.read(HEADER_LIMIT_BYTES)
-    if not start.startswith(b"ply"):
-        raise BadFileError("it does not start with 'ply'")
-    end = re.search(rb"(?:^|[\r\n])end_header[ \t]*(\r\n|\n|\r)", start)
-    if end is None:
-        raise BadFileError("its header does not end")
-    encoding, origin, elements = "", np.zeros(3), []
-    for line in re.split(r"[\r\n]+", start[: end.start()].decode("utf-8", "replace"))[1:]:
-        words = line.split()
-        match words:
-            case ["format", encoding, *_]:
-                pass
-            case ["comment", "splat_origin", x, y, z]:
-                origin = np.array([float(x), float(y), float(z)])
-            case ["element", name, count]:
-                elements.append(_Element(name, _count(count), (), False))
-            case ["property", *rest] if elements:
-                elements[-1] = _with_property(elements[-1], rest)
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case _:
-                raise BadFileError(f"its header holds a line that is not understood: {line[:80]!r}")
-    if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise BadFileError(f"its encoding {encoding[:40]!r} is not known")
-    return _Header(encoding, tuple(elements), origin, end.end())
-
-
-def _count(text: str) -> int:
-    if not re.fullmatch(r"[0-9]{1,15}", text):
-        raise BadFileError(f"it declares {text[:40]!r} elements")
-    return int(text)
-
-
-def _with_property(element: _Element, words: list[str]) -> _Element:
-    match words:
-        case ["list", _, _, name]:
-            return _Element(element.name, element.count, element.properties, True)
-        case [kind, name] if kind in _TYPES:
-            if any(name == known for known, _ in element.properties):
-                raise BadFileError(f"it declares the property {name[:40]!r} twice")
-            properties = (*element.properties, (name, _TYPES[kind]))
-            return _Element(element.name, element.count, properties, element.has_lists)
-    raise BadFileError(f"its header holds a property that is not understood: {words[:4]!r}"[:120])
-
-
-def _check_is_splats(header: _Header) -> None:
+def _check_is_splats(header: Header) -> None:
     names = {name for name, _ in header.vertex.properties}
-    if "packed_position" in names:
-        raise BadFileError("it is a compressed .ply, which is not supported")
     missing = [name for name in _REQUIRED if name not in names]
     if missing:
         raise BadFileError(f"its vertices lack {', '.join(missing)}: they are no splats")
@@ -210,39 +125,15 @@ def _check_is_splats(header: _Header) -> None:
         raise BadFileError("its vertices hold lists")
 
 
-def _read_rows(path: Path, file: BinaryIO, header: _Header) -> NDArray[np.generic]:
+def _read_rows(path: Path, file: BinaryIO, header: Header) -> NDArray[np.generic]:
     """[N] structured rows mapped from the file, or for ascii an [N, P] float64 table."""
-    before = _elements_before_vertex(header)
     if header.encoding == "ascii":
-        return _read_ascii_rows(path, file, header, before)
-    offset = header.data_starts
-    order = "<" if header.encoding == "binary_little_endian" else ">"
-    for element in before:
-        offset += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties)
-    row = np.dtype([(name, order + kind) for name, kind in header.vertex.properties])
-    wanted, there = header.vertex.count * row.itemsize, path.stat().st_size - offset
-    if there < wanted:
-        raise BadFileError(f"it is cut short: {wanted} bytes of vertices declared, {there} there")
-    if header.vertex.count == 0:
-        return np.zeros(0, row)
-    return np.memmap(path, row, "r", offset, header.vertex.count)
+        return _read_ascii_rows(path, file, header)
+    return binary_rows(path, header, "vertex")
 
 
-def _elements_before_vertex(header: _Header) -> list[_Element]:
-    before: list[_Element] = []
-    for element in header.elements:
-        if element.name == "vertex":
-            break
-        if element.has_lists:
-            raise BadFileError("it holds lists ahead of its vertices")
-        before.append(element)
-    return before
-
-
-def _read_ascii_rows(
-    path: Path, file: BinaryIO, header: _Header, before: list[_Element]
-) -> NDArray[np.generic]:
-    skipped = sum(element.count * len(element.properties) for element in before)
+def _read_ascii_rows(path: Path, file: BinaryIO, header: Header) -> NDArray[np.generic]:
+    skipped = sum(element.count * len(element.properties) for element in header.before("vertex"))
     width = len(header.vertex.properties)
     wanted = header.vertex.count * width
     # A number and its separator take two characters at least.

@@ -9,31 +9,23 @@ wrong turn of positions, rotations or SH shows in the picture.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats import format_of, verify_packed
+from stages.formats.verify_content import Y_UP, FileContent, logits, splats_of
 from stages.scene import Splats
 
-_Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-@dataclass(frozen=True)
-class FileContent:
-    """splats: as the file holds them, in its axes. world_from_file [4, 4]: from those axes to
-    ours (y down)."""
-
-    splats: Splats
-    world_from_file: NDArray[np.float64]
+__all__ = ["FileContent", "read_back"]
 
 
 def read_back(path: Path) -> FileContent:
     """What another program would find in the file. Raises whatever its parser raises: a file that
     was just written has no excuse."""
-    return _READERS[path.suffix.lower()](path)
+    return _READERS[format_of(path)](path)
 
 
 def _ply(path: Path) -> FileContent:
@@ -47,7 +39,7 @@ def _ply(path: Path) -> FileContent:
         sh[:, 0, channel] = vertex[f"f_dc_{channel}"]
         for k in range(per_channel):
             sh[:, k + 1, channel] = vertex[f"f_rest_{channel * per_channel + k}"]
-    splats = _splats(
+    splats = splats_of(
         means=np.stack([vertex[c] for c in "xyz"], axis=1),
         quaternions=np.stack([vertex[f"rot_{i}"] for i in range(4)], axis=1),
         log_scales=np.stack([vertex[f"scale_{i}"] for i in range(3)], axis=1),
@@ -61,11 +53,11 @@ def _splat(path: Path) -> FileContent:
     records = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 32)
     floats = np.ascontiguousarray(records[:, :24]).view("<f4").astype(np.float64)
     colours = records[:, 24:28] / 255.0
-    splats = _splats(
+    splats = splats_of(
         means=floats[:, :3],
         quaternions=(records[:, 28:].astype(np.float64) - 128.0) / 128.0,
         log_scales=np.log(floats[:, 3:]),
-        opacity_logits=_logits(colours[:, 3]),
+        opacity_logits=logits(colours[:, 3]),
         sh=((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
     )
     return FileContent(splats, np.eye(4))
@@ -106,15 +98,15 @@ def _gltf(path: Path) -> FileContent:
         sh[:, : len(bands)] = np.stack(bands, axis=1)
         xyzw = values(primitive, f"{prefix}ROTATION")
         parts.append(
-            _splats(
+            splats_of(
                 means=values(primitive, "POSITION"),
                 quaternions=np.roll(xyzw, 1, axis=1),
                 log_scales=np.log(values(primitive, f"{prefix}SCALE").astype(np.float64)),
-                opacity_logits=_logits(values(primitive, f"{prefix}OPACITY")[:, 0]),
+                opacity_logits=logits(values(primitive, f"{prefix}OPACITY")[:, 0]),
                 sh=sh,
             )
         )
-    return FileContent(_concatenated(parts), _Y_UP)
+    return FileContent(_concatenated(parts), Y_UP)
 
 
 def _usd(path: Path) -> FileContent:
@@ -133,45 +125,35 @@ def _usd(path: Path) -> FileContent:
         coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
         sh = coefficients.reshape(-1, (degree + 1) ** 2, 3)
         parts.append(
-            _splats(
+            splats_of(
                 means=np.array(get("positions").Get(), np.float32),
                 quaternions=np.array(get("orientations").Get(), np.float32)[:, columns],
                 log_scales=np.log(np.array(get("scales").Get(), np.float64)),
-                opacity_logits=_logits(np.array(get("opacities").Get())),
+                opacity_logits=logits(np.array(get("opacities").Get())),
                 sh=sh,
             )
         )
-    return FileContent(_concatenated(parts), _Y_UP)
-
-
-def _logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
-    inside = np.clip(p.astype(np.float64), 1e-30, 1 - 1e-9)
-    return np.log(inside / (1 - inside))
-
-
-def _splats(**arrays: NDArray[np.floating]) -> Splats:
-    values = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
-    n, k = values["sh"].shape[:2]
-    for name, width in {"means": 3, "quaternions": 4, "log_scales": 3}.items():
-        values[name] = values[name].reshape(n, width)
-    return Splats(**values, sh_degrees=np.full(n, math.isqrt(k) - 1, np.uint8))  # type: ignore[arg-type]
+    return FileContent(_concatenated(parts), Y_UP)
 
 
 def _concatenated(parts: list[Splats]) -> Splats:
     if not parts:
         shapes = {"means": 3, "quaternions": 4, "log_scales": 3}
         empty = {name: np.zeros((0, width)) for name, width in shapes.items()}
-        return _splats(**empty, opacity_logits=np.zeros(0), sh=np.zeros((0, 1, 3)))
+        return splats_of(**empty, opacity_logits=np.zeros(0), sh=np.zeros((0, 1, 3)))
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    return _splats(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+    return splats_of(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
 
 _READERS = {
-    ".ply": _ply,
-    ".splat": _splat,
-    ".glb": _gltf,
-    ".gltf": _gltf,
-    ".usda": _usd,
-    ".usdc": _usd,
-    ".usdz": _usd,
+    "ply": _ply,
+    "splat": _splat,
+    "glb": _gltf,
+    "gltf": _gltf,
+    "usda": _usd,
+    "usdc": _usd,
+    "usdz": _usd,
+    "compressed.ply": verify_packed.compressed_ply,
+    "spz": verify_packed.spz,
+    "sog": verify_packed.sog,
 }

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from stages.formats import FORMATS
-from tests.extremes.files import EXTREMES, through_a_file
+from tests.extremes.files import EXTREMES, KEPT_FORMATS, through_a_file
 
 
 @pytest.mark.parametrize("name", EXTREMES)
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("suffix", KEPT_FORMATS)
 def test_an_extreme_splat_draws_the_same_after_a_file(suffix: str, name: str) -> None:
     beyond = [m for m in through_a_file("cpu", suffix, name) if not m.accepted]
     assert not beyond, "\n".join(f"{m.what}: {m.error:.3g} > {m.bound:.3g}" for m in beyond)

@@ -1,0 +1,118 @@
+"""`splat convert`: a splat file of one format made into another, and the difference told."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli import console
+from stages.run.errors import Family, SplatError
+
+if TYPE_CHECKING:
+    from stages.scene import Splats
+
+Say = Callable[[str], None]
+_STEPS = 3
+
+
+def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
+    """Read `source`, write `target`, read that again with another parser and compare.
+
+    Raises SplatError: what keeps a file from being read or written, and "convert-verify-failed".
+    """
+    from stages import formats
+    from stages.formats.rows import kept_rows
+
+    names = formats.format_of(source), formats.format_of(target)  # before any work is done
+    begun = time.monotonic()
+    with _progress(quiet, as_json) as say:
+        say(f"reading {source}")
+        splats = formats.read(source)
+        say(f"writing {target}")
+        dropped = formats.write(target, splats)
+        say(f"comparing {target}")
+        errors = _compared(target, names[1], kept_rows(splats)[0])
+    size = target.stat().st_size
+    if names[1] == "gltf" and len(splats) > dropped:
+        size += target.with_suffix(".bin").stat().st_size
+    facts: dict[str, Any] = {
+        "source": str(source),
+        "target": str(target),
+        "splats": len(splats) - dropped,
+        "dropped": dropped,
+        "size_bytes": size,
+        "bytes_per_splat": round(size / max(1, len(splats) - dropped), 2),
+        "seconds": round(time.monotonic() - begun, 2),
+        **errors,
+    }
+    if as_json:
+        console.emit("converted", **facts)
+        return
+    if dropped:
+        console.note(f"Warning: {dropped} splats that no viewer can draw were left out.", "yellow")
+    _show(facts, errors, quiet)
+
+
+def _show(facts: dict[str, Any], errors: dict[str, float], quiet: bool) -> None:
+    told = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
+    console.note(f"{facts['target']}: {told}, {facts['bytes_per_splat']:.1f} bytes each")
+    worst = {name: value for name, value in errors.items() if value > 0}
+    if worst and not quiet:
+        console.note(f"Largest differences: {console.figures(worst)}", "dim")
+
+
+def _compared(path: Path, name: str, splats: Splats) -> dict[str, float]:
+    """The largest errors of the values. Raises SplatError "convert-verify-failed"."""
+    from stages.formats.compare import largest_errors
+    from stages.formats.verify import read_back
+
+    try:
+        content = read_back(path)
+    except Exception as error:  # whatever another parser raises: the file is wrong
+        raise _failed(path, f"another reader refused it ({error})") from error
+    if len(content.splats) != len(splats):
+        raise _failed(path, f"it holds {len(content.splats)} of {len(splats)} splats")
+    return largest_errors(splats, content, name)
+
+
+def _failed(path: Path, reason: str) -> SplatError:
+    return SplatError(
+        "convert-verify-failed",
+        given=f"{path} came out wrong: {reason}.",
+        wanted="A file that another program reads as the same splats.",
+        hint="Convert to another format, and report this with the file that was read.",
+        family=Family.QUALITY,
+    )
+
+
+@contextlib.contextmanager
+def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
+    """What tells the steps: a bar on a terminal, lines elsewhere, events for machines."""
+    done = 0
+    if as_json or quiet or not console.err.is_terminal:
+
+        def say(label: str) -> None:
+            nonlocal done
+            if as_json:
+                console.emit("progress", label=label, done=done, total=_STEPS)
+            elif not quiet:
+                console.note(label)
+            done += 1
+
+        yield say
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    columns = TextColumn("{task.description}", markup=False), BarColumn(24), MofNCompleteColumn()
+    with Progress(*columns, console=console.err, transient=True) as bar:
+        task = bar.add_task("", total=_STEPS)
+
+        def show(label: str) -> None:
+            nonlocal done
+            bar.update(task, description=label, completed=done)
+            done += 1
+
+        yield show

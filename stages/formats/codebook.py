@@ -1,0 +1,104 @@
+"""Many values told by few: a codebook of numbers, and a palette of vectors (both k-means)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIZE = 256
+_SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
+_COARSE = 128
+_SAMPLE = 1 << 15  # vectors that the coarse centres are found from
+_ROWS_AT_ONCE = 1 << 14
+
+
+def of_numbers(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[256] rising: near the values [M] in the least squares sense; all of them if they are few."""
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    distinct = np.unique(ordered)
+    if len(distinct) <= SIZE:
+        padding = np.full(SIZE - len(distinct), distinct[-1] if len(distinct) else 0.0)
+        return np.concatenate([distinct, padding])
+    # Half of the first centres where the values are many, half spread evenly, for the far ones.
+    ranks = np.linspace(0, len(ordered) - 1, SIZE // 2).astype(np.intp)
+    even = np.linspace(ordered[0], ordered[-1], SIZE - SIZE // 2)
+    centres = np.sort(np.concatenate([ordered[ranks], even]))
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    squares = np.concatenate([[0.0], np.cumsum(np.square(ordered))])
+    for _ in range(_SCALAR_ROUNDS):
+        ends = np.searchsorted(ordered, (centres[1:] + centres[:-1]) / 2)
+        ends = np.concatenate([[0], ends, [len(ordered)]])
+        counts = np.diff(ends)
+        used = np.flatnonzero(counts)
+        means = np.diff(sums[ends])[used] / counts[used]
+        errors = np.maximum(np.diff(squares[ends])[used] - counts[used] * means * means, 0)
+        # A centre without values goes to a cell whose values are far apart, and splits it.
+        widest = np.argsort(-errors, kind="stable")[: SIZE - len(used)]
+        spread = np.sqrt(errors[widest] / counts[used][widest])
+        extra = np.resize(means[widest] + spread, SIZE - len(used))
+        centres = np.sort(np.concatenate([means, extra]))
+    return centres
+
+
+def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """The index of the entry nearest to each value, in the shape of `values`."""
+    middles = (codebook[1:] + codebook[:-1]) / 2
+    return np.searchsorted(middles, values.astype(np.float64)).astype(np.uint8)
+
+
+def of_vectors(
+    vectors: NDArray[np.float32], size: int, seed: int = 0
+) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """(palette [at most `size`, D], which of its rows stands for each of `vectors` [N, D]).
+
+    In two levels, so that time grows with the square root of the palette: coarse clusters first,
+    and in each as many entries as its share of the vectors. Vectors of zeros stay zeros.
+    """
+    labels = np.zeros(len(vectors), np.intp)
+    palette = [np.zeros((1, vectors.shape[1]), np.float32)]
+    rows = np.flatnonzero(vectors.any(axis=1))
+    rng = np.random.default_rng(seed)
+    sample = np.sort(rng.permutation(rows)[:_SAMPLE])
+    coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)
+    cluster = _assigned(vectors[rows], coarse)
+    used = 1
+    for k in range(len(coarse)):
+        members = rows[cluster == k]
+        if not len(members):
+            continue
+        share = max(1, (size - 1 - len(coarse)) * len(members) // len(rows))
+        fine = _centres(vectors[members], share, rng)
+        labels[members] = used + _assigned(vectors[members], fine)
+        palette.append(fine)
+        used += len(fine)
+    return np.concatenate(palette), labels
+
+
+def _centres(
+    vectors: NDArray[np.float32], count: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """[at most count, D] by Lloyd's iterations from vectors drawn at random."""
+    if len(vectors) <= count:
+        return vectors
+    centres = vectors[np.sort(rng.choice(len(vectors), count, replace=False))]
+    for _ in range(_VECTOR_ROUNDS):
+        labels = _assigned(vectors, centres)
+        order = np.argsort(labels, kind="stable")
+        counts = np.bincount(labels, minlength=len(centres))
+        there = np.flatnonzero(counts)
+        starts = (np.cumsum(counts) - counts)[there]
+        sums = np.add.reduceat(vectors[order], starts, axis=0)
+        centres = centres.copy()
+        centres[there] = sums / counts[there, None].astype(np.float32)
+    return centres
+
+
+def _assigned(vectors: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.intp]:
+    """[N] the nearest centre of each."""
+    labels = np.zeros(len(vectors), np.intp)
+    lengths = np.square(centres).sum(axis=1)
+    step = max(64, _ROWS_AT_ONCE * _COARSE // max(1, len(centres)))
+    for start in range(0, len(vectors), step):
+        block = vectors[start : start + step]
+        labels[start : start + step] = (lengths - 2 * block @ centres.T).argmin(axis=1)
+    return labels

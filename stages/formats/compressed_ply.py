@@ -1,0 +1,238 @@
+"""The packed .ply of the PlayCanvas tools (.compressed.ply): 16 bytes a splat, and 3 more for each
+SH coefficient above degree 0.
+
+Rows come in chunks of 256 that lie near each other. An element `chunk` holds the least and greatest
+position, scale logarithm and colour (0.5 + C0 dc) of each; `vertex` holds four uint a splat:
+packed_position and packed_scale, 11 + 10 + 11 bits of x, y, z within the chunk's range, x highest;
+packed_rotation, 2 bits that name the largest of w, x, y, z and 10 bits for each of the others;
+packed_color, 8 bits each of red, green, blue (within the chunk's range) and opacity. `sh` holds
+f_rest_0.. as uchar, channel-major as in the .ply. Axes as in memory (y down).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats import morton, smallest_three
+from stages.formats.ply_header import Header, binary_rows, read_header
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import checked, kept_rows, linear_opacities, logits_of, unit_quaternions
+from stages.run.atomic import replacing
+from stages.scene import SH_C0, Splats
+
+CHUNK = 256
+# A flat splat's logarithm of -87 would take the precision of its whole chunk; what is smaller than
+# exp(-20) or larger than exp(20) units looks the same at the limit.
+LOG_SCALE_LIMIT = 20.0
+SH_LIMIT = 4.0  # uchar 0..255 stand for -SH_LIMIT..SH_LIMIT
+_BLOCK = CHUNK * 256
+_AXES_BITS = (11, 10, 11)
+_COLOUR_BITS = (8, 8, 8, 8)
+_WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_RANGES = (
+    ("{}_x", "{}_y", "{}_z"),
+    ("{}_scale_x", "{}_scale_y", "{}_scale_z"),
+    ("{}_r", "{}_g", "{}_b"),
+)
+
+order = morton.order
+
+
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+    """Write `splats`; return how many could not be drawn and were left out.
+
+    Positions stay relative to `splats.origin`; a comment says it. One SH degree for all, and
+    coefficients within -4..4. Raises SplatError when the file cannot be written.
+    """
+    splats, dropped = kept_rows(splats)
+    splats = splats.take(order(splats))
+    degree = int(splats.sh_degrees.max(initial=0))
+    splats = splats.with_sh_degree(degree)
+    starts = range(0, len(splats), _BLOCK)
+    blocks = [_pack(splats.take(np.arange(s, min(s + _BLOCK, len(splats))))) for s in starts]
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(_header_text(splats, degree, units).encode("ascii"))
+        for part in range(3):  # all chunks, then all words, then all SH
+            for block in blocks:
+                file.write(block[part].tobytes())
+    return dropped
+
+
+def _header_text(splats: Splats, degree: int, units: str) -> str:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment up axis: -y (right-handed; x right, y down, z forward)",
+        f"comment units: {units}",
+    ]
+    if splats.origin.any():
+        lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in splats.origin))
+    lines.append(f"element chunk {-(-len(splats) // CHUNK)}")
+    for names in _RANGES:
+        lines += [f"property float {name.format(end)}" for end in ("min", "max") for name in names]
+    lines.append(f"element vertex {len(splats)}")
+    lines += [f"property uint {name}" for name in _WORDS]
+    if degree:
+        lines.append(f"element sh {len(splats)}")
+        rest = 3 * ((degree + 1) ** 2 - 1)
+        lines += [f"property uchar f_rest_{i}" for i in range(rest)]
+    return "\n".join([*lines, "end_header", ""])
+
+
+def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """(ranges [chunks, 18] float32, words [N, 4] uint32, SH [N, 3K] uint8) of whole chunks."""
+    colours = 0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)
+    scales = np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+    place, ranges = _within_chunks(splats.means)
+    size, scale_ranges = _within_chunks(scales)
+    colour, colour_ranges = _within_chunks(colours)
+    rgba = np.concatenate([colour, linear_opacities(splats)[:, None]], axis=1)
+    largest, others = smallest_three.split(unit_quaternions(splats.quaternions))
+    turn = _joined_bits(0.5 + others / (2 * smallest_three.LIMIT), (10, 10, 10))
+    words = (
+        _joined_bits(place, _AXES_BITS),
+        turn | largest.astype(np.uint32) << np.uint32(30),
+        _joined_bits(size, _AXES_BITS),
+        _joined_bits(rgba, _COLOUR_BITS),
+    )
+    sh = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1).astype(np.float64)
+    steps = np.floor((sh / (2 * SH_LIMIT) + 0.5) * 256)
+    return (
+        np.concatenate([ranges, scale_ranges, colour_ranges], axis=1).astype("<f4"),
+        np.stack(words, axis=1).astype("<u4"),
+        np.clip(steps, 0, 255).astype(np.uint8),
+    )
+
+
+def _within_chunks(
+    values: NDArray[np.floating],
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """(`values` [N, 3] as fractions of their chunk's range; least and greatest [chunks, 6])."""
+    starts = np.arange(0, len(values), CHUNK)
+    low = np.minimum.reduceat(values, starts).astype(np.float32)
+    high = np.maximum.reduceat(values, starts).astype(np.float32)
+    least = np.repeat(low.astype(np.float64), CHUNK, axis=0)[: len(values)]
+    span = np.repeat(high.astype(np.float64), CHUNK, axis=0)[: len(values)] - least
+    fractions = (values - least) / np.where(span > 0, span, 1.0)
+    return fractions, np.concatenate([low, high], axis=1)
+
+
+def _joined_bits(fractions: NDArray[np.floating], bits: tuple[int, ...]) -> NDArray[np.uint32]:
+    """[N] the columns of `fractions` (0..1) in one word, the first column highest."""
+    word = np.zeros(len(fractions), np.uint32)
+    for column, width in zip(fractions.T, bits, strict=True):
+        top = (1 << width) - 1
+        steps = np.clip(np.rint(column * top), 0, top).astype(np.uint32)
+        word = word << np.uint32(width) | steps
+    return word
+
+
+def _split_bits(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.float64]:
+    """[N, len(bits)] the inverse of `_joined_bits`."""
+    columns = []
+    shift = sum(bits)
+    for width in bits:
+        shift -= width
+        top = (1 << width) - 1
+        columns.append((word >> np.uint32(shift) & np.uint32(top)) / top)
+    return np.stack(columns, axis=1)
+
+
+def read(path: Path) -> Splats:
+    """The splats of a packed .ply, float32; the SH element and the colour ranges may be missing.
+
+    Raises SplatError "splats-unreadable" for what is damaged or is no packed .ply.
+    """
+    path = Path(path)
+    with reading(path):
+        with path.open("rb") as file:
+            header = read_header(file)
+        if not header.is_compressed:
+            raise BadFileError("it is no compressed .ply: its name should end in .ply alone")
+        return unpack(path, header)
+
+
+def unpack(path: Path, header: Header) -> Splats:
+    """The splats of a packed .ply whose header was read. Raises BadFileError."""
+    if header.encoding == "ascii":
+        raise BadFileError("it is a compressed .ply as text, which is not read")
+    _require(header, "vertex", _WORDS)
+    _require(
+        header, "chunk", [name.format(e) for n in _RANGES[:2] for name in n for e in ("min", "max")]
+    )
+    vertices: NDArray[Any] = binary_rows(path, header, "vertex")
+    ranges: NDArray[Any] = binary_rows(path, header, "chunk")[: -(-len(vertices) // CHUNK)]
+    if len(ranges) * CHUNK < len(vertices):
+        raise BadFileError(f"it has {len(ranges)} chunks for {len(vertices)} splats")
+    if any(vertices.dtype[name].str[1:] != "u4" for name in _WORDS):
+        raise BadFileError("it is a compressed .ply whose words are no uint")
+    words = [vertices[name].astype(np.uint32) for name in _WORDS]
+    rgba = _split_bits(words[3], _COLOUR_BITS)
+    colours = _in_range(rgba[:, :3], ranges, _RANGES[2])
+    largest_float = float(np.finfo(np.float32).max)
+    dc = np.clip((colours - 0.5) / SH_C0, -largest_float, largest_float)
+    turn = (_split_bits(words[1], (2, 10, 10, 10))[:, 1:] - 0.5) * 2 * smallest_three.LIMIT
+    return checked(
+        Splats(
+            means=_in_range(_split_bits(words[0], _AXES_BITS), ranges, _RANGES[0]).astype("f4"),
+            quaternions=smallest_three.join(words[1] >> np.uint32(30), turn),
+            log_scales=_in_range(_split_bits(words[2], _AXES_BITS), ranges, _RANGES[1]).astype(
+                "f4"
+            ),
+            opacity_logits=logits_of(rgba[:, 3]),
+            sh=np.concatenate([dc[:, None].astype(np.float32), _rest(path, header)], axis=1),
+            sh_degrees=np.zeros(len(dc), np.uint8),
+            origin=header.origin,
+        )
+    )
+
+
+def _require(header: Header, element: str, names: Any) -> None:
+    there = {name for name, _ in header.element(element).properties}
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise BadFileError(f"it is a compressed .ply whose {element} lacks {', '.join(missing)}")
+
+
+def _in_range(
+    fractions: NDArray[np.float64], ranges: NDArray[Any], names: tuple[str, ...]
+) -> NDArray[np.float64]:
+    """[N, 3] the inverse of `_within_chunks`; files before colour ranges came mean 0..1."""
+    values = np.empty_like(fractions)
+    for i, name in enumerate(names):
+        ends = []
+        for end, usual in (("min", 0.0), ("max", 1.0)):
+            key = name.format(end)
+            known = key in (ranges.dtype.names or ())
+            column = ranges[key].astype(np.float64) if known else np.full(len(ranges), usual)
+            if not (np.abs(column) <= np.finfo(np.float32).max).all():
+                raise BadFileError(f"values of {key} are not finite numbers")
+            ends.append(np.repeat(column, CHUNK)[: len(fractions)])
+        values[:, i] = ends[0] + (ends[1] - ends[0]) * fractions[:, i]
+    return values
+
+
+def _rest(path: Path, header: Header) -> NDArray[np.float32]:
+    """[N, K, 3] coefficients above degree 0."""
+    count = header.vertex.count
+    if not any(element.name == "sh" for element in header.elements):
+        return np.zeros((count, 0, 3), np.float32)
+    kept = header.element("sh")
+    names = [name for name, _ in kept.properties if name.startswith("f_rest_")]
+    if len(names) not in (0, 9, 24, 45) or any(kind != "u1" for _, kind in kept.properties):
+        raise BadFileError(f"its element sh has {len(names)} f_rest, not 0, 9, 24 or 45 of uchar")
+    _require(header, "sh", [f"f_rest_{i}" for i in range(len(names))])
+    if kept.count != count:
+        raise BadFileError(f"it has {kept.count} rows of SH for {count} splats")
+    rows: NDArray[Any] = binary_rows(path, header, "sh")
+    table = np.empty((count, len(names)), np.float32)
+    levels = (np.arange(256) + 0.5) / 256
+    levels[[0, 255]] = (0.0, 1.0)
+    values = ((levels - 0.5) * 2 * SH_LIMIT).astype(np.float32)
+    for i in range(len(names)):
+        table[:, i] = values[rows[f"f_rest_{i}"]]
+    return table.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)

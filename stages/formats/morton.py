@@ -1,0 +1,42 @@
+"""An order of splats in which neighbours in space are mostly neighbours in the file."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Splats
+
+_BITS = 21  # three times 21 fit into 64
+
+
+def order(splats: Splats) -> NDArray[np.intp]:
+    """[N] rows along a Morton curve (interleaved bits of x, y, z); equals keep their order.
+
+    Of the ranks of the coordinates, not of their values: one splat far away would otherwise leave
+    all others in one cell.
+    """
+    code = np.zeros(len(splats), np.uint64)
+    for axis in range(3):
+        code |= _spread(_ranks(splats.means[:, axis])) << np.uint64(2 - axis)
+    return np.argsort(code, kind="stable")
+
+
+def _ranks(values: NDArray[np.floating]) -> NDArray[np.uint64]:
+    """[N] place of each value among the distinct ones, scaled to the bits of one axis."""
+    distinct, place = np.unique(values, return_inverse=True)
+    last = max(1, len(distinct) - 1)
+    return (place.reshape(-1).astype(np.uint64) * np.uint64((1 << _BITS) - 1)) // np.uint64(last)
+
+
+def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Two zero bits between each two bits."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
+    return bits

@@ -1,0 +1,145 @@
+"""The header of a .ply, and the rows of its elements as they lie in the file."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.problems import BadFileError
+
+HEADER_LIMIT_BYTES = 1 << 20
+TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+@dataclass(frozen=True)
+class Element:
+    name: str
+    count: int
+    properties: tuple[tuple[str, str], ...]  # (name, numpy type without byte order)
+    has_lists: bool
+
+
+@dataclass(frozen=True)
+class Header:
+    encoding: str
+    elements: tuple[Element, ...]
+    origin: NDArray[np.float64]
+    data_starts: int
+
+    @property
+    def vertex(self) -> Element:
+        return self.element("vertex")
+
+    def element(self, name: str) -> Element:
+        """Raises BadFileError if there is none."""
+        for element in self.elements:
+            if element.name == name:
+                return element
+        raise BadFileError(f"it has no element {name}")
+
+    @property
+    def is_compressed(self) -> bool:
+        """Packed into integers, see `compressed_ply`."""
+        return any(name == "packed_position" for name, _ in self.vertex.properties)
+
+    def before(self, name: str) -> list[Element]:
+        """The elements ahead of `name`. Raises BadFileError if one has rows of unknown length."""
+        ahead: list[Element] = []
+        for element in self.elements:
+            if element.name == name:
+                break
+            if element.has_lists:
+                raise BadFileError("it holds lists ahead of its vertices")
+            ahead.append(element)
+        return ahead
+
+    @property
+    def ascii_names(self) -> list[str] | None:
+        """The columns' names where rows are a plain table; None where NumPy knows them."""
+        if self.encoding != "ascii":
+            return None
+        return [name for name, _ in self.vertex.properties]
+
+
+def read_header(file: BinaryIO) -> Header:
+    start = file.read(HEADER_LIMIT_BYTES)
+    if not start.startswith(b"ply"):
+        raise BadFileError("it does not start with 'ply'")
+    end = re.search(rb"(?:^|[\r\n])end_header[ \t]*(\r\n|\n|\r)", start)
+    if end is None:
+        raise BadFileError("its header does not end")
+    encoding, origin, elements = "", np.zeros(3), []
+    for line in re.split(r"[\r\n]+", start[: end.start()].decode("utf-8", "replace"))[1:]:
+        words = line.split()
+        match words:
+            case ["format", encoding, *_]:
+                pass
+            case ["comment", "splat_origin", x, y, z]:
+                origin = np.array([float(x), float(y), float(z)])
+            case ["element", name, count]:
+                elements.append(Element(name, _count(count), (), False))
+            case ["property", *rest] if elements:
+                elements[-1] = _with_property(elements[-1], rest)
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise BadFileError(f"its header holds a line that is not understood: {line[:80]!r}")
+    if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise BadFileError(f"its encoding {encoding[:40]!r} is not known")
+    return Header(encoding, tuple(elements), origin, end.end())
+
+
+def _count(text: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,15}", text):
+        raise BadFileError(f"it declares {text[:40]!r} elements")
+    return int(text)
+
+
+def _with_property(element: Element, words: list[str]) -> Element:
+    match words:
+        case ["list", _, _, name]:
+            return Element(element.name, element.count, element.properties, True)
+        case [kind, name] if kind in TYPES:
+            if any(name == known for known, _ in element.properties):
+                raise BadFileError(f"it declares the property {name[:40]!r} twice")
+            properties = (*element.properties, (name, TYPES[kind]))
+            return Element(element.name, element.count, properties, element.has_lists)
+    raise BadFileError(f"its header holds a property that is not understood: {words[:4]!r}"[:120])
+
+
+def binary_rows(path: Path, header: Header, name: str) -> NDArray[np.generic]:
+    """[N] structured rows of the element `name`, mapped from a binary file.
+
+    Raises BadFileError when the file is too short for what it declares, before memory is taken.
+    """
+    element = header.element(name)
+    if element.has_lists:
+        raise BadFileError("its vertices hold lists")
+    offset = header.data_starts
+    order = "<" if header.encoding == "binary_little_endian" else ">"
+    for other in header.before(name):
+        offset += other.count * sum(np.dtype(kind).itemsize for _, kind in other.properties)
+    row = np.dtype([(name, order + kind) for name, kind in element.properties])
+    wanted, there = element.count * row.itemsize, path.stat().st_size - offset
+    if there < wanted:
+        what = "vertices" if name == "vertex" else f"element {name}"
+        raise BadFileError(
+            f"it is cut short: {wanted} bytes of {what} declared, {max(0, there)} there"
+        )
+    if element.count == 0:
+        return np.zeros(0, row)
+    return np.memmap(path, row, "r", offset, element.count)

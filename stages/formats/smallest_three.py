@@ -1,0 +1,38 @@
+"""Rotations without their largest component, which the length of 1 gives back."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+LIMIT = np.sqrt(0.5)  # the second largest component of a unit quaternion is at most this
+
+
+def split(quaternions: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """(column of the largest component [N]; the others [N, 3], in -LIMIT..LIMIT, in their order).
+
+    quaternions [N, 4]: unit, in any order of components. q and -q are one rotation: the sign is
+    the one that makes the largest component positive.
+    """
+    rows = np.arange(len(quaternions))
+    largest = np.abs(quaternions).argmax(axis=1)
+    signs = np.where(quaternions[rows, largest] < 0, -1.0, 1.0)
+    others = quaternions[rows[:, None], _columns(largest)].astype(np.float64)
+    return largest, np.clip(others * signs[:, None], -LIMIT, LIMIT)
+
+
+def join(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float32]:
+    """[N, 4] the inverse of `split`, unit whatever the others are."""
+    exact = others.astype(np.float64)
+    rows = np.arange(len(exact))
+    quaternions = np.empty((len(exact), 4))
+    quaternions[rows[:, None], _columns(largest)] = exact
+    quaternions[rows, largest] = np.sqrt(np.maximum(0.0, 1.0 - np.square(exact).sum(axis=1)))
+    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return (quaternions / norms).astype(np.float32)
+
+
+def _columns(largest: NDArray[np.integer]) -> NDArray[np.intp]:
+    """[N, 3] the columns beside the largest, rising."""
+    table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], np.intp)
+    return table[largest]

@@ -1,0 +1,139 @@
+"""SOG version 2, written: a zip of meta.json and lossless WebP pictures, a pixel a splat.
+
+Positions as 16 bits of sign ln(1 + |x|) in two pictures (low and high bytes), rotations as the
+smallest three of w, x, y, z with 252 + the largest's column in alpha, scale logarithms and dc as
+indices of codebooks of 256, opacity in the alpha of the colour. SH above degree 0 is a label in a
+palette of at most 65,536 rows, whose picture has 64 rows of the palette a line and three bytes a
+coefficient. Axes as in memory (y down). Specification: "The SOG Format", developer.playcanvas.com.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats import codebook, morton, smallest_three
+from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
+from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE, read
+from stages.run.atomic import replacing
+from stages.scene import Splats
+
+__all__ = ["order", "read", "write"]
+
+# Beyond them scales look the same, and the codebook's entries are better spent between.
+_LOG_SCALE_LIMIT = 20.0
+_PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
+_DC_LIMIT = 1e4
+
+order = morton.order
+
+
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+    """Write `splats`; return how many could not be drawn and were left out.
+
+    Positions stay relative to `splats.origin`; meta.json says it. Raises SplatError when the file
+    cannot be written.
+    """
+    splats, dropped = kept_rows(splats)
+    splats = splats.take(order(splats))
+    degree = int(splats.sh_degrees.max(initial=0))
+    splats = splats.with_sh_degree(degree)
+    meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": False}
+    meta["asset"] = {"generator": "splat", "units": units}
+    if splats.origin.any():
+        meta["asset"]["splat_origin"] = [float(v) for v in splats.origin]
+    pictures = {**_positions(splats, meta), **_shapes(splats, meta), **_colours(splats, meta)}
+    if degree and len(splats):
+        pictures |= _rest(splats, degree, meta)
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
+        _add(package, "meta.json", json.dumps(meta, allow_nan=False).encode())
+        for name, pixels in pictures.items():
+            _add(package, name, _webp(pixels))
+    return dropped
+
+
+def _add(package: zipfile.ZipFile, name: str, content: bytes) -> None:
+    """Stored, with the oldest time that zip knows: equal splats give equal bytes."""
+    package.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
+
+
+def _webp(pixels: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    file = io.BytesIO()
+    # exact: colours where alpha is 0 count too
+    Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True, method=4)
+    return file.getvalue()
+
+
+def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """[H, W, channels] nearly square, its sides multiples of 4, from [N, channels]."""
+    width = max(4, 4 * math.ceil(math.sqrt(len(rows)) / 4))
+    height = max(4, 4 * math.ceil(len(rows) / width / 4))
+    pixels = np.zeros((height * width, rows.shape[1]), np.uint8)
+    pixels[: len(rows)] = rows
+    return pixels.reshape(height, width, -1)
+
+
+def _positions(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
+    means = splats.means.astype(np.float64)
+    bent = np.sign(means) * np.log1p(np.abs(means))
+    low = bent.min(axis=0, initial=np.inf) if len(bent) else np.zeros(3)
+    high = bent.max(axis=0, initial=-np.inf) if len(bent) else np.zeros(3)
+    span = np.where(high > low, high - low, 1.0)
+    steps = np.rint((bent - low) / span * 65535).astype(np.uint16)
+    files = ["means_l.webp", "means_u.webp"]
+    meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
+    halves = (steps & 255, steps >> 8)
+    return {name: _picture(half.astype(np.uint8)) for name, half in zip(files, halves, strict=True)}
+
+
+def _shapes(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
+    logs = np.clip(splats.log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT)
+    book = codebook.of_numbers(logs)
+    meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
+    largest, others = smallest_three.split(unit_quaternions(splats.quaternions))
+    bytes_ = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
+    turns = np.concatenate([bytes_, 252 + largest[:, None]], axis=1).astype(np.uint8)
+    meta["quats"] = {"files": ["quats.webp"]}
+    scales = codebook.nearest(book, logs)
+    return {"scales.webp": _picture(scales), "quats.webp": _picture(turns)}
+
+
+def _colours(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
+    dc = np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT)
+    book = codebook.of_numbers(dc)
+    meta["sh0"] = {"codebook": book.tolist(), "files": ["sh0.webp"]}
+    opacity = np.rint(255 * linear_opacities(splats)).astype(np.uint8)
+    indices = codebook.nearest(book, dc)
+    return {"sh0.webp": _picture(np.concatenate([indices, opacity[:, None]], axis=1))}
+
+
+def _rest(splats: Splats, degree: int, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
+    count = (degree + 1) ** 2 - 1
+    vectors = np.clip(splats.sh[:, 1:], -_DC_LIMIT, _DC_LIMIT).astype(np.float32)
+    size = min(PALETTE_LIMIT, max(_PALETTE_LEAST, len(splats) // _SPLATS_PER_ENTRY))
+    palette, labels = codebook.of_vectors(vectors.reshape(len(splats), -1), size)
+    book = codebook.of_numbers(palette)
+    book[np.abs(book).argmin()] = 0.0  # what does not change with the view stays so
+    book.sort()
+    lines = -(-len(palette) // PER_LINE)
+    centroids = np.zeros((lines * PER_LINE, count, 3), np.uint8)
+    centroids[: len(palette)] = codebook.nearest(book, palette).reshape(-1, count, 3)
+    files = ["shN_centroids.webp", "shN_labels.webp"]
+    meta["shN"] = {
+        "count": len(palette),
+        "bands": degree,
+        "codebook": book.tolist(),
+        "files": files,
+    }
+    halves = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
+    pixels = (centroids.reshape(lines, PER_LINE * count, 3), _picture(halves.astype(np.uint8)))
+    return dict(zip(files, pixels, strict=True))

@@ -1,0 +1,173 @@
+"""Reading SOG version 2, from our own files and from other programs'.
+
+Nothing is unpacked to disk: members are looked up by the names that meta.json gives, and sizes are
+compared with the number of splats before memory is taken.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import warnings
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats import smallest_three
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import checked, logits_of
+from stages.scene import Splats
+
+PALETTE_LIMIT = 1 << 16
+PER_LINE = 64  # rows of the palette in a line of its picture
+_META_LIMIT_BYTES = 1 << 20
+# Real files take 10 bytes a splat. What declares more splats than this is refused before memory is
+# taken for them; few splats may all be equal.
+_SPLATS_PER_BYTE, _ALWAYS_ALLOWED = 4, 1 << 16
+
+
+def read(path: Path) -> Splats:
+    """The splats of a .sog, float32. Raises SplatError "splats-unreadable" for what is damaged, of
+    another version, or refers to what is not in it."""
+    path = Path(path)
+    with reading(path):
+        try:
+            with zipfile.ZipFile(path) as package:
+                return checked(_Source(package, path.stat().st_size).splats())
+        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+            raise BadFileError(f"it is no whole zip ({error})") from error
+        except (NotImplementedError, RuntimeError) as error:  # encrypted, or packed in another way
+            raise BadFileError(f"its zip cannot be unpacked ({error})") from error
+
+
+@dataclass(frozen=True)
+class _Source:
+    package: zipfile.ZipFile
+    size_bytes: int
+
+    def splats(self) -> Splats:
+        meta = json.loads(self._member("meta.json", _META_LIMIT_BYTES))
+        if not isinstance(meta, dict) or meta.get("version") != 2:
+            raise BadFileError("its meta.json is not of SOG version 2")
+        count = _whole(meta, "count", max(_ALWAYS_ALLOWED, _SPLATS_PER_BYTE * self.size_bytes))
+        low, high = (self._pixels(meta, "means", i, count) for i in (0, 1))
+        ends = [_numbers(meta, "means", name, 3) for name in ("mins", "maxs")]
+        steps = (low[:, :3] + 256.0 * high[:, :3]) / 65535
+        bent = ends[0] + (ends[1] - ends[0]) * steps
+        turns = self._pixels(meta, "quats", 0, count)
+        if (turns[:, 3] < 252).any():
+            raise BadFileError("its rotations do not name their largest component")
+        others = (turns[:, :3] / 255.0 - 0.5) * 2 * smallest_three.LIMIT
+        colours = self._pixels(meta, "sh0", 0, count)
+        dc = _numbers(meta, "sh0", "codebook", 256)[colours[:, :3]]
+        logs = _numbers(meta, "scales", "codebook", 256)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return Splats(
+                means=(np.sign(bent) * np.expm1(np.abs(bent))).astype(np.float32),
+                quaternions=smallest_three.join(turns[:, 3].astype(np.intp) - 252, others),
+                log_scales=logs[self._pixels(meta, "scales", 0, count)[:, :3]].astype(np.float32),
+                opacity_logits=logits_of(colours[:, 3] / 255.0),
+                sh=np.concatenate([dc[:, None], self._rest(meta, count)], axis=1).astype("f4"),
+                sh_degrees=np.zeros(count, np.uint8),
+                origin=_origin(meta),
+            )
+
+    def _rest(self, meta: dict[str, Any], count: int) -> NDArray[np.float32]:
+        """[N, K, 3] coefficients above degree 0."""
+        if "shN" not in meta:
+            return np.zeros((count, 0, 3), np.float32)
+        entries = _whole(_part(meta, "shN"), "count", PALETTE_LIMIT)
+        degree = _whole(_part(meta, "shN"), "bands", 3)
+        k = (degree + 1) ** 2 - 1
+        if not degree:
+            return np.zeros((count, 0, 3), np.float32)
+        book = _numbers(meta, "shN", "codebook", 256).astype(np.float32)
+        lines = -(-entries // PER_LINE)
+        indices = self._pixels(meta, "shN", 0, lines * PER_LINE * k, width=PER_LINE * k)
+        palette = indices[:, :3].reshape(-1, k, 3)
+        halves = self._pixels(meta, "shN", 1, count)
+        labels = halves[:, 0] + 256 * halves[:, 1].astype(np.intp)
+        if len(labels) and labels.max() >= entries:
+            raise BadFileError("its splats name SH that is not in its palette")
+        return book[palette[labels]]
+
+    def _member(self, name: Any, limit: int) -> bytes:
+        """A file of the zip. Raises BadFileError if it is not there or unpacks to more."""
+        if not isinstance(name, str) or name not in self.package.NameToInfo:
+            raise BadFileError(f"it does not hold {str(name)[:80]!r}")
+        if self.package.getinfo(name).file_size > limit:
+            raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
+        with self.package.open(name) as file:
+            content = file.read(limit + 1)
+        if len(content) > limit:
+            raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
+        return content
+
+    def _pixels(
+        self, meta: dict[str, Any], part: str, number: int, count: int, width: int = 0
+    ) -> NDArray[np.uint8]:
+        """[count, 4] the first pixels of a picture, line by line."""
+        from PIL import Image
+
+        files = _part(meta, part).get("files")
+        if not isinstance(files, list) or len(files) <= number:
+            raise BadFileError(f"its meta.json names no picture {number} of {part}")
+        most = 4 * count + 4096
+        content = self._member(files[number], 8 * most + 65536)
+        size = _webp_size(content)
+        if size[0] * size[1] < count or size[0] * size[1] > most or (width and size[0] != width):
+            raise BadFileError(f"its picture of {part} has {size[0]} x {size[1]} pixels")
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                with Image.open(io.BytesIO(content), formats=("WEBP",)) as image:
+                    if image.size != size:
+                        raise BadFileError(f"its picture of {part} is damaged")
+                    pixels = np.asarray(image.convert("RGBA"))
+        except (OSError, Image.DecompressionBombError, SyntaxError) as error:
+            raise BadFileError(f"its picture of {part} is damaged") from error
+        return pixels.reshape(-1, 4)[:count]
+
+
+def _webp_size(content: bytes) -> tuple[int, int]:
+    """(width, height) from the header, before a decoder takes memory for them."""
+    kind = content[12:16] if content[:4] == b"RIFF" and content[8:12] == b"WEBP" else b""
+    if kind == b"VP8L" and len(content) >= 25:
+        bits = struct.unpack_from("<I", content, 21)[0]
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"VP8X" and len(content) >= 30:
+        return tuple(1 + int.from_bytes(content[i : i + 3], "little") for i in (24, 27))  # type: ignore[return-value]
+    raise BadFileError("its pictures are not lossless WebP")
+
+
+def _part(meta: dict[str, Any], name: str) -> dict[str, Any]:
+    part = meta.get(name)
+    if not isinstance(part, dict):
+        raise BadFileError(f"its meta.json lacks {name}")
+    return part
+
+
+def _whole(part: dict[str, Any], name: str, most: int) -> int:
+    value = part.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= most:
+        raise BadFileError(f"its meta.json says {name} is {str(value)[:40]}, wanted 0 to {most}")
+    return value
+
+
+def _numbers(meta: dict[str, Any], part: str, name: str, count: int) -> NDArray[np.float64]:
+    values = np.array(_part(meta, part).get(name), np.float64)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise BadFileError(f"its meta.json lacks the {count} numbers of {part}.{name}")
+    return values
+
+
+def _origin(meta: dict[str, Any]) -> NDArray[np.float64]:
+    asset = meta.get("asset")
+    origin = asset.get("splat_origin") if isinstance(asset, dict) else None
+    return np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)

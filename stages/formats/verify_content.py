@@ -1,0 +1,35 @@
+"""What second readers hand out, and how they make splats of the values in a file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Splats
+
+Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class FileContent:
+    """splats: as the file holds them, in its axes. world_from_file [4, 4]: from those axes to
+    ours (y down)."""
+
+    splats: Splats
+    world_from_file: NDArray[np.float64]
+
+
+def logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
+    inside = np.clip(p.astype(np.float64), 1e-30, 1 - 1e-9)
+    return np.log(inside / (1 - inside))
+
+
+def splats_of(**arrays: NDArray[np.floating]) -> Splats:
+    values = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
+    n, k = values["sh"].shape[:2]
+    for name, width in {"means": 3, "quaternions": 4, "log_scales": 3}.items():
+        values[name] = values[name].reshape(n, width)
+    return Splats(**values, sh_degrees=np.full(n, math.isqrt(k) - 1, np.uint8))  # type: ignore[arg-type]

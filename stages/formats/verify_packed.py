@@ -1,0 +1,123 @@
+"""Second readers of the packed formats: plyfile, gzip, zipfile and Pillow, and plain arithmetic."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.verify_content import Y_UP, FileContent, logits, splats_of
+
+
+def compressed_ply(path: Path) -> FileContent:
+    from plyfile import PlyData
+
+    data = PlyData.read(str(path), mmap="c")
+    words, chunk = data["vertex"], np.arange(data["vertex"].count) // 256
+
+    def unpacked(name: str, columns: list[tuple[str, int, int]]) -> NDArray[np.float64]:
+        """columns: (suffix of the range's names, lowest bit, bits)."""
+        parts = []
+        for suffix, shift, bits in columns:
+            fraction = (words[name].astype(np.int64) >> shift) % 2**bits / (2**bits - 1)
+            low, high = (data["chunk"][e + suffix].astype(float)[chunk] for e in ("min_", "max_"))
+            parts.append(low * (1 - fraction) + high * fraction)
+        return np.stack(parts, axis=1)
+
+    axes = [("x", 21, 11), ("y", 11, 10), ("z", 0, 11)]
+    turns = words["packed_rotation"].astype(np.int64)
+    others = [((turns >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
+    colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
+    rest = data["sh"].data if "sh" in data else np.zeros((len(chunk), 0), np.uint8)
+    sh = np.zeros((len(chunk), len(rest.dtype.names or ()) // 3 + 1, 3))
+    sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
+    for i, name in enumerate(rest.dtype.names or ()):
+        per_channel = sh.shape[1] - 1
+        sh[:, 1 + i % per_channel, i // per_channel] = (rest[name] + 0.5) / 32 - 4
+    splats = splats_of(
+        means=unpacked("packed_position", axes),
+        quaternions=_with_largest(turns >> 30, np.stack(others, axis=1)),
+        log_scales=unpacked("packed_scale", [("scale_" + s, low, n) for s, low, n in axes]),
+        opacity_logits=logits(words["packed_color"].astype(np.int64) % 256 / 255),
+        sh=sh,
+    )
+    return FileContent(splats, np.eye(4))
+
+
+def spz(path: Path) -> FileContent:
+    import gzip
+    import struct
+
+    content = gzip.decompress(path.read_bytes())
+    magic, version, n, degree, fraction = struct.unpack_from("<IIIBB", content)
+    assert (magic, version) == (0x5053474E, 3), "the header is not that of version 3"
+    k = (degree + 1) ** 2 - 1
+    ends = 16 + np.cumsum([0, 9 * n, n, 3 * n, 3 * n, 4 * n, 3 * k * n])
+    assert len(content) == ends[-1], "the length is not that of the header"
+    parts = [np.frombuffer(content[a:b], np.uint8) for a, b in itertools.pairwise(ends)]
+    low, middle, high = parts[0].reshape(n, 3, 3).astype(np.int64).transpose(2, 0, 1)
+    fixed = low + 256 * middle + 65536 * high
+    words = parts[4].view("<u4").astype(np.int64)
+    tens = [words >> shift & 1023 for shift in (20, 10, 0)]
+    others = [math.sqrt(0.5) / 511 * np.where(t < 512, t, 512 - t) for t in tens]
+    xyzw = _with_largest(words >> 30, np.stack(others, axis=1))
+    sh = np.zeros((n, k + 1, 3))
+    sh[:, 0] = (parts[2].reshape(n, 3) / 255 - 0.5) / 0.15
+    sh[:, 1:] = parts[5].reshape(n, k, 3) / 128 - 1
+    splats = splats_of(
+        means=np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
+        quaternions=np.roll(xyzw, 1, axis=1),
+        log_scales=parts[3].reshape(n, 3) / 16 - 10,
+        opacity_logits=logits(parts[1] / 255),
+        sh=sh,
+    )
+    return FileContent(splats, Y_UP)
+
+
+def sog(path: Path) -> FileContent:
+    import json
+    import zipfile
+
+    from PIL import Image
+
+    with zipfile.ZipFile(path) as package:
+        meta = json.loads(package.read("meta.json"))
+
+        def pixels(part: str, number: int = 0) -> NDArray[np.int64]:
+            with package.open(meta[part]["files"][number]) as file:
+                return np.array(Image.open(file).convert("RGBA"), np.int64)
+
+        def a_splat(part: str, number: int = 0) -> NDArray[np.int64]:
+            return pixels(part, number).reshape(-1, 4)[: meta["count"]]
+
+        low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
+        part = (a_splat("means")[:, :3] + 256 * a_splat("means", 1)[:, :3]) / 65535
+        bent = low * (1 - part) + high * part
+        turns, colours = a_splat("quats"), a_splat("sh0")
+        sh = np.array(meta["sh0"]["codebook"])[colours[:, None, :3]]
+        if "shN" in meta:
+            k = (meta["shN"]["bands"] + 1) ** 2 - 1
+            halves, palette = a_splat("shN", 1), pixels("shN")[:, :, :3].reshape(-1, k, 3)
+            chosen = palette[halves[:, 0] + 256 * halves[:, 1]]
+            sh = np.concatenate([sh, np.array(meta["shN"]["codebook"])[chosen]], axis=1)
+        splats = splats_of(
+            means=np.where(bent < 0, -1, 1) * (np.exp(np.abs(bent)) - 1),
+            quaternions=_with_largest(turns[:, 3] - 252, (turns[:, :3] / 127.5 - 1) / 2**0.5),
+            log_scales=np.array(meta["scales"]["codebook"])[a_splat("scales")[:, :3]],
+            opacity_logits=logits(colours[:, 3] / 255),
+            sh=sh,
+        )
+    return FileContent(splats, np.eye(4))
+
+
+def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N, 4] where `others` [N, 3] leave out the component `column`, which is the largest."""
+    quaternions = np.zeros((len(others), 4))
+    for k in range(4):
+        rows = column == k
+        largest = np.sqrt(np.maximum(0, 1 - np.square(others[rows]).sum(axis=1)))
+        quaternions[rows] = np.insert(others[rows], k, largest, axis=1)
+    return quaternions

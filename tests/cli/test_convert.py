@@ -1,0 +1,100 @@
+"""`splat convert`: names decide the formats, and the difference is told."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from splatcli.app import app
+from stages import formats
+from tests.cli.test_help import help_of
+from tests.formats.truth import many_splats
+
+QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]  # USD is a process each
+
+
+def converted(*words: object, code: int = 0) -> tuple[str, str]:
+    """(standard output, standard error)."""
+    result = CliRunner().invoke(app, ["convert", *map(str, words)])
+    assert result.exit_code == code, result.stderr
+    return result.stdout, result.stderr
+
+
+@pytest.mark.parametrize(("source", "target"), list(itertools.product(QUICK, QUICK)))
+def test_any_format_becomes_any_other(tmp_path: Path, source: str, target: str) -> None:
+    formats.write(tmp_path / f"a.{source}", many_splats(20))
+    converted(tmp_path / f"a.{source}", tmp_path / f"b.{target}", "--quiet")
+    assert len(formats.read(tmp_path / f"b.{target}")) == 20
+
+
+def test_usd_is_read_and_written_too(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.usdz", many_splats(20))
+    converted(tmp_path / "a.usdz", tmp_path / "b.spz")
+    converted(tmp_path / "b.spz", tmp_path / "c.usda")
+    assert "ParticleField3DGaussianSplat" in (tmp_path / "c.usda").read_text()
+
+
+def test_what_was_made_is_told(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(300))
+    out, err = converted(tmp_path / "a.ply", tmp_path / "b.compressed.ply")
+    assert out == ""
+    assert "reading" in err
+    assert "300 splats" in err
+    assert "max position error" in err
+    _, quiet = converted(tmp_path / "a.ply", tmp_path / "b.glb", "--quiet")
+    assert quiet.count("\n") == 1
+
+
+def test_events_are_lines_of_json(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(300))
+    out, err = converted(tmp_path / "a.ply", tmp_path / "b.sog", "--json")
+    *steps, last = [json.loads(line) for line in out.splitlines()]
+    assert [step["done"] for step in steps] == [0, 1, 2]
+    assert (last["event"], last["splats"], last["dropped"]) == ("converted", 300, 0)
+    assert last["size_bytes"] == (tmp_path / "b.sog").stat().st_size
+    assert 0 < last["max_opacity_error"] < 0.01
+    assert err == ""
+
+
+def test_the_size_of_a_gltf_counts_its_bin(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(9))
+    out, _ = converted(tmp_path / "a.ply", tmp_path / "b.gltf", "--json")
+    sizes = sum((tmp_path / name).stat().st_size for name in ("b.gltf", "b.bin"))
+    assert json.loads(out.splitlines()[-1])["size_bytes"] == sizes
+
+
+def test_splats_that_cannot_be_drawn_are_counted(tmp_path: Path) -> None:
+    splats = many_splats(5)
+    formats.write(tmp_path / "a.ply", splats)
+    content = (tmp_path / "a.ply").read_bytes()
+    huge = np.float32(60).tobytes()  # exp(60) cannot be squared in float32
+    (tmp_path / "a.ply").write_bytes(content[:-20] + huge + content[-16:])
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.spz")
+    assert "1 splats" in err
+    assert "4 splats" in err
+
+
+@pytest.mark.parametrize(("source", "target"), [("a.ply", "b.obj"), ("a.obj", "b.ply")])
+def test_unknown_endings_name_the_known_ones(tmp_path: Path, source: str, target: str) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(3))
+    _, err = converted(tmp_path / source, tmp_path / target, code=2)
+    assert ".compressed.ply" in err
+    assert not (tmp_path / target).exists()
+
+
+def test_a_missing_or_damaged_file_leaves_nothing_behind(tmp_path: Path) -> None:
+    converted(tmp_path / "none.spz", tmp_path / "b.ply", code=3)
+    (tmp_path / "a.spz").write_bytes(b"\x1f\x8bnonsense")
+    converted(tmp_path / "a.spz", tmp_path / "b.ply", code=3)
+    assert not (tmp_path / "b.ply").exists()
+
+
+def test_help_names_every_ending() -> None:
+    text = help_of("convert")
+    for name in formats.FORMATS:
+        assert f".{name}" in text

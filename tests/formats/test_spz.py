@@ -1,0 +1,174 @@
+"""SPZ against its specification, written out again here, and files of other versions."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages import formats
+from stages.formats import spz
+from stages.run.errors import SplatError
+from stages.scene import Splats
+from tests.formats.test_compressed_ply import angles
+from tests.formats.truth import C0, many_splats, red_splat
+
+
+def content_of(path: Path) -> bytes:
+    return gzip.decompress(path.read_bytes())
+
+
+def test_every_byte_is_that_of_the_specification(tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    formats.write(path, red_splat())
+    content = content_of(path)
+    # largest coordinate 3: 3 x 2^21 is below 2^23, 3 x 2^22 is not
+    assert struct.unpack_from("<IIIBBBB", content) == (0x5053474E, 3, 1, 1, 21, 0, 0)
+    x, y, z = (
+        int.from_bytes(content[16 + 3 * i : 19 + 3 * i], "little", signed=True) for i in range(3)
+    )
+    assert (x, y, z) == (1 << 21, -2 << 21, -3 << 21)  # right, up, back
+    assert content[25] == 191  # 255 x 0.75
+    wanted = [255 * (0.5 + 0.15 * (v - 0.5) / C0) for v in (0.9, 0.1, 0.2)]
+    assert list(content[26:29]) == [round(v) for v in wanted]
+    assert list(content[29:32]) == [round(16 * (math.log(s) + 10)) for s in (0.1, 0.2, 0.4)]
+    # turned about x, y and z of the quaternion change sign; w, the last of x y z w, is the largest
+    units = [round(511 * math.sqrt(2) * v) for v in (1 / 6, 1 / 3, 1 / 3)]
+    word = 3 << 30 | units[0] << 20 | 1 << 19 | units[1] << 10 | 1 << 9 | units[2]
+    assert content[32:36] == struct.pack("<I", word)
+    # -C1 y and C1 z change sign, -C1 x not; 128 + 128 c in steps of 8: 0.3, -0.1 and 0.2
+    assert list(content[36:]) == [128, 168, 128, 112, 128, 128, 128, 128, 152]
+
+
+def test_a_file_of_version_2_is_read_as_the_specification_says(tmp_path: Path) -> None:
+    header = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 1, 0)
+    positions = b"".join(v.to_bytes(3, "little", signed=True) for v in (4096, -8192, 2048))
+    body = positions + bytes([64]) + bytes([255, 0, 128]) + bytes([160, 144, 176])
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(header + body + bytes([191, 64, 128])))
+    back = formats.read(path)
+    np.testing.assert_allclose(back.means, [[1, 2, -0.5]])
+    np.testing.assert_allclose(back.opacities, [64 / 255], atol=1e-6)
+    np.testing.assert_allclose(back.log_scales, [[0, -1, 1]])
+    np.testing.assert_allclose(
+        back.sh[0, 0], [0.5 / 0.15, -0.5 / 0.15, 0.5 / 255 / 0.15], rtol=1e-4
+    )
+    x, y, z = (191 / 127.5 - 1, 64 / 127.5 - 1, 128 / 127.5 - 1)
+    w = math.sqrt(1 - x * x - y * y - z * z)
+    np.testing.assert_allclose(back.quaternions, [[w, x, -y, -z]], atol=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_values_come_back_within_half_a_step(tmp_path: Path, degree: int) -> None:
+    splats = many_splats(500).with_sh_degree(degree)
+    path = tmp_path / "a.spz"
+    formats.write(path, splats)
+    back = formats.read(path)
+    bits = content_of(path)[13]
+    assert 2 ** (22 - bits) <= np.abs(splats.means).max() < 2 ** (23 - bits)
+    np.testing.assert_allclose(back.means, splats.means, atol=0.5 / 2**bits + 1e-6)
+    wanted = np.clip(splats.log_scales, -10, 255 / 16 - 10)
+    np.testing.assert_allclose(back.log_scales, wanted, atol=1 / 32 + 1e-5)
+    np.testing.assert_allclose(back.opacities, splats.opacities, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(back.sh[:, 0], splats.sh[:, 0], atol=0.5 / 255 / 0.15 + 1e-5)
+    # 9 bits over 1/sqrt 2: three errors of 1/1445, and the fourth what they make of the length
+    assert angles(splats.quaternions, back.quaternions).max() < 0.3
+    # steps of 8/128 and 16/128; the highest level is 255, half a step short of 1; beyond it no more
+    sh = np.clip(splats.sh[:, 1:], -1, 1)
+    for band, half in ((slice(0, 3), 1 / 32), (slice(3, 15), 1 / 16)):
+        np.testing.assert_allclose(back.sh[:, 1:][:, band], sh[:, band], atol=half + 0.5 / 128)
+    np.testing.assert_array_equal(back.sh[splats.sh == 0], 0)
+    assert len(content_of(path)) == 16 + 500 * (20 + 3 * ((degree + 1) ** 2 - 1))
+
+
+def test_a_small_scene_keeps_its_positions(tmp_path: Path) -> None:
+    """Steps of 1/4096 would leave a scene of 2 mm in metres with eight places."""
+    splats = many_splats(200)
+    small = replace(splats, means=splats.means * np.float32(1e-3))
+    formats.write(tmp_path / "a.spz", small)
+    error = np.abs(formats.read(tmp_path / "a.spz").means - small.means).max()
+    assert error < 1e-7
+
+
+def test_what_lies_beyond_reach_looks_the_same_from_the_middle(tmp_path: Path) -> None:
+    splats = many_splats(9)
+    splats.means[4] = (1e4, -5e3, 2e3)
+    splats.log_scales[4] = 3
+    formats.write(tmp_path / "a.spz", splats)
+    back = formats.read(tmp_path / "a.spz")
+    assert np.abs(back.means[4]).max() == pytest.approx(2048, abs=0.01)
+    along = back.means[4] / np.linalg.norm(back.means[4])
+    np.testing.assert_allclose(along, splats.means[4] / np.linalg.norm(splats.means[4]), atol=1e-6)
+    size, wanted = (np.exp(s.log_scales[4]) / np.linalg.norm(s.means[4]) for s in (back, splats))
+    np.testing.assert_allclose(size, wanted, rtol=1 / 32)
+    np.testing.assert_allclose(back.means[:4], splats.means[:4], atol=0.5 / 4096 + 1e-6)
+
+
+def test_extremes_stay_finite(tmp_path: Path) -> None:
+    splats = many_splats(4).with_sh_degree(1)
+    splats.log_scales[:] = [[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]]
+    splats.opacity_logits[:] = [100, -100, 20, -20]
+    splats.quaternions[:2] = [[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]]
+    splats.means[3] = (7e8, -3e38, 1e-40)
+    splats.sh[2, 0] = 3.4e38
+    assert formats.write(tmp_path / "a.spz", splats) == 0
+    back = formats.read(tmp_path / "a.spz")
+    assert len(back) == 4
+    np.testing.assert_allclose(back.opacities, [1, 0, 1, 0], atol=1e-6)
+    assert angles(splats.quaternions, back.quaternions).max() < 0.3
+
+
+def packed(splats: Splats, tmp_path: Path, at: int, new: bytes, extra: bytes = b"") -> Path:
+    """A file whose unpacked content was changed."""
+    path = tmp_path / "a.spz"
+    formats.write(path, splats)
+    content = bytearray(content_of(path))
+    content[at : at + len(new)] = new
+    path.write_bytes(gzip.compress(bytes(content) + extra))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("at", "new", "word"),
+    [
+        (0, b"XGSP", "NGSP"),
+        (4, b"\1", "version 1"),
+        (4, b"\4", "version 4"),
+        (8, b"\xff\xff\xff\xff", "declares"),
+        (8, b"\xff\xff\0\0", "cut short"),
+        (12, b"\4", "degree is 4"),
+        (12, b"\xff", "degree is 255"),
+        (13, b"\xff", "fractional"),
+    ],
+)
+def test_a_header_that_lies_is_refused(tmp_path: Path, at: int, new: bytes, word: str) -> None:
+    with pytest.raises(SplatError, match=word) as caught:
+        formats.read(packed(many_splats(5), tmp_path, at, new))
+    assert caught.value.code == "splats-unreadable"
+
+
+def test_what_follows_the_splats_is_passed_over_but_not_without_end(tmp_path: Path) -> None:
+    splats = many_splats(5)
+    assert len(formats.read(packed(splats, tmp_path, 0, b"N", extra=b"x" * 999))) == 5
+    with pytest.raises(SplatError, match="more than its header"):
+        formats.read(packed(splats, tmp_path, 0, b"N", extra=bytes(300 << 20)))
+
+
+def test_a_gzip_bomb_is_refused_before_it_unpacks(tmp_path: Path) -> None:
+    header = spz.HEADER.pack(b"NGSP", 3, 20_000_000, 3, 12, 0, 0)
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(header + bytes(100 << 20), 1))
+    with pytest.raises(SplatError, match="declares"):
+        formats.read(path)
+
+
+def test_version_4_is_named_when_it_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz.HEADER.pack(b"NGSP", 4, 1, 0, 12, 0, 0) + bytes(64))
+    with pytest.raises(SplatError, match="version 4"):
+        formats.read(path)
