@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from stages.scene import Camera, ExportedAssets, QuantisedSplats, Reconstruction, Splats
 
-FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz")
+FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz", "html")
 _LOSSY = ("splat",)
 _INDEX = "assets.json"
 _CHECK_SIDE_PX = 480
@@ -102,7 +102,7 @@ def run(
     for number, name in enumerate(wanted):
         report.progress(number, len(wanted), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
-        formats.write(path, splats, units=reconstruction.units)
+        formats.write(path, splats, units=reconstruction.units, views=reconstruction.views)
         size = path.stat().st_size
         if name == "gltf":
             size += path.with_suffix(".bin").stat().st_size if len(splats) else 0

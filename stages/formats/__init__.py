@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from stages.run.errors import Family, SplatError
 
 if TYPE_CHECKING:
-    from stages.scene import Splats
+    from stages.scene import Splats, View
 
 # Suffix without the dot -> module. The first four are what an export writes by default.
 FORMATS = {
@@ -25,6 +25,7 @@ FORMATS = {
     "gltf": "gltf",
     "usda": "usd",
     "usdc": "usd",
+    "html": "html",
 }
 
 
@@ -42,14 +43,18 @@ def format_of(path: Path) -> str:
     return name
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+def write(
+    path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
+) -> int:
     """Write `splats` in the format that the suffix of `path` names, whole or not at all; return
     how many could not be drawn (values not finite, or too large) and were left out.
 
     units: "metres" or "arbitrary", noted in the formats that can carry it.
+    views: cameras in the frame of `splats.means` to look from, for the format that shows itself.
     Raises SplatError "format-unknown", or what keeps the file from being written.
     """
-    dropped: int = _module(path).write(Path(path), splats, units=units)
+    more = {"views": views} if format_of(path) == "html" else {}
+    dropped: int = _module(path).write(Path(path), splats, units=units, **more)
     return dropped
 
 
