@@ -125,6 +125,27 @@ def render(
     views.render_to(target, out, camera, width, backend)
 
 
+def view(
+    target: Annotated[
+        Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
+    ] = None,
+    *,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port to serve on; 0 for any that is free.")
+    ] = 0,
+    open_browser: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the browser, or only print the address.")
+    ] = True,
+) -> None:
+    """Look at the splats in a browser: orbit, fly, stand where the photographs were taken.
+
+    The page is served to this machine only and needs no network. Ctrl-C ends it.
+    """
+    from splatcli import viewing
+
+    viewing.show(target, port, open_browser)
+
+
 def info(
     target: Annotated[
         Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
@@ -170,6 +191,7 @@ def _register() -> None:
     for extra, line in (
         (status, "splat status run/"),
         (render, "splat render run/ --camera IMG_0042.jpg --out view.png"),
+        (view, "splat view run/"),
         (info, "splat info run/7-export/scene.ply"),
         (convert, "splat convert scene.ply scene.sog"),
         (doctor, "splat doctor"),

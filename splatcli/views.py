@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 _STAGES_WITH_SPLATS = ("quantise", "prune", "train", "seed")
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp")
-_WIDTH_WITHOUT_A_PHOTOGRAPH_PX = 960
 
 
 def render_to(
@@ -35,7 +34,7 @@ def render_to(
             family=Family.USAGE,
         )
     splats, pipeline = load_splats(target)
-    views = _views(pipeline or _pipeline_around(target))
+    views = _views(pipeline or pipeline_around(target))
     seen = _camera_for(splats, views, camera)
     if width is not None:
         seen = seen.resized(width, max(1, round(width * seen.height / seen.width)))
@@ -153,7 +152,7 @@ def _flat(value: Any) -> Any:
     return " ".join(map(str, value)) if isinstance(value, list) else value
 
 
-def _pipeline_around(file: Path | None) -> Pipeline | None:
+def pipeline_around(file: Path | None) -> Pipeline | None:
     """The run whose export folder a file lies in: its cameras fit the file."""
     if file is None or not runfolder.is_run_folder(file.absolute().parent.parent):
         return None
@@ -167,8 +166,10 @@ def _views(pipeline: Pipeline | None) -> tuple[View, ...]:
 
 
 def _camera_for(splats: Splats, views: tuple[View, ...], wanted: str | None) -> Camera:
+    from stages.viewer.shots import in_front_of
+
     if wanted is None:
-        return views[0].camera if views else _in_front_of(splats)
+        return views[0].camera if views else in_front_of(splats)
     by_name = {view.name: view.camera for view in views}
     if wanted in by_name:
         return by_name[wanted]
@@ -185,25 +186,6 @@ def _camera_for(splats: Splats, views: tuple[View, ...], wanted: str | None) -> 
         hint="Leave --camera away, or name a run folder whose photographs you want to see.",
         family=Family.USAGE,
     )
-
-
-def _in_front_of(splats: Splats) -> Camera:
-    """A camera that sees the middle nine tenths of the splats, from -z and a little above."""
-    import numpy as np
-
-    from stages.scene import Camera, look_at
-
-    means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
-    if len(means) == 0:
-        means = np.zeros((1, 3))
-    low, high = np.percentile(means, (5, 95), axis=0)
-    middle = (low + high) / 2
-    distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
-    eye = middle + distance * np.array([0.0, -0.3, -1.0])
-    side = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX
-    height = side * 3 // 4
-    view = look_at(eye, middle)
-    return Camera(side, height, side, side, side / 2, height / 2, view)
 
 
 def _save(image: Any, out: Path) -> None:

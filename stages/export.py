@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
     from stages.scene import Camera, ExportedAssets, QuantisedSplats, Reconstruction, Splats
 
-FORMATS = ("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz", "compressed.ply", "spz", "sog")
+FORMATS = (
+    *("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz"),
+    *("compressed.ply", "spz", "sog", "html"),
+)
 _LOSSES = {
     "splat": "has 8-bit colours that do not change with the view",
     "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
@@ -107,7 +110,7 @@ def run(
     for number, name in enumerate(wanted):
         report.progress(number, len(wanted), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
-        formats.write(path, splats, units=reconstruction.units)
+        formats.write(path, splats, units=reconstruction.units, views=reconstruction.views)
         size = path.stat().st_size
         if name == "gltf":
             size += path.with_suffix(".bin").stat().st_size if len(splats) else 0

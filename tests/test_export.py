@@ -117,7 +117,7 @@ def test_a_wrong_file_does_not_pass(
 def test_a_file_that_another_parser_refuses_does_not_pass(
     scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def cut_short(path: Path, splats: Splats, *, units: str) -> int:
+    def cut_short(path: Path, splats: Splats, **more: Any) -> int:
         path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\n")
         return 0
 

@@ -29,6 +29,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "stages.measure",
         "stages.photos",
         "stages.structure",
+        "stages.viewer",
     ),
     ("stages.training",),
     tuple(f"stages.{name}" for name in STAGE_FILES),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from stages.run.errors import Family, SplatError
 
 if TYPE_CHECKING:
-    from stages.scene import Splats
+    from stages.scene import Splats, View
 
 # What a file's name ends in, without the dot -> module.
 FORMATS = {
@@ -28,6 +28,7 @@ FORMATS = {
     "compressed.ply": "compressed_ply",
     "spz": "spz",
     "sog": "sog",
+    "html": "html",
 }
 # Those that hold less than float32: smaller, and not the same splats any more.
 LOSSY = ("splat", "compressed.ply", "spz", "sog")
@@ -48,14 +49,18 @@ def format_of(path: Path) -> str:
     return max(endings, key=len)
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+def write(
+    path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
+) -> int:
     """Write `splats` in the format that the suffix of `path` names, whole or not at all; return
     how many could not be drawn (values not finite, or too large) and were left out.
 
     units: "metres" or "arbitrary", noted in the formats that can carry it.
+    views: cameras in the frame of `splats.means` to look from, for the format that shows itself.
     Raises SplatError "format-unknown", or what keeps the file from being written.
     """
-    dropped: int = _module(path).write(Path(path), splats, units=units)
+    more = {"views": views} if format_of(path) == "html" else {}
+    dropped: int = _module(path).write(Path(path), splats, units=units, **more)
     return dropped
 
 

@@ -47,12 +47,17 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Raises SplatError when the file cannot be written.
     """
     splats, dropped = kept_rows(splats)
-    header = _header_text(splats, units).encode("ascii")
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(header)
-        for start in range(0, len(splats), _ROWS_AT_ONCE):
-            file.write(_table(splats, slice(start, start + _ROWS_AT_ONCE)).tobytes())
+        for block in blocks(splats, units):
+            file.write(block)
     return dropped
+
+
+def blocks(splats: Splats, units: str) -> Iterator[bytes]:
+    """The bytes of the file, a part at a time; every splat must be drawable."""
+    yield _header_text(splats, units).encode("ascii")
+    for start in range(0, len(splats), _ROWS_AT_ONCE):
+        yield _table(splats, slice(start, start + _ROWS_AT_ONCE)).tobytes()
 
 
 def _header_text(splats: Splats, units: str) -> str:
@@ -91,7 +96,13 @@ def read(path: Path) -> Splats:
     "splats-unreadable" for what is damaged or is not splats.
     """
     path = Path(path)
-    with reading(path), path.open("rb") as file:
+    with reading(path):
+        return parse(path)
+
+
+def parse(path: Path) -> Splats:
+    """As `read`, but what is wrong is raised as it is found."""
+    with path.open("rb") as file:
         header = read_header(file)
         if header.is_compressed:
             return compressed_ply.unpack(path, header)

@@ -1,14 +1,19 @@
 """Second readers, for checking what the writers wrote.
 
 None of them shares code with its writer: plyfile, pygltflib with raw accessors, usd-core's
-attributes, and a byte-wise reading of .splat. They leave the splats in the file's own axes and
-say how those lie in our world, so that a check can move the camera instead of the splats: then a
-wrong turn of positions, rotations or SH shows in the picture.
+attributes, a byte-wise reading of .splat, and for .html the standard library's HTML parser. They
+leave the splats in the file's own axes and say how those lie in our world, so that a check can
+move the camera instead of the splats: then a wrong turn of positions, rotations or SH shows in the
+picture.
 """
 
 from __future__ import annotations
 
+import base64
+import gzip
+import io
 import math
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +33,13 @@ def read_back(path: Path) -> FileContent:
     return _READERS[format_of(path)](path)
 
 
-def _ply(path: Path) -> FileContent:
+def _ply(source: Any) -> FileContent:
+    """source: a path, or an open binary file."""
     from plyfile import PlyData
 
-    vertex = PlyData.read(str(path), mmap="c")["vertex"]
+    named = isinstance(source, Path)
+    data = PlyData.read(str(source), mmap="c") if named else PlyData.read(source)
+    vertex = data["vertex"]
     names = [item.name for item in vertex.properties]
     per_channel = sum(name.startswith("f_rest_") for name in names) // 3
     sh = np.zeros((len(vertex.data), per_channel + 1, 3), np.float32)
@@ -47,6 +55,32 @@ def _ply(path: Path) -> FileContent:
         sh=sh,
     )
     return FileContent(splats, np.eye(4))
+
+
+class _Chunks(HTMLParser):
+    """Collects what a browser would find in the script elements of class "splats"."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wanted = False
+        self.chunks: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.wanted = tag == "script" and ("class", "splats") in attrs
+
+    def handle_data(self, data: str) -> None:
+        if self.wanted:
+            self.chunks.append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        self.wanted = False
+
+
+def _html(path: Path) -> FileContent:
+    parser = _Chunks()
+    parser.feed(path.read_text(encoding="utf-8"))
+    packed = b"".join(base64.b64decode(chunk, validate=True) for chunk in parser.chunks)
+    return _ply(io.BytesIO(gzip.decompress(packed)))
 
 
 def _splat(path: Path) -> FileContent:
@@ -156,4 +190,5 @@ _READERS = {
     "compressed.ply": verify_packed.compressed_ply,
     "spz": verify_packed.spz,
     "sog": verify_packed.sog,
+    "html": _html,
 }

@@ -1,0 +1,95 @@
+"""One .html that shows its splats by itself: from disk, in any browser, without a network.
+
+It holds a viewer and, as base64 of gzip in script elements that nothing runs, the .ply of the
+reference trainer; so it keeps everything that .ply keeps.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+import tempfile
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from stages.formats import ply
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import kept_rows
+from stages.run.atomic import replacing
+from stages.scene import Splats, View
+from stages.viewer import compose
+from stages.viewer.shots import shots_of
+
+_GZIP = 31  # zlib's name for the gzip container; its header holds no time then
+_LEVEL = 6
+_CHUNK_BYTES = 3 << 20  # of gzip in a script element; a multiple of 3, so that base64 needs no "="
+_INFLATED_AT_ONCE = 1 << 22
+
+
+def write(
+    path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
+) -> int:
+    """Write `splats`; return how many could not be drawn and were left out.
+
+    views: cameras to look from. Raises SplatError when the file cannot be written.
+    """
+    splats, dropped = kept_rows(splats)
+    scene = compose.scene_data(path.stem, splats, shots_of(views, splats), units=units)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(compose.head(scene).encode("utf-8"))
+        for chunk in _chunks(_zipped(ply.blocks(splats, units))):
+            file.write(compose.CHUNK_START.encode("ascii"))
+            file.write(base64.b64encode(chunk))
+            file.write(compose.CHUNK_END.encode("ascii"))
+        file.write(compose.tail().encode("utf-8"))
+    return dropped
+
+
+def _zipped(blocks: Iterable[bytes]) -> Iterator[bytes]:
+    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, _GZIP)
+    for block in blocks:
+        yield packer.compress(block)
+    yield packer.flush()
+
+
+def _chunks(blocks: Iterable[bytes]) -> Iterator[bytes]:
+    """The same bytes in parts of `_CHUNK_BYTES`; the last may be shorter."""
+    held = bytearray()
+    for block in blocks:
+        held += block
+        while len(held) >= _CHUNK_BYTES:
+            yield bytes(held[:_CHUNK_BYTES])
+            del held[:_CHUNK_BYTES]
+    if held:
+        yield bytes(held)
+
+
+def read(path: Path) -> Splats:
+    """The splats of a page that `write` made. Raises SplatError "splats-unreadable"."""
+    path = Path(path)
+    with reading(path), tempfile.TemporaryDirectory(prefix="splat-") as folder:
+        inside = Path(folder) / "inside.ply"
+        with inside.open("wb") as file:
+            for block in _unzipped(path):
+                file.write(block)
+        return ply.parse(inside)
+
+
+def _unzipped(path: Path) -> Iterator[bytes]:
+    page = path.read_bytes()
+    if not page.rstrip().endswith(compose.PAGE_END.strip().encode("ascii")):
+        raise BadFileError("it is no whole page: its end is missing")
+    start, end = (re.escape(t.encode("ascii")) for t in (compose.CHUNK_START, compose.CHUNK_END))
+    unpacker = zlib.decompressobj(_GZIP)
+    try:
+        for match in re.finditer(start + rb"([A-Za-z0-9+/=]*)" + end, page):
+            data = base64.b64decode(match[1], validate=True)
+            while data:
+                yield unpacker.decompress(data, _INFLATED_AT_ONCE)
+                data = unpacker.unconsumed_tail
+    except (zlib.error, binascii.Error) as error:
+        raise BadFileError(f"the splats in it are damaged ({error})") from error
+    if not unpacker.eof:
+        raise BadFileError("it holds no splats, or not all of them")

@@ -1,0 +1,107 @@
+// Address options: ?camera=NAME starts there, ?bare leaves all controls away, ?webgl asks for it.
+// For scripts: `splatReady` is a promise that resolves when the first camera is drawn, and
+// `splatShow(name)` one that resolves when the camera of that name is.
+const STEADY_FRAMES = 6; // sorting runs beside drawing and takes a few frames to be seen
+
+function settingsFor(scene) {
+    const pose = (shot) => {
+        const half = Math.max(shot.width / shot.fx, shot.height / shot.fy) / 2;
+        const fov = (Math.atan(half) * 360) / Math.PI;
+        return { initial: { position: shot.position, target: shot.target, fov } };
+    };
+    const off = { enabled: false };
+    return {
+        version: 2,
+        tonemapping: "none",
+        highPrecisionRendering: false,
+        background: { color: [0, 0, 0] },
+        postEffectSettings: {
+            sharpness: { ...off, amount: 0 },
+            bloom: { ...off, intensity: 1, blurLevel: 2 },
+            grading: { ...off, brightness: 0, contrast: 1, saturation: 1, tint: [1, 1, 1] },
+            vignette: { ...off, intensity: 0.5, inner: 0.3, outer: 0.75, curvature: 1 },
+            fringing: { ...off, intensity: 0.5 }
+        },
+        animTracks: [],
+        cameras: [pose(scene.shots[0])],
+        annotations: scene.shots.map((shot) => ({
+            position: shot.target,
+            title: shot.name,
+            text: "",
+            camera: pose(shot)
+        })),
+        startMode: "default"
+    };
+}
+
+function steady(app) {
+    return new Promise((resolve) => {
+        let drawn = 0;
+        const draw = () => {
+            app.renderNextFrame = true;
+        };
+        const ready = (camera, layer, complete, loading) => {
+            drawn = complete && loading === 0 ? drawn + 1 : 0;
+            if (drawn < STEADY_FRAMES) return;
+            app.off("update", draw);
+            app.systems.gsplat.off("frame:ready", ready);
+            app.once("frameend", resolve);
+        };
+        app.on("update", draw);
+        app.systems.gsplat.on("frame:ready", ready);
+    });
+}
+
+function loaded(viewer) {
+    return new Promise((resolve, reject) => {
+        if (viewer.state.loaded) resolve();
+        viewer.events.once("loaded:changed", resolve);
+        viewer.app.assets.on("error", (error) => reject(new Error(String(error))));
+    });
+}
+
+async function start() {
+    const scene = JSON.parse(find("scene").textContent);
+    const query = new URLSearchParams(location.search);
+    const bare = query.has("bare");
+    if (scene.count === 0) throw new Error("There is not one splat to show.");
+    const viewer = await SuperSplatViewer.createViewer({
+        container: find("view"),
+        settings: settingsFor(scene),
+        contentUrl: scene.content || "scene.ply",
+        contentFilename: "scene.ply",
+        contents: contentOf(scene),
+        renderer: query.has("webgl") ? "webgl" : "webgpu",
+        ui: !bare,
+        noanim: true
+    });
+    const { app } = viewer;
+    app.scene.gsplat.radialSorting = false; // by z, the order that the splats were trained in
+    await loaded(viewer);
+    let panel = null;
+    const lens = new Lens(app, app.graphicsDevice.canvas, () => panel && panel.moved());
+    viewer.events.on("cameraMode:changed", () => lens.release()); // by a button or a key
+    const show = (shot) => {
+        viewer.selectAnnotation(scene.shots.indexOf(shot)); // where orbiting goes on from
+        lens.hold(shot);
+        if (panel) panel.shown(shot);
+        return steady(app);
+    };
+    if (!bare) panel = new Panel(scene, show);
+    app.on("prerender", () => panel && panel.frames++);
+    const named = (name) => scene.shots.find((shot) => shot.name === name);
+    window.splatShow = async (name) => {
+        if (!named(name)) throw new Error(`There is no camera ${name}.`);
+        await show(named(name));
+        return { name, splats: app.stats.frame.gsplats, renderer: app.graphicsDevice.deviceType };
+    };
+    find("message").hidden = true;
+    const judged = scene.shots.find((shot) => shot.held_out);
+    const first = named(query.get("camera")) || judged || scene.shots[0];
+    return window.splatShow(first.name);
+}
+
+window.splatReady = start();
+window.splatReady.catch((error) => {
+    find("message").textContent = `The splats cannot be shown: ${error.message}`;
+});

@@ -1,0 +1,107 @@
+"""Our cameras, as the page takes them.
+
+The viewer turns content by 180 degrees about z, so that y down becomes y up; cameras are turned
+with it. Its own camera has x right, y up and looks along -z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Camera, Splats, View, look_at, split_held_out
+
+_VIEWER_FROM_WORLD = np.diag([-1.0, -1.0, 1.0])
+_CAMERA_FROM_VIEWERS = np.diag([1.0, -1.0, -1.0])
+_WIDTH_WITHOUT_A_PHOTOGRAPH_PX = 960
+_MEANS_FOR_DEPTH = 4000
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A place to look from. photo: the address of its photograph; "" without one. held_out:
+    whether training never saw it."""
+
+    name: str
+    camera: Camera
+    photo: str = ""
+    held_out: bool = False
+
+
+def shots_of(views: Sequence[View], splats: Splats) -> tuple[Shot, ...]:
+    """The capture's cameras by name, without photographs; or one in front of the splats."""
+    if not views:
+        return (Shot("in front", in_front_of(splats)),)
+    held = {view.name for view in split_held_out(tuple(views))[1]}
+    ordered = sorted(views, key=lambda view: view.name)
+    return tuple(Shot(view.name, view.camera, held_out=view.name in held) for view in ordered)
+
+
+def in_front_of(splats: Splats) -> Camera:
+    """A camera that sees the middle nine tenths of the splats, from -z and a little above."""
+    means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
+    if len(means) == 0:
+        means = np.zeros((1, 3))
+    low, high = np.percentile(means, (5, 95), axis=0)
+    middle = (low + high) / 2
+    distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
+    eye = middle + distance * np.array([0.0, -0.3, -1.0])
+    side = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX
+    height = side * 3 // 4
+    return Camera(side, height, side, side, side / 2, height / 2, look_at(eye, middle))
+
+
+def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
+    """A shot as plain data. means [N, 3]: what it looks at, for the distance to turn around.
+
+    position, target: the viewer's world. rotation: x, y, z, w, from the viewer's camera to its
+    world. Lengths in pixels as in `Camera`.
+    """
+    camera = shot.camera
+    depth = _depth_of_interest(camera, means)
+    rotation = _VIEWER_FROM_WORLD @ camera.world_to_camera[:3, :3].T @ _CAMERA_FROM_VIEWERS
+    return {
+        "name": shot.name,
+        "photo": shot.photo,
+        "held_out": shot.held_out,
+        **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "position": _plain(_VIEWER_FROM_WORLD @ camera.centre),
+        "target": _plain(_VIEWER_FROM_WORLD @ (camera.centre + depth * camera.forward)),
+        "rotation": _plain(_quaternion_xyzw(rotation)),
+    }
+
+
+def _depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
+    """The median z of what lies in the picture; of all in front if nothing does."""
+    points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
+    x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+    ahead = z > 0.01
+    with np.errstate(all="ignore"):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = ahead & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+    for chosen in (inside, ahead):
+        if chosen.any():
+            return float(np.median(z[chosen]))
+    return 1.0
+
+
+def _quaternion_xyzw(r: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternion of a rotation: the eigenvector of a symmetric matrix, good at every angle."""
+    k = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]],
+            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]],
+            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
+        ]
+    )
+    vector: NDArray[np.float64] = np.linalg.eigh(k)[1][:, -1]
+    return vector if vector[3] >= 0 else -vector
+
+
+def _plain(values: NDArray[np.floating]) -> list[float]:
+    return [round(float(value), 9) for value in values]

@@ -1,0 +1,50 @@
+"""The list of files that `splat view` serves: the page, the splats, the photographs."""
+
+from __future__ import annotations
+
+import mimetypes
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from stages.scene import Splats, View
+from stages.viewer import compose
+from stages.viewer.server import Item
+from stages.viewer.shots import shots_of
+
+
+def site(
+    title: str,
+    splats: Splats,
+    content: Path,
+    views: Sequence[View] = (),
+    photos: Path | None = None,
+    units: str = "arbitrary",
+) -> dict[str, Item]:
+    """By address. content: the splats as .ply. photos: the folder that `View.image` starts from;
+    a photograph that is not there is left out."""
+    items = {"/scene.ply": Item(content, "application/octet-stream")}
+    images = {view.name: view.image for view in views}
+    shots = []
+    for number, shot in enumerate(shots_of(views, splats)):
+        file = _inside(photos, images.get(shot.name, ""))
+        if file is not None:
+            # An address of our own: names of photographs hold anything.
+            address = f"photos/{number}{file.suffix.lower()}"
+            kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+            items[f"/{address}"] = Item(file, kind)
+            shot = replace(shot, photo=address)
+        shots.append(shot)
+    scene = compose.scene_data(title, splats, shots, units=units, content="scene.ply")
+    page = compose.head(scene) + compose.tail()
+    items["/"] = Item(page.encode("utf-8"), "text/html; charset=utf-8")
+    return items
+
+
+def _inside(folder: Path | None, name: str) -> Path | None:
+    """The file of that name in the folder, if there is one: a damaged list of photographs must
+    not make another file public."""
+    if folder is None or not name:
+        return None
+    file = (folder / name).resolve()
+    return file if file.is_relative_to(folder.resolve()) and file.is_file() else None

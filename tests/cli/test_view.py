@@ -1,0 +1,76 @@
+"""`splat view`: from the command to the page and back to the shell."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from stages import formats
+from tests.formats.truth import many_splats
+
+COMMAND = (sys.executable, "-m", "splatcli", "view")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
+@pytest.mark.parametrize(
+    ("suffix", "stop"),
+    [("splat", signal.SIGINT), ("glb", signal.SIGTERM), ("html", signal.SIGINT)],
+)
+def test_a_file_is_served_until_ctrl_c(tmp_path: Path, suffix: str, stop: signal.Signals) -> None:
+    path = tmp_path / f"thing.{suffix}"
+    formats.write(path, many_splats(7))
+    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        [*COMMAND, str(path), "--no-open"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        address = running.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", address)
+        page = urllib.request.urlopen(address, timeout=20).read().decode()
+        content = urllib.request.urlopen(address + "scene.ply", timeout=20).read()
+        running.send_signal(stop)
+        assert running.wait(timeout=20) == 0
+        said = running.stderr.read()
+    assert f"<title>thing.{suffix}</title>" in page
+    assert '"count": 7' in page
+    assert b"element vertex 7\n" in content
+    assert "Traceback" not in said
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_what_is_missing_is_said(splat, tmp_path: Path) -> None:
+    result = splat("view", "nowhere.ply", "--no-open")
+    assert result.exit_code == 3
+    assert "nowhere.ply does not exist" in result.stderr
+
+
+def test_nothing_to_see_is_said(splat, tmp_path: Path) -> None:
+    formats.write(tmp_path / "none.ply", many_splats(4).take([]))
+    result = splat("view", "none.ply", "--no-open")
+    assert result.exit_code == 3
+    assert "none.ply holds no splat" in result.stderr
+
+
+def test_a_taken_port_is_said(splat, tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(4))
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        result = splat("view", "a.ply", "--no-open", "--port", port)
+    assert result.exit_code == 2
+    assert f"Port {port}" in result.stderr
+    assert "Leave --port away" in result.stderr
