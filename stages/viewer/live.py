@@ -92,13 +92,12 @@ class LivePage:
 
     def _answer_picture(self, query: dict[str, str]) -> Item:
         """shot: number of the camera whose lens is used. side: longer side in pixels. place:
-        12 numbers, the upper rows of world_to_camera; by default those of the shot."""
-        number, side = int(query.get("shot", "0")), int(query.get("side", "640"))
+        12 numbers, the upper rows of world_to_camera."""
+        number, side = int(query.get("shot", "")), int(query.get("side", ""))
         if not (0 <= number < len(self._cameras) and SIDES[0] <= side <= SIDES[1]):
             raise ValueError(f"shot {number}, side {side}")
-        camera = self._cameras[number].fitted(side)
-        if "place" in query:
-            camera = replace(camera, world_to_camera=_rigid(query["place"]))
+        place = _rigid(query.get("place", ""))
+        camera = replace(self._cameras[number].fitted(side), world_to_camera=place)
         last = self._end_told
         picture = self.pictures.ask(camera, PATIENCE_S)
         self.told = last

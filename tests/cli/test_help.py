@@ -79,6 +79,7 @@ def test_process_has_the_promised_options() -> None:
         "--max-splats",
         "--format",
         "--allow-partial",
+        "--view",
         "--quiet",
         "--json",
     ):

@@ -77,23 +77,20 @@ async function follow() {
     }
 }
 
-function address(side) {
-    const shot = scene.shots.indexOf(live.shot);
-    const place = live.moved ? `&place=${orbit.place().join()}` : "";
-    return `picture?shot=${shot}&side=${side}${place}`;
-}
-
 async function draw() {
     const { version } = live;
     const box = find("view").getBoundingClientRect();
     const whole = Math.max(SIDES[0], Math.min(SIDES[1], Math.round(Math.max(box.width, box.height))));
     const still = live.drawn === version || !live.picture;
-    const picture = await ask(address(still ? whole : Math.min(whole, QUICK_SIDE)));
+    const side = still ? whole : Math.min(whole, QUICK_SIDE);
+    const place = live.moved ? orbit.place() : live.shot.place;
+    const shot = scene.shots.indexOf(live.shot);
+    const picture = await ask(`picture?shot=${shot}&side=${side}&place=${place.join()}`);
     if (!picture.jpeg) return REST_MS;
     live.drawn = version;
     image.src = picture.jpeg;
     await image.decode();
-    live.picture = { ...picture, jpeg: "", shot: live.shot.name, version, sharp: still };
+    live.picture = { step: picture.step, seconds: picture.seconds, sharp: still, place, version };
     panel.tick();
     if (version !== live.version || !still) return 0;
     return Math.max(REST_MS, (1000 * picture.seconds) / REST_SHARE);
@@ -166,8 +163,9 @@ const panel = new Live(scene, (shot) => {
     changed();
     panel.shown(shot);
 });
-find("title").title = "Drag to turn, right-drag to move, wheel to come closer; W A S D Q E to fly; "
-    + "left and right for the cameras; P for the photograph.";
+const help = find("panel").appendChild(document.createElement("small"));
+help.textContent = "Drag turns, right drag moves, the wheel comes closer, W A S D Q E fly; "
+    + "\u2190 \u2192 other cameras, P the photograph.";
 panel.step(Math.max(0, scene.shots.findIndex((shot) => shot.held_out)));
 listen();
 follow();
