@@ -203,10 +203,13 @@ def test_the_picture_follows_training_untouched_and_the_end_is_told(
     worker.join()
     worker.page.pictures.offer_last(worker.draw, 1_000_000)
     worker.page.ended("finished")
-    until(browser, "splatLive.picture.step === 1000000")
+    until(browser, "splatLive.picture.step === 1000000 && splatLive.state.end")
     message = browser.run("document.getElementById('message').textContent")
     assert "Training has finished" in message
-    assert worker.page.told
+    deadline = time.monotonic() + WAIT_S
+    while not worker.page.told:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_at_rest_a_picture_is_asked_for_seldom(browser: Browser, worker: Any) -> None:

@@ -64,15 +64,17 @@ async function ask(address) {
     return answer.json();
 }
 
+const over = () => Boolean(live.state.end) || live.gone;
+
 async function follow() {
-    while (!live.state.end && !live.gone) {
+    while (!over()) {
         try {
             live.state = await ask("state");
         } catch {
             live.gone = true;
         }
         panel.tick();
-        if (live.state.end || live.gone) wake();
+        if (over()) wake();
         await new Promise((done) => setTimeout(done, STATE_MS));
     }
 }
@@ -97,13 +99,12 @@ async function draw() {
 }
 
 async function pictures() {
-    for (let last = false; !last && !live.gone; ) {
-        last = live.state.end !== undefined && live.state.end !== "";
-        let rest = STATE_MS;
-        const training = live.state.phase === "training";
-        if (last || (training && !document.hidden)) rest = await draw().catch(() => STATE_MS);
-        if (!last) await pause(rest);
+    while (!over()) {
+        const wanted = live.state.phase === "training" && !document.hidden;
+        const rest = wanted ? await draw().catch(() => REST_MS) : STATE_MS;
+        if (!over()) await pause(rest);
     }
+    await draw().catch(() => {}); // the trainer's last picture stays
 }
 
 function changed() {
