@@ -83,3 +83,7 @@ ASPECT_TIMES_ANGLE = 0.5
 EIGHT_BIT_ANGLE = 0.02
 """Radians by which 8 bits a component may turn a rotation: four errors of 1/256, doubled, and what
 bringing it back to length 1 adds."""
+
+LIVE_PICTURE_DB = 40.0
+"""What a browser shows of a training against the reference's picture from the same place: all that
+lies between is JPEG of quality 92, which leaves 45 to 51 dB of pictures without camera noise."""

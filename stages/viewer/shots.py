@@ -72,7 +72,7 @@ def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
     world. Lengths in pixels as in `Camera`.
     """
     camera = shot.camera
-    depth = _depth_of_interest(camera, means)
+    depth = depth_of_interest(camera, means)
     rotation = _VIEWER_FROM_WORLD @ camera.world_to_camera[:3, :3].T @ _CAMERA_FROM_VIEWERS
     return {
         "name": shot.name,
@@ -85,7 +85,7 @@ def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
     }
 
 
-def _depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
+def depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
     """The median z of what lies in the picture; of all in front if nothing does."""
     points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
     x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T

@@ -81,6 +81,7 @@ def test_process_has_the_promised_options() -> None:
         "--max-splats",
         "--format",
         "--allow-partial",
+        "--view",
         "--quiet",
         "--json",
     ):
