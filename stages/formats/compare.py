@@ -8,9 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import FORMATS
+from stages.formats.blocks import block_of, passing
 from stages.formats.turn import turned
 from stages.formats.verify import FileContent
 from stages.scene import Splats
+
+_NAMES = (
+    "max_position_error",
+    "max_log_scale_error",
+    "max_opacity_error",
+    "max_rotation_error_degrees",
+    "max_sh_error",
+)
 
 
 def largest_errors(splats: Splats, content: FileContent, name: str) -> dict[str, float]:
@@ -19,26 +28,31 @@ def largest_errors(splats: Splats, content: FileContent, name: str) -> dict[str,
     splats: what was written, as `rows.kept_rows` leaves them. name: of the format; some sort the
     rows. Positions in world units, scales in natural logarithms, opacities in 0..1.
     """
-    if content.world_from_file[1, 1] < 0:
-        splats = turned(splats)
-    order = getattr(importlib.import_module(f"stages.formats.{FORMATS[name]}"), "order", None)
-    if order is not None:
-        splats = splats.take(order(splats))
+    module = importlib.import_module(f"stages.formats.{FORMATS[name]}")
+    order = module.order(splats) if hasattr(module, "order") else None
     if name == "splat":
         splats = splats.with_sh_degree(0)
-    file = content.splats.with_sh_degree(splats.sh_degree)
-    return {
-        "max_position_error": _largest(splats.means, file.means),
-        "max_log_scale_error": _largest(splats.log_scales, file.log_scales),
-        "max_opacity_error": _largest(splats.opacities, file.opacities),
-        "max_rotation_error_degrees": _rotation(splats.quaternions, file.quaternions),
-        "max_sh_error": _largest(splats.sh, file.sh),
-    }
+    worst: dict[str, float] = dict.fromkeys(_NAMES, 0.0)
+    for rows in passing(len(splats)):
+        mine, theirs = block_of(splats, rows, order), block_of(content.splats, rows)
+        if content.world_from_file[1, 1] < 0:
+            mine = turned(mine)
+        theirs = theirs.with_sh_degree(splats.sh_degree)
+        errors = (
+            _largest(mine.means, theirs.means),
+            _largest(mine.log_scales, theirs.log_scales),
+            _largest(mine.opacities, theirs.opacities),
+            _rotation(mine.quaternions, theirs.quaternions),
+            _largest(mine.sh, theirs.sh),
+        )
+        # NaN stays: a comparison with it would lose it
+        worst = {k: float(np.maximum(worst[k], e)) for k, e in zip(_NAMES, errors, strict=True)}
+    return {name: float(f"{value:.3g}") for name, value in worst.items()}
 
 
 def _largest(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     difference = np.abs(a.astype(np.float64) - b.astype(np.float64))
-    return float(f"{difference.max(initial=0.0):.3g}")
+    return float(difference.max(initial=0.0))
 
 
 def _rotation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
@@ -49,4 +63,4 @@ def _rotation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
     # |a - b| = 2 sin(angle / 4): exact for small angles, where the arc cosine is not
     apart = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
     degrees = np.degrees(4 * np.arcsin(np.minimum(apart / 2, 1)))
-    return float(f"{degrees.max(initial=0.0):.3g}")
+    return float(degrees.max(initial=0.0))
