@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +19,23 @@ LOG_SCALE_MIN = -87.0  # below it a scale is no normal float32 any more
 # What linear 0 and 1 become: alpha is drawn between 1/255 and 0.99, so neither can be told from
 # the exact value.
 LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
+
+_keeps_damage: ContextVar[bool] = ContextVar("keeps_damage", default=False)
+
+
+@contextmanager
+def damage_kept() -> Iterator[None]:
+    """Inside, readers hand out values that are not finite instead of refusing the file: for who
+    wants to know what is in it."""
+    token = _keeps_damage.set(True)
+    try:
+        yield
+    finally:
+        _keeps_damage.reset(token)
+
+
+def keeps_damage() -> bool:
+    return _keeps_damage.get()
 
 
 def drawable(splats: Splats) -> NDArray[np.bool_]:
@@ -80,9 +100,9 @@ def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
     logits = np.empty(len(opacities), np.float32)
     for rows in blocks(len(opacities)):
         p = opacities[rows].astype(np.float64)
-        if not ((p >= 0) & (p <= 1)).all():
+        if not ((p >= 0) & (p <= 1)).all() and not keeps_damage():
             raise BadFileError("opacities lie outside 0..1")
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             logits[rows] = np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX)
     return logits
 
@@ -93,9 +113,9 @@ def logs_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.flo
     logs = np.empty(scales.shape, np.float32)
     for rows in blocks(len(scales)):
         exact = scales[rows].astype(np.float64) * factor
-        if not (exact >= 0).all():
+        if not (exact >= 0).all() and not keeps_damage():
             raise BadFileError("scales are negative or not numbers")
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             logs[rows] = np.maximum(np.log(exact), LOG_SCALE_MIN)
     return logs
 
@@ -130,7 +150,7 @@ def checked(splats: Splats) -> Splats:
     )
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
         bad = not_finite(getattr(clean, name))
-        if bad:
+        if bad and not keeps_damage():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")
     return clean
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,35 +71,23 @@ def _gzipped(file: BinaryIO, size: int) -> _Content:
         raise BadFileError("it does not hold 'NGSP'")
     if version not in (2, 3):
         raise BadFileError(f"it is SPZ version {version} in gzip; there 2 and 3 are read")
-    widths = _widths(version, degree, bits)
-    stream.expect(count * sum(widths))
-    arrays = [stream.rows(count, width) for width in widths]
+    sizes = widths(version, degree, bits)
+    stream.expect(count * sum(sizes))
+    arrays = [stream.rows(count, size) for size in sizes]
     extra = stream.finish()
     upright = _is_upright(extra) if flags & _HAS_EXTENSIONS else True
     return _Content(version, degree, bits, arrays, upright)
 
 
 def _plain(file: BinaryIO, size: int) -> _Content:
-    head = file.read(HEADER.size + _TABLE_STARTS.size)
-    if len(head) < HEADER.size + _TABLE_STARTS.size:
-        raise BadFileError("it is cut short")
-    _, version, count, degree, bits, flags, streams = HEADER.unpack_from(head)
-    (table_starts,) = _TABLE_STARTS.unpack_from(head, HEADER.size)
-    if version != 4:
-        raise BadFileError(f"it is SPZ version {version} without gzip; there 4 is read")
-    widths = _widths(version, degree, bits)
-    check_size(count * sum(widths), size)
-    if not 0 <= table_starts - len(head) <= min(_EXTENSIONS_LIMIT_BYTES, size):
-        raise BadFileError(f"its table starts at {table_starts}")
-    extra = file.read(table_starts - len(head))
-    table = file.read(streams * _TABLE_ROW.size)
-    if len(table) < streams * _TABLE_ROW.size:
-        raise BadFileError("it is cut short")
-    sizes = list(_TABLE_ROW.iter_unpack(table))
-    if streams < len(widths) - (widths[-1] == 0):
-        raise BadFileError(f"it has {streams} streams for {len(widths)} arrays")
+    head, extra, table = _table(file, size)
+    _, version, count, degree, bits, flags, streams = head
+    sizes = widths(version, degree, bits)
+    check_size(count * sum(sizes), size)
+    if streams < len(sizes) - (sizes[-1] == 0):
+        raise BadFileError(f"it has {streams} streams for {len(sizes)} arrays")
     arrays = []
-    for width, (packed, declared) in zip(widths, [*sizes, (0, 0)], strict=False):
+    for width, (packed, declared) in zip(sizes, [*table, (0, 0)], strict=False):
         if declared != count * width:
             raise BadFileError(f"it declares {declared} bytes for {count} times {width}")
         arrays.append(unpacked(file, packed, declared).reshape(count, width))
@@ -107,7 +95,35 @@ def _plain(file: BinaryIO, size: int) -> _Content:
     return _Content(version, degree, bits, arrays, upright)
 
 
-def _widths(version: int, degree: int, bits: int) -> tuple[int, ...]:
+def _table(file: BinaryIO, size: int) -> tuple[tuple[Any, ...], bytes, list[tuple[int, int]]]:
+    """(header, extensions, (packed, unpacked) bytes of each stream) of a file of version 4, which
+    is left where the streams start."""
+    head = file.read(HEADER.size + _TABLE_STARTS.size)
+    if len(head) < HEADER.size + _TABLE_STARTS.size:
+        raise BadFileError("it is cut short")
+    values = HEADER.unpack_from(head)
+    (starts,) = _TABLE_STARTS.unpack_from(head, HEADER.size)
+    if values[1] != 4:
+        raise BadFileError(f"it is SPZ version {values[1]} without gzip; there 4 is read")
+    if not 0 <= starts - len(head) <= min(_EXTENSIONS_LIMIT_BYTES, size):
+        raise BadFileError(f"its table starts at {starts}")
+    extra = file.read(starts - len(head))
+    table = file.read(values[-1] * _TABLE_ROW.size)
+    if len(table) < values[-1] * _TABLE_ROW.size:
+        raise BadFileError("it is cut short")
+    return values, extra, list(_TABLE_ROW.iter_unpack(table))
+
+
+def packed_sizes(path: Path) -> list[int]:
+    """Bytes in the file of each array of version 4; [] for the versions that pack all together."""
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            return []
+        file.seek(0)
+        return [packed for packed, _ in _table(file, path.stat().st_size)[2]]
+
+
+def widths(version: int, degree: int, bits: int) -> tuple[int, ...]:
     """Bytes a splat of each array."""
     if degree > 3 or bits > 31:
         raise BadFileError(f"its SH degree is {degree} and its fractional bits are {bits}")

@@ -1,7 +1,7 @@
 """Reading Gaussian splats from USD, in a process of its own.
 
 The USD library ends the whole process when it meets some kinds of damage in a .usdc, so the file
-is opened by a child: `python -m stages.formats.usd_read FILE OUTPUT` leaves the splats in OUTPUT
+is opened by a child: `python -m stages.formats.usd_read FILE OUTPUT [keep-damage]` leaves the splats in OUTPUT
 (see stages.scene.storage) or says on its standard output why not.
 """
 
@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stages.formats.far import recentred
 from stages.formats.problems import BadFileError, reading
-from stages.formats.rows import checked, joined, logits_of, logs_of
+from stages.formats.rows import checked, damage_kept, joined, keeps_damage, logits_of, logs_of
 from stages.formats.turn import turned
 from stages.scene import Splats, load_splats, save_splats
 
@@ -48,6 +48,7 @@ def read(path: Path) -> Splats:
             "stages.formats.usd_read",
             str(path.resolve()),
             str(output),
+            *(["keep-damage"] if keeps_damage() else []),
         ]
         try:
             child = subprocess.run(
@@ -161,10 +162,11 @@ def _limit_memory(path: Path) -> None:
 
 def main(arguments: list[str]) -> int:
     """The child: exit status 0 with the splats in the second file, or 3 with the reason said."""
-    source, output = map(Path, arguments)
+    source, output = map(Path, arguments[:2])
     _limit_memory(source)
     try:
-        splats = parse(source)
+        with damage_kept() if arguments[2:] else nullcontext():
+            splats = parse(source)
     except BadFileError as error:
         print(error)
         return _REFUSED
