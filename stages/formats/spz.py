@@ -30,6 +30,7 @@ from stages.scene import Splats
 
 __all__ = ["read", "write"]
 
+_LEVEL = 6  # 9 takes eight times as long for 1 % less
 _LEAST_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
 _FIXED_LIMIT = (1 << 23) - 1
 _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip then packs
@@ -59,7 +60,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         replacing(path) as temporary,
         temporary.open("wb") as file,
         # without a name and a time, so that equal splats give equal bytes
-        gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as packed,
+        gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) as packed,
     ):
         packed.write(header)
         for array in arrays:
