@@ -83,3 +83,7 @@ ASPECT_TIMES_ANGLE = 0.5
 EIGHT_BIT_ANGLE = 0.02
 """Radians by which 8 bits a component may turn a rotation: four errors of 1/256, doubled, and what
 bringing it back to length 1 adds."""
+
+FILM_LEVELS = 3
+"""Of 255, by which a film's plain colour may differ: luma has 219 levels, chroma 224, and H.264
+rounds at quality 17."""
