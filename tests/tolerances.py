@@ -87,3 +87,7 @@ bringing it back to length 1 adds."""
 LIVE_PICTURE_DB = 40.0
 """What a browser shows of a training against the reference's picture from the same place: all that
 lies between is JPEG of quality 92, which leaves 45 to 51 dB of pictures without camera noise."""
+
+FILM_LEVELS = 3
+"""Of 255, by which a film's plain colour may differ: luma has 219 levels, chroma 224, and H.264
+rounds at quality 17."""
