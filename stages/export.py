@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 
 FORMATS = (
     *("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz"),
-    *("compressed.ply", "spz", "sog", "html"),
+    *("quantised.glb", "compressed.ply", "spz", "sog", "html"),
 )
 _LOSSES = {
     "splat": "has 8-bit colours that do not change with the view",
+    "quantised.glb": "has rotations, sizes and opacities of 16 bits",
     "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
     "spz": "has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
     "sog": "has 256 sizes and colours, and a palette of view-dependent colours",

@@ -23,6 +23,7 @@ FORMATS = {
     "glb": "gltf",
     "usdz": "usd",
     "gltf": "gltf",
+    "quantised.glb": "gltf_quantised",
     "usda": "usd",
     "usdc": "usd",
     "compressed.ply": "compressed_ply",
@@ -31,7 +32,7 @@ FORMATS = {
     "html": "html",
 }
 # Those that hold less than float32: smaller, and not the same splats any more.
-LOSSY = ("splat", "compressed.ply", "spz", "sog")
+LOSSY = ("splat", "quantised.glb", "compressed.ply", "spz", "sog")
 
 
 def format_of(path: Path) -> str:
