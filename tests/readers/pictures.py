@@ -22,10 +22,12 @@ PAGES = Path(__file__).parent / "pages"
 # What each engine reads (their documentation, and tried).
 ENGINES = {
     "playcanvas": ("ply", "glb", "quantised.glb", "gltf", "compressed.ply", "sog"),
+    "three": ("glb", "quantised.glb", "gltf"),
     "spark": ("ply", "splat", "compressed.ply", "spz", "sog"),
 }
 NEAR, FAR = 0.01, 1000.0
 _PATIENCE_S = 120
+_AT_REST = 3  # equal pictures in a row, so that a sort that is under way shows
 
 
 class _Handler(SimpleHTTPRequestHandler):
@@ -81,11 +83,13 @@ class Engine:
     """One engine in one browser page."""
 
     def __init__(self, browser: Browser, address: str, name: str) -> None:
+        browser.said.clear()
         self.browser = browser
         browser.open(f"{address}index.html?engine={name}")
         deadline = time.monotonic() + _PATIENCE_S
         while not browser.run("'splatOpen' in window"):
-            assert time.monotonic() < deadline, browser.said
+            assert not browser.said, browser.said
+            assert time.monotonic() < deadline, "the engine never loaded"
             time.sleep(0.1)
 
     def open(self, name: str) -> int:
@@ -100,11 +104,12 @@ class Engine:
         """
         self.browser.run(f"splatLook({json.dumps(view_of(camera))})")
         deadline = time.monotonic() + _PATIENCE_S
-        last = None
+        last, same = self.browser.picture(), 0
         while time.monotonic() < deadline:
-            self.browser.run("splatFrames(6)")
+            self.browser.run("splatFrames(2)")
             picture = self.browser.picture()
-            if last is not None and picture.any() and np.array_equal(picture, last):
+            same = same + 1 if picture.any() and np.array_equal(picture, last) else 0
+            if same == _AT_REST:
                 return picture
             last = picture
         raise AssertionError(f"the picture never came to rest; the page said {self.browser.said}")

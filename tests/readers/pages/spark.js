@@ -14,7 +14,7 @@ export async function open(canvas, address) {
   // What the reference rasteriser does, where Spark has other defaults: widen each splat by 0.3
   // pixels without making up for it, sort by depth, cut at 3 standard deviations.
   const spark = new SparkRenderer({
-    renderer, preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3,
+    renderer, preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3, clipXY: 4,
   });
   scene.add(spark);
   camera = new THREE.PerspectiveCamera();
