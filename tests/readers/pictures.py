@@ -27,7 +27,8 @@ ENGINES = {
 }
 NEAR, FAR = 0.01, 1000.0
 _PATIENCE_S = 120
-_AT_REST = 3  # equal pictures in a row, so that a sort that is under way shows
+# How long a picture must stay as it is: a sort that is under way has ended by then.
+_REST_S, _REST_FRAMES = 2.0, 5
 
 
 class _Handler(SimpleHTTPRequestHandler):
@@ -104,14 +105,15 @@ class Engine:
         """
         self.browser.run(f"splatLook({json.dumps(view_of(camera))})")
         deadline = time.monotonic() + _PATIENCE_S
-        last, same = self.browser.picture(), 0
+        last, since, frames = self.browser.picture(), time.monotonic(), 0
         while time.monotonic() < deadline:
             self.browser.run("splatFrames(2)")
             picture = self.browser.picture()
-            same = same + 1 if picture.any() and np.array_equal(picture, last) else 0
-            if same == _AT_REST:
+            if not picture.any() or not np.array_equal(picture, last):
+                last, since, frames = picture, time.monotonic(), 0
+            frames += 2
+            if frames > _REST_FRAMES and time.monotonic() - since > _REST_S:
                 return picture
-            last = picture
         raise AssertionError(f"the picture never came to rest; the page said {self.browser.said}")
 
 

@@ -11,6 +11,8 @@ export async function open(canvas, address) {
   app.setCanvasResolution(pc.RESOLUTION_FIXED, canvas.width, canvas.height);
   app.setCanvasFillMode(pc.FILLMODE_NONE);
   app.scene.gsplat.dataFormat = pc.GSPLATDATA_LARGE; // float32 colours and positions
+  // By default colours follow the view only after a turn of 10 degrees.
+  app.scene.gsplat.colorUpdateAngle = 0;
   camera = new pc.Entity();
   camera.addComponent('camera', {
     clearColor: new pc.Color(0, 0, 0, 1),
@@ -46,10 +48,17 @@ function component(options) {
   return options.asset.resource;
 }
 
-export function look({ worldFromView, projection }) {
+export async function look({ worldFromView, projection }) {
   const place = new pc.Mat4();
   place.data.set(worldFromView);
-  camera.setPosition(place.getTranslation());
-  camera.setRotation(new pc.Quat().setFromMat4(place));
   camera.camera.calculateProjection = (matrix) => matrix.data.set(projection);
+  // Arrive by moving, as a person would: what is sorted and coloured before the first frame of a
+  // new scene is done again only when the camera moves.
+  for (const degrees of [2, 1, 0]) {
+    camera.setPosition(place.getTranslation());
+    camera.setRotation(new pc.Quat().setFromMat4(place));
+    camera.rotateLocal(0, degrees, 0);
+    camera.translateLocal(0.01 * degrees, 0, 0);
+    await window.splatFrames(3);
+  }
 }
