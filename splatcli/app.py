@@ -201,7 +201,7 @@ def convert(
 ) -> None:
     """Make a splat file into one of another format.
 
-    Endings: .ply .splat .glb .gltf .usda .usdc .usdz .compressed.ply .spz .sog .html
+    Endings: .ply .splat .glb .gltf .usda .usdc .usdz .quantised.glb .compressed.ply .spz .sog .html
     """
     from splatcli import convert as work
 

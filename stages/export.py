@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FORMATS = (
     *("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz"),
-    *("compressed.ply", "spz", "sog", "html"),
+    *("quantised.glb", "compressed.ply", "spz", "sog", "html"),
 )
 _INDEX = "assets.json"
 
