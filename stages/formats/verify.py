@@ -183,7 +183,7 @@ def _gltf(path: Path) -> FileContent:
     return FileContent(_concatenated(parts), Y_UP)
 
 
-def _accessor_values(accessor: Any, view: Any, blob: bytes) -> NDArray[np.floating]:
+def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
     """[count, components], one element after the other; c / (2^b - 1) or, signed,
     c / (2^(b - 1) - 1) of normalised integers (glTF 2.0, section 3.6.2.2)."""
     kind = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor.componentType]
