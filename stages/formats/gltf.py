@@ -64,7 +64,7 @@ def write(
     document, arrays = _document(attributes, splats, units)
     size = sum(array.nbytes for array in arrays)
     if path.suffix.lower() == ".glb":
-        _write_glb(path, document, arrays, size)
+        write_glb(path, document, arrays, size)
     else:
         _write_pair(path, document, arrays, size)
     return dropped
@@ -92,11 +92,15 @@ def _primitives(splats: Splats) -> Iterator[dict[str, NDArray[Any]]]:
 
 
 def _fallback_colours(splats: Splats, opacities: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """[N, 4] for viewers that only draw points: glTF wants linear light (IEC 61966-2-1)."""
+    """[N, 4] for viewers that only draw points: glTF wants linear light."""
     encoded = np.clip(dc_to_rgb(splats.sh[:, 0].astype(np.float64)), 0, 1)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    colours = np.concatenate([linear, opacities[:, None]], axis=1)
+    colours = np.concatenate([linear_light(encoded), opacities[:, None]], axis=1)
     return np.rint(65535 * colours).astype("<u2")
+
+
+def linear_light(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
+    """sRGB values in 0..1 as linear light in 0..1 (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _document(
@@ -112,7 +116,7 @@ def _document(
         names = {}
         for name, array in attributes.items():
             names[name] = len(accessors)
-            accessors.append(_accessor(name, array, len(views)))
+            accessors.append(accessor(name, array, len(views)))
             views.append(
                 {
                     "buffer": 0,
@@ -147,20 +151,21 @@ def _document(
     return document, arrays
 
 
-def _accessor(name: str, array: NDArray[Any], view: int) -> dict[str, Any]:
+def accessor(name: str, array: NDArray[Any], view: int) -> dict[str, Any]:
+    """Of a vertex attribute; integers are read as shares of the largest."""
     kind = {1: "SCALAR", 2: f"VEC{array.shape[-1]}"}[array.ndim]
-    accessor: dict[str, Any] = {
+    described: dict[str, Any] = {
         "bufferView": view,
         "componentType": _COMPONENT_TYPES[array.dtype.newbyteorder("<").str],
         "count": len(array),
         "type": kind,
     }
     if array.dtype.kind == "u":
-        accessor["normalized"] = True
+        described["normalized"] = True
     if name == "POSITION":
-        accessor["min"] = [float(v) for v in array.min(axis=0)]
-        accessor["max"] = [float(v) for v in array.max(axis=0)]
-    return accessor
+        described["min"] = [float(v) for v in array.min(axis=0)]
+        described["max"] = [float(v) for v in array.max(axis=0)]
+    return described
 
 
 def _primitive(names: dict[str, int]) -> dict[str, Any]:
@@ -178,7 +183,9 @@ def _primitive(names: dict[str, int]) -> dict[str, Any]:
     }
 
 
-def _write_glb(path: Path, document: dict[str, Any], arrays: list[NDArray[Any]], size: int) -> None:
+def write_glb(path: Path, document: dict[str, Any], arrays: list[NDArray[Any]], size: int) -> None:
+    """`document` and, as its one buffer, `arrays` one after the other: `size` bytes in all, a
+    multiple of 4 each. Raises SplatError when it cannot be written or would pass 4 GiB."""
     if arrays:
         document["buffers"] = [{"byteLength": size}]
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()

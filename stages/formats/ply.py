@@ -130,6 +130,8 @@ def parse(path: Path) -> Splats:
 def _check_is_splats(header: Header) -> None:
     names = {name for name, _ in header.vertex.properties}
     missing = [name for name in _REQUIRED if name not in names]
+    if missing and any(element.name == "face" for element in header.elements):
+        raise BadFileError("it is a mesh of triangles, not splats")
     if missing:
         raise BadFileError(f"its vertices lack {', '.join(missing)}: they are no splats")
     if header.vertex.has_lists:
