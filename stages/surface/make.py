@@ -121,8 +121,8 @@ def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
 def _from_sparse_points(
     mesh: Mesh, points: NDArray[np.float64], volume: fuse.Volume
 ) -> dict[str, float | None]:
-    inside = ((points >= volume.corner) & (points <= volume.far_corner)).all(axis=1)
-    share = float(inside.mean()) if len(inside) else 0.0
+    inside = np.all((points >= volume.corner) & (points <= volume.far_corner), axis=1)
+    share = float(inside.mean()) if len(points) else 0.0
     figures: dict[str, float | None] = {"sparse_points_inside_share": round(share, 4)}
     found = distances(points[inside], mesh, volume.voxel)
     diagonal = float(np.linalg.norm(volume.far_corner - volume.corner))

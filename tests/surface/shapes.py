@@ -21,24 +21,34 @@ def directions(count: int) -> NDArray[np.float64]:
     return np.stack([r * np.cos(turn), y, r * np.sin(turn)], axis=1)
 
 
-def splats_at(
-    places: NDArray[np.floating], size: float, rgb: tuple[float, float, float], logit: float = 4.0
+def ball(
+    centre: NDArray[np.floating],
+    radius: float,
+    rgb: tuple[float, float, float],
+    count: int = 4000,
+    logit: float = 4.0,
 ) -> Splats:
-    """Round splats of standard deviation `size`, all alike."""
-    n = len(places)
-    dc = rgb_to_dc(np.broadcast_to(np.array(rgb, np.float32), (n, 3)))
+    """A sphere tiled with discs of splats, each flat against it."""
+    outwards = directions(count)
+    across = 2.2 * radius / np.sqrt(count)  # two thirds of the way from one to the next
+    flat = across / 20
+    dc = rgb_to_dc(np.broadcast_to(np.array(rgb, np.float32), (count, 3)))
+    # The half-way rotation from z to the normal: (1 + n_z, z x n), which is never zero here.
+    quaternions = np.stack(
+        [1 + outwards[:, 2], -outwards[:, 1], outwards[:, 0], np.zeros(count)], axis=1
+    )
     return Splats(
-        means=np.asarray(places, np.float32),
-        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        log_scales=np.full((n, 3), np.log(size), np.float32),
-        opacity_logits=np.full(n, logit, np.float32),
+        means=(centre + radius * outwards).astype(np.float32),
+        quaternions=quaternions.astype(np.float32),
+        log_scales=np.tile(np.log([across, across, flat]), (count, 1)).astype(np.float32),
+        opacity_logits=np.full(count, logit, np.float32),
         sh=np.asarray(dc, np.float32)[:, None],
-        sh_degrees=np.zeros(n, np.uint8),
+        sh_degrees=np.zeros(count, np.uint8),
     )
 
 
 def sphere(rgb: tuple[float, float, float] = (1.0, 0.5, 0.0), logit: float = 4.0) -> Splats:
-    return splats_at(CENTRE + directions(4000), 0.03, rgb, logit)
+    return ball(CENTRE, 1.0, rgb, logit=logit)
 
 
 def joined(*parts: Splats) -> Splats:
