@@ -173,6 +173,32 @@ def convert(
     work.convert(source, target, quiet, as_json)
 
 
+def verify(
+    target: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Splat file, or a run folder for all its files; by default the run here."
+        ),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder or splat file that it must equal; by default the run around it."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Prove a file: read it with a second parser, draw it, compare it with what was trained.
+
+    A file outside a run, without --against, is compared with itself: two parsers that share no
+    code must read the same. Exit status 7 if a file is wrong.
+    """
+    from splatcli import verify as work
+
+    work.verify(target, against, quiet, as_json)
+
+
 def doctor(as_json: AsJson = False) -> None:
     """Check what this machine has, and what is missing."""
     from splatcli import checkup
@@ -194,6 +220,7 @@ def _register() -> None:
         (view, "splat view run/"),
         (info, "splat info run/7-export/scene.ply"),
         (convert, "splat convert scene.ply scene.sog"),
+        (verify, "splat verify run/7-export/scene.glb"),
         (doctor, "splat doctor"),
     ):
         app.command(extra.__name__, epilog=_example(line))(guarded(extra))

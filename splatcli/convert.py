@@ -19,7 +19,7 @@ _STEPS = 3
 
 
 def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
-    """Read `source`, write `target`, read that again with another parser and compare.
+    """Read `source`, write `target`, read that again with another parser, draw it and compare.
 
     Raises SplatError: what keeps a file from being read or written, "convert-mesh", and
     "convert-verify-failed".
@@ -37,7 +37,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
         say(f"writing {target}")
         dropped = formats.write(target, splats)
         say(f"comparing {target}")
-        errors = _compared(target, names[1], kept_rows(splats)[0])
+        found = _proven(source, target, kept_rows(splats)[0])
     size = target.stat().st_size
     if names[1] == "gltf" and len(splats) > dropped:
         size += target.with_suffix(".bin").stat().st_size
@@ -49,36 +49,36 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
         "size_bytes": size,
         "bytes_per_splat": round(size / max(1, len(splats) - dropped), 2),
         "seconds": round(time.monotonic() - begun, 2),
-        **errors,
+        **found,
     }
     if as_json:
         console.emit("converted", **facts)
         return
     if dropped:
         console.note(f"Warning: {dropped} splats that no viewer can draw were left out.", "yellow")
-    _show(facts, errors, quiet)
+    _show(facts, found, quiet)
 
 
-def _show(facts: dict[str, Any], errors: dict[str, float], quiet: bool) -> None:
+def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
     told = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
-    console.note(f"{facts['target']}: {told}, {facts['bytes_per_splat']:.1f} bytes each")
-    worst = {name: value for name, value in errors.items() if value > 0}
+    quality = console.figure("verify_db", found["verify_db"])
+    console.note(f"{facts['target']}: {told}, {facts['bytes_per_splat']:.1f} bytes each, {quality}")
+    worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}
     if worst and not quiet:
         console.note(f"Largest differences: {console.figures(worst)}", "dim")
 
 
-def _compared(path: Path, name: str, splats: Splats) -> dict[str, float]:
-    """The largest errors of the values. Raises SplatError "convert-verify-failed"."""
-    from stages.formats.compare import largest_errors
-    from stages.formats.verify import read_back
+def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
+    """What the proof found. Raises SplatError "convert-verify-failed"."""
+    from splatcli.views import views_around
+    from stages.formats import format_of
+    from stages.formats.proof import Prover, cameras_for
 
-    try:
-        content = read_back(path)
-    except Exception as error:  # whatever another parser raises: the file is wrong
-        raise _failed(path, f"another reader refused it ({error})") from error
-    if len(content.splats) != len(splats):
-        raise _failed(path, f"it holds {len(content.splats)} of {len(splats)} splats")
-    return largest_errors(splats, content, name)
+    cameras = cameras_for(splats, views_around(source))
+    proof = Prover.of(splats, cameras, came_as=format_of(source)).prove(target)
+    if proof.fault:
+        raise _failed(target, proof.fault)
+    return proof.figures
 
 
 def _no_mesh(target: Path) -> SplatError:

@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from splatcli import options, progress, summary
+from splatcli import options, progress, summary, watching
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
 from stages.run import runfolder
@@ -40,6 +40,12 @@ def preset_parameter() -> Parameter:
     return options.keyword("preset", options.choice("preset", presets()) | None, option)
 
 
+def view_parameter() -> Parameter:
+    """`--view`, of the commands that train."""
+    option = typer.Option("--view", help="Show the scene in the browser while it is trained.")
+    return options.keyword("view", bool, option, default=False)
+
+
 def presets() -> Mapping[str, Any]:
     """Training settings by preset name."""
     from stages.train import PRESETS
@@ -54,13 +60,14 @@ def process_parameters() -> list[Parameter]:
     for name in STAGE_NAMES:
         for parameter in options.parameters(load_stage(name).settings_type, PROCESS_OPTIONS):
             found.setdefault(parameter.name, parameter)
-    return [preset_parameter(), *(found[name] for name in PROCESS_OPTIONS if name in found)]
+    chosen = (found[name] for name in PROCESS_OPTIONS if name in found)
+    return [preset_parameter(), *chosen, view_parameter()]
 
 
 def stage_parameters(name: str) -> list[Parameter]:
-    """All settings of one stage; training has presets too."""
+    """All settings of one stage; training has presets too, and can be watched."""
     own = options.parameters(load_stage(name).settings_type)
-    return [preset_parameter(), *own] if name == "train" else own
+    return [preset_parameter(), *own, view_parameter()] if name == "train" else own
 
 
 def settings_for(
@@ -108,9 +115,12 @@ def run(
     may_run: Collection[str] | None = None,
     quiet: bool = False,
     as_json: bool = False,
+    view: bool = False,
 ) -> None:
-    """Run the pipeline and show what came of it."""
+    """Run the pipeline and show what came of it. view: on a page too, while it trains."""
     listener = progress.listener_for(quiet, as_json)
+    if view:
+        listener = watching.Together(watching.Watching(pipeline, as_json), listener)
     pipeline.run(settings, until=until, may_run=may_run, listener=listener)
     summary.show(pipeline, until, quiet=quiet, as_json=as_json)
 
@@ -123,8 +133,9 @@ def run_all(
     pipeline = Pipeline(run_folder, photos)
     base = defaults() if photos is not None else pipeline.recorded_settings()
     typed = options.given_only(given)
+    view = typed.pop("view", False)
     settings = settings_for(base, typed, typed.pop("preset", None))
-    run(pipeline, settings, quiet=quiet, as_json=as_json)
+    run(pipeline, settings, quiet=quiet, as_json=as_json, view=view)
 
 
 def run_stage(
@@ -143,14 +154,14 @@ def run_stage(
     else:
         base = pipeline.recorded_settings()
     typed = options.given_only(given)
-    preset = typed.pop("preset", None)
+    preset, view = typed.pop("preset", None), typed.pop("view", False)
     if "formats" in typed:
         typed["formats"] = _with_exported(pipeline, typed["formats"])
     settings = settings_for({name: base[name]}, typed, preset)
     if not runfolder.is_run_folder(pipeline.run_folder):
         settings = {**base, **settings}
     may_run = _may_run(name)
-    run(pipeline, settings, until=name, may_run=may_run, quiet=quiet, as_json=as_json)
+    run(pipeline, settings, until=name, may_run=may_run, quiet=quiet, as_json=as_json, view=view)
 
 
 def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:

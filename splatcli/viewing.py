@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import tempfile
 import threading
 import webbrowser
@@ -67,11 +69,20 @@ def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
         _end_like_ctrl_c()
         console.out.print(server.address)
         console.note(f"{count:,} splats. Ctrl-C ends it.")
-        if open_browser and not webbrowser.open(server.address):
+        if open_browser and not open_page(server.address):
             console.note("No browser could be opened; open the address yourself.")
         server.serve_forever()
     except KeyboardInterrupt:
         console.note("Ended.")
+
+
+def open_page(address: str) -> bool:
+    """Whether a browser took the address. On a machine without a screen none is tried: one that
+    draws in the terminal could show nothing, and would hold it."""
+    screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+    if sys.platform.startswith("linux") and not screen:
+        return False
+    return webbrowser.open(address)
 
 
 def _end_like_ctrl_c() -> None:

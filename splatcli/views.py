@@ -13,7 +13,7 @@ from stages.run.errors import Family, SplatError
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.scene import Camera, Splats, View
+    from stages.scene import Camera, ExportedFile, Splats, View
 
 _STAGES_WITH_SPLATS = ("quantise", "prune", "train", "seed")
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp")
@@ -135,11 +135,20 @@ def _about_run(pipeline: Pipeline) -> dict[str, Any]:
     manifest = pipeline.manifest("export")
     if manifest is not None:
         folder = pipeline.stage_folder("export")
+        proven = manifest.metrics.get("formats", {})
         facts["assets"] = {
-            str(folder / file.path): console.size(file.size_bytes)
+            str(folder / file.path): _size_and_quality(file, proven.get(file.format, {}))
             for file in pipeline.load("export").files
         }
     return facts
+
+
+def _size_and_quality(file: ExportedFile, proven: dict[str, Any]) -> str:
+    """proven: what export found when it read the file back and drew it."""
+    told = [console.size(file.size_bytes)]
+    if "verify_db" in proven:
+        told.append(console.figure("verify_db", proven["verify_db"]))
+    return ", ".join(told)
 
 
 def _rounded(values: Any) -> list[float]:
@@ -157,6 +166,11 @@ def pipeline_around(file: Path | None) -> Pipeline | None:
     if file is None or not runfolder.is_run_folder(file.absolute().parent.parent):
         return None
     return Pipeline(file.absolute().parent.parent)
+
+
+def views_around(file: Path | None) -> tuple[View, ...]:
+    """Those of the run whose export folder a file lies in; none elsewhere."""
+    return _views(pipeline_around(file))
 
 
 def _views(pipeline: Pipeline | None) -> tuple[View, ...]:

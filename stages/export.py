@@ -7,7 +7,6 @@ compared with the splats that it was made from. A file that came out wrong stops
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,10 +17,8 @@ from stages.run.errors import Family, SplatError
 from stages.run.stage import Report, Stage
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from stages.scene import Camera, ExportedAssets, QuantisedSplats, Reconstruction, Splats
+    from stages.formats.proof import Prover
+    from stages.scene import ExportedAssets, QuantisedSplats, Reconstruction, Splats
 
 FORMATS = (
     *("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz"),
@@ -33,18 +30,7 @@ MESHES = {
     "mesh.glb": ("mesh.glb",),
     "mesh.ply": ("mesh.ply",),
 }
-_LOSSES = {
-    "splat": "has 8-bit colours that do not change with the view",
-    "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
-    "spz": "has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
-    "sog": "has 256 sizes and colours, and a palette of view-dependent colours",
-}
 _INDEX = "assets.json"
-_CHECK_SIDE_PX = 480
-_CHECK_CAMERAS = 3
-_CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
-_LOSSLESS_DB = 45.0  # below it a file that should hold everything is wrong
-_LOSSY_DB = 30.0  # below it the loss is worth a warning
 
 
 @dataclass(frozen=True)
@@ -99,12 +85,14 @@ def run(
 ) -> ExportedAssets:
     """Write inputs["quantise"] in all formats into `folder`, seen by the views of inputs["sfm"].
 
-    Metrics: files (how many), splats, dropped, formats: by format size_bytes, bytes_per_splat,
-    verify_db (PSNR between pictures of the splats and of the file, the worst camera) and the
-    largest errors of the values; mesh: see `surface.make`. Raises SplatError
-    "export-verify-failed" (family QUALITY), and what keeps a file from being written.
+    Metrics: files (how many), splats, dropped, formats: by format size_bytes, bytes_per_splat and
+    the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
+    the file, the worst camera) and the largest errors of the values; mesh: the figures of
+    `surface.make`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
+    file from being written.
     """
     from stages import formats
+    from stages.formats.proof import Prover, cameras_for
     from stages.formats.rows import kept_rows
     from stages.scene import ExportedAssets, ExportedFile
 
@@ -117,7 +105,8 @@ def run(
         splats = replace(splats, origin=reconstruction.origin)
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
-    checker = _Checker.of(splats, reconstruction, settings.backend)
+    cameras = cameras_for(splats, reconstruction.views)
+    prover = Prover.of(splats, cameras, settings.backend)
     files, figures = [], {}
     for number, name in enumerate(wanted):
         report.progress(number, len(wanted), f"writing .{name}")
@@ -130,7 +119,7 @@ def run(
         figures[name] = {
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
-            **checker.check(path, name, report),
+            **_proven(prover, path, name, report),
         }
         report.progress(number + 1, len(wanted), f".{name}", verify_db=figures[name]["verify_db"])
     for name, path, size in _write_meshes(splats, reconstruction, settings, folder, report):
@@ -194,64 +183,20 @@ def _write_index(folder: Path, files: list[Any]) -> None:
     (folder / _INDEX).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
-@dataclass(frozen=True)
-class _Checker:
-    """Compares files with the splats that they were made from."""
+def _proven(prover: Prover, path: Path, name: str, report: Report) -> dict[str, Any]:
+    """The file's figures. Raises SplatError "export-verify-failed"."""
+    from stages.formats import LOSSY
 
-    splats: Splats
-    cameras: tuple[Camera, ...]
-    pictures: tuple[NDArray[np.float32], ...]
-    backend: str
-
-    @classmethod
-    def of(cls, splats: Splats, reconstruction: Reconstruction, backend: str) -> _Checker:
-        from stages.raster import render
-        from stages.scene import split_held_out
-
-        training, held = split_held_out(reconstruction.views)
-        views = held or training
-        count = min(_CHECK_CAMERAS, len(views))
-        chosen = [views[i * len(views) // count] for i in range(count)]
-        cameras = tuple(view.camera.fitted(_CHECK_SIDE_PX) for view in chosen)
-        pictures = tuple(render(splats, camera, backend=backend).image for camera in cameras)
-        return cls(splats, cameras, pictures, backend)
-
-    def check(self, path: Path, name: str, report: Report) -> dict[str, float]:
-        """The file's figures. Raises SplatError "export-verify-failed"."""
-        from stages.formats.compare import largest_errors
-        from stages.formats.verify import read_back
-
-        try:
-            content = read_back(path)
-        except Exception as error:  # whatever another parser raises: the file is wrong
-            raise _failed(path, f"another reader refused it ({error})") from error
-        if len(content.splats) != len(self.splats):
-            raise _failed(path, f"it holds {len(content.splats)} of {len(self.splats)} splats")
-        worst = self._worst_db(content)
-        if name in _LOSSES:
-            if worst < _LOSSY_DB:
-                report.warn(
-                    f"export-{name.replace('.', '-')}-lossy",
-                    f"{path.name} differs from the trained splats by {worst:.1f} dB: the format "
-                    f"{_LOSSES[name]}. Where a viewer reads them, prefer .ply, .glb or .usdz.",
-                )
-        elif worst < _LOSSLESS_DB:
-            raise _failed(path, f"drawn again it differs by {worst:.1f} dB")
-        return {"verify_db": round(worst, 2), **largest_errors(self.splats, content, name)}
-
-    def _worst_db(self, content: Any) -> float:
-        """The camera is moved into the file's axes, not the file's splats into ours: so the turn
-        of positions, rotations and SH is checked by something other than itself."""
-        from stages.measure.images import psnr
-        from stages.raster import render
-
-        worst = _CAP_DB
-        for camera, picture in zip(self.cameras, self.pictures, strict=True):
-            moved = camera.moved(content.world_from_file)
-            drawn = render(content.splats, moved, backend=self.backend).image
-            decibels = psnr(drawn, picture)
-            worst = min(worst, 0.0 if math.isnan(decibels) else decibels)
-        return worst
+    proof = prover.prove(path)
+    if proof.fault:
+        raise _failed(path, proof.fault)
+    if proof.loss_db is not None:
+        report.warn(
+            f"export-{name.replace('.', '-')}-lossy",
+            f"{path.name} differs from the trained splats by {proof.loss_db:.1f} dB: the format "
+            f"{LOSSY[name]}. Where a viewer reads them, prefer .ply, .glb or .usdz.",
+        )
+    return proof.figures
 
 
 def _failed(path: Path, reason: str) -> SplatError:

@@ -42,6 +42,7 @@ def test_every_format_draws_the_same_picture_again(scene: SmallScene, tmp_path: 
     for file in assets.files:
         figures = report.metrics["formats"][file.format]
         assert (tmp_path / file.path).is_file()
+        assert figures["verify_cameras"] == 2  # those held out of ten
         if file.format in formats.LOSSY:
             assert 20 < figures["verify_db"] < 70
             if file.format == "splat":

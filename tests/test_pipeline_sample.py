@@ -95,6 +95,16 @@ def test_info_reads_every_asset(result: dict[str, Any], folder: Path) -> None:
     assert len(set(counts.values())) == 1, counts
 
 
+def test_verify_finds_what_the_manifest_says(result: dict[str, Any], folder: Path) -> None:
+    found = events(splat("verify", "--json", folder=folder))
+    found = [event for event in found if event["event"] == "verified"]
+    assert [each["format"] for each in found] == list(FORMATS)
+    for each in found:
+        assert each["right"], each["fault"]
+        kept = metrics(result, "export")["formats"][each["format"]]
+        assert {name: each[name] for name in kept} == kept
+
+
 def test_asking_for_a_format_that_is_there_runs_nothing_and_loses_none(
     result: dict[str, Any], folder: Path
 ) -> None:

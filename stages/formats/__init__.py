@@ -30,8 +30,13 @@ FORMATS = {
     "sog": "sog",
     "html": "html",
 }
-# Those that hold less than float32: smaller, and not the same splats any more.
-LOSSY = ("splat", "compressed.ply", "spz", "sog")
+# Those that hold less than float32, and what of: smaller, and not the same splats any more.
+LOSSY = {
+    "splat": "has 8-bit colours that do not change with the view",
+    "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
+    "spz": "has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
+    "sog": "has 256 sizes and colours, and a palette of view-dependent colours",
+}
 
 
 def format_of(path: Path) -> str:

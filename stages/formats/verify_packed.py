@@ -53,17 +53,16 @@ def spz(path: Path) -> FileContent:
 
     content = gzip.decompress(path.read_bytes())
     magic, version, n, degree, fraction = struct.unpack_from("<IIIBB", content)
-    assert (magic, version) == (0x5053474E, 3), "the header is not that of version 3"
+    assert magic == 0x5053474E, "the header does not begin with NGSP"
+    assert version in (2, 3), f"the version is {version}, not 2 or 3"
     k = (degree + 1) ** 2 - 1
-    ends = 16 + np.cumsum([0, 9 * n, n, 3 * n, 3 * n, 4 * n, 3 * k * n])
+    turn_bytes = 3 if version == 2 else 4
+    ends = 16 + np.cumsum([0, 9 * n, n, 3 * n, 3 * n, turn_bytes * n, 3 * k * n])
     assert len(content) == ends[-1], "the length is not that of the header"
     parts = [np.frombuffer(content[a:b], np.uint8) for a, b in itertools.pairwise(ends)]
     low, middle, high = parts[0].reshape(n, 3, 3).astype(np.int64).transpose(2, 0, 1)
     fixed = low + 256 * middle + 65536 * high
-    words = parts[4].view("<u4").astype(np.int64)
-    tens = [words >> shift & 1023 for shift in (20, 10, 0)]
-    others = [math.sqrt(0.5) / 511 * np.where(t < 512, t, 512 - t) for t in tens]
-    xyzw = _with_largest(words >> 30, np.stack(others, axis=1))
+    xyzw = _xyz_in_bytes(parts[4]) if version == 2 else _smallest_three(parts[4].view("<u4"))
     sh = np.zeros((n, k + 1, 3))
     sh[:, 0] = (parts[2].reshape(n, 3) / 255 - 0.5) / 0.15
     sh[:, 1:] = parts[5].reshape(n, k, 3) / 128 - 1
@@ -75,6 +74,20 @@ def spz(path: Path) -> FileContent:
         sh=sh,
     )
     return FileContent(splats, Y_UP)
+
+
+def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """[N, 4] x, y, z, w, where w is what is missing to 1 and never negative."""
+    xyz = parts.reshape(-1, 3).astype(np.float64) * 2 / 255 - 1
+    return np.insert(xyz, 3, np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1))), axis=1)
+
+
+def _smallest_three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """[N, 4] x, y, z, w from two bits for the largest and a sign and nine bits for the others."""
+    words = packed.astype(np.int64)
+    tens = [words >> shift & 1023 for shift in (20, 10, 0)]
+    others = [math.sqrt(0.5) / 511 * np.where(t < 512, t, 512 - t) for t in tens]
+    return _with_largest(words >> 30, np.stack(others, axis=1))
 
 
 def sog(path: Path) -> FileContent:

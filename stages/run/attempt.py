@@ -17,7 +17,7 @@ from stages.run.libraries import versions
 from stages.run.manifest import Manifest, plain, write_json
 from stages.run.memory import PeakMemory
 from stages.run.request import Request
-from stages.run.stage import Numbers, Report, Stage
+from stages.run.stage import Draw, Numbers, Report, Stage
 from stages.run.workspace import BOOKKEEPING, USAGE, Workspace
 
 _NOTE_EVERY_S = 5.0
@@ -31,6 +31,9 @@ class Listener:
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         """As `Report.progress`."""
+
+    def drawable(self, stage: Stage, draw: Draw) -> None:
+        """As `Report.offer`."""
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         """The stage ran and its output is final."""
@@ -63,6 +66,7 @@ def attempt(
     report.listener = lambda label, done, total, numbers: listener.progressed(
         stage, label, done, total, numbers
     )
+    report.onlooker = lambda draw: listener.drawable(stage, draw)
     usage = _Usage(space.partial)
     try:
         with PeakMemory(tick=usage.note) as memory:

@@ -10,9 +10,16 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stages.scene import Camera
 
 Numbers = dict[str, float | int | str]
+Draw: TypeAlias = "Callable[[Camera], NDArray[np.uint8]]"
 
 
 @dataclass
@@ -23,12 +30,14 @@ class Report:
     warnings: (code, message) pairs; the message is a full sentence with advice.
     stop_requested: set from outside (Ctrl-C); long stages look at it at each step boundary, write
         their checkpoint and raise `Interrupted`.
+    onlooker: called with what `offer` is given. What it does must not change what a stage makes.
     """
 
     metrics: dict[str, Any] = field(default_factory=dict)
     warnings: list[tuple[str, str]] = field(default_factory=list)
     listener: Callable[[str, int, int, Numbers], None] | None = None
     stop_requested: threading.Event = field(default_factory=threading.Event)
+    onlooker: Callable[[Draw], None] | None = None
     device: str = "cpu"
 
     def metric(self, name: str, value: Any) -> None:
@@ -46,6 +55,12 @@ class Report:
         """Tell the listener that `done` of `total` units are finished, with the numbers to show."""
         if self.listener is not None:
             self.listener(label, done, total, numbers)
+
+    def offer(self, draw: Draw) -> None:
+        """A picture of the work so far can be drawn, by this thread and until this call returns:
+        draw(camera) gives sRGB [H, W, 3]. It is drawn only if an onlooker wants it."""
+        if self.onlooker is not None:
+            self.onlooker(draw)
 
 
 @dataclass(frozen=True)

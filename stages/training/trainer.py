@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from stages.raster.cpu import NO_SMOOTHING, CpuRasteriser
 from stages.raster.smoothing import smoothing_widths
 from stages.run.errors import Interrupted
 from stages.run.stage import Report
-from stages.scene import Splats
+from stages.scene import Camera, Splats
 from stages.training.checkpoint import load_checkpoint, save_checkpoint
 from stages.training.densify import densify, neighbours_together, reset_opacities
 from stages.training.loss import image_loss
@@ -70,6 +71,7 @@ class Trainer:
                 save_checkpoint(self.folder, model, step, self.history)
                 last_saved = time.monotonic()
             self._tick(model, step, loss)
+            self.report.offer(partial(self.draw, model, step))
         return model
 
     def _begin(self, start: Splats) -> tuple[Model, int]:
@@ -188,3 +190,10 @@ class Trainer:
         )
         image = np.clip(forward.image[:3].transpose(1, 2, 0), 0.0, 1.0)
         return image, level.pixels.transpose(1, 2, 0) * np.float32(1 / 255)
+
+    def draw(self, model: Model, step: int, camera: Camera) -> NDArray[np.uint8]:
+        """[H, W, 3] of the model after `step` steps, in the colours that training sees by then."""
+        settings = self.settings(self.schedule.active_sh_degree(step - 1))
+        forward = self.rasteriser.forward(model.arrays, camera, settings, self._smoothing(model))
+        image = np.clip(forward.image[:3].transpose(1, 2, 0), 0.0, 1.0)
+        return np.rint(image * 255).astype(np.uint8)

@@ -19,6 +19,7 @@ CHUNK_START = '<script type="text/plain" class="splats">'
 CHUNK_END = "</script>\n"
 PAGE_END = "</body>\n</html>\n"
 _SCRIPTS = ("lens.js", "content.js", "panel.js", "main.js")
+_LIVE_SCRIPTS = ("orbit.js", "panel.js", "live.js")
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self' data: blob:"
@@ -41,6 +42,15 @@ def scene_data(
 
 def head(scene: dict[str, Any]) -> str:
     """The document up to where splats may follow, in chunks between CHUNK_START and CHUNK_END."""
+    return _head(scene, _asset("vendor", "supersplat-viewer.min.css"))
+
+
+def live(scene: dict[str, Any]) -> str:
+    """The page that shows training: pictures come from the trainer, so it needs no viewer."""
+    return _head(scene, _asset("page", "live.css")) + _script(_LIVE_SCRIPTS) + PAGE_END
+
+
+def _head(scene: dict[str, Any], style: str) -> str:
     # "<" is escaped so that no name can end the script element that holds it.
     data = json.dumps(scene, ensure_ascii=True, allow_nan=False).replace("<", "\\u003c")
     return (
@@ -49,8 +59,7 @@ def head(scene: dict[str, Any]) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
         f"<title>{html.escape(scene['title'])}</title>\n"
-        f"<style>\n{_asset('vendor', 'supersplat-viewer.min.css')}\n"
-        f"{_asset('page', 'page.css')}</style>\n</head>\n<body>\n"
+        f"<style>\n{style}\n{_asset('page', 'page.css')}</style>\n</head>\n<body>\n"
         f"{_asset('page', 'body.html')}"
         f'<script type="application/json" id="scene">{data}</script>\n'
     )
@@ -59,12 +68,16 @@ def head(scene: dict[str, Any]) -> str:
 def tail() -> str:
     """The scripts and the end of the document."""
     licence = _asset("vendor", "LICENSE").replace("--", "- -")
-    ours = "".join(_asset("page", name) for name in _SCRIPTS)
     return (
         f"<!-- SuperSplat Viewer and PlayCanvas engine:\n{licence}-->\n"
         f"<script>{_asset('vendor', 'supersplat-viewer.min.js')}</script>\n"
-        f"<script>\n(() => {{\n{ours}}})();\n</script>\n{PAGE_END}"
+        f"{_script(_SCRIPTS)}{PAGE_END}"
     )
+
+
+def _script(names: Sequence[str]) -> str:
+    ours = "".join(_asset("page", name) for name in names)
+    return f"<script>\n(() => {{\n{ours}}})();\n</script>\n"
 
 
 def _asset(*parts: str) -> str:

@@ -1,20 +1,21 @@
 """Serves a list of files to browsers on this machine, and nothing else.
 
 What may be asked for is a dictionary of addresses; a path in a request is only ever looked up in
-it, so there is nothing to climb out of.
+it, so there is nothing to climb out of. An address may also stand for an answer that is worked out
+when it is asked for.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 LOOPBACK = "127.0.0.1"
 
@@ -33,13 +34,19 @@ class Item:
         return self.content.open("rb"), self.content.stat().st_size
 
 
+Answer = Callable[[dict[str, str]], Item]
+"""From the options of an address (what follows "?"). Raises ValueError for those that make no
+sense."""
+
+
 class LocalServer(ThreadingHTTPServer):
-    """Listens on 127.0.0.1 only. items: by address, such as "/" or "/scene.ply". port: 0 for any
-    that is free. Raises OSError if the port is taken."""
+    """Listens on 127.0.0.1 only. items: by address, such as "/" or "/scene.ply"; answers are worked
+    out in a thread of their own, for pages of this server alone. port: 0 for any that is free.
+    Raises OSError if the port is taken."""
 
     daemon_threads = True
 
-    def __init__(self, items: Mapping[str, Item], port: int = 0) -> None:
+    def __init__(self, items: Mapping[str, Item | Answer], port: int = 0) -> None:
         self.items = dict(items)
         super().__init__((LOOPBACK, port), _Handler)
 
@@ -67,7 +74,18 @@ class _Handler(BaseHTTPRequestHandler):
         if host not in (f"{name}:{self.server.server_port}" for name in (LOOPBACK, "localhost")):
             self.send_error(HTTPStatus.FORBIDDEN)
             return
-        item = self.server.items.get(urlsplit(self.path).path)
+        asked = urlsplit(self.path)
+        item = self.server.items.get(asked.path)
+        if item is not None and not isinstance(item, Item):
+            # A page elsewhere cannot read the answer, but must not cause the work either.
+            if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+                self.send_error(HTTPStatus.FORBIDDEN)
+                return
+            try:
+                item = item(dict(parse_qsl(asked.query)))
+            except ValueError:
+                self.send_error(HTTPStatus.BAD_REQUEST)
+                return
         try:
             source, size = item.open() if item is not None else (None, 0)
         except OSError:

@@ -43,16 +43,26 @@ def shots_of(views: Sequence[View], splats: Splats) -> tuple[Shot, ...]:
 
 def in_front_of(splats: Splats) -> Camera:
     """A camera that sees the middle nine tenths of the splats, from -z and a little above."""
+    return around(splats, 1, 0.9)[0]
+
+
+def around(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
+    """`count` cameras evenly around the middle `part` of the splats, the first in front; each sees
+    all of that part."""
     means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
     if len(means) == 0:
         means = np.zeros((1, 3))
-    low, high = np.percentile(means, (5, 95), axis=0)
+    low, high = np.quantile(means, (0.5 - part / 2, 0.5 + part / 2), axis=0)
     middle = (low + high) / 2
     distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
-    eye = middle + distance * np.array([0.0, -0.3, -1.0])
-    side = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX
-    height = side * 3 // 4
-    return Camera(side, height, side, side, side / 2, height / 2, look_at(eye, middle))
+    width = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX
+    height = width * 3 // 4
+    cameras = []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        eye = middle + distance * np.array([np.sin(angle), -0.3, -np.cos(angle)])
+        pose = look_at(eye, middle)
+        cameras.append(Camera(width, height, width, width, width / 2, height / 2, pose))
+    return tuple(cameras)
 
 
 def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
@@ -62,7 +72,7 @@ def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
     world. Lengths in pixels as in `Camera`.
     """
     camera = shot.camera
-    depth = _depth_of_interest(camera, means)
+    depth = depth_of_interest(camera, means)
     rotation = _VIEWER_FROM_WORLD @ camera.world_to_camera[:3, :3].T @ _CAMERA_FROM_VIEWERS
     return {
         "name": shot.name,
@@ -75,7 +85,7 @@ def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
     }
 
 
-def _depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
+def depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
     """The median z of what lies in the picture; of all in front if nothing does."""
     points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
     x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T

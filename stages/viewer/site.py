@@ -10,7 +10,7 @@ from pathlib import Path
 from stages.scene import Splats, View
 from stages.viewer import compose
 from stages.viewer.server import Item
-from stages.viewer.shots import shots_of
+from stages.viewer.shots import Shot, shots_of
 
 
 def site(
@@ -23,10 +23,21 @@ def site(
 ) -> dict[str, Item]:
     """By address. content: the splats as .ply. photos: the folder that `View.image` starts from;
     a photograph that is not there is left out."""
-    items = {"/scene.ply": Item(content, "application/octet-stream")}
+    shots, items = with_photographs(shots_of(views, splats), views, photos)
+    items["/scene.ply"] = Item(content, "application/octet-stream")
+    scene = compose.scene_data(title, splats, shots, units=units, content="scene.ply")
+    page = compose.head(scene) + compose.tail()
+    items["/"] = Item(page.encode("utf-8"), "text/html; charset=utf-8")
+    return items
+
+
+def with_photographs(
+    shots: Sequence[Shot], views: Sequence[View], photos: Path | None
+) -> tuple[list[Shot], dict[str, Item]]:
+    """(the shots with the addresses of their photographs, what these addresses give)."""
     images = {view.name: view.image for view in views}
-    shots = []
-    for number, shot in enumerate(shots_of(views, splats)):
+    found, items = [], {}
+    for number, shot in enumerate(shots):
         file = _inside(photos, images.get(shot.name, ""))
         if file is not None:
             # An address of our own: names of photographs hold anything.
@@ -34,11 +45,8 @@ def site(
             kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             items[f"/{address}"] = Item(file, kind)
             shot = replace(shot, photo=address)
-        shots.append(shot)
-    scene = compose.scene_data(title, splats, shots, units=units, content="scene.ply")
-    page = compose.head(scene) + compose.tail()
-    items["/"] = Item(page.encode("utf-8"), "text/html; charset=utf-8")
-    return items
+        found.append(shot)
+    return found, items
 
 
 def _inside(folder: Path | None, name: str) -> Path | None:

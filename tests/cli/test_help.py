@@ -16,7 +16,9 @@ from splatcli.app import app
 from stages import STAGE_NAMES
 
 ROOT = Path(__file__).parent.parent.parent
-COMMANDS = ("process", *STAGE_NAMES, "status", "render", "view", "info", "convert", "doctor")
+COMMANDS = (
+    *("process", *STAGE_NAMES, "status", "render", "view", "info", "convert", "verify", "doctor"),
+)
 HEAVY = ("torch", "numba", "cv2", "pycolmap", "numpy", "PIL", "pxr")
 
 
@@ -79,6 +81,7 @@ def test_process_has_the_promised_options() -> None:
         "--max-splats",
         "--format",
         "--allow-partial",
+        "--view",
         "--quiet",
         "--json",
     ):

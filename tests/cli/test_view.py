@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from splatcli import viewing
 from stages import formats
 from tests.formats.truth import many_splats
 
@@ -74,3 +75,29 @@ def test_a_taken_port_is_said(splat, tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert f"Port {port}" in result.stderr
     assert "Leave --port away" in result.stderr
+
+
+@pytest.mark.parametrize("words", [("train",), ("process",)])
+def test_a_training_that_is_finished_is_not_watched(splat, words: tuple[str, ...]) -> None:
+    splat("process", "photos")
+    result = splat(*words, "--view")
+    assert result.exit_code == 0
+    assert "there is nothing to watch" in result.stderr
+    assert "splat view" in result.stderr
+    assert "http://" not in result.stderr
+
+
+def test_only_what_trains_can_be_watched(splat) -> None:
+    assert splat("prune", "--view").exit_code == 2
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others always have a screen")
+def test_no_browser_is_tried_without_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(viewing.webbrowser, "open", lambda a: opened.append(a) is None)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    assert not viewing.open_page("http://127.0.0.1:1/")
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert viewing.open_page("http://127.0.0.1:2/")
+    assert opened == ["http://127.0.0.1:2/"]

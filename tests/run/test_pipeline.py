@@ -391,6 +391,22 @@ def test_interrupted_stage_goes_on_from_its_checkpoint(photos: Path, run_folder:
     assert pipeline.load("count") == "10 from 6"
 
 
+def test_what_a_stage_offers_to_draw_reaches_the_listener(photos: Path, run_folder: Path) -> None:
+    def offering(inputs, settings, folder, report) -> None:
+        report.offer(lambda camera: f"seen from {camera}")
+        (folder / "count.txt").write_text("7")
+
+    class Looking(Listener):
+        seen: tuple[str, str] | None = None
+
+        def drawable(self, stage, draw) -> None:
+            self.seen = (stage.name, draw("above"))
+
+    looking = Looking()
+    Pipeline(run_folder, photos, fake_stages(count=offering)).run(listener=looking)
+    assert looking.seen == ("count", "seen from above")
+
+
 def test_leftovers_of_other_settings_are_not_used(photos: Path, run_folder: Path) -> None:
     pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
     with pytest.raises(Interrupted):

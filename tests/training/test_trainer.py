@@ -12,7 +12,7 @@ from stages.raster.cpu import CpuRasteriser, splat_arrays
 from stages.raster.smoothing import smoothing_widths
 from stages.run.errors import Interrupted, SplatError
 from stages.run.stage import Report
-from stages.scene import Splats, split_held_out
+from stages.scene import Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
@@ -147,6 +147,44 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, stop_at):
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
     assert second.history == whole.history
+
+
+def test_looking_on_does_not_change_what_is_trained(tmp_path):
+    """Every step drawn, from elsewhere, larger and smaller than the photographs; the model grows on
+    the way."""
+    alone, start = small_problem(tmp_path, "alone", steps=150)
+    wanted = alone.run(start)
+    drawn = []
+    report = Report()
+
+    def look(draw):
+        width, height = (97, 61) if len(drawn) % 2 else (19, 23)
+        where = camera(width, height, matrix=look_at(np.array([2.0, -1, -3]), np.zeros(3)))
+        drawn.append(draw(where))
+        assert drawn[-1].shape == (height, width, 3)
+
+    report.onlooker = look
+    watched, start = small_problem(tmp_path, "watched", report, steps=150)
+    found = watched.run(start)
+    assert len(drawn) == 150
+    assert len(found) > len(start)
+    for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
+        assert a.tobytes() == b.tobytes()
+    assert watched.history == alone.history
+
+
+def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
+    report = Report()
+    t, start = small_problem(tmp_path, "seen", report, steps=40)
+    where = camera(48, 36)
+    seen = []
+    report.onlooker = lambda draw: seen.append(draw(where))
+    trained = finished(t.run(start), 1, start)
+    settings = t.settings(t.schedule.sh_degree)
+    image = render(trained, where, settings, backend="reference").image
+    levels = np.rint(np.clip(image, 0, 1) * 255)
+    assert np.abs(seen[-1] - levels).max() <= 1  # rounding of halves
+    assert np.abs(seen[0] - levels).mean() > 5  # the first step looked different
 
 
 def test_a_torn_checkpoint_means_a_fresh_start(tmp_path):

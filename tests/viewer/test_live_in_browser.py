@@ -1,0 +1,280 @@
+"""The page of a training in a real browser: what the trainer draws, from where the visitor is."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages.measure.images import psnr
+from stages.raster import RasterSettings, render
+from stages.run.pipeline import Pipeline
+from stages.scene import Camera, Splats, scene_extent
+from stages.training.trainer import NEAR
+from stages.viewer.live import LivePage
+from stages.viewer.server import LocalServer
+from stages.viewer.shots import depth_of_interest, shots_of
+from tests.sample import command, environment, process_words
+from tests.tolerances import LIVE_PICTURE_DB
+from tests.viewer.browser import Browser
+from tests.viewer.test_in_browser import (
+    PROGRAM,
+    WORSE_DB,
+    browser,
+    coloured_scene,
+    views,
+    wrong_versions,
+)
+
+__all__ = ["browser"]
+
+pytestmark = pytest.mark.skipif(
+    PROGRAM is None, reason="no Chromium on the path, and SPLAT_CHROMIUM names none"
+)
+WAIT_S = 60.0
+SETTLED = "const p = splatLive.picture; p && p.sharp && p.version === splatLive.version"
+
+
+def ours(splats: Splats, camera: Camera, settings: RasterSettings | None = None) -> np.ndarray:
+    """By the reference: the kernels are the worker's."""
+    return np.clip(render(splats, camera, settings, backend="reference").image, 0, 1)
+
+
+class Worker(threading.Thread):
+    """Trains nothing, but offers pictures of its splats as training does."""
+
+    def __init__(self, page: LivePage) -> None:
+        super().__init__(daemon=True)
+        self.page, self.splats, self.stop = page, coloured_scene(), threading.Event()
+
+    def run(self) -> None:
+        step = 0
+        while not self.stop.wait(0.002):
+            step += 1
+            self.page.progressed("training", step, 10**6, {"splats": 10, "loss": 0.5})
+            self.page.pictures.offer(self.draw, step)
+
+    def draw(self, camera: Camera) -> np.ndarray:
+        return np.rint(np.clip(render(self.splats, camera).image, 0, 1) * 255).astype(np.uint8)
+
+
+@pytest.fixture
+def worker(tmp_path: Path) -> Iterator[Worker]:
+    for view in views():
+        picture = ours(coloured_scene(), view.camera)
+        Image.fromarray(np.uint8(picture * 255)).save(tmp_path / view.image)
+    splats = coloured_scene()
+    page = LivePage("test", views(), shots_of(views(), splats), splats.means, tmp_path)
+    working = Worker(page)
+    server = LocalServer(page.items)
+    serving = threading.Thread(target=server.serve_forever)
+    for thread in (working, serving):
+        thread.start()
+    working.address = server.address  # type: ignore[attr-defined]
+    yield working
+    working.stop.set()
+    server.shutdown()
+    server.server_close()
+    for thread in (working, serving):
+        thread.join()
+
+
+def until(browser: Browser, script: str) -> Any:
+    """Waits until the script's last expression is true."""
+    deadline = time.monotonic() + WAIT_S
+    while not (value := browser.run(f"{{ {script} }}")):
+        state = browser.run("[splatLive.state, splatLive.picture, splatLive.version]")
+        assert time.monotonic() < deadline, (script, state, browser.said)
+        time.sleep(0.05)
+    return value
+
+
+def bare(browser: Browser, address: str) -> None:
+    """The page with nothing before the picture."""
+    browser.requests.clear()
+    browser.open(address)
+    browser.run(
+        "{ const style = document.createElement('style');"
+        "style.textContent = '#panel, #message { visibility: hidden }';"
+        "document.head.append(style); }"
+    )
+
+
+def shown(browser: Browser) -> tuple[np.ndarray, np.ndarray]:
+    """(what is on the screen, world_to_camera that it is drawn from), once all is at rest."""
+    until(browser, SETTLED)
+    rows = np.array(browser.run("splatLive.picture.place"), np.float64).reshape(3, 4)
+    return browser.picture(), np.vstack([rows, [0, 0, 0, 1]])
+
+
+def mouse(browser: Browser, *path: tuple[int, int], button: str = "left") -> None:
+    held = {"left": 1, "right": 2}[button]
+    for number, (x, y) in enumerate(path):
+        kind = "mouseMoved" if number else "mousePressed"
+        where = {"x": x, "y": y, "button": button, "buttons": held, "clickCount": 1}
+        browser.call("Input.dispatchMouseEvent", type=kind, **where)
+    x, y = path[-1]
+    where = {"x": x, "y": y, "button": button, "buttons": 0, "clickCount": 1}
+    browser.call("Input.dispatchMouseEvent", type="mouseReleased", **where)
+
+
+def seen_at(matrix: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarray:
+    """[2] pixels."""
+    x, y, z = matrix[:3, :3] @ point + matrix[:3, 3]
+    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+
+def test_the_page_shows_what_is_trained_from_every_camera(browser: Browser, worker: Any) -> None:
+    bare(browser, worker.address)
+    for view in views():
+        until(browser, f"splatLive.shot.name === {view.name!r}")
+        picture, matrix = shown(browser)
+        np.testing.assert_allclose(matrix, view.camera.world_to_camera, atol=1e-12)
+        right = psnr(picture, ours(coloured_scene(), view.camera))
+        assert right > LIVE_PICTURE_DB, view.name
+        for name, wrong in wrong_versions(picture).items():
+            worse = psnr(wrong, ours(coloured_scene(), view.camera))
+            assert worse < right - WORSE_DB, (view.name, name)
+        browser.run("document.getElementById('next').click()")
+    assert not [a for a in browser.requests if not a.startswith((worker.address, "data:"))]
+
+
+def test_dragging_turns_the_scene_with_the_hand(browser: Browser, worker: Any) -> None:
+    bare(browser, worker.address)
+    _, before = shown(browser)
+    camera = views()[0].camera
+    depth = depth_of_interest(camera, coloured_scene().means)
+    pivot = camera.centre + depth * camera.forward
+    near = pivot - 0.2 * depth * camera.forward
+    mouse(browser, (150, 120), (165, 125), (190, 140))
+    picture, matrix = shown(browser)
+    moved = replace(camera, world_to_camera=matrix)
+    assert psnr(picture, ours(coloured_scene(), moved)) > LIVE_PICTURE_DB
+    assert psnr(picture, ours(coloured_scene(), camera)) < LIVE_PICTURE_DB - WORSE_DB
+    np.testing.assert_allclose(
+        seen_at(matrix, camera, pivot), seen_at(before, camera, pivot), atol=1e-6
+    )
+    assert (seen_at(matrix, camera, near) > seen_at(before, camera, near) + 1).all()
+
+
+def test_right_dragging_takes_the_scene_along_and_the_wheel_comes_closer(
+    browser: Browser, worker: Any
+) -> None:
+    bare(browser, worker.address)
+    _, before = shown(browser)
+    camera = views()[0].camera
+    pivot = camera.centre + depth_of_interest(camera, coloured_scene().means) * camera.forward
+    mouse(browser, (150, 120), (170, 110), button="right")
+    _, matrix = shown(browser)
+    travelled = seen_at(matrix, camera, pivot) - seen_at(before, camera, pivot)
+    np.testing.assert_allclose(travelled, [20, -10], atol=1e-6)
+    browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=150, y=120, deltaX=0, deltaY=-50)
+    until(browser, "splatLive.version >= 3")
+    _, closer = shown(browser)
+    depths = [(m[:3, :3] @ pivot + m[:3, 3])[2] for m in (matrix, closer)]
+    assert depths[1] == pytest.approx(depths[0] * np.exp(-0.2))
+
+
+def test_the_picture_follows_training_untouched_and_the_end_is_told(
+    browser: Browser, worker: Any
+) -> None:
+    bare(browser, worker.address)
+    picture, _ = shown(browser)
+    worker.splats = replace(worker.splats, sh=-worker.splats.sh)
+    step = browser.run("splatLive.picture.step")
+    until(browser, f"splatLive.picture.step > {step + 1}")
+    time.sleep(0.2)  # for the screen
+    camera = views()[0].camera
+    now = browser.picture()
+    assert psnr(now, picture) < LIVE_PICTURE_DB - WORSE_DB
+    assert psnr(now, ours(worker.splats, camera)) > LIVE_PICTURE_DB
+    worker.stop.set()
+    worker.join()
+    worker.page.pictures.offer_last(worker.draw, 1_000_000)
+    worker.page.ended("finished")
+    until(browser, "splatLive.picture.step === 1000000 && splatLive.state.end")
+    message = browser.run("document.getElementById('message').textContent")
+    assert "Training has finished" in message
+    deadline = time.monotonic() + WAIT_S
+    while not worker.page.told:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_at_rest_a_picture_is_asked_for_seldom(browser: Browser, worker: Any) -> None:
+    bare(browser, worker.address)
+    shown(browser)
+    browser.requests.clear()
+    time.sleep(3)
+    browser.run("0")  # takes in what was requested
+    assert sum("/picture" in address for address in browser.requests) <= 4
+
+
+class Running:
+    """`splat WORDS --view --json`, and the events that it has told."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self.process = subprocess.Popen(
+            command(*words, "--view", "--json"),
+            cwd=folder,
+            env={**environment(), "DISPLAY": "", "WAYLAND_DISPLAY": "", "BROWSER": ""},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.lines = map(json.loads, self.process.stdout)
+
+    def address(self) -> str:
+        return str(next(e["address"] for e in self.lines if e["event"] == "view"))
+
+    def end(self) -> int:
+        for _ in self.lines:
+            pass
+        return self.process.wait(timeout=60)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
+def test_a_training_is_watched_stopped_and_watched_to_its_end(
+    browser: Browser, tmp_path: Path
+) -> None:
+    first = Running(tmp_path, *process_words("--steps", "1500"))
+    bare(browser, first.address())
+    until(browser, SETTLED)
+    early, step = browser.picture(), browser.run("splatLive.picture.step")
+    until(browser, f"splatLive.picture.step > {step + 100}")
+    time.sleep(0.2)  # for the screen
+    assert psnr(browser.picture(), early) < LIVE_PICTURE_DB
+    first.process.send_signal(signal.SIGINT)
+    assert first.end() == 130
+    until(browser, "splatLive.state.end === 'stopped'")
+
+    second = Running(tmp_path, "train", "run")
+    run = Pipeline(tmp_path / "run")
+    seen, address = run.load("sfm"), second.address()
+    view = sorted(seen.views, key=lambda v: v.name)[0]
+    size = {"width": view.camera.width, "height": view.camera.height}
+    browser.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False)
+    bare(browser, address)
+    assert second.end() == 0
+    until(browser, "splatLive.picture && splatLive.picture.step === 1500")
+    assert browser.run("splatLive.state.end") == "finished"
+    settings = RasterSettings(near=NEAR * scene_extent(seen.views))
+    right = ours(run.load("train"), view.camera, settings)
+    assert psnr(browser.picture(), right) > LIVE_PICTURE_DB
+    manifest = run.manifest("train")
+    assert manifest is not None
+    assert "view" not in manifest.settings
+    assert 0 < manifest.metrics["resumed_from_step"] < 1500
+    assert not [a for a in browser.requests if not a.startswith((address, "data:"))]
