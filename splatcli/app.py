@@ -152,10 +152,10 @@ def info(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Count the splats of a file or a run, with bounds and degrees."""
-    from splatcli import views
+    """Count the splats of a file or a run: degrees, bounds, bytes, and what is wrong with them."""
+    from splatcli import info as work
 
-    views.show_info(target, as_json)
+    work.show(target, as_json)
 
 
 def convert(

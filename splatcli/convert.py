@@ -103,7 +103,8 @@ def _failed(path: Path, reason: str) -> SplatError:
 
 @contextlib.contextmanager
 def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
-    """What tells the steps: a bar on a terminal, lines elsewhere, events for machines."""
+    """What tells the steps: lines, or events for machines; on a terminal a bar that also shows how
+    far each step is."""
     done = 0
     if as_json or quiet or not console.err.is_terminal:
 
@@ -117,15 +118,21 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
 
         yield say
         return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    columns = TextColumn("{task.description}", markup=False), BarColumn(24), MofNCompleteColumn()
+    from stages.formats.blocks import watched
+
+    columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
     with Progress(*columns, console=console.err, transient=True) as bar:
-        task = bar.add_task("", total=_STEPS)
+        task = bar.add_task("", total=None)
 
         def show(label: str) -> None:
             nonlocal done
-            bar.update(task, description=label, completed=done)
             done += 1
+            bar.reset(task, total=None, description=f"{done}/{_STEPS} {label}")
 
-        yield show
+        def pass_over(rows: int, total: int) -> None:
+            bar.update(task, completed=rows, total=total)
+
+        with watched(pass_over):
+            yield show

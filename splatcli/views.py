@@ -1,4 +1,4 @@
-"""`splat render` and `splat info`: a look at a run or at a splat file."""
+"""`splat render`: a picture of a run or of a splat file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stages.run.errors import Family, SplatError
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.scene import Camera, ExportedFile, Splats, View
+    from stages.scene import Camera, Splats, View
 
 _STAGES_WITH_SPLATS = ("quantise", "prune", "train", "seed")
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp")
@@ -54,27 +54,13 @@ def render_to(
     console.note(f"{out}: {seen.width} x {seen.height}, {len(splats):,} splats")
 
 
-def show_info(target: Path | None, as_json: bool) -> None:
-    """Print counts, degrees and bounds of a file or of a run's newest splats."""
-    splats, pipeline = load_splats(target)
-    facts = describe(splats)
-    if pipeline is None and target is not None:
-        facts = {"file": str(target), "size": console.size(target.stat().st_size), **facts}
-    if pipeline is not None:
-        facts = {**_about_run(pipeline), **facts}
-    if as_json:
-        console.emit("info", **facts)
-    else:
-        rows = [(console.label(k), console.figure(k, _flat(v))) for k, v in facts.items()]
-        console.table(("", ""), rows)
-
-
-def load_splats(target: Path | None) -> tuple[Splats, Pipeline | None]:
-    """(splats, the pipeline if `target` is a run): from a file, or a run's newest stage."""
+def load_splats(target: Path | None, strict: bool = True) -> tuple[Splats, Pipeline | None]:
+    """(splats, the pipeline if `target` is a run): from a file, or a run's newest stage. strict:
+    whether a value that is not finite makes a file unreadable."""
     if target is not None and target.is_file():
         from stages.formats import read
 
-        return read(target), None
+        return read(target, strict=strict), None
     if target is not None and not target.exists():
         raise SplatError(
             "file-missing",
@@ -100,65 +86,6 @@ def newest_with_splats(pipeline: Pipeline) -> str:
         hint="Run `splat process` to go on.",
         family=Family.USAGE,
     )
-
-
-def describe(splats: Splats) -> dict[str, Any]:
-    """Plain facts: count, SH degrees, bounds of the centres, typical size and opacity."""
-    import numpy as np
-
-    facts: dict[str, Any] = {"splats": len(splats), "sh_degree": splats.sh_degree}
-    if len(splats) == 0:
-        return facts
-    degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
-    facts["splats_by_degree"] = {str(int(d)): int(n) for d, n in zip(degrees, counts, strict=True)}
-    finite = np.isfinite(splats.means).all(axis=1)
-    facts["not_finite"] = int((~finite).sum())
-    if finite.any():
-        low, middle, high = np.percentile(splats.means[finite], (0, 50, 100), axis=0)
-        facts["bounds_low"] = _rounded(low)
-        facts["bounds_high"] = _rounded(high)
-        facts["median_centre"] = _rounded(middle)
-        facts["median_scale"] = float(np.exp(np.median(splats.log_scales[finite])))
-    facts["median_opacity"] = float(np.median(splats.opacities))
-    facts["origin"] = _rounded(splats.origin)
-    return facts
-
-
-def _about_run(pipeline: Pipeline) -> dict[str, Any]:
-    name = newest_with_splats(pipeline)
-    facts: dict[str, Any] = {"run": str(pipeline.run_folder), "splats_from": name}
-    if pipeline.manifest("sfm") is not None:
-        reconstruction = pipeline.load("sfm")
-        facts["photographs"] = len(reconstruction.views)
-        facts["units"] = reconstruction.units
-        facts["levelled"] = bool(reconstruction.levelled)
-    manifest = pipeline.manifest("export")
-    if manifest is not None:
-        folder = pipeline.stage_folder("export")
-        proven = manifest.metrics.get("formats", {})
-        facts["assets"] = {
-            str(folder / file.path): _size_and_quality(file, proven.get(file.format, {}))
-            for file in pipeline.load("export").files
-        }
-    return facts
-
-
-def _size_and_quality(file: ExportedFile, proven: dict[str, Any]) -> str:
-    """proven: what export found when it read the file back and drew it."""
-    told = [console.size(file.size_bytes)]
-    if "verify_db" in proven:
-        told.append(console.figure("verify_db", proven["verify_db"]))
-    return ", ".join(told)
-
-
-def _rounded(values: Any) -> list[float]:
-    return [float(f"{value:.5g}") for value in values]
-
-
-def _flat(value: Any) -> Any:
-    if isinstance(value, dict):
-        return ", ".join(f"{key}: {item}" for key, item in value.items())
-    return " ".join(map(str, value)) if isinstance(value, list) else value
 
 
 def pipeline_around(file: Path | None) -> Pipeline | None:

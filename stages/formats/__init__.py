@@ -7,6 +7,7 @@ them back so; each format's own axes and units of measure stay inside its module
 from __future__ import annotations
 
 import importlib
+from contextlib import nullcontext
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -69,10 +70,17 @@ def write(
     return dropped
 
 
-def read(path: Path) -> Splats:
-    """The splats of a file, float32, y down. Raises SplatError "format-unknown" or
-    "splats-unreadable"."""
-    splats: Splats = _module(path).read(Path(path))
+def read(path: Path, *, strict: bool = True) -> Splats:
+    """The splats of a file, float32, y down.
+
+    strict: whether a value that is not finite makes the file unreadable. Raises SplatError
+    "format-unknown" or "splats-unreadable".
+    """
+    from stages.formats.rows import damage_kept
+
+    module = _module(path)
+    with nullcontext() if strict else damage_kept():
+        splats: Splats = module.read(Path(path))
     return splats
 
 

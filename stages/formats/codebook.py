@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import blocks, passing
+
 SIZE = 256
 _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
 _COARSE = 128
@@ -14,8 +16,10 @@ _ROWS_AT_ONCE = 1 << 14
 
 def of_numbers(values: NDArray[np.floating]) -> NDArray[np.float64]:
     """[256] rising: near the values [M] in the least squares sense; all of them if they are few."""
-    ordered = np.sort(values, axis=None).astype(np.float64)
-    distinct = np.unique(ordered)
+    ordered = np.sort(values, axis=None)
+    new = np.ones(len(ordered), bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
+    distinct = ordered[new].astype(np.float64)
     if len(distinct) <= SIZE:
         padding = np.full(SIZE - len(distinct), distinct[-1] if len(distinct) else 0.0)
         return np.concatenate([distinct, padding])
@@ -23,10 +27,11 @@ def of_numbers(values: NDArray[np.floating]) -> NDArray[np.float64]:
     ranks = np.linspace(0, len(ordered) - 1, SIZE // 2).astype(np.intp)
     even = np.linspace(ordered[0], ordered[-1], SIZE - SIZE // 2)
     centres = np.sort(np.concatenate([ordered[ranks], even]))
-    sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    squares = np.concatenate([[0.0], np.cumsum(np.square(ordered))])
+    sums, squares = _running(ordered, 1), _running(ordered, 2)
     for _ in range(_SCALAR_ROUNDS):
-        ends = np.searchsorted(ordered, (centres[1:] + centres[:-1]) / 2)
+        # looked up in the values' own type: NumPy would copy all of them into another
+        middles = ((centres[1:] + centres[:-1]) / 2).astype(ordered.dtype)
+        ends = np.searchsorted(ordered, middles)
         ends = np.concatenate([[0], ends, [len(ordered)]])
         counts = np.diff(ends)
         used = np.flatnonzero(counts)
@@ -40,10 +45,20 @@ def of_numbers(values: NDArray[np.floating]) -> NDArray[np.float64]:
     return centres
 
 
+def _running(ordered: NDArray[np.floating], power: int) -> NDArray[np.float64]:
+    """[M + 1] sums of the first 0, 1, 2, ... values to a power of 1 or 2."""
+    sums = np.zeros(len(ordered) + 1)
+    np.power(ordered, power, out=sums[1:], dtype=np.float64)
+    return np.cumsum(sums, out=sums)
+
+
 def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDArray[np.uint8]:
     """The index of the entry nearest to each value, in the shape of `values`."""
     middles = (codebook[1:] + codebook[:-1]) / 2
-    return np.searchsorted(middles, values.astype(np.float64)).astype(np.uint8)
+    indices = np.empty(values.shape, np.uint8)
+    for rows in blocks(len(values)):
+        indices[rows] = np.searchsorted(middles, values[rows].astype(np.float64))
+    return indices
 
 
 def of_vectors(
@@ -60,15 +75,21 @@ def of_vectors(
     rng = np.random.default_rng(seed)
     sample = np.sort(rng.permutation(rows)[:_SAMPLE])
     coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)
-    cluster = _assigned(vectors[rows], coarse)
+    cluster = np.empty(len(rows), np.int32)
+    for part in passing(len(rows)):
+        cluster[part] = _assigned(vectors[rows[part]], coarse)
+    # the rows of one cluster after the other, in their order
+    rows = rows[np.argsort(cluster, kind="stable")]
+    ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
     used = 1
-    for k in range(len(coarse)):
-        members = rows[cluster == k]
+    for k in passing(len(coarse), 1):
+        members = rows[ends[k.start - 1] if k.start else 0 : ends[k.start]]
         if not len(members):
             continue
         share = max(1, (size - 1 - len(coarse)) * len(members) // len(rows))
-        fine = _centres(vectors[members], share, rng)
-        labels[members] = used + _assigned(vectors[members], fine)
+        inside = vectors[members]
+        fine = _centres(inside, share, rng)
+        labels[members] = used + _assigned(inside, fine)
         palette.append(fine)
         used += len(fine)
     return np.concatenate(palette), labels

@@ -11,6 +11,8 @@ f_rest_0.. as uchar, channel-major as in the .ply. Axes as in memory (y down).
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import morton, smallest_three
+from stages.formats.blocks import allocated, passing
 from stages.formats.ply_header import Header, binary_rows, read_header
 from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, kept_rows, linear_opacities, logits_of, unit_quaternions
@@ -49,16 +52,14 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     coefficients within -4..4. Raises SplatError when the file cannot be written.
     """
     splats, dropped = kept_rows(splats)
-    splats = splats.take(order(splats))
     degree = int(splats.sh_degrees.max(initial=0))
-    splats = splats.with_sh_degree(degree)
-    starts = range(0, len(splats), _BLOCK)
-    blocks = [_pack(splats.take(np.arange(s, min(s + _BLOCK, len(splats))))) for s in starts]
+    splats, rows = splats.with_sh_degree(degree), order(splats)
+    packed = [_pack(splats.take(rows[part])) for part in passing(len(splats), _BLOCK)]
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header_text(splats, degree, units).encode("ascii"))
         for part in range(3):  # all chunks, then all words, then all SH
-            for block in blocks:
-                file.write(block[part].tobytes())
+            for block in packed:
+                file.write(block[part].data)
     return dropped
 
 
@@ -170,25 +171,29 @@ def unpack(path: Path, header: Header) -> Splats:
         raise BadFileError(f"it has {len(ranges)} chunks for {len(vertices)} splats")
     if any(vertices.dtype[name].str[1:] != "u4" for name in _WORDS):
         raise BadFileError("it is a compressed .ply whose words are no uint")
+    rest = _rest_rows(path, header)
+    degree = 0 if rest is None else math.isqrt(len(rest.dtype.names or ()) // 3 + 1) - 1
+    splats = replace(allocated(len(vertices), degree), origin=header.origin)
+    for rows in passing(len(vertices), _BLOCK):
+        chunks = ranges[rows.start // CHUNK : -(-rows.stop // CHUNK)]
+        _unpack_block(splats.take(rows), vertices[rows], chunks)
+        if degree and rest is not None:
+            splats.sh[rows, 1:] = _rest_values(rest[rows])
+    return checked(splats)
+
+
+def _unpack_block(out: Splats, vertices: NDArray[Any], ranges: NDArray[Any]) -> None:
+    """Fill `out` (all but the SH above degree 0) with the splats of whole chunks."""
     words = [vertices[name].astype(np.uint32) for name in _WORDS]
     rgba = _split_bits(words[3], _COLOUR_BITS)
     colours = _in_range(rgba[:, :3], ranges, _RANGES[2])
     largest_float = float(np.finfo(np.float32).max)
-    dc = np.clip((colours - 0.5) / SH_C0, -largest_float, largest_float)
     turn = (_split_bits(words[1], (2, 10, 10, 10))[:, 1:] - 0.5) * 2 * smallest_three.LIMIT
-    return checked(
-        Splats(
-            means=_in_range(_split_bits(words[0], _AXES_BITS), ranges, _RANGES[0]).astype("f4"),
-            quaternions=smallest_three.join(words[1] >> np.uint32(30), turn),
-            log_scales=_in_range(_split_bits(words[2], _AXES_BITS), ranges, _RANGES[1]).astype(
-                "f4"
-            ),
-            opacity_logits=logits_of(rgba[:, 3]),
-            sh=np.concatenate([dc[:, None].astype(np.float32), _rest(path, header)], axis=1),
-            sh_degrees=np.zeros(len(dc), np.uint8),
-            origin=header.origin,
-        )
-    )
+    out.means[:] = _in_range(_split_bits(words[0], _AXES_BITS), ranges, _RANGES[0])
+    out.quaternions[:] = smallest_three.join(words[1] >> np.uint32(30), turn)
+    out.log_scales[:] = _in_range(_split_bits(words[2], _AXES_BITS), ranges, _RANGES[1])
+    out.opacity_logits[:] = logits_of(rgba[:, 3])
+    out.sh[:, 0] = np.clip((colours - 0.5) / SH_C0, -largest_float, largest_float)
 
 
 def _require(header: Header, element: str, names: Any) -> None:
@@ -216,23 +221,26 @@ def _in_range(
     return values
 
 
-def _rest(path: Path, header: Header) -> NDArray[np.float32]:
-    """[N, K, 3] coefficients above degree 0."""
-    count = header.vertex.count
+def _rest_rows(path: Path, header: Header) -> NDArray[Any] | None:
+    """[N] rows of f_rest_0.., if there are any."""
     if not any(element.name == "sh" for element in header.elements):
-        return np.zeros((count, 0, 3), np.float32)
+        return None
     kept = header.element("sh")
     names = [name for name, _ in kept.properties if name.startswith("f_rest_")]
     if len(names) not in (0, 9, 24, 45) or any(kind != "u1" for _, kind in kept.properties):
         raise BadFileError(f"its element sh has {len(names)} f_rest, not 0, 9, 24 or 45 of uchar")
-    _require(header, "sh", [f"f_rest_{i}" for i in range(len(names))])
-    if kept.count != count:
-        raise BadFileError(f"it has {kept.count} rows of SH for {count} splats")
+    names = [f"f_rest_{i}" for i in range(len(names))]
+    _require(header, "sh", names)
+    if kept.count != header.vertex.count:
+        raise BadFileError(f"it has {kept.count} rows of SH for {header.vertex.count} splats")
     rows: NDArray[Any] = binary_rows(path, header, "sh")
-    table = np.empty((count, len(names)), np.float32)
+    return rows[names] if names else None
+
+
+def _rest_values(rows: NDArray[Any]) -> NDArray[np.float32]:
+    """[M, K, 3] coefficients above degree 0."""
     levels = (np.arange(256) + 0.5) / 256
     levels[[0, 255]] = (0.0, 1.0)
     values = ((levels - 0.5) * 2 * SH_LIMIT).astype(np.float32)
-    for i in range(len(names)):
-        table[:, i] = values[rows[f"f_rest_{i}"]]
-    return table.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
+    steps = np.stack([rows[name] for name in rows.dtype.names or ()], axis=1)
+    return values[steps].reshape(len(rows), 3, -1).transpose(0, 2, 1)

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from stages.formats import ply
+from stages.formats.blocks import tell
 from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import kept_rows
 from stages.run.atomic import replacing
@@ -25,6 +26,8 @@ from stages.viewer.shots import shots_of
 _GZIP = 31  # zlib's name for the gzip container; its header holds no time then
 _LEVEL = 6
 _CHUNK_BYTES = 3 << 20  # of gzip in a script element; a multiple of 3, so that base64 needs no "="
+_LINE_LIMIT_BYTES = 2 * _CHUNK_BYTES  # base64 takes 4/3, and the element a little
+_END_BYTES = 1 << 10
 _INFLATED_AT_ONCE = 1 << 22
 
 
@@ -78,18 +81,25 @@ def read(path: Path) -> Splats:
 
 
 def _unzipped(path: Path) -> Iterator[bytes]:
-    page = path.read_bytes()
-    if not page.rstrip().endswith(compose.PAGE_END.strip().encode("ascii")):
-        raise BadFileError("it is no whole page: its end is missing")
+    """The .ply inside, a part at a time; each script element is a line of its own."""
     start, end = (re.escape(t.encode("ascii")) for t in (compose.CHUNK_START, compose.CHUNK_END))
+    wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)
     unpacker = zlib.decompressobj(_GZIP)
-    try:
-        for match in re.finditer(start + rb"([A-Za-z0-9+/=]*)" + end, page):
-            data = base64.b64decode(match[1], validate=True)
-            while data:
-                yield unpacker.decompress(data, _INFLATED_AT_ONCE)
-                data = unpacker.unconsumed_tail
-    except (zlib.error, binascii.Error) as error:
-        raise BadFileError(f"the splats in it are damaged ({error})") from error
+    with path.open("rb") as page:
+        size = page.seek(0, 2)
+        page.seek(max(0, size - _END_BYTES))
+        if not page.read().rstrip().endswith(compose.PAGE_END.strip().encode("ascii")):
+            raise BadFileError("it is no whole page: its end is missing")
+        page.seek(0)
+        try:
+            while line := page.readline(_LINE_LIMIT_BYTES):
+                match = wanted.fullmatch(line)
+                data = base64.b64decode(match[1], validate=True) if match else b""
+                while data:
+                    yield unpacker.decompress(data, _INFLATED_AT_ONCE)
+                    data = unpacker.unconsumed_tail
+                    tell(page.tell(), size)
+        except (zlib.error, binascii.Error) as error:
+            raise BadFileError(f"the splats in it are damaged ({error})") from error
     if not unpacker.eof:
         raise BadFileError("it holds no splats, or not all of them")

@@ -1,4 +1,4 @@
-"""A gzip stream read piece by piece, that cannot be made to fill the memory."""
+"""gzip and zstd streams read piece by piece, that cannot be made to fill the memory."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from stages.formats.problems import BadFileError
 _RATIO_LIMIT = 100
 _ALWAYS_ALLOWED_BYTES = 64 << 20
 _PIECE_BYTES = 1 << 18
+_WINDOW_BYTES = 1 << 27  # of zstd: what its own decoders allow; every encoder's levels keep to it
 _EXTRA_BYTES = 1 << 20  # after the splats: extensions, which are passed over
 
 
@@ -27,32 +28,32 @@ class Inflated:
 
     def expect(self, count: int) -> None:
         """Refuse a file that cannot honestly hold `count` bytes more."""
-        if count > max(_ALWAYS_ALLOWED_BYTES, _RATIO_LIMIT * self._size):
-            raise BadFileError(f"it declares {count} bytes in a file of {self._size}")
+        check_size(count, self._size)
 
     def read(self, count: int) -> bytes:
         """Exactly `count` bytes."""
-        parts: list[bytes] = []
-        missing = count
-        while missing:
-            part = self._some(missing)
-            if not part:
-                raise BadFileError(f"it is cut short: {missing} bytes are missing")
-            parts.append(part)
-            missing -= len(part)
-        return b"".join(parts)
+        return self.rows(1, count).tobytes()
 
     def rows(self, count: int, width: int) -> NDArray[np.uint8]:
         """[count, width] bytes."""
-        return np.frombuffer(self.read(count * width), np.uint8).reshape(count, width)
+        out = np.empty(count * width, np.uint8)
+        filled = 0
+        while filled < len(out):
+            part = self._some(len(out) - filled)
+            if not part:
+                raise BadFileError(f"it is cut short: {len(out) - filled} bytes are missing")
+            out[filled : filled + len(part)] = np.frombuffer(part, np.uint8)
+            filled += len(part)
+        return out.reshape(count, width)
 
-    def finish(self) -> None:
-        """Read to the end, where gzip keeps its check sum."""
-        extra = 0
+    def finish(self) -> bytes:
+        """What follows, to the end, where gzip keeps its check sum."""
+        extra = b""
         while part := self._some(_PIECE_BYTES):
-            extra += len(part)
-            if extra > _EXTRA_BYTES:
+            extra += part
+            if len(extra) > _EXTRA_BYTES:
                 raise BadFileError("it holds more than its header declares")
+        return extra
 
     def _some(self, limit: int) -> bytes:
         """At least one byte and at most `limit`; nothing at the stream's end."""
@@ -67,3 +68,42 @@ class Inflated:
             if not piece:
                 raise BadFileError("it is cut short")
         return b""
+
+
+def check_size(count: int, file_bytes: int) -> None:
+    """Raises BadFileError for a file that cannot honestly unpack to `count` bytes."""
+    if count > max(_ALWAYS_ALLOWED_BYTES, _RATIO_LIMIT * file_bytes):
+        raise BadFileError(f"it declares {count} bytes in a file of {file_bytes}")
+
+
+def unpacked(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np.uint8]:
+    """[count] bytes: the zstd frame in the next `packed_bytes` of the file, whole.
+
+    `count` must have passed `check_size`. Raises BadFileError for what is damaged.
+    """
+    import zstandard
+
+    packed = file.read(packed_bytes) if packed_bytes <= _left(file) else b""
+    if len(packed) < packed_bytes:
+        raise BadFileError("it is cut short")
+    out = np.empty(count, np.uint8)
+    unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
+    try:
+        with unpacker.stream_reader(packed) as stream:
+            filled = 0
+            while filled < count and (more := stream.readinto(out[filled:].data)):
+                filled += more
+            if filled < count:
+                raise BadFileError(f"it is cut short: {count - filled} bytes are missing")
+            if count and stream.read(1):
+                raise BadFileError("it holds more than its header declares")
+    except zstandard.ZstdError as error:
+        raise BadFileError(f"it is damaged ({error})") from error
+    return out
+
+
+def _left(file: BinaryIO) -> int:
+    here = file.tell()
+    end = file.seek(0, 2)
+    file.seek(here)
+    return end - here

@@ -7,8 +7,9 @@ The format records neither axes nor units; ours says them in comments. World: y 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,13 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import compressed_ply
+from stages.formats.blocks import allocated, forget, passing
+from stages.formats.far import recentred
 from stages.formats.ply_header import Header, binary_rows, read_header
 from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, kept_rows
 from stages.run.atomic import replacing
 from stages.scene import Splats
 
-_ROWS_AT_ONCE = 1 << 16
+_ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3: the columns of a block are gathered from the cache
+_Tables = Iterator[tuple[slice, NDArray[Any]]]
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -56,8 +60,8 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 def blocks(splats: Splats, units: str) -> Iterator[bytes]:
     """The bytes of the file, a part at a time; every splat must be drawable."""
     yield _header_text(splats, units).encode("ascii")
-    for start in range(0, len(splats), _ROWS_AT_ONCE):
-        yield _table(splats, slice(start, start + _ROWS_AT_ONCE)).tobytes()
+    for rows in passing(len(splats), _ROWS_AT_ONCE):
+        yield _table(splats, rows).tobytes()
 
 
 def _header_text(splats: Splats, units: str) -> str:
@@ -107,24 +111,39 @@ def parse(path: Path) -> Splats:
         if header.is_compressed:
             return compressed_ply.unpack(path, header)
         _check_is_splats(header)
-        columns = _Columns(_read_rows(path, file, header), header.ascii_names)
-        count = sum(1 for name in columns.names if name.startswith("f_rest_"))
+        names = [name for name, _ in header.vertex.properties]
+        count = sum(1 for name in names if name.startswith("f_rest_"))
         if count not in (0, 9, 24, 45):
             raise BadFileError(f"it has {count} f_rest properties, not 0, 9, 24 or 45")
-        rest = columns.floats([f"f_rest_{i}" for i in range(count)])
-        dc = columns.floats(["f_dc_0", "f_dc_1", "f_dc_2"])
-        rest = rest.reshape(len(rest), 3, count // 3).transpose(0, 2, 1)
-        return checked(
-            Splats(
-                means=columns.floats(["x", "y", "z"]),
-                quaternions=columns.floats([f"rot_{i}" for i in range(4)]),
-                log_scales=columns.floats([f"scale_{i}" for i in range(3)]),
-                opacity_logits=columns.floats(["opacity"])[:, 0],
-                sh=np.concatenate([dc[:, None], rest], axis=1),
-                sh_degrees=np.zeros(len(dc), np.uint8),
-                origin=header.origin,
-            )
-        )
+        if header.encoding == "ascii":
+            _check_ascii_size(path, header)
+            tables = _ascii_tables(file, header)
+        else:
+            tables = _binary_tables(binary_rows(path, header, "vertex"))
+        splats = allocated(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
+        wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
+        exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
+        for rows, table in tables:
+            columns = _Columns(names, table)
+            _fill(splats.take(rows), columns, count)
+            if exact is not None:
+                exact[rows] = columns.take(["x", "y", "z"])
+            else:
+                splats.means[rows] = columns.floats(["x", "y", "z"])
+    if exact is None:
+        return checked(replace(splats, origin=header.origin))
+    means, origin = recentred(exact, header.origin)
+    return checked(replace(splats, means=means, origin=origin))
+
+
+def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:
+    """All but the means of some rows, `splats` being views of them."""
+    splats.quaternions[:] = columns.floats([f"rot_{i}" for i in range(4)])
+    splats.log_scales[:] = columns.floats([f"scale_{i}" for i in range(3)])
+    splats.opacity_logits[:] = columns.floats(["opacity"])[:, 0]
+    splats.sh[:, 0] = columns.floats(["f_dc_0", "f_dc_1", "f_dc_2"])
+    rest = columns.floats([f"f_rest_{i}" for i in range(rest_count)])
+    splats.sh[:, 1:] = rest.reshape(len(rest), 3, rest_count // 3).transpose(0, 2, 1)
 
 
 def _check_is_splats(header: Header) -> None:
@@ -138,35 +157,58 @@ def _check_is_splats(header: Header) -> None:
         raise BadFileError("its vertices hold lists")
 
 
-def _read_rows(path: Path, file: BinaryIO, header: Header) -> NDArray[np.generic]:
-    """[N] structured rows mapped from the file, or for ascii an [N, P] float64 table."""
-    if header.encoding == "ascii":
-        return _read_ascii_rows(path, file, header)
-    return binary_rows(path, header, "vertex")
+def _binary_tables(mapped: NDArray[Any]) -> _Tables:
+    """The rows of a binary file, some at a time: [M, P] where all columns are of one type, else
+    [M] structured."""
+    kinds = {mapped.dtype[name] for name in mapped.dtype.names or ()}
+    for rows in passing(len(mapped), _ROWS_AT_ONCE):
+        block = np.array(mapped[rows])
+        forget(mapped)
+        plain = block.view(block.dtype[0]).reshape(len(block), -1) if len(kinds) == 1 else block
+        yield rows, plain
 
 
-def _read_ascii_rows(path: Path, file: BinaryIO, header: Header) -> NDArray[np.generic]:
+def _ascii_numbers(header: Header) -> tuple[int, int]:
+    """(how many numbers precede the vertices, how many theirs are)."""
     skipped = sum(element.count * len(element.properties) for element in header.before("vertex"))
-    width = len(header.vertex.properties)
-    wanted = header.vertex.count * width
+    return skipped, header.vertex.count * len(header.vertex.properties)
+
+
+def _check_ascii_size(path: Path, header: Header) -> None:
     # A number and its separator take two characters at least.
-    if 2 * (skipped + wanted) > path.stat().st_size - header.data_starts + 1:
+    if 2 * sum(_ascii_numbers(header)) > path.stat().st_size - header.data_starts + 1:
         raise BadFileError("it is cut short: it cannot hold the numbers that it declares")
+
+
+def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
+    """The rows of a text file, some at a time: [M, P] float64."""
+    skipped, declared = _ascii_numbers(header)
+    width = len(header.vertex.properties)
     file.seek(header.data_starts)
-    words = _words(file)
-    table = np.empty(wanted)
-    filled = -skipped
-    for numbers in words:
-        chunk = np.array(numbers, dtype=np.float64)
-        first = max(0, -filled)
-        room = chunk[first : first + max(0, wanted - max(filled, 0))]
-        table[max(filled, 0) : max(filled, 0) + len(room)] = room
-        filled += len(chunk)
-        if filled >= wanted:
-            return table.reshape(header.vertex.count, width)
-    if wanted and filled < wanted:
-        raise BadFileError(f"it is cut short: {wanted} numbers declared, {max(filled, 0)} there")
-    return table.reshape(header.vertex.count, width)
+    numbers = _numbers(file)
+    held = np.zeros(0)
+    while len(held) < skipped and (more := next(numbers, None)) is not None:
+        skipped -= len(held)
+        held = more
+    held = held[skipped:]
+    for rows in passing(header.vertex.count, _ROWS_AT_ONCE):
+        wanted = (rows.stop - rows.start) * width
+        parts, there = [held], len(held)
+        while there < wanted:
+            more = next(numbers, None)
+            if more is None:
+                found = rows.start * width + there
+                raise BadFileError(f"it is cut short: {declared} numbers declared, {found} there")
+            parts.append(more)
+            there += len(more)
+        whole = np.concatenate(parts)
+        held = whole[wanted:]
+        yield rows, whole[:wanted].reshape(-1, width)
+
+
+def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
+    for words in _words(file):
+        yield np.array(words, dtype=np.float64)
 
 
 def _words(file: BinaryIO) -> Iterator[list[bytes]]:
@@ -184,28 +226,25 @@ def _words(file: BinaryIO) -> Iterator[list[bytes]]:
 
 @dataclass(frozen=True)
 class _Columns:
-    rows: NDArray[np.generic]
-    ascii_names: list[str] | None
+    names: list[str]
+    table: NDArray[Any]  # [M, P], or [M] structured
 
-    @property
-    def names(self) -> list[str]:
-        return list(
-            self.ascii_names if self.ascii_names is not None else self.rows.dtype.names or ()
-        )
-
-    def floats(self, names: list[str]) -> NDArray[np.float32]:
-        """[N, len(names)] float32. Raises BadFileError for values that float32 cannot hold."""
-        out = np.empty((len(self.rows), len(names)), np.float32)
+    def take(self, names: list[str]) -> NDArray[Any]:
+        """[M, len(names)] in a type that holds them all."""
+        if self.table.ndim == 2:
+            return self.table[:, [self.names.index(name) for name in names]]
+        kind = np.result_type(*(self.table.dtype[name] for name in names)) if names else "f4"
+        out = np.empty((len(self.table), len(names)), kind)
         for i, name in enumerate(names):
-            if name not in self.names:
-                raise BadFileError(f"its vertices lack {name}")
-            column = self._column(name)
-            with np.errstate(over="ignore"):
-                out[:, i] = column
-            if column.dtype.itemsize == 8 and (np.isinf(out[:, i]) & np.isfinite(column)).any():
-                raise BadFileError(f"values of {name} are too large")
+            out[:, i] = self.table[name]
         return out
 
-    def _column(self, name: str) -> NDArray[Any]:
-        rows: NDArray[Any] = self.rows
-        return rows[name] if self.ascii_names is None else rows[:, self.ascii_names.index(name)]
+    def floats(self, names: list[str]) -> NDArray[np.float32]:
+        """[M, len(names)] float32. Raises BadFileError for values that float32 cannot hold."""
+        exact = self.take(names)
+        with np.errstate(over="ignore"):
+            out = exact.astype(np.float32)
+        if exact.dtype.itemsize == 8 and (lost := np.isinf(out) & np.isfinite(exact)).any():
+            name = names[int(lost.any(axis=0).argmax())]
+            raise BadFileError(f"values of {name} are too large")
+        return out

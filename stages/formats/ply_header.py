@@ -67,13 +67,6 @@ class Header:
             ahead.append(element)
         return ahead
 
-    @property
-    def ascii_names(self) -> list[str] | None:
-        """The columns' names where rows are a plain table; None where NumPy knows them."""
-        if self.encoding != "ascii":
-            return None
-        return [name for name, _ in self.vertex.properties]
-
 
 def read_header(file: BinaryIO) -> Header:
     start = file.read(HEADER_LIMIT_BYTES)

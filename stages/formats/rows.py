@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import blocks
 from stages.formats.problems import BadFileError
 from stages.raster.api import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
@@ -16,10 +20,34 @@ LOG_SCALE_MIN = -87.0  # below it a scale is no normal float32 any more
 # the exact value.
 LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
 
+_keeps_damage: ContextVar[bool] = ContextVar("keeps_damage", default=False)
+
+
+@contextmanager
+def damage_kept() -> Iterator[None]:
+    """Inside, readers hand out values that are not finite instead of refusing the file: for who
+    wants to know what is in it."""
+    token = _keeps_damage.set(True)
+    try:
+        yield
+    finally:
+        _keeps_damage.reset(token)
+
+
+def keeps_damage() -> bool:
+    return _keeps_damage.get()
+
 
 def drawable(splats: Splats) -> NDArray[np.bool_]:
     """[N] true where every value is finite, the scales can be squared in float32 and the
     quaternion has a direction: the rule of our rasteriser. The others no viewer can draw."""
+    good = np.empty(len(splats), bool)
+    for rows in blocks(len(splats)):
+        good[rows] = _drawable(splats.take(rows))
+    return good
+
+
+def _drawable(splats: Splats) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore", over="ignore"):
         good = np.isfinite(splats.means).all(axis=1)
         good &= np.abs(splats.means).max(axis=1, initial=0.0) <= np.finfo(np.float32).max
@@ -44,15 +72,21 @@ def kept_rows(splats: Splats) -> tuple[Splats, int]:
 def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
     """[N, 4] w, x, y, z of length 1; the norm is taken in float64, where 1e-20 squared is
     not 0."""
-    exact = quaternions.astype(np.float64)
-    return (exact / np.linalg.norm(exact, axis=1, keepdims=True)).astype(np.float32)
+    unit = np.empty((len(quaternions), 4), np.float32)
+    for rows in blocks(len(quaternions)):
+        exact = quaternions[rows].astype(np.float64)
+        unit[rows] = exact / np.linalg.norm(exact, axis=1, keepdims=True)
+    return unit
 
 
 def linear_scales(splats: Splats) -> NDArray[np.float32]:
     """[N, 3] standard deviations; never below the least normal float32, so that a logarithm
     gives the scale back."""
-    exact = np.maximum(splats.log_scales.astype(np.float64), LOG_SCALE_MIN)
-    return np.exp(exact).astype(np.float32)
+    scales = np.empty((len(splats), 3), np.float32)
+    for rows in blocks(len(splats)):
+        exact = np.maximum(splats.log_scales[rows].astype(np.float64), LOG_SCALE_MIN)
+        scales[rows] = np.exp(exact)
+    return scales
 
 
 def linear_opacities(splats: Splats) -> NDArray[np.float32]:
@@ -63,28 +97,36 @@ def linear_opacities(splats: Splats) -> NDArray[np.float32]:
 
 def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
     """[N] the inverse of `linear_opacities`. Raises BadFileError for values outside [0, 1]."""
-    p = opacities.astype(np.float64)
-    if not ((p >= 0) & (p <= 1)).all():
-        raise BadFileError("opacities lie outside 0..1")
-    with np.errstate(divide="ignore"):
-        return np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX).astype(np.float32)
+    logits = np.empty(len(opacities), np.float32)
+    for rows in blocks(len(opacities)):
+        p = opacities[rows].astype(np.float64)
+        if not ((p >= 0) & (p <= 1)).all() and not keeps_damage():
+            raise BadFileError("opacities lie outside 0..1")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logits[rows] = np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX)
+    return logits
 
 
-def logs_of(scales: NDArray[np.floating]) -> NDArray[np.float32]:
-    """[N, 3] the inverse of `linear_scales`; 0 (a flat splat) becomes the least scale that a
-    float32 keeps. Raises BadFileError for negative scales."""
-    if not (scales >= 0).all():
-        raise BadFileError("scales are negative or not numbers")
-    with np.errstate(divide="ignore"):
-        return np.maximum(np.log(scales.astype(np.float64)), LOG_SCALE_MIN).astype(np.float32)
+def logs_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
+    """[N, 3] the inverse of `linear_scales`, of scales enlarged by `factor`; 0 (a flat splat)
+    becomes the least scale that a float32 keeps. Raises BadFileError for negative scales."""
+    logs = np.empty(scales.shape, np.float32)
+    for rows in blocks(len(scales)):
+        exact = scales[rows].astype(np.float64) * factor
+        if not (exact >= 0).all() and not keeps_damage():
+            raise BadFileError("scales are negative or not numbers")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs[rows] = np.maximum(np.log(exact), LOG_SCALE_MIN)
+    return logs
 
 
 def degrees_in_use(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[N] the highest degree with a coefficient that is not 0, of `sh` [N, (L + 1)^2, 3]."""
     degrees = np.zeros(len(sh), np.uint8)
-    for degree in range(1, round(sh.shape[1] ** 0.5)):
-        band = sh[:, degree * degree : (degree + 1) ** 2]
-        degrees[(band != 0).any(axis=(1, 2))] = degree
+    for rows in blocks(len(sh)):
+        for degree in range(1, round(sh.shape[1] ** 0.5)):
+            band = sh[rows, degree * degree : (degree + 1) ** 2]
+            degrees[rows][(band != 0).any(axis=(1, 2))] = degree
     return degrees
 
 
@@ -107,14 +149,23 @@ def checked(splats: Splats) -> Splats:
         sh_degrees=degrees_in_use(splats.sh),
     )
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
-        bad = int((~np.isfinite(getattr(clean, name))).sum())
-        if bad:
+        bad = not_finite(getattr(clean, name))
+        if bad and not keeps_damage():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")
     return clean
 
 
+def not_finite(values: NDArray[np.floating]) -> int:
+    """How many of `values` are NaN or infinite."""
+    return sum(
+        int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)) if values.size
+    )
+
+
 def joined(parts: list[Splats]) -> Splats:
     """All rows of all parts, at the highest degree among them; the origin is left at 0."""
+    if len(parts) == 1:
+        return replace(parts[0], origin=np.zeros(3))
     degree = max((part.sh_degree for part in parts), default=0)
     wide = [part.with_sh_degree(degree) for part in parts]
     empty = {"opacity_logits": (0,), "sh_degrees": (0,), "sh": (0, 1, 3), "quaternions": (0, 4)}

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import codebook, morton, smallest_three
+from stages.formats.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE, read
 from stages.run.atomic import replacing
@@ -42,16 +43,18 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     cannot be written.
     """
     splats, dropped = kept_rows(splats)
-    splats = splats.take(order(splats))
     degree = int(splats.sh_degrees.max(initial=0))
-    splats = splats.with_sh_degree(degree)
+    splats, places = splats.with_sh_degree(degree), order(splats)
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": False}
     meta["asset"] = {"generator": "splat", "units": units}
     if splats.origin.any():
         meta["asset"]["splat_origin"] = [float(v) for v in splats.origin]
-    pictures = {**_positions(splats, meta), **_shapes(splats, meta), **_colours(splats, meta)}
+    # The view-dependent part is large: the others do without it.
+    base = splats.with_sh_degree(0).take(places)
+    pictures = {**_positions(base, meta), **_shapes(base, meta), **_colours(base, meta)}
+    del base
     if degree and len(splats):
-        pictures |= _rest(splats, degree, meta)
+        pictures |= _rest(splats, places, meta)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
         _add(package, "meta.json", json.dumps(meta, allow_nan=False).encode())
         for name, pixels in pictures.items():
@@ -83,25 +86,33 @@ def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _positions(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
-    means = splats.means.astype(np.float64)
-    bent = np.sign(means) * np.log1p(np.abs(means))
-    low = bent.min(axis=0, initial=np.inf) if len(bent) else np.zeros(3)
-    high = bent.max(axis=0, initial=-np.inf) if len(bent) else np.zeros(3)
+    low, high = (np.zeros(3), np.zeros(3))
+    if len(splats):  # the curve rises: the ends of the bent are the bent ends
+        low, high = (_bent(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
     span = np.where(high > low, high - low, 1.0)
-    steps = np.rint((bent - low) / span * 65535).astype(np.uint16)
+    steps = np.empty((len(splats), 3), np.uint16)
+    for rows in passing(len(splats)):
+        steps[rows] = np.rint((_bent(splats.means[rows]) - low) / span * 65535)
     files = ["means_l.webp", "means_u.webp"]
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
     halves = (steps & 255, steps >> 8)
     return {name: _picture(half.astype(np.uint8)) for name, half in zip(files, halves, strict=True)}
 
 
+def _bent(means: NDArray[np.floating]) -> NDArray[np.float64]:
+    exact = means.astype(np.float64)
+    return np.sign(exact) * np.log1p(np.abs(exact))
+
+
 def _shapes(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
     logs = np.clip(splats.log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT)
     book = codebook.of_numbers(logs)
     meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
-    largest, others = smallest_three.split(unit_quaternions(splats.quaternions))
-    bytes_ = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
-    turns = np.concatenate([bytes_, 252 + largest[:, None]], axis=1).astype(np.uint8)
+    turns = np.empty((len(splats), 4), np.uint8)
+    for rows in passing(len(splats)):
+        largest, others = smallest_three.split(unit_quaternions(splats.quaternions[rows]))
+        turns[rows, :3] = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
+        turns[rows, 3] = 252 + largest
     meta["quats"] = {"files": ["quats.webp"]}
     scales = codebook.nearest(book, logs)
     return {"scales.webp": _picture(scales), "quats.webp": _picture(turns)}
@@ -116,9 +127,14 @@ def _colours(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8
     return {"sh0.webp": _picture(np.concatenate([indices, opacity[:, None]], axis=1))}
 
 
-def _rest(splats: Splats, degree: int, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
-    count = (degree + 1) ** 2 - 1
-    vectors = np.clip(splats.sh[:, 1:], -_DC_LIMIT, _DC_LIMIT).astype(np.float32)
+def _rest(
+    splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
+) -> dict[str, NDArray[np.uint8]]:
+    """places: the order in which the splats are written."""
+    count = splats.sh.shape[1] - 1
+    vectors = np.empty((len(splats), count, 3), np.float32)
+    for rows in passing(len(splats)):
+        vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
     size = min(PALETTE_LIMIT, max(_PALETTE_LEAST, len(splats) // _SPLATS_PER_ENTRY))
     palette, labels = codebook.of_vectors(vectors.reshape(len(splats), -1), size)
     book = codebook.of_numbers(palette)
@@ -130,7 +146,7 @@ def _rest(splats: Splats, degree: int, meta: dict[str, Any]) -> dict[str, NDArra
     files = ["shN_centroids.webp", "shN_labels.webp"]
     meta["shN"] = {
         "count": len(palette),
-        "bands": degree,
+        "bands": splats.sh_degree,
         "codebook": book.tolist(),
         "files": files,
     }

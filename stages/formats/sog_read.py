@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import struct
 import warnings
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import smallest_three
+from stages.formats.blocks import allocated, passing
 from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, logits_of
 from stages.scene import Splats
@@ -56,46 +58,51 @@ class _Source:
         if not isinstance(meta, dict) or meta.get("version") != 2:
             raise BadFileError("its meta.json is not of SOG version 2")
         count = _whole(meta, "count", max(_ALWAYS_ALLOWED, _SPLATS_PER_BYTE * self.size_bytes))
-        low, high = (self._pixels(meta, "means", i, count) for i in (0, 1))
+        low, high = (self._pixels(meta, "means", i, count)[:, :3] for i in (0, 1))
         ends = [_numbers(meta, "means", name, 3) for name in ("mins", "maxs")]
-        steps = (low[:, :3] + 256.0 * high[:, :3]) / 65535
-        bent = ends[0] + (ends[1] - ends[0]) * steps
         turns = self._pixels(meta, "quats", 0, count)
         if (turns[:, 3] < 252).any():
             raise BadFileError("its rotations do not name their largest component")
-        others = (turns[:, :3] / 255.0 - 0.5) * 2 * smallest_three.LIMIT
-        colours = self._pixels(meta, "sh0", 0, count)
-        dc = _numbers(meta, "sh0", "codebook", 256)[colours[:, :3]]
-        logs = _numbers(meta, "scales", "codebook", 256)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return Splats(
-                means=(np.sign(bent) * np.expm1(np.abs(bent))).astype(np.float32),
-                quaternions=smallest_three.join(turns[:, 3].astype(np.intp) - 252, others),
-                log_scales=logs[self._pixels(meta, "scales", 0, count)[:, :3]].astype(np.float32),
-                opacity_logits=logits_of(colours[:, 3] / 255.0),
-                sh=np.concatenate([dc[:, None], self._rest(meta, count)], axis=1).astype("f4"),
-                sh_degrees=np.zeros(count, np.uint8),
-                origin=_origin(meta),
-            )
+        colours, scales = (self._pixels(meta, part, 0, count) for part in ("sh0", "scales"))
+        books = [_numbers(meta, part, "codebook", 256) for part in ("sh0", "scales")]
+        palette, labels = self._palette(meta, count)
+        splats = replace(
+            allocated(count, math.isqrt(1 + palette.shape[1]) - 1), origin=_origin(meta)
+        )
+        for rows in passing(count):
+            out = splats.take(rows)
+            steps = (low[rows] + 256.0 * high[rows]) / 65535
+            bent = ends[0] + (ends[1] - ends[0]) * steps
+            others = (turns[rows, :3] / 255.0 - 0.5) * 2 * smallest_three.LIMIT
+            with np.errstate(over="ignore", invalid="ignore"):
+                out.means[:] = np.sign(bent) * np.expm1(np.abs(bent))
+                out.sh[:, 0] = books[0][colours[rows, :3]]
+                out.log_scales[:] = books[1][scales[rows, :3]]
+            out.quaternions[:] = smallest_three.join(turns[rows, 3].astype(np.intp) - 252, others)
+            out.opacity_logits[:] = logits_of(colours[rows, 3] / 255.0)
+            out.sh[:, 1:] = palette[labels[rows]]
+        return splats
 
-    def _rest(self, meta: dict[str, Any], count: int) -> NDArray[np.float32]:
-        """[N, K, 3] coefficients above degree 0."""
+    def _palette(
+        self, meta: dict[str, Any], count: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """(SH above degree 0 [entries, K, 3], which of them is each splat's [N])."""
+        none = np.zeros((1, 0, 3), np.float32), np.zeros(count, np.intp)
         if "shN" not in meta:
-            return np.zeros((count, 0, 3), np.float32)
+            return none
         entries = _whole(_part(meta, "shN"), "count", PALETTE_LIMIT)
         degree = _whole(_part(meta, "shN"), "bands", 3)
         k = (degree + 1) ** 2 - 1
         if not degree:
-            return np.zeros((count, 0, 3), np.float32)
+            return none
         book = _numbers(meta, "shN", "codebook", 256).astype(np.float32)
         lines = -(-entries // PER_LINE)
         indices = self._pixels(meta, "shN", 0, lines * PER_LINE * k, width=PER_LINE * k)
-        palette = indices[:, :3].reshape(-1, k, 3)
         halves = self._pixels(meta, "shN", 1, count)
         labels = halves[:, 0] + 256 * halves[:, 1].astype(np.intp)
         if len(labels) and labels.max() >= entries:
             raise BadFileError("its splats name SH that is not in its palette")
-        return book[palette[labels]]
+        return book[indices[:, :3].reshape(-1, k, 3)], labels
 
     def _member(self, name: Any, limit: int) -> bytes:
         """A file of the zip. Raises BadFileError if it is not there or unpacks to more."""

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import allocated, passing
 from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import (
     checked,
@@ -33,7 +34,7 @@ RECORD = np.dtype(
 def order(splats: Splats) -> NDArray[np.intp]:
     """[N] rows from the largest volume x opacity to the least; equals keep their order."""
     with np.errstate(divide="ignore"):
-        size = splats.log_scales.astype(np.float64).sum(axis=1) + np.log(linear_opacities(splats))
+        size = splats.log_scales.sum(axis=1, dtype=np.float64) + np.log(linear_opacities(splats))
     return np.argsort(-size, kind="stable")
 
 
@@ -80,9 +81,10 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Raises SplatError when the file cannot be written.
     """
     splats, dropped = kept_rows(splats)
-    records = encode(splats.take(order(splats)))
+    splats, places = splats.with_sh_degree(0), order(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(records.tobytes())
+        for rows in passing(len(splats)):
+            file.write(encode(splats.take(places[rows])).tobytes())
     return dropped
 
 
@@ -93,4 +95,10 @@ def read(path: Path) -> Splats:
         size = path.stat().st_size
         if size % RECORD.itemsize:
             raise BadFileError(f"its {size} bytes are no multiple of {RECORD.itemsize}")
-        return checked(decode(np.fromfile(path, RECORD)))
+        splats = allocated(size // RECORD.itemsize, 0)
+        with path.open("rb") as file:
+            for rows in passing(len(splats)):
+                block = decode(np.fromfile(file, RECORD, rows.stop - rows.start))
+                for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+                    getattr(splats, name)[rows] = getattr(block, name)
+        return checked(splats)

@@ -26,14 +26,19 @@ _SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], n
 _QUATERNION_SIGNS = np.array([1, 1, -1, -1], np.float32)
 
 
-def turned(splats: Splats) -> Splats:
-    """The splats in the other frame (y down to y up, and back)."""
-    dtype = splats.means.dtype
-    signs = _SH_SIGNS[: splats.sh.shape[1], None]
-    return replace(
-        splats,
-        means=splats.means * FLIP.astype(dtype),
-        quaternions=splats.quaternions * _QUATERNION_SIGNS,
-        sh=splats.sh * signs,
-        origin=splats.origin * FLIP + 0.0,  # + 0.0: an origin of -0 would be written as such
-    )
+def turned(splats: Splats, *, reuse: bool = False) -> Splats:
+    """The splats in the other frame (y down to y up, and back).
+
+    reuse: into the arrays that they come in, for a caller who needs those no more.
+    """
+    signs = {
+        "means": FLIP.astype(splats.means.dtype),
+        "quaternions": _QUATERNION_SIGNS,
+        "sh": _SH_SIGNS[: splats.sh.shape[1], None],
+    }
+    arrays = {}
+    for name, sign in signs.items():
+        values = getattr(splats, name)
+        arrays[name] = np.multiply(values, sign, out=values if reuse else None)
+    # + 0.0: an origin of -0 would be written as such
+    return replace(splats, **arrays, origin=splats.origin * FLIP + 0.0)

@@ -10,18 +10,15 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.rows import (
-    kept_rows,
-    linear_opacities,
-    linear_scales,
-    unit_quaternions,
-)
+from stages.formats.blocks import block_of, passing
+from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
 from stages.formats.turn import turned
 from stages.formats.usd_read import read
 from stages.run.atomic import replacing
@@ -42,7 +39,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """
     path = Path(path)
     splats, dropped = kept_rows(splats)
-    layer = _layer(turned(splats), units, ".usda" if path.suffix.lower() == ".usda" else ".usdc")
+    layer = _layer(splats, units, ".usda" if path.suffix.lower() == ".usda" else ".usdc")
     with replacing(path) as temporary:
         if path.suffix.lower() == ".usdz":
             _write_package(temporary, layer, f"{path.stem}.usdc")
@@ -62,37 +59,59 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
     stage.SetDefaultPrim(root)
     note: dict[str, Any] = {"units": units}
     if splats.origin.any():
-        note["origin"] = Gf.Vec3d(*map(float, splats.origin))
+        note["origin"] = Gf.Vec3d(*map(float, turned(splats.take(slice(0))).origin))
     layer.customLayerData = {"splat": note}
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PRIM)
-    scales = linear_scales(splats)
-    unit = unit_quaternions(splats.quaternions)
-    vectors = Vt.Vec3fArray.FromNumpy
-    field.CreatePositionsAttr(vectors(_f4(splats.means)))
+    base = splats.with_sh_degree(0)
+    positions = _filled(Vt.Vec3fArray, base, lambda block: block.means)
+    field.CreatePositionsAttr(positions)
     # Gf keeps the real part last in memory, although it is written first.
-    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(_f4(unit[:, [1, 2, 3, 0]])))
-    field.CreateScalesAttr(vectors(scales))
-    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(linear_opacities(splats)))
+    turns = _filled(
+        Vt.QuatfArray, base, lambda block: unit_quaternions(block.quaternions)[:, [1, 2, 3, 0]]
+    )
+    field.CreateOrientationsAttr(turns)
+    field.CreateScalesAttr(_filled(Vt.Vec3fArray, base, linear_scales))
+    field.CreateOpacitiesAttr(_filled(Vt.FloatArray, base, linear_opacities))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.sh_degree)
-    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(_f4(splats.sh.reshape(-1, 3))))
+    coefficients = _filled(Vt.Vec3fArray, splats, lambda block: block.sh.reshape(-1, 3))
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(coefficients)
     field.CreateProjectionModeHintAttr(UsdVol.Tokens.perspective)
     field.CreateSortingModeHintAttr(UsdVol.Tokens.zDepth)  # as the splats were trained
     if len(splats):
-        field.CreateExtentAttr(vectors(_extent(splats.means, unit, scales)))
+        field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_extent(base)))
     colour = Usd.ColorSpaceAPI.Apply(field.GetPrim())
     colour.CreateColorSpaceNameAttr("srgb_rec709_scene")
     return layer
 
 
-def _f4(values: NDArray[Any]) -> NDArray[np.float32]:
-    return np.ascontiguousarray(values, np.float32)
+def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any]]) -> Any:
+    """A USD array of `values_of` the upright splats. The library copies what it is given, so it
+    is given a block at a time."""
+    array, end = kind(0), 0
+    for rows in passing(len(splats)):
+        values = np.ascontiguousarray(values_of(turned(block_of(splats, rows))), np.float32)
+        if not end:
+            array = kind(len(values) // (rows.stop - rows.start) * len(splats))
+        array[end : end + len(values)] = kind.FromNumpy(values)
+        end += len(values)
+    return array
 
 
-def _extent(
-    means: NDArray[np.floating], unit: NDArray[np.float32], scales: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """[2, 3] the box of all ellipsoids of 3 standard deviations."""
+def _extent(splats: Splats) -> NDArray[np.float32]:
+    """[2, 3] the box of all ellipsoids of 3 standard deviations, upright."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for rows in passing(len(splats)):
+        block = turned(block_of(splats, rows))
+        reach = _reach(unit_quaternions(block.quaternions), linear_scales(block))
+        low = np.minimum(low, (block.means - reach).min(axis=0))
+        high = np.maximum(high, (block.means + reach).max(axis=0))
+    most = np.finfo(np.float32).max
+    return np.clip(np.stack([low, high]), -most, most).astype(np.float32)
+
+
+def _reach(unit: NDArray[np.float32], scales: NDArray[np.float32]) -> NDArray[np.float64]:
+    """[N, 3] half the box of each ellipsoid."""
     w, x, y, z = unit.astype(np.float64).T
     rows = np.array(
         [
@@ -101,9 +120,8 @@ def _extent(
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    reach = 3 * np.sqrt(np.einsum("ijn,nj->ni", rows**2, scales.astype(np.float64) ** 2))
-    box = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
-    return np.clip(box, -np.finfo(np.float32).max, np.finfo(np.float32).max).astype(np.float32)
+    squares = np.einsum("ijn,nj->ni", rows**2, scales.astype(np.float64) ** 2)
+    return np.asarray(3 * np.sqrt(squares))
 
 
 def _export(layer: Any, path: Path) -> None:

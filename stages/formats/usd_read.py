@@ -1,8 +1,8 @@
 """Reading Gaussian splats from USD, in a process of its own.
 
 The USD library ends the whole process when it meets some kinds of damage in a .usdc, so the file
-is opened by a child: `python -m stages.formats.usd_read FILE OUTPUT` leaves the splats in OUTPUT
-(see stages.scene.storage) or says on its standard output why not.
+is opened by a child: `python -m stages.formats.usd_read FILE OUTPUT [keep-damage]` leaves the
+splats in OUTPUT (see stages.scene.storage) or says on its standard output why not.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.far import recentred
 from stages.formats.problems import BadFileError, reading
-from stages.formats.rows import checked, joined, logits_of, logs_of
+from stages.formats.rows import checked, damage_kept, joined, keeps_damage, logits_of, logs_of
 from stages.formats.turn import turned
 from stages.scene import Splats, load_splats, save_splats
 
@@ -34,7 +35,8 @@ _BASE_BYTES, _BYTES_PER_BYTE = 4 << 30, 64
 def read(path: Path) -> Splats:
     """All Gaussian splats of a USD file, turned to y down, float32.
 
-    Prims may be moved and scaled evenly; up axis y. Raises SplatError "splats-unreadable" for a
+    Prims may be moved and scaled evenly; up axis y. What is placed far from zero keeps its
+    precision in `origin`. Raises SplatError "splats-unreadable" for a
     damaged file, one without splats, one that refers to other files, or one with rotated prims.
     """
     path = Path(path)
@@ -46,6 +48,7 @@ def read(path: Path) -> Splats:
             "stages.formats.usd_read",
             str(path.resolve()),
             str(output),
+            *(["keep-damage"] if keeps_damage() else []),
         ]
         try:
             child = subprocess.run(
@@ -72,7 +75,10 @@ def parse(path: Path) -> Splats:
     parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
     if not parts:
         raise BadFileError(f"it holds no {_TYPE}")
-    return checked(turned(replace(joined(parts), origin=_origin(stage))))
+    splats = joined(parts)
+    del parts
+    means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
+    return checked(turned(replace(splats, means=means, origin=origin), reuse=True))
 
 
 def _open(path: Path) -> Any:
@@ -113,22 +119,22 @@ def _splats(prim: Any) -> Splats:
             raise BadFileError(f"it has {given} {name} for {n} splats, wanted {length}")
     scale, offset = _placement(prim)
     return Splats(
-        means=(means * scale + offset).astype(np.float32),
+        means=means.astype(np.float64) * scale + offset,  # `parse` brings them near zero
         quaternions=orientations[:, [3, 0, 1, 2]],
-        log_scales=logs_of(scales.astype(np.float64) * scale),
+        log_scales=logs_of(scales, scale),
         opacity_logits=logits_of(opacities),
-        sh=coefficients.reshape(n, (degree + 1) ** 2, 3),
+        sh=coefficients.reshape(n, (degree + 1) ** 2, 3).copy(),
         sh_degrees=np.full(n, degree, np.uint8),
     )
 
 
 def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
-    """[N, width] float32: the attribute, or its twin in half precision where only that is set."""
+    """[N, width] float32, not to be changed: the attribute, or its twin in half precision where
+    only that is set."""
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
         value = attribute.Get() if attribute else None
         if value is not None:
-            array = np.array(value, np.float32)
-            return array.reshape(-1, width)
+            return np.asarray(value, np.float32).reshape(-1, width)
     raise BadFileError(f"its splats have no {name}")
 
 
@@ -156,10 +162,11 @@ def _limit_memory(path: Path) -> None:
 
 def main(arguments: list[str]) -> int:
     """The child: exit status 0 with the splats in the second file, or 3 with the reason said."""
-    source, output = map(Path, arguments)
+    source, output = map(Path, arguments[:2])
     _limit_memory(source)
     try:
-        splats = parse(source)
+        with damage_kept() if arguments[2:] else nullcontext():
+            splats = parse(source)
     except BadFileError as error:
         print(error)
         return _REFUSED

@@ -10,21 +10,25 @@ picture.
 from __future__ import annotations
 
 import base64
-import gzip
-import io
 import math
+import tempfile
+import zlib
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import format_of, verify_packed
+from stages.formats.blocks import forget, passing
 from stages.formats.verify_content import Y_UP, FileContent, logits, splats_of
 from stages.scene import Splats
 
 __all__ = ["FileContent", "read_back"]
+
+_PLY_ROWS = 1 << 14  # columns are gathered from the cache
+_PAGE_PIECE = 1 << 22  # characters: the parser goes over an unfinished element once a piece
 
 
 def read_back(path: Path) -> FileContent:
@@ -34,81 +38,117 @@ def read_back(path: Path) -> FileContent:
         return _READERS[format_of(path)](path)
 
 
-def _ply(source: Any) -> FileContent:
-    """source: a path, or an open binary file."""
+def _ply(path: Path) -> FileContent:
     from plyfile import PlyData
 
-    named = isinstance(source, Path)
-    data = PlyData.read(str(source), mmap="c") if named else PlyData.read(source)
-    vertex = data["vertex"]
+    vertex = PlyData.read(str(path), mmap="c")["vertex"]
     names = [item.name for item in vertex.properties]
     per_channel = sum(name.startswith("f_rest_") for name in names) // 3
-    sh = np.zeros((len(vertex.data), per_channel + 1, 3), np.float32)
-    for channel in range(3):
-        sh[:, 0, channel] = vertex[f"f_dc_{channel}"]
-        for k in range(per_channel):
-            sh[:, k + 1, channel] = vertex[f"f_rest_{channel * per_channel + k}"]
-    splats = splats_of(
-        means=np.stack([vertex[c] for c in "xyz"], axis=1),
-        quaternions=np.stack([vertex[f"rot_{i}"] for i in range(4)], axis=1),
-        log_scales=np.stack([vertex[f"scale_{i}"] for i in range(3)], axis=1),
-        opacity_logits=np.asarray(vertex["opacity"]),
-        sh=sh,
-    )
-    return FileContent(splats, np.eye(4))
+    count = len(vertex.data)
+    arrays: dict[str, NDArray[np.float32]] = {
+        "means": np.zeros((count, 3), np.float32),
+        "quaternions": np.zeros((count, 4), np.float32),
+        "log_scales": np.zeros((count, 3), np.float32),
+        "opacity_logits": np.zeros(count, np.float32),
+        "sh": np.zeros((count, per_channel + 1, 3), np.float32),
+    }
+    for part in passing(count, _PLY_ROWS):
+        rows = vertex.data[part]
+        for i in range(3):
+            arrays["means"][part, i] = rows["xyz"[i]]
+            arrays["log_scales"][part, i] = rows[f"scale_{i}"]
+            arrays["sh"][part, 0, i] = rows[f"f_dc_{i}"]
+            for k in range(per_channel):
+                arrays["sh"][part, k + 1, i] = rows[f"f_rest_{i * per_channel + k}"]
+        for i in range(4):
+            arrays["quaternions"][part, i] = rows[f"rot_{i}"]
+        arrays["opacity_logits"][part] = rows["opacity"]
+        forget(vertex.data)
+    return FileContent(splats_of(**arrays), np.eye(4))
 
 
 class _Chunks(HTMLParser):
-    """Collects what a browser would find in the script elements of class "splats"."""
+    """Unpacks what a browser would find in the script elements of class "splats" into a file."""
 
-    def __init__(self) -> None:
+    def __init__(self, target: BinaryIO) -> None:
         super().__init__()
+        self.target = target
         self.wanted = False
-        self.chunks: list[str] = []
+        self.held: list[str] = []
+        self.unpacker = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.wanted = tag == "script" and ("class", "splats") in attrs
 
     def handle_data(self, data: str) -> None:
         if self.wanted:
-            self.chunks.append(data)
+            self.held.append(data)
 
     def handle_endtag(self, tag: str) -> None:
+        packed = base64.b64decode("".join(self.held), validate=True)
+        self.target.write(self.unpacker.decompress(packed))
+        self.held.clear()
         self.wanted = False
 
 
 def _html(path: Path) -> FileContent:
-    parser = _Chunks()
-    parser.feed(path.read_text(encoding="utf-8"))
-    packed = b"".join(base64.b64decode(chunk, validate=True) for chunk in parser.chunks)
-    return _ply(io.BytesIO(gzip.decompress(packed)))
+    with tempfile.TemporaryDirectory(prefix="splat-") as folder:
+        inside = Path(folder) / "inside.ply"
+        with path.open(encoding="utf-8") as page, inside.open("wb") as target:
+            parser = _Chunks(target)
+            while piece := page.read(_PAGE_PIECE):
+                parser.feed(piece)
+            parser.close()
+        assert parser.unpacker.eof, "the splats in it are cut short"
+        return _ply(inside)
 
 
 def _splat(path: Path) -> FileContent:
     records = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 32)
-    floats = np.ascontiguousarray(records[:, :24]).view("<f4").astype(np.float64)
-    colours = records[:, 24:28] / 255.0
+    floats = np.ascontiguousarray(records[:, :24]).view("<f4")
+    colours = records[:, 24:28].astype(np.float32) / 255
     splats = splats_of(
         means=floats[:, :3],
-        quaternions=(records[:, 28:].astype(np.float64) - 128.0) / 128.0,
-        log_scales=np.log(floats[:, 3:]),
+        quaternions=(records[:, 28:].astype(np.float32) - 128) / 128,
+        log_scales=np.log(floats[:, 3:], dtype=np.float64),
         opacity_logits=logits(colours[:, 3]),
         sh=((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
     )
     return FileContent(splats, np.eye(4))
 
 
-def _gltf(path: Path) -> FileContent:
+class _Bytes:
+    """A file's bytes from `start`, read where they are looked at."""
+
+    def __init__(self, path: Path, start: int = 0) -> None:
+        self.path, self.start = path, start
+
+    def __getitem__(self, part: slice) -> bytes:
+        with self.path.open("rb") as file:
+            file.seek(self.start + part.start)
+            return file.read(part.stop - part.start)
+
+
+def _gltf_parts(path: Path) -> tuple[Any, _Bytes]:
+    """(the document, the content of its first buffer)."""
     from urllib.parse import unquote
 
     from pygltflib import GLTF2
 
-    document = GLTF2().load(str(path))
-    assert document is not None
-    if path.suffix.lower() == ".gltf" and document.buffers:
-        blob = (path.parent / unquote(document.buffers[0].uri)).read_bytes()
-    else:
-        blob = document.binary_blob() or b""
+    if path.suffix.lower() == ".gltf":
+        document = GLTF2.gltf_from_json(path.read_text(encoding="utf-8"))
+        name = unquote(document.buffers[0].uri) if document.buffers else path.name
+        return document, _Bytes(path.parent / name)
+    with path.open("rb") as file:
+        head = np.frombuffer(file.read(20), "<u4")
+        assert file.seek(0, 2) == head[2], "its length is not that of its header"
+        file.seek(20)
+        document = GLTF2.gltf_from_json(file.read(int(head[3])).decode("utf-8"))
+    return document, _Bytes(path, 20 + int(head[3]) + 8)
+
+
+def _gltf(path: Path) -> FileContent:
+    document, blob = _gltf_parts(path)
     kinds = {5121: np.uint8, 5123: np.uint16, 5126: np.float32}
     widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
@@ -117,20 +157,23 @@ def _gltf(path: Path) -> FileContent:
         view = document.bufferViews[accessor.bufferView]
         start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
         count = accessor.count * widths[accessor.type]
-        flat = np.frombuffer(blob, kinds[accessor.componentType], count, start)
+        kind = np.dtype(kinds[accessor.componentType])
+        flat = np.frombuffer(blob[start : start + count * kind.itemsize], kind)
         return flat.reshape(accessor.count, widths[accessor.type])
 
     prefix = "KHR_gaussian_splatting:"
     parts = []
     for primitive in document.meshes[0].primitives if document.meshes else []:
         bands = [
-            values(primitive, f"{prefix}SH_DEGREE_{d}_COEF_{i}")
+            f"{prefix}SH_DEGREE_{d}_COEF_{i}"
             for d in range(4)
             for i in range(2 * d + 1)
             if hasattr(primitive.attributes, f"{prefix}SH_DEGREE_{d}_COEF_{i}")
         ]
-        sh = np.zeros((len(bands[0]), 16, 3), np.float32)
-        sh[:, : len(bands)] = np.stack(bands, axis=1)
+        degree_0 = document.accessors[getattr(primitive.attributes, bands[0])]
+        sh = np.zeros((degree_0.count, 16, 3), np.float32)
+        for k, name in enumerate(bands):
+            sh[:, k] = values(primitive, name)
         xyzw = values(primitive, f"{prefix}ROTATION")
         parts.append(
             splats_of(
@@ -145,33 +188,34 @@ def _gltf(path: Path) -> FileContent:
 
 
 def _usd(path: Path) -> FileContent:
-    from pxr import Gf, Usd, Vt
+    from pxr import Gf, Sdf, Usd, Vt
 
     # In which column each of w, x, y, z arrives, found out and not assumed.
     columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
-    stage = Usd.Stage.Open(str(path))
-    stage.Reload()  # the library's cache may hold an older file of the same name
+    # Without the library's cache, which may hold an older file of the same name.
+    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(str(path)))
     parts = []
     for prim in stage.Traverse():
         if prim.GetTypeName() != "ParticleField3DGaussianSplat":
             continue
         get = prim.GetAttribute
         degree = get("radiance:sphericalHarmonicsDegree").Get()
-        coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
-        sh = coefficients.reshape(-1, (degree + 1) ** 2, 3)
+        coefficients = np.asarray(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
         parts.append(
             splats_of(
-                means=np.array(get("positions").Get(), np.float32),
-                quaternions=np.array(get("orientations").Get(), np.float32)[:, columns],
-                log_scales=np.log(np.array(get("scales").Get(), np.float64)),
-                opacity_logits=logits(np.array(get("opacities").Get())),
-                sh=sh,
+                means=np.asarray(get("positions").Get(), np.float32),
+                quaternions=np.asarray(get("orientations").Get(), np.float32)[:, columns],
+                log_scales=np.log(np.asarray(get("scales").Get()), dtype=np.float64),
+                opacity_logits=logits(np.asarray(get("opacities").Get())),
+                sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
             )
         )
     return FileContent(_concatenated(parts), Y_UP)
 
 
 def _concatenated(parts: list[Splats]) -> Splats:
+    if len(parts) == 1:
+        return parts[0]
     if not parts:
         shapes = {"means": 3, "quaternions": 4, "log_scales": 3}
         empty = {name: np.zeros((0, width)) for name, width in shapes.items()}

@@ -23,7 +23,7 @@ class FileContent:
 
 
 def logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
-    inside = np.clip(p.astype(np.float64), 1e-30, 1 - 1e-9)
+    inside = np.clip(p, 1e-30, 1 - 1e-9, dtype=np.float64)
     return np.log(inside / (1 - inside))
 
 

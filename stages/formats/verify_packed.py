@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import passing
 from stages.formats.verify_content import Y_UP, FileContent, logits, splats_of
 
 
@@ -32,7 +33,7 @@ def compressed_ply(path: Path) -> FileContent:
     others = [((turns >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
     colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
     rest = data["sh"].data if "sh" in data else np.zeros((len(chunk), 0), np.uint8)
-    sh = np.zeros((len(chunk), len(rest.dtype.names or ()) // 3 + 1, 3))
+    sh = np.zeros((len(chunk), len(rest.dtype.names or ()) // 3 + 1, 3), np.float32)
     sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
     for i, name in enumerate(rest.dtype.names or ()):
         per_channel = sh.shape[1] - 1
@@ -63,9 +64,10 @@ def spz(path: Path) -> FileContent:
     low, middle, high = parts[0].reshape(n, 3, 3).astype(np.int64).transpose(2, 0, 1)
     fixed = low + 256 * middle + 65536 * high
     xyzw = _xyz_in_bytes(parts[4]) if version == 2 else _smallest_three(parts[4].view("<u4"))
-    sh = np.zeros((n, k + 1, 3))
+    sh = np.zeros((n, k + 1, 3), np.float32)
     sh[:, 0] = (parts[2].reshape(n, 3) / 255 - 0.5) / 0.15
-    sh[:, 1:] = parts[5].reshape(n, k, 3) / 128 - 1
+    for rows in passing(n):
+        sh[rows, 1:] = parts[5].reshape(n, k, 3)[rows] / 128 - 1
     splats = splats_of(
         means=np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
         quaternions=np.roll(xyzw, 1, axis=1),
@@ -99,23 +101,25 @@ def sog(path: Path) -> FileContent:
     with zipfile.ZipFile(path) as package:
         meta = json.loads(package.read("meta.json"))
 
-        def pixels(part: str, number: int = 0) -> NDArray[np.int64]:
+        def pixels(part: str, number: int = 0) -> NDArray[np.int32]:
             with package.open(meta[part]["files"][number]) as file:
-                return np.array(Image.open(file).convert("RGBA"), np.int64)
+                return np.array(Image.open(file).convert("RGBA"), np.int32)
 
-        def a_splat(part: str, number: int = 0) -> NDArray[np.int64]:
+        def a_splat(part: str, number: int = 0) -> NDArray[np.int32]:
             return pixels(part, number).reshape(-1, 4)[: meta["count"]]
 
         low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
         part = (a_splat("means")[:, :3] + 256 * a_splat("means", 1)[:, :3]) / 65535
         bent = low * (1 - part) + high * part
         turns, colours = a_splat("quats"), a_splat("sh0")
-        sh = np.array(meta["sh0"]["codebook"])[colours[:, None, :3]]
-        if "shN" in meta:
-            k = (meta["shN"]["bands"] + 1) ** 2 - 1
+        k = (meta["shN"]["bands"] + 1) ** 2 - 1 if "shN" in meta else 0
+        sh = np.zeros((meta["count"], k + 1, 3), np.float32)
+        sh[:, 0] = np.array(meta["sh0"]["codebook"])[colours[:, :3]]
+        if k:
             halves, palette = a_splat("shN", 1), pixels("shN")[:, :, :3].reshape(-1, k, 3)
-            chosen = palette[halves[:, 0] + 256 * halves[:, 1]]
-            sh = np.concatenate([sh, np.array(meta["shN"]["codebook"])[chosen]], axis=1)
+            values = np.array(meta["shN"]["codebook"], np.float32)[palette]
+            for rows in passing(len(sh)):
+                sh[rows, 1:] = values[halves[rows, 0] + 256 * halves[rows, 1]]
         splats = splats_of(
             means=np.where(bent < 0, -1, 1) * (np.exp(np.abs(bent)) - 1),
             quaternions=_with_largest(turns[:, 3] - 252, (turns[:, :3] / 127.5 - 1) / 2**0.5),

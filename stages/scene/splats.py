@@ -66,8 +66,8 @@ class Splats:
         with np.errstate(over="ignore"):
             return 1.0 / (1.0 + np.exp(-self.opacity_logits))
 
-    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Splats:
-        """The rows named by an index or a mask."""
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Splats:
+        """The rows named by an index, a mask or a slice."""
         return replace(
             self,
             means=self.means[index],

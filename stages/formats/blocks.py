@@ -1,0 +1,80 @@
+"""Work on many splats a block of rows at a time, so that what is made on the way stays small.
+
+Who wants to know how far the work is watches it: `with watched(watcher): formats.read(path)`.
+Readers and writers go over the rows more than once (values, order, one attribute after the other),
+so what is told is the pass that is going on.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Splats
+
+ROWS = 1 << 16  # 16 MB of splats of degree 3
+Watcher = Callable[[int, int], None]  # (done, in all) of a pass: rows, mostly
+_watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
+
+
+@contextmanager
+def watched(watcher: Watcher) -> Iterator[None]:
+    """`watcher` hears of every pass inside the block, on the thread that works."""
+    token = _watcher.set(watcher)
+    try:
+        yield
+    finally:
+        _watcher.reset(token)
+
+
+def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
+    """0..count in slices of `rows`."""
+    for start in range(0, count, rows):
+        yield slice(start, min(start + rows, count))
+
+
+def passing(count: int, rows: int = ROWS) -> Iterator[slice]:
+    """`blocks`, told to who watches: for a pass that takes its time."""
+    for part in blocks(count, rows):
+        yield part
+        tell(part.stop, count)
+
+
+def tell(done: int, total: int) -> None:
+    """To who watches, of a pass that does not go by rows."""
+    watcher = _watcher.get()
+    if watcher is not None:
+        watcher(done, total)
+
+
+def block_of(splats: Splats, rows: slice, order: NDArray[np.integer] | None = None) -> Splats:
+    """Some rows: views of them, or with an `order` copies of those that it names."""
+    return splats.take(rows if order is None else order[rows])
+
+
+def allocated(count: int, degree: int) -> Splats:
+    """`count` splats for a reader to fill, float32; what they hold is not defined."""
+    return Splats(
+        means=np.empty((count, 3), np.float32),
+        quaternions=np.empty((count, 4), np.float32),
+        log_scales=np.empty((count, 3), np.float32),
+        opacity_logits=np.empty(count, np.float32),
+        sh=np.empty((count, (degree + 1) ** 2, 3), np.float32),
+        sh_degrees=np.zeros(count, np.uint8),
+    )
+
+
+def forget(mapped: NDArray[np.generic]) -> None:
+    """Let go of the pages of a mapped file that were read; the next look reads them again.
+
+    Without it a file that is gone through once counts as memory in use. Does nothing where the
+    system does not offer it, or for an array that is not mapped.
+    """
+    holder = getattr(mapped, "_mmap", None)
+    with suppress(AttributeError, ValueError, OSError):
+        holder.madvise(mmap.MADV_DONTNEED)  # type: ignore[union-attr]

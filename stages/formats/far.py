@@ -1,0 +1,30 @@
+"""Positions that float32 cannot tell apart, as in a survey's coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# A float32 has 24 bits (IEEE 754). Farther from zero than 1000 times its own spread, a scene has
+# less than 14 of them left to tell its splats apart, and nearer than 1000 units it does not matter:
+# there they are good to 1/30,000 of a unit.
+_FAR_SPREADS, _FAR_UNITS = 1000.0, 1000.0
+
+
+def recentred(
+    means: NDArray[np.float64], origin: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """(means [N, 3] float32, origin [3]): their sum is that of what came in.
+
+    Means that lie far from zero for their spread are moved beside it, by whole units; others stay
+    as they are. A value too large for a float32 becomes infinite.
+    """
+    finite = means[np.isfinite(means).all(axis=1)]
+    shift = np.zeros(3)
+    if len(finite):
+        middle = np.median(finite, axis=0)
+        spread = np.median(np.abs(finite - middle), axis=0).max()
+        if np.abs(middle).max() > max(_FAR_UNITS, _FAR_SPREADS * spread):
+            shift = np.rint(middle)
+    with np.errstate(over="ignore"):
+        return (means - shift).astype(np.float32), origin + shift

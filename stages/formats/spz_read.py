@@ -1,0 +1,179 @@
+"""Reading SPZ of versions 2, 3 and 4, from our own files and from other programs'.
+
+The arrays are those of `spz`. Versions 2 and 3: gzip around a header of 16 bytes and the arrays;
+rotations of version 2 are x, y, z as uint8. Version 4: a plain header of 32 bytes, records of
+extensions, a table of (packed, unpacked) sizes as uint64, and one zstd stream an array; without SH
+above degree 0 there is no array for it. Specification: nianticlabs/spz, README.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats import smallest_three
+from stages.formats.blocks import allocated, passing
+from stages.formats.inflate import Inflated, check_size, unpacked
+from stages.formats.problems import BadFileError, reading
+from stages.formats.rows import checked, logits_of, unit_quaternions
+from stages.formats.turn import turned
+from stages.scene import Splats
+
+HEADER = struct.Struct("<4sIIBBBB")
+MAGIC = b"NGSP"
+COLOUR_SCALE = 0.15
+MAGNITUDE = 511  # 9 bits beside a sign
+_TABLE_STARTS = struct.Struct("<I12x")  # follows HEADER in version 4, whose last byte is a count
+_TABLE_ROW, _RECORD = struct.Struct("<QQ"), struct.Struct("<II")
+_HAS_EXTENSIONS = 2  # in the flags
+_EXTENSIONS_LIMIT_BYTES = 1 << 20
+# SPZ_ADOBE_coordinate_system: axes other than right, up, back. Codes of the reference library:
+# 0 unspecified, 4 right up back, 6 right down front, which are ours.
+_AXES_EXTENSION, _UPRIGHT, _OURS = 0xADBE0003, (0, 4), 6
+
+
+@dataclass(frozen=True)
+class _Content:
+    """arrays: [N, bytes] of positions, opacities, colours, scales, rotations, SH."""
+
+    version: int
+    degree: int
+    bits: int
+    arrays: list[NDArray[np.uint8]]
+    upright: bool
+
+
+def read(path: Path) -> Splats:
+    """The splats of an .spz, turned to y down, float32.
+
+    Whether they were trained with antialiasing is not kept. Raises SplatError
+    "splats-unreadable" for what is damaged, or of another version.
+    """
+    path = Path(path)
+    with reading(path), path.open("rb") as file:
+        plain = file.read(len(MAGIC)) == MAGIC
+        file.seek(0)
+        size = path.stat().st_size
+        content = _plain(file, size) if plain else _gzipped(file, size)
+        splats = _decoded(content)
+        return checked(turned(splats, reuse=True) if content.upright else splats)
+
+
+def _gzipped(file: BinaryIO, size: int) -> _Content:
+    stream = Inflated(file, size)
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack(stream.read(HEADER.size))
+    if magic != MAGIC:
+        raise BadFileError("it does not hold 'NGSP'")
+    if version not in (2, 3):
+        raise BadFileError(f"it is SPZ version {version} in gzip; there 2 and 3 are read")
+    sizes = widths(version, degree, bits)
+    stream.expect(count * sum(sizes))
+    arrays = [stream.rows(count, size) for size in sizes]
+    extra = stream.finish()
+    upright = _is_upright(extra) if flags & _HAS_EXTENSIONS else True
+    return _Content(version, degree, bits, arrays, upright)
+
+
+def _plain(file: BinaryIO, size: int) -> _Content:
+    head, extra, table = _table(file, size)
+    _, version, count, degree, bits, flags, streams = head
+    sizes = widths(version, degree, bits)
+    check_size(count * sum(sizes), size)
+    if streams < len(sizes) - (sizes[-1] == 0):
+        raise BadFileError(f"it has {streams} streams for {len(sizes)} arrays")
+    arrays = []
+    for width, (packed, declared) in zip(sizes, [*table, (0, 0)], strict=False):
+        if declared != count * width:
+            raise BadFileError(f"it declares {declared} bytes for {count} times {width}")
+        arrays.append(unpacked(file, packed, declared).reshape(count, width))
+    upright = _is_upright(extra) if flags & _HAS_EXTENSIONS else True
+    return _Content(version, degree, bits, arrays, upright)
+
+
+def _table(file: BinaryIO, size: int) -> tuple[tuple[Any, ...], bytes, list[tuple[int, int]]]:
+    """(header, extensions, (packed, unpacked) bytes of each stream) of a file of version 4, which
+    is left where the streams start."""
+    head = file.read(HEADER.size + _TABLE_STARTS.size)
+    if len(head) < HEADER.size + _TABLE_STARTS.size:
+        raise BadFileError("it is cut short")
+    values = HEADER.unpack_from(head)
+    (starts,) = _TABLE_STARTS.unpack_from(head, HEADER.size)
+    if values[1] != 4:
+        raise BadFileError(f"it is SPZ version {values[1]} without gzip; there 4 is read")
+    if not 0 <= starts - len(head) <= min(_EXTENSIONS_LIMIT_BYTES, size):
+        raise BadFileError(f"its table starts at {starts}")
+    extra = file.read(starts - len(head))
+    table = file.read(values[-1] * _TABLE_ROW.size)
+    if len(table) < values[-1] * _TABLE_ROW.size:
+        raise BadFileError("it is cut short")
+    return values, extra, list(_TABLE_ROW.iter_unpack(table))
+
+
+def packed_sizes(path: Path) -> list[int]:
+    """Bytes in the file of each array of version 4; [] for the versions that pack all together."""
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            return []
+        file.seek(0)
+        return [packed for packed, _ in _table(file, path.stat().st_size)[2]]
+
+
+def widths(version: int, degree: int, bits: int) -> tuple[int, ...]:
+    """Bytes a splat of each array."""
+    if degree > 3 or bits > 31:
+        raise BadFileError(f"its SH degree is {degree} and its fractional bits are {bits}")
+    return (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
+
+
+def _is_upright(records: bytes) -> bool:
+    """Whether the axes are right, up, back; False if they are ours. Other extensions (limits for
+    cameras) are passed over. Raises BadFileError for other axes."""
+    while len(records) >= _RECORD.size:
+        kind, length = _RECORD.unpack_from(records)
+        value = records[_RECORD.size : _RECORD.size + length]
+        if kind == _AXES_EXTENSION:
+            axes = int.from_bytes(value, "little")
+            if axes not in (*_UPRIGHT, _OURS):
+                raise BadFileError(f"its axes are number {axes} of SPZ, which is not read")
+            return axes != _OURS
+        records = records[_RECORD.size + length :]
+    return True
+
+
+def _decoded(content: _Content) -> Splats:
+    """The splats in the file's axes."""
+    positions, opacities, colours, scales, rotations, sh = content.arrays
+    splats = allocated(len(positions), content.degree)
+    for rows in passing(len(positions)):
+        out = splats.take(rows)
+        padded = np.zeros((len(out), 3, 4), np.uint8)
+        padded[:, :, 1:] = positions[rows].reshape(-1, 3, 3)
+        fixed = padded.view("<i4")[:, :, 0] >> 8  # the shift brings the sign down
+        out.means[:] = fixed / float(1 << content.bits)
+        out.quaternions[:] = _rotations(rotations[rows], content.version)
+        out.log_scales[:] = scales[rows].astype(np.float32) / 16 - 10
+        out.opacity_logits[:] = logits_of(opacities[rows, 0] / 255)
+        out.sh[:, 0] = (colours[rows] / 255 - 0.5) / COLOUR_SCALE
+        out.sh[:, 1:] = (sh[rows].reshape(len(out), -1, 3).astype(np.float32) - 128) / 128
+    return splats
+
+
+def _rotations(packed: NDArray[np.uint8], version: int) -> NDArray[np.float32]:
+    """[N, 4] w, x, y, z."""
+    if version == 2:
+        xyz = packed / 127.5 - 1
+        w = np.sqrt(np.maximum(0.0, 1 - np.square(xyz).sum(axis=1, keepdims=True)))
+        return unit_quaternions(np.concatenate([w, xyz], axis=1))
+    word = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    columns = []
+    for shift in (20, 10, 0):
+        part = (word >> np.uint32(shift)) & np.uint32(1023)
+        magnitude = (part & np.uint32(MAGNITUDE)) * (smallest_three.LIMIT / MAGNITUDE)
+        columns.append(np.where(part >> np.uint32(9), -magnitude, magnitude))
+    xyzw = smallest_three.join(word >> np.uint32(30), np.stack(columns, axis=1))
+    return xyzw[:, [3, 0, 1, 2]]
