@@ -84,6 +84,10 @@ EIGHT_BIT_ANGLE = 0.02
 """Radians by which 8 bits a component may turn a rotation: four errors of 1/256, doubled, and what
 bringing it back to length 1 adds."""
 
+MESH_VOXELS = 1.0
+"""How far a fused surface may lie from the true one, in voxels: marching cubes interpolates within
+one, and median depth is the centre of a splat a third as wide."""
+
 LIVE_PICTURE_DB = 40.0
 """What a browser shows of a training against the reference's picture from the same place: all that
 lies between is JPEG of quality 92, which leaves 45 to 51 dB of pictures without camera noise."""

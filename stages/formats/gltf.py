@@ -73,5 +73,9 @@ def fallback_colours(splats: Splats, opacities: NDArray[np.float32]) -> NDArray[
     """[N, 4] in 0..1 for viewers that only draw points: COLOR_0 wants linear light (the curve of
     IEC 61966-2-1)."""
     encoded = np.clip(dc_to_rgb(splats.sh[:, 0].astype(np.float64)), 0, 1)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return np.concatenate([linear, opacities[:, None]], axis=1)
+    return np.concatenate([linear_light(encoded), opacities[:, None]], axis=1)
+
+
+def linear_light(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
+    """sRGB values in 0..1 as linear light in 0..1 (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -50,7 +50,7 @@ def write_file(
     document, arrays = _document(primitives, origin, units, node_scale)
     size = sum(array.nbytes for array in arrays)
     if path.suffix.lower() == ".glb":
-        _write_glb(path, document, arrays, size)
+        write_glb(path, document, arrays, size)
     else:
         _write_pair(path, document, arrays, size)
 
@@ -71,7 +71,7 @@ def _document(
         names = {}
         for name, attribute in attributes.items():
             names[name] = len(accessors)
-            accessors.append(_accessor(name, attribute, len(views)))
+            accessors.append(accessor(name, attribute, len(views)))
             array = np.ascontiguousarray(attribute.rows)
             view = {
                 "buffer": 0,
@@ -111,20 +111,21 @@ def _document(
     return document, arrays
 
 
-def _accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
+def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
+    """Of a vertex attribute in the buffer view numbered `view`."""
     rows, width = attribute.rows, attribute.width
-    accessor: dict[str, Any] = {
+    described: dict[str, Any] = {
         "bufferView": view,
         "componentType": _COMPONENT_TYPES[rows.dtype.str],
         "count": len(rows),
         "type": "SCALAR" if width == 1 else f"VEC{width}",
     }
     if rows.dtype.kind in "iu":
-        accessor["normalized"] = True
+        described["normalized"] = True
     if name == "POSITION":
-        accessor["min"] = [float(v) for v in rows.min(axis=0)]
-        accessor["max"] = [float(v) for v in rows.max(axis=0)]
-    return accessor
+        described["min"] = [float(v) for v in rows.min(axis=0)]
+        described["max"] = [float(v) for v in rows.max(axis=0)]
+    return described
 
 
 def _primitive(names: dict[str, int]) -> dict[str, Any]:
@@ -142,7 +143,9 @@ def _primitive(names: dict[str, int]) -> dict[str, Any]:
     }
 
 
-def _write_glb(path: Path, document: dict[str, Any], arrays: list[NDArray[Any]], size: int) -> None:
+def write_glb(path: Path, document: dict[str, Any], arrays: list[NDArray[Any]], size: int) -> None:
+    """`document` and, as its one buffer, `arrays` one after the other: `size` bytes in all, a
+    multiple of 4 each. Raises SplatError when it cannot be written or would pass 4 GiB."""
     if arrays:
         document["buffers"] = [{"byteLength": size}]
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
