@@ -8,6 +8,7 @@ import zipfile
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from stages.formats import format_of, spz_read
 from stages.formats.inflate import Inflated
@@ -53,7 +54,7 @@ def anatomy_of(path: Path) -> Anatomy | None:
             parts = _ply(path)
         elif name == "splat":
             count = path.stat().st_size // RECORD.itemsize
-            fields = RECORD.fields or {}
+            fields: Any = RECORD.fields or {}
             parts = {_SPLAT.get(k, "rotations"): count * v[0].itemsize for k, v in fields.items()}
         elif name in ("glb", "gltf"):
             parts = _gltf(path)

@@ -1,8 +1,8 @@
 """Work on many splats a block of rows at a time, so that what is made on the way stays small.
 
-Who wants to know how far the work is watches it: `with watched(watcher): formats.read(path)`. Readers
-and writers go over the rows more than once (values, order, one attribute after the other), so what
-is told is the pass that is going on.
+Who wants to know how far the work is watches it: `with watched(watcher): formats.read(path)`.
+Readers and writers go over the rows more than once (values, order, one attribute after the other),
+so what is told is the pass that is going on.
 """
 
 from __future__ import annotations

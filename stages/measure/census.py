@@ -17,6 +17,7 @@ What counts as trouble:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,9 +69,9 @@ def census_of(splats: Splats) -> Census:
     degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
     by_degree = {int(d): int(n) for d, n in zip(degrees, counts, strict=True)}
     whole, not_finite = _finite(splats)
-    box = _box(splats.means[whole].astype(np.float64))
+    box: dict[str, Any] = _box(splats.means[whole].astype(np.float64))
     extent = float(np.linalg.norm(box["middle_high"] - box["middle_low"]))
-    found = dict.fromkeys(
+    found: dict[str, Any] = dict.fromkeys(
         ("needles", "giants", "outliers", "transparent", "no_rotation", "too_large"), 0
     )
     keys = np.empty(len(splats), np.uint64)
