@@ -39,12 +39,11 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """
     path = Path(path)
     splats, dropped = kept_rows(splats)
-    layer = _layer(splats, units, ".usda" if path.suffix.lower() == ".usda" else ".usdc")
     with replacing(path) as temporary:
         if path.suffix.lower() == ".usdz":
-            _write_package(temporary, layer, f"{path.stem}.usdc")
+            _write_package(temporary, splats, units, f"{path.stem}.usdc")
         else:
-            _export(layer, temporary)
+            _export(_layer(splats, units, path.suffix.lower()), temporary)
     return dropped
 
 
@@ -135,7 +134,7 @@ def _export(layer: Any, path: Path) -> None:
         raise OSError("the USD library could not write it")
 
 
-def _write_package(path: Path, layer: Any, name: str) -> None:
+def _write_package(path: Path, splats: Splats, units: str, name: str) -> None:
     """A .usdz: an uncompressed zip with every file aligned to 64 bytes, the first file the scene.
 
     The zip writer copies the time of the file, in local time: a fixed one keeps the bytes equal.
@@ -144,7 +143,7 @@ def _write_package(path: Path, layer: Any, name: str) -> None:
 
     with tempfile.TemporaryDirectory(prefix=".partial-", dir=path.parent) as folder:
         inner = Path(folder) / "scene.usdc"
-        _export(layer, inner)
+        _export(_layer(splats, units, ".usdc"), inner)
         moment = time.mktime((1980, 1, 1, 12, 0, 0, 0, 0, -1))
         os.utime(inner, (moment, moment))
         with Sdf.ZipFileWriter.CreateNew(str(path)) as package:

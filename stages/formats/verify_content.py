@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import blocks
 from stages.scene import Splats
 
 Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -33,3 +35,16 @@ def splats_of(**arrays: NDArray[np.floating]) -> Splats:
     for name, width in {"means": 3, "quaternions": 4, "log_scales": 3}.items():
         values[name] = values[name].reshape(n, width)
     return Splats(**values, sh_degrees=np.full(n, math.isqrt(k) - 1, np.uint8))  # type: ignore[arg-type]
+
+
+def splats_by_rows(
+    count: int, values_of: Callable[[slice], dict[str, NDArray[np.floating]]]
+) -> Splats:
+    """`splats_of` what `values_of` says for some rows, asked for one block after the other."""
+    arrays: dict[str, NDArray[np.floating]] = {}
+    for rows in blocks(count) if count else [slice(0, 0)]:
+        for name, values in values_of(rows).items():
+            if name not in arrays:
+                arrays[name] = np.empty((count, *values.shape[1:]), np.float32)
+            arrays[name][rows] = values
+    return splats_of(**arrays)

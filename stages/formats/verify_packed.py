@@ -9,43 +9,46 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import passing
-from stages.formats.verify_content import Y_UP, FileContent, logits, splats_of
+from stages.formats.verify_content import Y_UP, FileContent, logits, splats_by_rows
 
 
 def compressed_ply(path: Path) -> FileContent:
     from plyfile import PlyData
 
     data = PlyData.read(str(path), mmap="c")
-    words, chunk = data["vertex"], np.arange(data["vertex"].count) // 256
-
-    def unpacked(name: str, columns: list[tuple[str, int, int]]) -> NDArray[np.float64]:
-        """columns: (suffix of the range's names, lowest bit, bits)."""
-        parts = []
-        for suffix, shift, bits in columns:
-            fraction = (words[name].astype(np.int64) >> shift) % 2**bits / (2**bits - 1)
-            low, high = (data["chunk"][e + suffix].astype(float)[chunk] for e in ("min_", "max_"))
-            parts.append(low * (1 - fraction) + high * fraction)
-        return np.stack(parts, axis=1)
-
+    ranges, rest = data["chunk"], data["sh"].data if "sh" in data else None
+    per_channel = len(rest.dtype.names) // 3 if rest is not None else 0
     axes = [("x", 21, 11), ("y", 11, 10), ("z", 0, 11)]
-    turns = words["packed_rotation"].astype(np.int64)
-    others = [((turns >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
-    colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
-    rest = data["sh"].data if "sh" in data else np.zeros((len(chunk), 0), np.uint8)
-    sh = np.zeros((len(chunk), len(rest.dtype.names or ()) // 3 + 1, 3), np.float32)
-    sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
-    for i, name in enumerate(rest.dtype.names or ()):
-        per_channel = sh.shape[1] - 1
-        sh[:, 1 + i % per_channel, i // per_channel] = (rest[name] + 0.5) / 32 - 4
-    splats = splats_of(
-        means=unpacked("packed_position", axes),
-        quaternions=_with_largest(turns >> 30, np.stack(others, axis=1)),
-        log_scales=unpacked("packed_scale", [("scale_" + s, low, n) for s, low, n in axes]),
-        opacity_logits=logits(words["packed_color"].astype(np.int64) % 256 / 255),
-        sh=sh,
-    )
-    return FileContent(splats, np.eye(4))
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        words = data["vertex"].data[rows]
+        chunk = np.arange(rows.start, rows.start + len(words)) // 256
+
+        def unpacked(name: str, columns: list[tuple[str, int, int]]) -> NDArray[np.float64]:
+            """columns: (suffix of the range's names, lowest bit, bits)."""
+            parts = []
+            for suffix, shift, bits in columns:
+                fraction = (words[name].astype(np.int64) >> shift) % 2**bits / (2**bits - 1)
+                low, high = (ranges[e + suffix].astype(float)[chunk] for e in ("min_", "max_"))
+                parts.append(low * (1 - fraction) + high * fraction)
+            return np.stack(parts, axis=1)
+
+        turns = words["packed_rotation"].astype(np.int64)
+        others = [((turns >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
+        colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
+        sh = np.zeros((len(words), per_channel + 1, 3), np.float32)
+        sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
+        for i, name in enumerate(rest.dtype.names if rest is not None else ()):
+            sh[:, 1 + i % per_channel, i // per_channel] = (rest[name][rows] + 0.5) / 32 - 4
+        return {
+            "means": unpacked("packed_position", axes),
+            "quaternions": _with_largest(turns >> 30, np.stack(others, axis=1)),
+            "log_scales": unpacked("packed_scale", [("scale_" + s, low, n) for s, low, n in axes]),
+            "opacity_logits": logits(words["packed_color"].astype(np.int64) % 256 / 255),
+            "sh": sh,
+        }
+
+    return FileContent(splats_by_rows(data["vertex"].count, values_of), np.eye(4))
 
 
 def spz(path: Path) -> FileContent:
@@ -60,22 +63,28 @@ def spz(path: Path) -> FileContent:
     turn_bytes = 3 if version == 2 else 4
     ends = 16 + np.cumsum([0, 9 * n, n, 3 * n, 3 * n, turn_bytes * n, 3 * k * n])
     assert len(content) == ends[-1], "the length is not that of the header"
-    parts = [np.frombuffer(content[a:b], np.uint8) for a, b in itertools.pairwise(ends)]
-    low, middle, high = parts[0].reshape(n, 3, 3).astype(np.int64).transpose(2, 0, 1)
-    fixed = low + 256 * middle + 65536 * high
-    xyzw = _xyz_in_bytes(parts[4]) if version == 2 else _smallest_three(parts[4].view("<u4"))
-    sh = np.zeros((n, k + 1, 3), np.float32)
-    sh[:, 0] = (parts[2].reshape(n, 3) / 255 - 0.5) / 0.15
-    for rows in passing(n):
-        sh[rows, 1:] = parts[5].reshape(n, k, 3)[rows] / 128 - 1
-    splats = splats_of(
-        means=np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
-        quaternions=np.roll(xyzw, 1, axis=1),
-        log_scales=parts[3].reshape(n, 3) / 16 - 10,
-        opacity_logits=logits(parts[1] / 255),
-        sh=sh,
-    )
-    return FileContent(splats, Y_UP)
+    parts = [
+        np.frombuffer(content, np.uint8, b - a, a).reshape(n, (b - a) // max(1, n))
+        for a, b in itertools.pairwise(ends.tolist())
+    ]
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        places, alphas, colours, sizes, turns, rest = (part[rows] for part in parts)
+        low, middle, high = places.reshape(-1, 3, 3).astype(np.int64).transpose(2, 0, 1)
+        fixed = low + 256 * middle + 65536 * high
+        sh = np.zeros((len(alphas), k + 1, 3), np.float32)
+        sh[:, 0] = (colours.reshape(-1, 3) / 255 - 0.5) / 0.15
+        sh[:, 1:] = rest.reshape(len(alphas), k, 3) / 128 - 1
+        xyzw = _xyz_in_bytes(turns) if version == 2 else _smallest_three(turns)
+        return {
+            "means": np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
+            "quaternions": np.roll(xyzw, 1, axis=1),
+            "log_scales": sizes.reshape(-1, 3) / 16 - 10,
+            "opacity_logits": logits(alphas.reshape(-1) / 255),
+            "sh": sh,
+        }
+
+    return FileContent(splats_by_rows(n, values_of), Y_UP)
 
 
 def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -84,9 +93,9 @@ def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.insert(xyz, 3, np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1))), axis=1)
 
 
-def _smallest_three(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
     """[N, 4] x, y, z, w from two bits for the largest and a sign and nine bits for the others."""
-    words = packed.astype(np.int64)
+    words = np.ascontiguousarray(parts).view("<u4").reshape(-1).astype(np.int64)
     tens = [words >> shift & 1023 for shift in (20, 10, 0)]
     others = [math.sqrt(0.5) / 511 * np.where(t < 512, t, 512 - t) for t in tens]
     return _with_largest(words >> 30, np.stack(others, axis=1))
@@ -101,33 +110,39 @@ def sog(path: Path) -> FileContent:
     with zipfile.ZipFile(path) as package:
         meta = json.loads(package.read("meta.json"))
 
-        def pixels(part: str, number: int = 0) -> NDArray[np.int32]:
+        def pixels(part: str, number: int = 0) -> NDArray[np.uint8]:
             with package.open(meta[part]["files"][number]) as file:
-                return np.array(Image.open(file).convert("RGBA"), np.int32)
+                return np.array(Image.open(file).convert("RGBA"))
 
-        def a_splat(part: str, number: int = 0) -> NDArray[np.int32]:
+        def a_splat(part: str, number: int = 0) -> NDArray[np.uint8]:
             return pixels(part, number).reshape(-1, 4)[: meta["count"]]
 
-        low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
-        part = (a_splat("means")[:, :3] + 256 * a_splat("means", 1)[:, :3]) / 65535
-        bent = low * (1 - part) + high * part
-        turns, colours = a_splat("quats"), a_splat("sh0")
-        k = (meta["shN"]["bands"] + 1) ** 2 - 1 if "shN" in meta else 0
-        sh = np.zeros((meta["count"], k + 1, 3), np.float32)
-        sh[:, 0] = np.array(meta["sh0"]["codebook"])[colours[:, :3]]
-        if k:
+        lows, highs = a_splat("means"), a_splat("means", 1)
+        turns, colours, sizes = a_splat("quats"), a_splat("sh0"), a_splat("scales")
+        k, palette, halves = 0, np.zeros((1, 0, 3), np.uint8), np.zeros_like(turns)
+        if "shN" in meta:
+            k = (meta["shN"]["bands"] + 1) ** 2 - 1
             halves, palette = a_splat("shN", 1), pixels("shN")[:, :, :3].reshape(-1, k, 3)
-            values = np.array(meta["shN"]["codebook"], np.float32)[palette]
-            for rows in passing(len(sh)):
-                sh[rows, 1:] = values[halves[rows, 0] + 256 * halves[rows, 1]]
-        splats = splats_of(
-            means=np.where(bent < 0, -1, 1) * (np.exp(np.abs(bent)) - 1),
-            quaternions=_with_largest(turns[:, 3] - 252, (turns[:, :3] / 127.5 - 1) / 2**0.5),
-            log_scales=np.array(meta["scales"]["codebook"])[a_splat("scales")[:, :3]],
-            opacity_logits=logits(colours[:, 3] / 255),
-            sh=sh,
-        )
-    return FileContent(splats, np.eye(4))
+    low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
+    books = {part: np.array(meta[part]["codebook"]) for part in ("sh0", "scales")}
+    book = np.array(meta["shN"]["codebook"]) if k else np.zeros(256)
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        part = (lows[rows, :3] + 256.0 * highs[rows, :3]) / 65535
+        bent = low * (1 - part) + high * part
+        sh = np.zeros((len(bent), k + 1, 3), np.float32)
+        sh[:, 0] = books["sh0"][colours[rows, :3]]
+        sh[:, 1:] = book[palette[halves[rows, 0] + 256 * halves[rows, 1].astype(np.int64)]]
+        others = (turns[rows, :3] / 127.5 - 1) / 2**0.5
+        return {
+            "means": np.where(bent < 0, -1, 1) * (np.exp(np.abs(bent)) - 1),
+            "quaternions": _with_largest(turns[rows, 3].astype(np.int64) - 252, others),
+            "log_scales": books["scales"][sizes[rows, :3]],
+            "opacity_logits": logits(colours[rows, 3] / 255),
+            "sh": sh,
+        }
+
+    return FileContent(splats_by_rows(meta["count"], values_of), np.eye(4))
 
 
 def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
