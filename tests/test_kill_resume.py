@@ -108,9 +108,9 @@ def test_killed_run_ends_in_the_same_bytes(tmp_path: Path) -> None:
 
 
 def known_defect_of_sfm(one: Path, other: Path) -> None:
-    """Now and then, interrupted or not, structure from motion finds a few points more or less from
-    the same photographs. The cause is not found; until it is, such a pair says nothing about
-    resuming, and the test says so instead of passing or failing."""
+    """Matching on two threads now and then gave other points from the same photographs, interrupted
+    or not. On one thread that has not been seen, but too few runs have been made to be sure: such a
+    pair says nothing about resuming, and the test says so instead of passing or failing."""
     models = [json.loads((run / "2-sfm" / "sfm.json").read_text()) for run in (one, other)]
     points = [model["metrics"]["points"] for model in models]
     if points[0] != points[1]:
