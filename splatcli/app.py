@@ -109,20 +109,55 @@ def render(
     target: Annotated[
         Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("view.png"),
+    *,
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Picture (.png), film (.mp4) or folder of frames."),
+    ] = Path("view.png"),
     camera: Annotated[
         str | None,
         typer.Option(help="A photograph's name or number; by default the first, or one in front."),
     ] = None,
+    path: Annotated[
+        str | None,
+        typer.Option(
+            help="For films and frames: orbit, capture (past the photographs' cameras), or a "
+            "camera file (transforms.json, COLMAP folder).",
+            show_default="orbit",
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, max=100_000, help="How many frames along the path.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=3600, help="How long the film lasts.", show_default="by path"),
+    ] = None,
+    fps: Annotated[float, typer.Option(min=1, max=240, help="Frames a second.")] = 30.0,
     width: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Width of the picture (pixels).")
     ] = None,
+    depth: Annotated[
+        bool,
+        typer.Option("--depth", help="Depth too: .depth.tiff of 32-bit floats, or .depth.mp4."),
+    ] = False,
     backend: Annotated[str, typer.Option(help="auto, cpu or reference.")] = "auto",
+    quiet: Quiet = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Draw the splats as one of the photographs saw them."""
-    from splatcli import views
+    """Draw the splats: as a photograph saw them, or as a film along a path.
 
-    views.render_to(target, out, camera, width, backend)
+    Frames that are in the folder already are written again. Depth is z in world units, 0 where
+    there is nothing; in films it is light where near.
+    """
+    from splatcli import rendering
+
+    rendering.render(
+        target,
+        rendering.Wanted(
+            out, camera, path, frames, seconds, fps, width, depth, backend, quiet, as_json
+        ),
+    )
 
 
 def view(
@@ -166,7 +201,7 @@ def convert(
 ) -> None:
     """Make a splat file into one of another format.
 
-    Endings: .ply .splat .glb .gltf .usda .usdc .usdz .compressed.ply .spz .sog .html
+    Endings: .ply .splat .glb .gltf .usda .usdc .usdz .quantised.glb .compressed.ply .spz .sog .html
     """
     from splatcli import convert as work
 
@@ -199,6 +234,25 @@ def verify(
     work.verify(target, against, quiet, as_json)
 
 
+def cameras(
+    source: Annotated[
+        Path, typer.Argument(help="Run folder, transforms.json, or folder with a COLMAP model.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(help="A .json name for nerfstudio, or a folder for COLMAP.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Write cameras for other programs: those of a run, of nerfstudio or of COLMAP.
+
+    A run's cameras belong to its undistorted photographs, which the file names; sparse points go
+    with them. nerfstudio's world is z up, COLMAP's is ours: y down.
+    """
+    from splatcli import cameras as work
+
+    work.convert(source, out, as_json)
+
+
 def doctor(as_json: AsJson = False) -> None:
     """Check what this machine has, and what is missing."""
     from splatcli import checkup
@@ -216,11 +270,12 @@ def _register() -> None:
         app.command(name, help=_STAGE_HELP[name], epilog=_example(line))(guarded(command))
     for extra, line in (
         (status, "splat status run/"),
-        (render, "splat render run/ --camera IMG_0042.jpg --out view.png"),
+        (render, "splat render run/ --path orbit --out film.mp4"),
         (view, "splat view run/"),
         (info, "splat info run/7-export/scene.ply"),
         (convert, "splat convert scene.ply scene.sog"),
         (verify, "splat verify run/7-export/scene.glb"),
+        (cameras, "splat cameras run/ transforms.json"),
         (doctor, "splat doctor"),
     ):
         app.command(extra.__name__, epilog=_example(line))(guarded(extra))

@@ -18,6 +18,7 @@ from stages.run.libraries import versions
 from stages.run.memory import available_mib
 
 _MODULES = {
+    "fast-simplification": "fast_simplification",
     "numba": "numba",
     "numpy": "numpy",
     "opencv-contrib-python-headless": "cv2",
@@ -26,6 +27,8 @@ _MODULES = {
     "plyfile": "plyfile",
     "pycolmap": "pycolmap",
     "pygltflib": "pygltflib",
+    "scikit-image": "skimage",
+    "scipy": "scipy",
     "torch": "torch",
     "usd-core": "pxr",
 }

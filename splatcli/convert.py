@@ -21,11 +21,14 @@ _STEPS = 3
 def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     """Read `source`, write `target`, read that again with another parser, draw it and compare.
 
-    Raises SplatError: what keeps a file from being read or written, and "convert-verify-failed".
+    Raises SplatError: what keeps a file from being read or written, "convert-mesh", and
+    "convert-verify-failed".
     """
     from stages import formats
     from stages.formats.rows import kept_rows
 
+    if target.name.lower().endswith((".mesh.glb", ".mesh.ply")):
+        raise _no_mesh(target)
     names = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
     with _progress(quiet, as_json) as say:
@@ -76,6 +79,16 @@ def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     if proof.fault:
         raise _failed(target, proof.fault)
     return proof.figures
+
+
+def _no_mesh(target: Path) -> SplatError:
+    return SplatError(
+        "convert-mesh",
+        given=f"{target} is the name of a mesh.",
+        wanted="A format of splats: a mesh is made with the cameras of a run.",
+        hint="In the run's folder: splat export --format mesh",
+        family=Family.USAGE,
+    )
 
 
 def _failed(path: Path, reason: str) -> SplatError:

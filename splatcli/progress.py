@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -224,3 +226,39 @@ class Bars(Listener):
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
+
+
+@contextmanager
+def counting(what: str, total: int, quiet: bool, as_json: bool) -> Iterator[Callable[[], None]]:
+    """Yield what is called after each of `total` things; shows how many are done, how fast and how
+    long it will still take."""
+    done, last, pace = 0, time.monotonic(), _Pace()
+    bar = Progress(
+        TextColumn(what),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        _Rate(),
+        TimeRemainingColumn(compact=True),
+        console=console.err,
+        transient=True,
+        disable=quiet or as_json or not console.err.is_terminal,
+    )
+    task = bar.add_task(what, total=total)
+    pace.new_phase(0, total)
+
+    def tick() -> None:
+        nonlocal done, last
+        done += 1
+        bar.advance(task)
+        pace.new_phase(done, total)
+        every = _EVENT_EVERY_S if as_json else _LINE_EVERY_S
+        if (done < total or not as_json) and time.monotonic() - last < every:
+            return
+        last = time.monotonic()
+        if as_json:
+            console.emit("progress", label=what, done=done, total=total)
+        elif bar.disable and not quiet:
+            console.note(f"{what}: {done}/{total}, {pace.text()}")
+
+    with bar:
+        yield tick

@@ -80,8 +80,22 @@ def _assets(pipeline: Pipeline) -> list[tuple[str, int, str]]:
 
 def _quality(manifest: Manifest, name: str) -> str:
     """How near pictures of the file are to pictures of the splats before export."""
+    if name.startswith("mesh."):
+        return _mesh_quality(manifest.metrics.get("mesh", {}))
     figures = manifest.metrics.get("formats", {}).get(name, {})
     return console.figure("verify_db", figures["verify_db"]) if "verify_db" in figures else ""
+
+
+def _mesh_quality(mesh: dict[str, Any]) -> str:
+    """What a mesh is, what it covers, how near it is to the points of the reconstruction."""
+    words = [
+        f"collision proxy: {mesh.get('triangles', 0):,} triangles",
+        f"{mesh.get('covered_share', 0):.0%} of what the photographs show",
+    ]
+    if mesh.get("sparse_median_distance_share") is not None:
+        apart = f"{mesh['sparse_median_distance_share']:.2%} of its size"
+        words.append(f"{apart} from the sparse points (median)")
+    return ", ".join(words)
 
 
 def _as_data(

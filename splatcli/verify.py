@@ -67,13 +67,22 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
 
 
 def _files(target: Path | None) -> list[Path]:
-    """The file itself; of a run folder, what it exported."""
+    """The file itself; of a run folder, what it exported but for meshes, which hold no splats."""
     if target is not None and not target.is_dir():
         return [target]
     from splatcli.folders import find_run_folder
 
     assets = Pipeline(find_run_folder(target)).load("export")
-    return [assets.folder / file.path for file in assets.files]
+    files = [file for file in assets.files if not file.format.startswith("mesh.")]
+    if not files:
+        raise SplatError(
+            "verify-no-splats",
+            given=f"{assets.folder} holds meshes only.",
+            wanted="Files of splats: meshes were read back and compared when they were written.",
+            hint="Export one, for example: splat export --format ply",
+            family=Family.USAGE,
+        )
+    return [assets.folder / file.path for file in files]
 
 
 def _original(file: Path, against: Path | None, read: Splats) -> _Original:

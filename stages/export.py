@@ -18,12 +18,18 @@ from stages.run.stage import Report, Stage
 
 if TYPE_CHECKING:
     from stages.formats.proof import Prover
-    from stages.scene import ExportedAssets, QuantisedSplats, Reconstruction
+    from stages.scene import ExportedAssets, QuantisedSplats, Reconstruction, Splats
 
 FORMATS = (
     *("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz"),
-    *("compressed.ply", "spz", "sog", "html"),
+    *("quantised.glb", "compressed.ply", "spz", "sog", "html"),
 )
+# What `--format` says -> the files that it stands for. They hold triangles: no splat reader's.
+MESHES = {
+    "mesh": ("mesh.glb", "mesh.ply"),
+    "mesh.glb": ("mesh.glb",),
+    "mesh.ply": ("mesh.ply",),
+}
 _INDEX = "assets.json"
 
 
@@ -33,7 +39,10 @@ class ExportSettings:
 
     formats: tuple[str, ...] = field(
         default=("ply", "splat", "glb", "usdz"),
-        metadata={"help": "File format to write; repeatable.", "choices": FORMATS},
+        metadata={
+            "help": "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
+            "choices": (*FORMATS, *MESHES),
+        },
     )
     name: str = field(default="scene", metadata={"help": "Name of the files, without a suffix."})
     backend: str = field(
@@ -43,16 +52,19 @@ class ExportSettings:
             "choices": ("auto", "cpu", "reference"),
         },
     )
+    mesh_triangles: int = field(
+        default=50_000, metadata={"help": "Triangles of the mesh, at most about.", "min": 100}
+    )
 
 
 def check(settings: ExportSettings) -> None:
     """Raises SplatError for a format that is not written, and for a name that cannot be one."""
-    unknown = [name for name in settings.formats if name not in FORMATS]
+    unknown = [name for name in settings.formats if name not in (*FORMATS, *MESHES)]
     if unknown or not settings.formats:
         raise SplatError(
             "export-format-unknown",
             given=f"Asked to export {', '.join(unknown) or 'no format at all'}.",
-            wanted=f"One or more of {', '.join(FORMATS)}.",
+            wanted=f"One or more of {', '.join((*FORMATS, *MESHES))}.",
             hint="Name each with --format, for example: splat export --format glb --format usdz",
             family=Family.USAGE,
         )
@@ -75,8 +87,9 @@ def run(
 
     Metrics: files (how many), splats, dropped, formats: by format size_bytes, bytes_per_splat and
     the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
-    the file, the worst camera) and the largest errors of the values. Raises SplatError
-    "export-verify-failed" (family QUALITY), and what keeps a file from being written.
+    the file, the worst camera) and the largest errors of the values; mesh: the figures of
+    `surface.make`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
+    file from being written.
     """
     from stages import formats
     from stages.formats.proof import Prover, cameras_for
@@ -91,7 +104,7 @@ def run(
     if not splats.origin.any():
         splats = replace(splats, origin=reconstruction.origin)
     _say_what_is_missing(len(splats), dropped, report)
-    wanted = tuple(dict.fromkeys(settings.formats))
+    wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
     prover = Prover.of(splats, cameras, settings.backend)
     files, figures = [], {}
@@ -109,12 +122,34 @@ def run(
             **_proven(prover, path, name, report),
         }
         report.progress(number + 1, len(wanted), f".{name}", verify_db=figures[name]["verify_db"])
+    for name, path, size in _write_meshes(splats, reconstruction, settings, folder, report):
+        files.append(ExportedFile(name, path.name, size))
+        figures[name] = {"size_bytes": size}
     report.metric("files", len(files))
     report.metric("splats", len(splats))
     report.metric("dropped", dropped)
     report.metric("formats", figures)
     _write_index(folder, files)
     return ExportedAssets(folder, tuple(files))
+
+
+def _write_meshes(
+    splats: Splats,
+    reconstruction: Reconstruction,
+    settings: ExportSettings,
+    folder: Path,
+    report: Report,
+) -> list[tuple[str, Path, int]]:
+    """(format, path, bytes) of each mesh asked for; metric: mesh, see `surface.make`."""
+    wanted = dict.fromkeys(file for name in settings.formats for file in MESHES.get(name, ()))
+    if not wanted:
+        return []
+    from stages.surface.files import write_meshes
+    from stages.surface.make import make
+
+    made = make(splats, reconstruction, settings.mesh_triangles, settings.backend, report)
+    report.metric("mesh", made.figures)
+    return write_meshes(folder, settings.name, wanted, made.mesh, reconstruction.units)
 
 
 def _clear(folder: Path) -> None:

@@ -29,6 +29,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "stages.measure",
         "stages.photos",
         "stages.structure",
+        "stages.surface",
         "stages.viewer",
     ),
     ("stages.training",),

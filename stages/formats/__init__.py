@@ -24,6 +24,7 @@ FORMATS = {
     "glb": "gltf",
     "usdz": "usd",
     "gltf": "gltf",
+    "quantised.glb": "gltf_quantised",
     "usda": "usd",
     "usdc": "usd",
     "compressed.ply": "compressed_ply",
@@ -34,6 +35,7 @@ FORMATS = {
 # Those that hold less than float32, and what of: smaller, and not the same splats any more.
 LOSSY = {
     "splat": "has 8-bit colours that do not change with the view",
+    "quantised.glb": "has rotations, sizes and opacities of 16 bits",
     "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
     "spz": "has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
     "sog": "has 256 sizes and colours, and a palette of view-dependent colours",

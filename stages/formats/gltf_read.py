@@ -52,7 +52,7 @@ def read(path: Path) -> Splats:
         origin = extras.get("splat_origin") if isinstance(extras, dict) else None
         origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
         if not parts and "meshes" in document:
-            raise BadFileError(f"no mesh in its scene uses {_EXTENSION}")
+            raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
         return checked(turned(replace(joined(parts), origin=origin)))
 
 

@@ -149,6 +149,8 @@ def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:
 def _check_is_splats(header: Header) -> None:
     names = {name for name, _ in header.vertex.properties}
     missing = [name for name in _REQUIRED if name not in names]
+    if missing and any(element.name == "face" for element in header.elements):
+        raise BadFileError("it is a mesh of triangles, not splats")
     if missing:
         raise BadFileError(f"its vertices lack {', '.join(missing)}: they are no splats")
     if header.vertex.has_lists:

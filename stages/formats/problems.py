@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from stages.run.errors import SplatError
@@ -14,9 +15,33 @@ class BadFileError(ValueError):
     """A reader's own finding; `reading` adds which file it was."""
 
 
+@dataclass(frozen=True)
+class Kind:
+    """What a file was to be read as."""
+
+    code: str
+    what: str
+    wanted: str
+    hint: str
+
+
+SPLATS = Kind(
+    "splats-unreadable",
+    "splats",
+    "A whole file of Gaussian splats in the format that its suffix names.",
+    "Copy or export the file again; if it comes from another program, try its .ply.",
+)
+CAMERAS = Kind(
+    "cameras-unreadable",
+    "cameras",
+    "A transforms.json of nerfstudio's, or a COLMAP model with pinhole cameras.",
+    "Export the cameras again; a run's own are written by `splat cameras RUN OUT`.",
+)
+
+
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn what goes wrong inside the block into SplatError "splats-unreadable" naming `path`.
+def reading(path: Path, kind: Kind = SPLATS) -> Iterator[None]:
+    """Turn what goes wrong inside the block into the SplatError of `kind` that names `path`.
 
     Besides `BadFileError` these are the exceptions that damaged bytes raise in Python and NumPy;
     RecursionError comes from deeply nested JSON, MemoryError from a file larger than memory.
@@ -30,9 +55,9 @@ def reading(path: Path) -> Iterator[None]:
             raise BadFileError("it is empty")
         yield
     except OSError as error:
-        raise _unreadable(path, error.strerror or str(error)) from error
+        raise _unreadable(path, kind, error.strerror or str(error)) from error
     except MemoryError as error:
-        raise _unreadable(path, "it needs more memory than there is") from error
+        raise _unreadable(path, kind, "it needs more memory than there is") from error
     except (
         ValueError,
         LookupError,
@@ -42,13 +67,13 @@ def reading(path: Path) -> Iterator[None]:
         struct.error,
     ) as error:
         reason = str(error) if isinstance(error, BadFileError) else f"it is damaged ({error})"
-        raise _unreadable(path, reason) from error
+        raise _unreadable(path, kind, reason) from error
 
 
-def _unreadable(path: Path, reason: str) -> SplatError:
+def _unreadable(path: Path, kind: Kind, reason: str) -> SplatError:
     return SplatError(
-        "splats-unreadable",
-        given=f"{path} cannot be read as splats: {reason}.",
-        wanted="A whole file of Gaussian splats in the format that its suffix names.",
-        hint="Copy or export the file again; if it comes from another program, try its .ply.",
+        kind.code,
+        given=f"{path} cannot be read as {kind.what}: {reason}.",
+        wanted=kind.wanted,
+        hint=kind.hint,
     )

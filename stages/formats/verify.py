@@ -149,17 +149,13 @@ def _gltf_parts(path: Path) -> tuple[Any, _Bytes]:
 
 def _gltf(path: Path) -> FileContent:
     document, blob = _gltf_parts(path)
-    kinds = {5121: np.uint8, 5123: np.uint16, 5126: np.float32}
-    widths = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+    scale = 1.0
+    if document.nodes:
+        scale = (document.nodes[0].scale or [1.0])[0]
 
     def values(primitive: Any, name: str) -> NDArray[np.floating]:
         accessor = document.accessors[getattr(primitive.attributes, name)]
-        view = document.bufferViews[accessor.bufferView]
-        start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
-        count = accessor.count * widths[accessor.type]
-        kind = np.dtype(kinds[accessor.componentType])
-        flat = np.frombuffer(blob[start : start + count * kind.itemsize], kind)
-        return flat.reshape(accessor.count, widths[accessor.type])
+        return _accessor_values(accessor, document.bufferViews[accessor.bufferView], blob)
 
     prefix = "KHR_gaussian_splatting:"
     parts = []
@@ -177,14 +173,31 @@ def _gltf(path: Path) -> FileContent:
         xyzw = values(primitive, f"{prefix}ROTATION")
         parts.append(
             splats_of(
-                means=values(primitive, "POSITION"),
+                means=scale * values(primitive, "POSITION"),
                 quaternions=np.roll(xyzw, 1, axis=1),
-                log_scales=np.log(values(primitive, f"{prefix}SCALE").astype(np.float64)),
+                log_scales=np.log(scale * values(primitive, f"{prefix}SCALE").astype(np.float64)),
                 opacity_logits=logits(values(primitive, f"{prefix}OPACITY")[:, 0]),
                 sh=sh,
             )
         )
     return FileContent(_concatenated(parts), Y_UP)
+
+
+def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
+    """[count, components], one element after the other; c / (2^b - 1) or, signed,
+    c / (2^(b - 1) - 1) of normalised integers (glTF 2.0, section 3.6.2.2)."""
+    kind = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor.componentType]
+    largest = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535, 5126: 1}[accessor.componentType]
+    element = np.dtype((kind, ({"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type],)))
+    step = view.byteStride or element.itemsize
+    start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+    # a record with what lies between two elements as padding; the last need not have it
+    record = np.dtype({"names": ["v"], "formats": [element], "offsets": [0], "itemsize": step})
+    data = blob[start : start + accessor.count * step].ljust(accessor.count * step, b"\0")
+    values = np.frombuffer(data, record, accessor.count)["v"]
+    if not accessor.normalized:
+        return values
+    return np.clip(values.astype(np.float64) / largest, -1, 1)
 
 
 def _usd(path: Path) -> FileContent:
@@ -229,6 +242,7 @@ _READERS = {
     "splat": _splat,
     "glb": _gltf,
     "gltf": _gltf,
+    "quantised.glb": _gltf,
     "usda": _usd,
     "usdc": _usd,
     "usdz": _usd,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,13 +69,24 @@ def render(
     backend: "auto" (the fastest that is present), "cpu" (Numba) or "reference" (torch).
     Raises ValueError for another name.
     """
+    return renderer(splats, settings, backend, smoothing)(camera)
+
+
+def renderer(
+    splats: Splats,
+    settings: RasterSettings | None = None,
+    backend: str = "auto",
+    smoothing: NDArray[np.float32] | None = None,
+) -> Callable[[Camera], Rendering]:
+    """What draws the same splats from one camera after another, and keeps its buffers between
+    them. What it hands out is the caller's own. As `render` for the rest."""
     settings = settings or RasterSettings()
     if backend in ("auto", "cpu"):
-        from stages.raster.cpu import render_cpu
+        from stages.raster.cpu import renderer_cpu
 
-        return render_cpu(splats, camera, settings, smoothing)
+        return renderer_cpu(splats, settings, smoothing)
     if backend == "reference":
         from stages.raster.reference import render_reference
 
-        return render_reference(splats, camera, settings, smoothing)
+        return lambda camera: render_reference(splats, camera, settings, smoothing)
     raise ValueError(f"backend {backend!r}, wanted auto, cpu or reference")

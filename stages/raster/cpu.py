@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -337,20 +338,22 @@ def splat_arrays(splats: Splats) -> tuple[NDArray[np.float32], ...]:
     )
 
 
-def render_cpu(
-    splats: Splats,
-    camera: Camera,
-    settings: RasterSettings,
-    smoothing: NDArray[np.float32] | None = None,
-) -> Rendering:
-    """`render` by the kernels."""
+def renderer_cpu(
+    splats: Splats, settings: RasterSettings, smoothing: NDArray[np.float32] | None = None
+) -> Callable[[Camera], Rendering]:
+    """`renderer` by the kernels."""
     widths = NO_SMOOTHING if smoothing is None else np.ascontiguousarray(smoothing, np.float32)
-    forward = CpuRasteriser().forward(splat_arrays(splats), camera, settings, widths, depths=True)
-    image = forward.image
-    return Rendering(
-        np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
-        image[3].copy(),
-        image[4].copy(),
-        image[5].copy(),
-        forward.culled,
-    )
+    rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
+
+    def draw(camera: Camera) -> Rendering:
+        forward = rasteriser.forward(arrays, camera, settings, widths, depths=True)
+        image = forward.image
+        return Rendering(
+            np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
+            image[3].copy(),
+            image[4].copy(),
+            image[5].copy(),
+            forward.culled,
+        )
+
+    return draw

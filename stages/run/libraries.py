@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 NAMES = (
     "splat",
+    "fast-simplification",
     "numba",
     "numpy",
     "opencv-contrib-python-headless",
@@ -16,6 +17,8 @@ NAMES = (
     "pycolmap",
     "pygltflib",
     "plyfile",
+    "scikit-image",
+    "scipy",
     "torch",
     "usd-core",
 )

@@ -53,6 +53,22 @@ class Camera:
         """The same view with its longer side at most `long_side` pixels; never enlarged."""
         return self.resized(*fitted_size(self.width, self.height, long_side))
 
+    def reframed(self, width: int, height: int) -> Camera:
+        """All that the camera sees, in a picture of another size and perhaps shape: more to two
+        sides, never less."""
+        scale = min(width / self.width, height / self.height)
+        if abs(scale * self.width - width) < 1.5 and abs(scale * self.height - height) < 1.5:
+            return self.resized(width, height)  # the same shape, but for whole pixels
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * scale,
+            fy=self.fy * scale,
+            cx=width / 2 + (self.cx - self.width / 2) * scale,
+            cy=height / 2 + (self.cy - self.height / 2) * scale,
+        )
+
     def moved(self, world_from_new: NDArray[np.float64]) -> Camera:
         """The camera as seen from a new world frame (x_world = world_from_new x_new), [4, 4]."""
         return replace(self, world_to_camera=self.world_to_camera @ world_from_new)

@@ -38,7 +38,9 @@ def extract(job: Job) -> None:
 def match(job: Job) -> None:
     """Match and verify pairs of photographs; pairs that the database holds are not done again."""
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = job.threads
+    # Threads that build their search indices at the same time now and then build wrong ones: in one
+    # of some hundred processes all matches of two photographs, one a thread, were others.
+    matching.num_threads = 1
     matching.use_gpu = pycolmap.has_cuda
     common: dict[str, Any] = {
         "matching_options": matching,

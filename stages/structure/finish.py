@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stages.formats.cameras_colmap import ColmapModel, write_colmap_model
 from stages.run.atomic import replacing
 from stages.run.errors import Interrupted, SplatError
 from stages.run.stage import Report
 from stages.scene import Camera, Capture, Photo, Reconstruction, View
-from stages.structure.colmap_files import ColmapModel, write_colmap_model
 from stages.structure.levelling import upright
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene import logit
+from stages.scene.rotations import matrices_of
 from stages.training.optimiser import Model
 
 SPLIT_FACTOR = 1.6  # children of a split are that much smaller
@@ -97,23 +98,11 @@ def _children(parents: Model, rng: np.random.Generator) -> Model:
     """Two for each parent, drawn from its own Gaussian."""
     twice = parents.take(np.repeat(np.arange(len(parents)), 2)).fresh()
     offsets = rng.normal(size=(len(twice), 3)) * np.exp(twice.log_scales.astype(np.float64))
-    twice.means += np.einsum("nij,nj->ni", rotation_matrices(twice.quaternions), offsets).astype(
+    twice.means += np.einsum("nij,nj->ni", matrices_of(twice.quaternions), offsets).astype(
         np.float32
     )
     twice.log_scales -= np.float32(np.log(SPLIT_FACTOR))
     return twice
-
-
-def rotation_matrices(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[N, 3, 3] of quaternions w, x, y, z."""
-    q = quaternions.astype(np.float64)
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def reset_opacities(model: Model) -> None:

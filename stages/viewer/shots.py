@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene import Camera, Splats, View, look_at, split_held_out
+from stages.scene.rotations import quaternions_of
 
 _VIEWER_FROM_WORLD = np.diag([-1.0, -1.0, 1.0])
 _CAMERA_FROM_VIEWERS = np.diag([1.0, -1.0, -1.0])
@@ -81,7 +82,7 @@ def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
         **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "position": _plain(_VIEWER_FROM_WORLD @ camera.centre),
         "target": _plain(_VIEWER_FROM_WORLD @ (camera.centre + depth * camera.forward)),
-        "rotation": _plain(_quaternion_xyzw(rotation)),
+        "rotation": _plain(quaternions_of(rotation)[[1, 2, 3, 0]]),
     }
 
 
@@ -97,20 +98,6 @@ def depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
         if chosen.any():
             return float(np.median(z[chosen]))
     return 1.0
-
-
-def _quaternion_xyzw(r: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion of a rotation: the eigenvector of a symmetric matrix, good at every angle."""
-    k = np.array(
-        [
-            [r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]],
-            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]],
-            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
-        ]
-    )
-    vector: NDArray[np.float64] = np.linalg.eigh(k)[1][:, -1]
-    return vector if vector[3] >= 0 else -vector
 
 
 def _plain(values: NDArray[np.floating]) -> list[float]:

@@ -98,3 +98,10 @@ def test_help_names_every_ending() -> None:
     text = help_of("convert")
     for name in formats.FORMATS:
         assert f".{name}" in text
+
+
+def test_a_mesh_is_made_from_a_run_and_not_converted_to(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.mesh.glb", code=2)
+    assert "splat export --format mesh" in err
+    assert not (tmp_path / "b.mesh.glb").exists()

@@ -17,7 +17,8 @@ from stages import STAGE_NAMES
 
 ROOT = Path(__file__).parent.parent.parent
 COMMANDS = (
-    *("process", *STAGE_NAMES, "status", "render", "view", "info", "convert", "verify", "doctor"),
+    *("process", *STAGE_NAMES, "status", "render", "view", "info", "convert", "verify"),
+    *("cameras", "doctor"),
 )
 HEAVY = ("torch", "numba", "cv2", "pycolmap", "numpy", "PIL", "pxr")
 

@@ -16,6 +16,7 @@ from splatcli import verify as command
 from splatcli import views
 from splatcli.app import app
 from stages import formats
+from stages.run.errors import SplatError
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -92,6 +93,21 @@ def test_a_run_folder_means_all_its_files(run: Path) -> None:
         assert words in out
     assert "verifying" in err
     assert "itself" not in out + err
+
+
+@pytest.mark.parametrize("beside", [("ply",), ()])
+def test_the_meshes_of_a_run_are_not_taken_for_splats(
+    run: Path, monkeypatch: pytest.MonkeyPatch, beside: tuple[str, ...]
+) -> None:
+    names = (*beside, "mesh.glb")
+    files = tuple(ExportedFile(name, f"scene.{name}", 1) for name in names)
+    assets = ExportedAssets(run / "7-export", files)
+    monkeypatch.setattr(command, "Pipeline", lambda path: SimpleNamespace(load=lambda name: assets))
+    if beside:
+        assert command._files(run) == [run / "7-export" / "scene.ply"]
+    else:
+        with pytest.raises(SplatError, match="meshes only"):
+            command._files(run)
 
 
 def test_verifying_changes_nothing_in_the_run(run: Path) -> None:

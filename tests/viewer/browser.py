@@ -1,15 +1,19 @@
-"""A headless Chromium, spoken to over a pair of pipes: nothing to install beside it."""
+"""A headless Chromium, spoken to over a pair of pipes: no driver to install beside it."""
 
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import itertools
 import json
 import os
+import platform
 import select
 import shutil
 import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +21,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from tests.packages import UnavailableError, installed, node
+
+_PACKAGE = Path(__file__).parent / "chromium"
 NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome", "chrome")
 _OPTIONS = (
     "--headless=new",
@@ -32,10 +39,34 @@ _OPTIONS = (
 )
 
 
-def find_chromium() -> str | None:
-    """The program that SPLAT_CHROMIUM names, or the first that the path has."""
+@functools.cache
+def chromium() -> str:
+    """The program that SPLAT_CHROMIUM names, or the first that the path has, or one from npm.
+
+    Raises UnavailableError. From npm it is a download of 70 MB, once.
+    """
     named = os.environ.get("SPLAT_CHROMIUM")
-    return named or next((path for name in NAMES if (path := shutil.which(name))), None)
+    found = named or next((path for name in NAMES if (path := shutil.which(name))), None)
+    return found or _unpacked()
+
+
+def _unpacked() -> str:
+    """@sparticuz/chromium: a Chromium for Linux on x86-64 with SwiftShader, made for machines
+    without a desktop's libraries."""
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        raise UnavailableError("no Chromium on the path, and SPLAT_CHROMIUM names none")
+    packages = installed(_PACKAGE)
+    home = packages.parent / "unpacked"
+    if not home.is_dir():
+        with tempfile.TemporaryDirectory(dir=packages.parent) as temporary:
+            content = Path(temporary) / "content"
+            content.mkdir()
+            node().run(_PACKAGE / "unpack.mjs", packages, content)
+            try:
+                content.rename(home)
+            except OSError:  # another run was faster
+                assert home.is_dir()
+    return str(home / "chromium")
 
 
 class Browser:
@@ -53,6 +84,7 @@ class Browser:
         self._process = subprocess.Popen(
             ["bash", "-c", command, program, *_OPTIONS, f"--user-data-dir={profile}"],
             pass_fds=(their_in, their_out),
+            env=_environment(program),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -132,3 +164,15 @@ class Browser:
         self._process.wait(timeout=20)
         os.close(self._to)
         os.close(self._from)
+
+
+def _environment(program: str) -> dict[str, str]:
+    """With the libraries and fonts that lie beside an unpacked browser; a bare machine has none."""
+    home = Path(program).parent
+    if not (home / "al2023").is_dir():
+        return dict(os.environ)
+    found = {
+        "LD_LIBRARY_PATH": str(home / "al2023" / "lib"),
+        "FONTCONFIG_PATH": str(home / "fonts"),
+    }
+    return {**os.environ, **found}

@@ -1,0 +1,101 @@
+"""A smaller .glb: KHR_gaussian_splatting with the integers that its specification allows.
+
+Rotations are normalised int16, scales and opacities normalised uint16, the fallback colours uint8;
+positions and SH stay float32, which is all that the specification allows for them. Splats are
+grouped into one primitive for each SH degree in use, so that one without view-dependent colour
+pays for none.
+
+Why these widths: glTF starts each attribute at a multiple of 4 bytes, so a uint8 opacity is not
+smaller than a uint16. On a room of 216,000 splats rotation, scale and opacity cost 96, 86 and
+97 dB; int8 rotations 66, uint8 opacities 70 and uint8 scales 42.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats.gltf import fallback_colours, sh_attributes
+from stages.formats.gltf_file import EXTENSION, Attribute, write_file
+from stages.formats.gltf_read import read
+from stages.formats.rows import (
+    kept_rows,
+    linear_opacities,
+    linear_scales,
+    unit_quaternions,
+)
+from stages.formats.turn import turned
+from stages.scene import Splats
+
+__all__ = ["order", "read", "write"]
+
+_U16 = 65535
+# A step of the scales may be this part of a middling splat's size. Where a few huge splats would
+# make the steps coarser, scales stay float32.
+_COARSEST_STEP = 0.01
+
+
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+    """Write `splats` as `path`; return how many could not be drawn and were left out.
+
+    Normalised scales end at 1, so the node enlarges them by a power of two, and positions are
+    divided by it, which costs no bits. Raises SplatError as `gltf.write`.
+    """
+    splats, dropped = kept_rows(splats)
+    upright = turned(splats.take(order(splats)))
+    unit = _unit(linear_scales(upright))
+    primitives = [_attributes(group, unit) for group in _groups(upright)]
+    write_file(Path(path), primitives, upright.origin, units, node_scale=unit or 1.0)
+    return dropped
+
+
+def order(splats: Splats) -> NDArray[np.intp]:
+    """[N] the row of `splats` that each row of the file comes from: by rising degree."""
+    return np.argsort(splats.sh_degrees, kind="stable")
+
+
+def _groups(splats: Splats) -> Iterator[Splats]:
+    """The splats of each degree in use, with no more bands than they use."""
+    for degree in np.unique(splats.sh_degrees):
+        group = splats.take(splats.sh_degrees == degree)
+        yield replace(group, sh=group.sh[:, : (int(degree) + 1) ** 2])
+
+
+def _unit(scales: NDArray[np.float32]) -> float | None:
+    """The power of two that all `scales` [N, 3] lie below; None if steps of it would be coarse."""
+    if not len(scales):
+        return None
+    unit = float(2.0 ** np.ceil(np.log2(scales.max())))
+    middling = float(np.median(scales.max(axis=1)))
+    return unit if unit / _U16 <= _COARSEST_STEP * middling else None
+
+
+def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
+    """splats: upright, all of one degree. unit: see `_unit`."""
+    opacities = linear_opacities(splats)
+    colours = np.rint(255 * fallback_colours(splats, opacities)).astype("u1")
+    rotations = np.rint(32767.0 * unit_quaternions(splats.quaternions)).astype("<i2")
+    scales = linear_scales(splats)
+    if unit is None:
+        scale = Attribute(scales.astype("<f4"), 3)
+    else:
+        # never 0, which some viewers take for a flat splat
+        steps = np.maximum(np.rint(scales / np.float64(unit) * _U16), 1)
+        scale = Attribute(_padded(steps.astype("<u2"), 4), 3)
+    opacity = np.rint(float(_U16) * opacities[:, None]).astype("<u2")
+    return {
+        "POSITION": Attribute((splats.means / np.float32(unit or 1.0)).astype("<f4"), 3),
+        "COLOR_0": Attribute(colours, 4),
+        f"{EXTENSION}:ROTATION": Attribute(rotations[:, [1, 2, 3, 0]], 4),
+        f"{EXTENSION}:SCALE": scale,
+        f"{EXTENSION}:OPACITY": Attribute(_padded(opacity, 2), 1),
+        **sh_attributes(splats),
+    }
+
+
+def _padded(rows: NDArray[np.uint16], width: int) -> NDArray[np.uint16]:
+    return np.pad(rows, ((0, 0), (0, width - rows.shape[1])))

@@ -1,0 +1,35 @@
+"""Rotation matrices and unit quaternions w, x, y, z of the same rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[..., 4] unit, w >= 0, of rotation matrices [..., 3, 3]: the eigenvector of Bar-Itzhack's
+    symmetric matrix (J. Guidance 23(6), 2000), which is stable for every angle."""
+    rows = np.moveaxis(np.asarray(rotations, np.float64), (-2, -1), (0, 1))
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    matrix = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    quaternions = np.linalg.eigh(np.moveaxis(matrix, (0, 1), (-2, -1)))[1][..., 3]
+    return np.where(quaternions[..., :1] >= 0, quaternions, -quaternions)
+
+
+def matrices_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[..., 3, 3] of quaternions [..., 4] w, x, y, z of any length but 0."""
+    q = np.asarray(quaternions, np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)

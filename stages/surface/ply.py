@@ -1,0 +1,44 @@
+"""A mesh as a binary .ply: vertices with normals and colours, triangles. World: y down, as in the
+splats' own .ply, so that both lie over each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from stages.run.atomic import replacing
+from stages.surface.mesh import NOTE, Mesh
+
+_VERTEX = np.dtype([("place", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
+_FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
+
+
+def write(path: Path, mesh: Mesh, units: str) -> None:
+    """Raises SplatError when the file cannot be written."""
+    vertices = np.zeros(len(mesh.vertices), _VERTEX)
+    vertices["place"], vertices["normal"] = mesh.vertices, mesh.normals()
+    vertices["colour"] = mesh.colours
+    faces = np.zeros(len(mesh.faces), _FACE)
+    faces["count"], faces["vertices"] = 3, mesh.faces
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(_header(mesh, units).encode("ascii"))
+        file.write(vertices.tobytes())
+        file.write(faces.tobytes())
+
+
+def _header(mesh: Mesh, units: str) -> str:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {NOTE}",
+        "comment up axis: -y (right-handed; x right, y down, z forward)",
+        f"comment units: {units}",
+    ]
+    if mesh.origin.any():
+        lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in mesh.origin))
+    lines.append(f"element vertex {len(mesh.vertices)}")
+    lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header", ""])

@@ -1,0 +1,217 @@
+"""`splat render`: pictures, films and folders, and what cannot be drawn."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatcli import rendering, routes
+from stages import formats
+from stages.formats import cameras_nerfstudio
+from stages.raster import render
+from stages.scene import Camera, View, look_at
+from stages.viewer.picture_files import eight_bits
+from tests import scenes
+from tests.tolerances import FILM_LEVELS
+
+CLOUD = scenes.cloud(60)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    formats.write(tmp_path / "a.ply", CLOUD)
+    return tmp_path / "a.ply"
+
+
+def around(count: int = 8) -> tuple[View, ...]:
+    middle = np.array([0.0, 0.0, 4.0])
+    made = []
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
+        eye = middle + 3 * np.array([np.sin(angle), -0.4, -np.cos(angle)])
+        made.append(
+            View(f"{i}.jpg", f"{i}.jpg", scenes.camera(64, 49, matrix=look_at(eye, middle)))
+        )
+    return tuple(made)
+
+
+@pytest.fixture
+def captured(monkeypatch: pytest.MonkeyPatch) -> tuple[View, ...]:
+    """As if the file lay in a run with these photographs."""
+    monkeypatch.setattr(routes, "views_of", lambda pipeline: around())
+    return around()
+
+
+def last_event(result) -> dict:
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    video = cv2.VideoCapture(str(path))
+    frames = []
+    while True:
+        there, frame = video.read()
+        if not there:
+            return frames
+        frames.append(frame[..., ::-1])
+
+
+def test_a_film_shows_what_the_pictures_show(splat, scene: Path, captured) -> None:
+    words = ("render", str(scene), "--frames", "4")
+    told = last_event(splat(*words, "--out", "a.mp4", "--fps", "12", "--json"))
+    splat(*words, "--out", "frames", "--width", "64")
+    assert (told["frames"], told["width"], told["height"]) == (4, 64, 48)  # even
+    film = frames_of(Path("a.mp4"))
+    assert cv2.VideoCapture("a.mp4").get(cv2.CAP_PROP_FPS) == 12
+    names = sorted(path.name for path in Path("frames").iterdir())
+    assert names == [f"frame_000{i}.png" for i in (1, 2, 3, 4)]
+    for frame, name in zip(film, names, strict=True):
+        picture = np.array(Image.open(Path("frames") / name).resize((64, 48)))
+        # Colour has half the resolution: compare what is larger than that.
+        ours, theirs = (cv2.blur(p.astype(np.float32), (9, 9)) for p in (picture, frame))
+        assert np.abs(ours - theirs).mean() < FILM_LEVELS
+
+
+def test_how_long_a_film_is(splat, scene: Path) -> None:
+    told = last_event(
+        splat("render", str(scene), "-o", "a.mp4", "--seconds", "0.5", "--width", "16", "--json")
+    )
+    assert told["frames"] == 15
+
+
+def test_depth_of_a_picture_is_what_was_rendered(splat, scene: Path, captured) -> None:
+    splat("render", str(scene), "--out", "a.png", "--depth", "--camera", "3")
+    drawn = render(CLOUD, captured[3].camera)
+    depth = cv2.imread("a.depth.tiff", cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(depth, drawn.median_depth)
+    np.testing.assert_array_equal(np.array(Image.open("a.png")), eight_bits(drawn.image))
+
+
+def test_depth_of_films_and_folders(splat, scene: Path, captured) -> None:
+    words = ("render", str(scene), "--frames", "2", "--width", "32", "--depth", "--out")
+    told = last_event(splat(*words, "a.mp4", "--json"))
+    assert 0 < told["depth_near"] < told["depth_far"]
+    assert len(frames_of(Path("a.depth.mp4"))) == 2
+    splat(*words, "frames")
+    assert sorted(path.name for path in Path("frames").iterdir()) == [
+        *("frame_0001.depth.tiff", "frame_0001.png"),
+        *("frame_0002.depth.tiff", "frame_0002.png"),
+    ]
+
+
+def test_the_capture_path_passes_the_photographs(splat, scene: Path, captured) -> None:
+    told = last_event(
+        splat(*("render", str(scene), "--path", "capture", "--frames", "5", "-o", "f", "--json"))
+    )
+    assert (told["frames"], told["width"], told["height"]) == (5, 64, 49)
+
+
+def test_a_camera_file_is_drawn_camera_by_camera(splat, scene: Path, captured) -> None:
+    cameras_nerfstudio.write(Path("transforms.json"), captured, Path("images"))
+    splat("render", str(scene), "--path", "transforms.json", "--out", "f")
+    pictures = sorted(Path("f").iterdir())
+    for path, view in zip(pictures, captured, strict=True):
+        wanted = eight_bits(render(CLOUD, view.camera).image).astype(int)
+        assert np.abs(np.array(Image.open(path)) - wanted).max() <= 1
+    told = last_event(
+        splat(
+            *("render", str(scene), "--path", "transforms.json", "--frames", "3", "--json"), "-og"
+        )
+    )
+    assert told["frames"] == 3
+
+
+def test_a_distorted_camera_file_is_drawn_and_said(splat, scene: Path, captured) -> None:
+    cameras_nerfstudio.write(Path("t.json"), captured, Path("images"))
+    data = json.loads(Path("t.json").read_text())
+    Path("t.json").write_text(json.dumps(data | {"k1": 0.1}))
+    result = splat("render", str(scene), "--path", "t.json", "--out", "a.mp4")
+    assert result.exit_code == 0
+    assert "distort" in result.stderr
+
+
+def test_frames_of_a_longer_path_are_counted_and_kept(splat, scene: Path) -> None:
+    words = ("render", str(scene), "--width", "16", "--out", "f", "--frames")
+    splat(*words, "3")
+    result = splat(*words, "2")
+    assert "1 frames of an earlier" in result.stderr
+    assert len(list(Path("f").iterdir())) == 3
+
+
+def test_half_a_capture_is_said(splat, scene: Path, monkeypatch) -> None:
+    monkeypatch.setattr(routes, "views_of", lambda pipeline: around(8)[:3])
+    result = splat("render", str(scene), "--frames", "2", "--width", "16", "--out", "f")
+    assert "81 degrees" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--out", "a.gif"], 2, ".mp4"),
+        (["--out", "a.png", "--path", "orbit"], 2, "--path"),
+        (["--out", "a.png", "--frames", "3"], 2, "--frames"),
+        (["--out", "a.mp4", "--camera", "0"], 2, "--camera"),
+        (["--out", "a.mp4", "--frames", "0"], 2, "--frames"),
+        (["--out", "a.mp4", "--fps", "0"], 2, "--fps"),
+        (["--out", "a.mp4", "--frames", "3", "--seconds", "1"], 2, "--seconds"),
+        (["--out", "a.mp4", "--path", "capture"], 2, "orbit"),
+        (["--out", "a.mp4", "--path", "spiral"], 2, "capture"),
+        (["--out", "a.mp4", "--path", "a.ply"], 2, "COLMAP"),
+        (["--out", "a.mp4", "--path", "photos"], 2, "COLMAP"),
+        (["--out", "a.png", "--width", "99999"], 2, "--width"),
+        (["--out", "a.png", "--backend", "magic"], 2, "backend"),
+        (["--out", "no/a.mp4", "--frames", "2", "--width", "16"], 6, "folder"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said(splat, scene: Path, words, code: int, said: str) -> None:
+    before = sorted(os.listdir())
+    result = splat("render", str(scene), *words)
+    assert result.exit_code == code, result.output
+    assert said in result.stderr
+    assert sorted(os.listdir()) == before
+
+
+def test_a_picture_larger_than_memory_is_refused_at_once(splat, scene: Path, monkeypatch) -> None:
+    monkeypatch.setattr(rendering.memory, "available_mib", lambda: 100.0)
+    result = splat("render", str(scene), "--out", "a.png", "--width", "4000")
+    assert result.exit_code == 6
+    assert "smaller --width" in result.stderr
+
+
+def test_a_file_without_cameras_is_no_path(splat, scene: Path) -> None:
+    Path("t.json").write_text('{"w": 1, "h": 1, "fl_x": 1, "frames": []}')
+    result = splat("render", str(scene), "--path", "t.json", "--out", "a.mp4")
+    assert result.exit_code == 3
+    assert "no camera" in result.stderr
+
+
+def test_cameras_of_other_shapes_are_shown_whole_in_a_film() -> None:
+    """By hand: 60 x 90 into 90 x 60 is two thirds as large, with 25 pixels to either side."""
+    tall = Camera(60, 90, 50.0, 50.0, 30.0, 45.0, np.eye(4))
+    wide = tall.reframed(90, 60)
+    assert (wide.width, wide.height) == (90, 60)
+    assert wide.fx == wide.fy == pytest.approx(100 / 3)
+    assert (wide.cx, wide.cy) == (45.0, 30.0)
+    assert tall.reframed(30, 45).fx == pytest.approx(25.0)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
+def test_ctrl_c_leaves_no_half_film(scene: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "splatcli", "render", str(scene), "--json"]
+    command += ["--out", str(tmp_path / "a.mp4"), "--frames", "100000", "--width", "64"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        assert "progress" in running.stdout.readline()
+        running.send_signal(signal.SIGINT)
+        running.stdout.read()
+        assert running.wait(timeout=30) == 130
+    assert os.listdir(tmp_path) == ["a.ply"]

@@ -1,0 +1,65 @@
+"""Web engines that we did not write draw our files as we do: upright, not mirrored, in colour."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages import formats
+from stages.formats.rows import degrees_in_use
+from stages.measure.images import psnr
+from stages.raster import render
+from stages.scene import Splats
+from tests.packages import UnavailableError
+from tests.readers.pictures import ENGINES, Engine, camera_for, served
+from tests.tolerances import ENGINE_DB
+from tests.viewer.browser import Browser, chromium
+from tests.viewer.pictures import SIZE, coloured_scene, views, wrong_versions
+
+pytestmark = pytest.mark.slow
+WORSE_DB = 5.0
+
+
+def scene() -> Splats:
+    """Splats of degree 0 and 3 among each other, none brighter than white: some engines keep
+    colours in 8 bits."""
+    splats = coloured_scene()
+    sh = splats.sh.copy()
+    sh[:, 1:] *= 0.4
+    sh[:, 0] *= 0.8
+    return replace(splats, sh=sh, sh_degrees=degrees_in_use(sh))
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    try:
+        program = chromium()
+    except UnavailableError as reason:
+        pytest.skip(str(reason))
+    opened = Browser(program, tmp_path_factory.mktemp("profile"), SIZE)
+    yield opened
+    opened.close()
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_engines_draw_what_render_draws(
+    browser: Browser, packages: Path, tmp_path: Path, name: str
+) -> None:
+    splats = scene()
+    with served(packages, tmp_path) as address:
+        engine = Engine(browser, address, name)
+        for suffix in ENGINES[name]:
+            path = tmp_path / f"scene.{suffix}"
+            formats.write(path, splats)
+            assert engine.open(path.name) == len(splats), suffix
+            for view in views()[:2]:
+                ours = np.clip(render(splats, view.camera).image, 0, 1)
+                theirs = engine.draw(camera_for(path, view.camera))
+                right = psnr(theirs, ours)
+                assert right > ENGINE_DB[name], (suffix, view.name)
+                for what, wrong in wrong_versions(theirs).items():
+                    assert psnr(wrong, ours) < right - WORSE_DB, (suffix, view.name, what)

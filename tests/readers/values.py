@@ -1,0 +1,147 @@
+"""The values that other people's readers find in our files, as splats in the file's own axes."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.formats.verify import read_back
+from stages.formats.verify_content import Y_UP, FileContent, logits, splats_of
+from tests.packages import UnavailableError, installed, node
+
+HERE = Path(__file__).parent
+Y_DOWN = np.eye(4)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """name, with the version that it was tried with; the formats that it reads; `read` raises
+    UnavailableError where it is not installed."""
+
+    name: str
+    formats: tuple[str, ...]
+    read: Callable[[Path], FileContent]
+
+
+def _gsply(path: Path) -> FileContent:
+    gsply: Any = _imported("gsply")
+    spz = path.suffix == ".spz"
+    data = gsply.read_spz(path) if spz else gsply.plyread(path)
+    rest = data.shN if data.shN is not None else np.zeros((len(data.means), 0, 3))
+    return FileContent(
+        splats_of(
+            means=data.means,
+            quaternions=data.quats,
+            log_scales=data.scales,
+            opacity_logits=data.opacities,
+            sh=np.concatenate([data.sh0[:, None], rest], axis=1),
+        ),
+        Y_UP if spz else Y_DOWN,
+    )
+
+
+def _open3d(path: Path) -> FileContent:
+    """Scales linear, SH after the DC channel by channel."""
+    open3d: Any = _imported("open3d")
+    cloud = open3d.t.io.read_point_cloud(str(path))
+    values = {name: cloud.point[name].numpy() for name in cloud.point}
+    count = len(values["positions"])
+    sh = values["f_dc"].reshape(count, 1, 3)
+    if "f_rest" in values:
+        rest = values["f_rest"].reshape(count, -1, 3)
+        sh = np.concatenate([sh, rest], axis=1)
+    return FileContent(
+        splats_of(
+            means=values["positions"],
+            quaternions=values["rot"],
+            log_scales=np.log(values["scale"]),
+            opacity_logits=values["opacity"][:, 0],
+            sh=sh,
+        ),
+        Y_UP if path.suffix == ".spz" else Y_DOWN,
+    )
+
+
+def _tinyusdz(path: Path) -> FileContent:
+    """Quaternions as they lie in memory in USD: the real part last."""
+    tinyusdz: Any = _imported("tinyusdz")
+    stage = tinyusdz.load(str(path))
+    assert stage.get_metadata("upAxis") == "Y"
+    prim = stage.get_prim_at_path("/Scene/Splats")
+    assert prim.type_name == "ParticleField3DGaussianSplat"
+
+    def values(name: str) -> np.ndarray:
+        return np.asarray(memoryview(prim.get_attribute(name).value))
+
+    degree = prim.get_attribute("radiance:sphericalHarmonicsDegree").value.as_scalar()
+    coefficients = values("radiance:sphericalHarmonicsCoefficients")
+    return FileContent(
+        splats_of(
+            means=values("positions"),
+            quaternions=np.roll(values("orientations"), 1, axis=1),
+            log_scales=np.log(values("scales").astype(np.float64)),
+            opacity_logits=logits(values("opacities")),
+            sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
+        ),
+        Y_UP,
+    )
+
+
+def _splat_transform(path: Path) -> FileContent:
+    """Written by it as .ply, and that read by plyfile; it leaves the axes as they are."""
+    command = installed(HERE) / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out.ply"
+        node().run(command, path, out)
+        axes = Y_UP if path.suffix == ".spz" else Y_DOWN
+        return replace(read_back(out), world_from_file=axes)
+
+
+def _adobe_spz(path: Path) -> FileContent:
+    """Colours there are DC coefficients already; SH are coefficient by coefficient, RGB last."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "values"
+        said = node().run(HERE / "scripts" / "spz.mjs", installed(HERE), path, out)
+        about = json.loads(said.splitlines()[-1])  # the library talks too
+        count, bands = about["count"], (about["degree"] + 1) ** 2 - 1
+        flat = np.fromfile(out, "<f4")
+    ends = np.cumsum([3 * count, 3 * count, 4 * count, count, 3 * count])
+    means, scales, rotations, alphas, colours, sh = np.split(flat, ends)
+    dc = colours.reshape(count, 1, 3)
+    return FileContent(
+        splats_of(
+            means=means.reshape(count, 3),
+            quaternions=np.roll(rotations.reshape(count, 4), 1, axis=1),
+            log_scales=scales.reshape(count, 3),
+            opacity_logits=alphas,
+            sh=np.concatenate([dc, sh.reshape(count, bands, 3)], axis=1),
+        ),
+        Y_UP,
+    )
+
+
+def _imported(name: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise UnavailableError(f"{name} is not installed ({error})") from error
+
+
+READERS = (
+    Reader("plyfile", ("ply",), read_back),
+    Reader("pygltflib", ("glb", "gltf", "quantised.glb"), read_back),
+    Reader("usd-core", ("usda", "usdc", "usdz"), read_back),
+    Reader("gsply", ("ply", "compressed.ply", "spz"), _gsply),
+    Reader("tinyusdz", ("usda", "usdc", "usdz"), _tinyusdz),
+    Reader("splat-transform", ("ply", "splat", "compressed.ply", "spz", "sog"), _splat_transform),
+    Reader("@adobe/spz", ("spz",), _adobe_spz),
+    Reader("Open3D", ("ply", "splat", "spz"), _open3d),
+)
