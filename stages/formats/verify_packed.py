@@ -16,8 +16,9 @@ def compressed_ply(path: Path) -> FileContent:
     from plyfile import PlyData
 
     data = PlyData.read(str(path), mmap="c")
-    ranges, rest = data["chunk"], data["sh"].data if "sh" in data else None
-    per_channel = len(rest.dtype.names) // 3 if rest is not None else 0
+    ranges, rest = data["chunk"], data["sh"].data if "sh" in data else np.zeros(0, "u1")
+    names = rest.dtype.names or ()
+    per_channel = len(names) // 3
     axes = [("x", 21, 11), ("y", 11, 10), ("z", 0, 11)]
 
     def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
@@ -38,7 +39,7 @@ def compressed_ply(path: Path) -> FileContent:
         colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
         sh = np.zeros((len(words), per_channel + 1, 3), np.float32)
         sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
-        for i, name in enumerate(rest.dtype.names if rest is not None else ()):
+        for i, name in enumerate(names):
             sh[:, 1 + i % per_channel, i // per_channel] = (rest[name][rows] + 0.5) / 32 - 4
         return {
             "means": unpacked("packed_position", axes),

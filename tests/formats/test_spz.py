@@ -185,10 +185,3 @@ def test_a_gzip_bomb_is_refused_before_it_unpacks(tmp_path: Path) -> None:
     path.write_bytes(gzip.compress(header + bytes(100 << 20), 1))
     with pytest.raises(SplatError, match="declares"):
         formats.read(path)
-
-
-def test_version_4_is_named_when_it_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.spz"
-    path.write_bytes(spz.HEADER.pack(b"NGSP", 4, 1, 0, 12, 0, 0) + bytes(64))
-    with pytest.raises(SplatError, match="version 4"):
-        formats.read(path)

@@ -1,0 +1,91 @@
+"""`splat info`: what is in a file, and what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from splatcli.app import app
+from stages import formats
+from tests.formats.truth import many_splats
+
+
+def info(path: Path, code: int = 0) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["info", str(path), "--json"])
+    assert result.exit_code == code, result.stderr
+    return dict(json.loads(result.stdout))
+
+
+# degree 3: 15 coefficients of 3 channels above degree 0
+BYTES = {
+    "ply": {"positions": 12, "normals": 12, "colours": 12, "SH": 180, "scales": 12},
+    "splat": {"positions": 12, "scales": 12, "colours, opacities": 4, "rotations": 4},
+    "glb": {"positions": 12, "rotations": 16, "SH": 180, "opacities": 4},
+    "compressed.ply": {"positions": 4, "rotations": 4, "SH": 45},
+}
+
+
+@pytest.mark.parametrize("suffix", BYTES)
+def test_bytes_are_told_by_attribute(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    formats.write(path, many_splats(300))
+    told = info(path)
+    assert told["splats"] == 300
+    assert told["bytes_per_splat"].items() >= BYTES[suffix].items()
+    assert sum(told["bytes_per_splat"].values()) * 300 == pytest.approx(path.stat().st_size, 1e-3)
+
+
+def test_bytes_of_packed_files_are_those_on_disk_where_parts_are_packed_alone(
+    tmp_path: Path,
+) -> None:
+    formats.write(tmp_path / "a.sog", many_splats(300))
+    told = info(tmp_path / "a.sog")["bytes_per_splat"]
+    size = (tmp_path / "a.sog").stat().st_size
+    assert sum(told.values()) * 300 == pytest.approx(size, 1e-2)
+    formats.write(tmp_path / "a.spz", many_splats(300))  # gzip packs all together
+    told = info(tmp_path / "a.spz")["bytes_per_splat_unpacked"]
+    assert told == {
+        "positions": 9,
+        "opacities": 1,
+        "colours": 3,
+        "scales": 3,
+        "rotations": 4,
+        "SH": 45,
+    }
+
+
+def test_values_that_are_not_finite_are_described_and_not_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    formats.write(path, many_splats(300))
+    head, rows = path.read_bytes().split(b"end_header\n", 1)
+    table = np.frombuffer(rows, "<f4").reshape(300, 62).copy()
+    table[:5, 0] = np.nan  # x
+    table[7, 61] = np.inf  # rot_3
+    path.write_bytes(head + b"end_header\n" + table.tobytes())
+    told = info(path)
+    assert told["not_finite"] == 6
+    assert told["warnings"]["not-finite-positions"].startswith("5 splats")
+    assert told["warnings"]["not-finite-rotations"].startswith("1 splats")
+    assert np.isfinite(told["bounds_high"]).all()
+    result = CliRunner().invoke(app, ["info", str(path)])
+    assert result.exit_code == 0
+    assert "5 splats (1.7 %) are not finite in their positions" in result.stderr
+
+
+def test_a_damaged_file_stays_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"ply\nnonsense")
+    assert info(tmp_path / "a.ply", code=3)["code"] == "splats-unreadable"
+
+
+def test_a_usd_file_that_is_not_finite_is_described_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    formats.write(path, many_splats(3))
+    text = path.read_text()
+    place = text.index("positions = [(") + len("positions = [(")
+    path.write_text(text[:place] + "nan" + text[text.index(",", place) :])
+    assert info(path)["warnings"]["not-finite-positions"].startswith("1 splats")
