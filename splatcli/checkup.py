@@ -18,6 +18,7 @@ from stages.run.libraries import versions
 from stages.run.memory import available_mib
 
 _MODULES = {
+    "av": "av",
     "numba": "numba",
     "numpy": "numpy",
     "opencv-contrib-python-headless": "cv2",

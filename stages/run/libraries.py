@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 NAMES = (
     "splat",
+    "av",
     "numba",
     "numpy",
     "opencv-contrib-python-headless",
