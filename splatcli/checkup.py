@@ -18,6 +18,7 @@ from stages.run.libraries import versions
 from stages.run.memory import available_mib
 
 _MODULES = {
+    "av": "av",
     "fast-simplification": "fast_simplification",
     "numba": "numba",
     "numpy": "numpy",

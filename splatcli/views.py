@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatcli.folders import find_run_folder
+from splatcli.routes import views_of
 from stages.run import runfolder
 from stages.run.errors import Family, SplatError
 from stages.run.pipeline import Pipeline
@@ -59,7 +60,4 @@ def pipeline_around(file: Path | None) -> Pipeline | None:
 
 def views_around(file: Path | None) -> tuple[View, ...]:
     """Those of the run whose export folder a file lies in; none elsewhere."""
-    pipeline = pipeline_around(file)
-    if pipeline is None or pipeline.manifest("sfm") is None:
-        return ()
-    return tuple(sorted(pipeline.load("sfm").views, key=lambda view: view.name))
+    return views_of(pipeline_around(file))

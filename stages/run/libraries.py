@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 NAMES = (
     "splat",
+    "av",
     "fast-simplification",
     "numba",
     "numpy",

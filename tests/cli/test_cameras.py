@@ -10,9 +10,7 @@ import pytest
 
 from stages.formats.cameras import read_cameras
 from stages.formats.cameras_colmap import read_model, write_colmap_model
-from stages.structure import reconstruction_files
 from tests.formats.test_cameras_colmap import example
-from tests.small_scene import small_scene
 
 
 def poses(path: Path) -> dict[str, np.ndarray]:
@@ -57,9 +55,6 @@ def test_colmap_keeps_its_points(splat, tmp_path: Path) -> None:
 
 def test_a_run_gives_what_its_sfm_found(splat, pretend, tmp_path: Path) -> None:
     def sfm(inputs, settings, folder, report) -> None:
-        (tmp_path / "drawn").mkdir()
-        small = small_scene(tmp_path / "drawn", views=3, n=5)
-        reconstruction_files.save_reconstruction(folder, small.reconstruction)
         project(folder / "colmap")
 
     pretend["sfm"] = sfm
