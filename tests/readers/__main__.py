@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from stages import formats, quantise, sfm
-from stages.formats.compare import largest_errors
+from stages.formats.compare import differences
 from stages.formats.rows import kept_rows
 from stages.formats.verify import read_back
 from stages.measure.images import psnr
@@ -110,7 +110,7 @@ def _readers(splats: Splats, folder: Path, names: list[str]) -> None:
             count = len(content.splats)
             errors = ["-"] * len(columns)
             if count == len(splats):
-                errors = [f"{e:.2g}" for e in largest_errors(splats, content, name).values()]
+                errors = [f"{e:.2g}" for e in differences(splats, content, name).largest.values()]
             print(f"| `{name}` | {reader.name} | {count} | {' | '.join(errors)} |", flush=True)
 
 

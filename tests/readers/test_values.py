@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stages import formats
-from stages.formats.compare import largest_errors
+from stages.formats.compare import differences
 from stages.formats.verify import read_back
 from tests.formats.truth import many_splats
 from tests.packages import UnavailableError
@@ -40,8 +40,8 @@ def test_other_readers_find_what_was_written(
         pytest.skip(str(reason))
     assert len(content.splats) == len(splats)
     # What the format itself loses, tests/formats checks against values known by hand.
-    allowed = largest_errors(splats, read_back(path), suffix)
-    for name, error in largest_errors(splats, content, suffix).items():
+    allowed = differences(splats, read_back(path), suffix).largest
+    for name, error in differences(splats, content, suffix).largest.items():
         if suffix == "splat" and name == "max_rotation_error_degrees":
             assert error < SPLAT_BYTES_DEGREES
         else:

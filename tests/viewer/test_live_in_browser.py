@@ -28,20 +28,11 @@ from stages.viewer.shots import depth_of_interest, shots_of
 from tests.sample import command, environment, process_words
 from tests.tolerances import LIVE_PICTURE_DB
 from tests.viewer.browser import Browser
-from tests.viewer.test_in_browser import (
-    PROGRAM,
-    WORSE_DB,
-    browser,
-    coloured_scene,
-    views,
-    wrong_versions,
-)
+from tests.viewer.pictures import coloured_scene, views, wrong_versions
+from tests.viewer.test_in_browser import WORSE_DB, browser
 
 __all__ = ["browser"]
 
-pytestmark = pytest.mark.skipif(
-    PROGRAM is None, reason="no Chromium on the path, and SPLAT_CHROMIUM names none"
-)
 WAIT_S = 60.0
 SETTLED = "const p = splatLive.picture; p && p.sharp && p.version === splatLive.version"
 
