@@ -39,16 +39,16 @@ def fuzz(name: str, inputs: int) -> Tally:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise BeatenError(f"{name}: hangs on {_kept(Path(folder), layer.ending)}") from None
+            raise BeatenError(f"{name}: hangs on {_kept(Path(folder), layer.name)}") from None
         if child.returncode != 0:
-            kept = _kept(Path(folder), layer.ending)
+            kept = _kept(Path(folder), layer.name)
             said = "\n".join(child.stderr.splitlines()[-25:])
             raise BeatenError(f"{name}: status {child.returncode}, input {kept}\n{said}")
     return Tally(**json.loads(child.stdout.splitlines()[-1]))
 
 
-def _kept(folder: Path, ending: str) -> Path:
+def _kept(folder: Path, name: str) -> Path:
     """The input that was being read, copied to where it stays."""
     kept = Path(tempfile.mkdtemp(prefix="splat-fuzz-"))
     shutil.copytree(folder, kept, dirs_exist_ok=True)
-    return kept / f"a.{ending}"
+    return kept / name

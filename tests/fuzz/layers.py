@@ -10,32 +10,23 @@ import base64
 import functools
 import gzip
 import io
+import itertools
 import re
 import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+import zstandard
 
 from stages import formats
 from tests.formats.truth import many_splats
+from tests.fuzz import camera_layers
+from tests.fuzz.layer import SPLATS, Layer
 
-SPLATS = 40
-
-
-@dataclass(frozen=True)
-class Layer:
-    """content: of a whole file, or of what is inside it. pack: makes the file again.
-    beside: other files of the same folder, by name. text: whether words can be changed.
-    share: of the inputs that others get, where each takes a process."""
-
-    ending: str
-    content: Callable[[], bytes]
-    pack: Callable[[bytes], bytes] = bytes
-    beside: Callable[[], dict[str, bytes]] = dict
-    text: bool = False
-    share: float = 1.0
+_SPZ_4 = Path(__file__).parents[1] / "formats" / "spz4" / "adobe_degree_3.spz"
 
 
 @functools.cache
@@ -60,13 +51,13 @@ def _ascii_ply() -> bytes:
     return out.getvalue()
 
 
-def _glb_json() -> bytes:
-    content = files("glb")["a.glb"]
+def _glb_json(ending: str) -> bytes:
+    content = files(ending)[f"a.{ending}"]
     return content[20 : 20 + struct.unpack_from("<I", content, 12)[0]]
 
 
-def _glb_with(text: bytes) -> bytes:
-    whole = files("glb")["a.glb"]
+def _glb_with(ending: str, text: bytes) -> bytes:
+    whole = files(ending)[f"a.{ending}"]
     body = whole[20 + struct.unpack_from("<I", whole, 12)[0] :]
     text += b" " * (-len(text) % 4)
     size = 20 + len(text) + len(body)
@@ -116,38 +107,72 @@ def _html_with(inside: bytes) -> bytes:
     return _html_around(opening + base64.b64encode(gzip.compress(inside, 1)) + closing)
 
 
+def _glb_document(ending: str) -> Layer:
+    return Layer(
+        f"a.{ending}",
+        lambda: _glb_json(ending),
+        lambda new: _glb_with(ending, new),
+        text=True,
+    )
+
+
+def _spz_4() -> tuple[bytes, list[bytes]]:
+    """(header, arrays) of a file with one zstd frame an array."""
+    whole = _SPZ_4.read_bytes()
+    count, (starts,) = whole[15], struct.unpack_from("<I", whole, 16)
+    packed = [size for size, _ in struct.iter_unpack("<QQ", whole[starts : starts + 16 * count])]
+    ends = starts + 16 * count + np.cumsum(packed)
+    unpack = zstandard.ZstdDecompressor().decompress
+    return whole[:32], [unpack(whole[e - n : e]) for n, e in zip(packed, ends, strict=True)]
+
+
+def _spz_4_with(content: bytes) -> bytes:
+    """The file of a header and arrays that may have become longer or shorter."""
+    arrays = _spz_4()[1]
+    cuts = [32, *(32 + np.cumsum([len(array) for array in arrays[:-1]])), None]
+    parts = [content[start:end] for start, end in itertools.pairwise(cuts)]
+    packed = [zstandard.ZstdCompressor().compress(part) for part in parts]
+    sizes = [struct.pack("<QQ", len(b), len(a)) for a, b in zip(parts, packed, strict=True)]
+    return b"".join([content[:32], *sizes, *packed])
+
+
 def _part(ending: str, name: str, *, text: bool) -> Layer:
     return Layer(
-        ending,
+        f"a.{ending}",
         lambda: _zipped_part(ending, name),
         lambda new: _zip_with(ending, name, new),
         text=text,
     )
 
 
-LAYERS = {
-    "ply": Layer("ply", _whole("ply")),
-    "ply, header and words": Layer("ply", _whole("ply"), text=True),
-    "ply, ascii": Layer("ply", _ascii_ply, text=True),
-    "splat": Layer("splat", _whole("splat")),
-    "compressed.ply": Layer("compressed.ply", _whole("compressed.ply")),
-    "spz": Layer("spz", _whole("spz")),
+LAYERS: dict[str, Layer] = {
+    "ply": Layer("a.ply", _whole("ply")),
+    "ply, header and words": Layer("a.ply", _whole("ply"), text=True),
+    "ply, ascii": Layer("a.ply", _ascii_ply, text=True),
+    "splat": Layer("a.splat", _whole("splat")),
+    "compressed.ply": Layer("a.compressed.ply", _whole("compressed.ply")),
+    "spz": Layer("a.spz", _whole("spz")),
     "spz, unpacked": Layer(
-        "spz",
+        "a.spz",
         lambda: gzip.decompress(files("spz")["a.spz"]),
         lambda inside: gzip.compress(inside, 1),
     ),
-    "sog": Layer("sog", _whole("sog")),
+    "spz 4": Layer("a.spz", _SPZ_4.read_bytes),
+    "spz 4, unpacked": Layer("a.spz", lambda: b"".join([_spz_4()[0], *_spz_4()[1]]), _spz_4_with),
+    "sog": Layer("a.sog", _whole("sog")),
     "sog, meta.json": _part("sog", "meta.json", text=True),
     "sog, a picture": _part("sog", "means_l.webp", text=False),
-    "glb": Layer("glb", _whole("glb")),
-    "glb, document": Layer("glb", _glb_json, _glb_with, text=True),
+    "glb": Layer("a.glb", _whole("glb")),
+    "glb, document": _glb_document("glb"),
+    "quantised.glb": Layer("a.quantised.glb", _whole("quantised.glb")),
+    "quantised.glb, document": _glb_document("quantised.glb"),
     "gltf": Layer(
-        "gltf", _whole("gltf"), beside=lambda: {"a.bin": files("gltf")["a.bin"]}, text=True
+        "a.gltf", _whole("gltf"), beside=lambda: {"a.bin": files("gltf")["a.bin"]}, text=True
     ),
-    "html": Layer("html", lambda: _html_parts()[1], _html_around, text=True),
-    "html, unpacked": Layer("html", _html_inside, _html_with, text=True),
-    "usda": Layer("usda", _whole("usda"), text=True, share=0.05),
-    "usdc": Layer("usdc", _whole("usdc"), share=0.05),
-    "usdz": Layer("usdz", _whole("usdz"), share=0.05),
+    "html": Layer("a.html", lambda: _html_parts()[1], _html_around, text=True),
+    "html, unpacked": Layer("a.html", _html_inside, _html_with, text=True),
+    "usda": Layer("a.usda", _whole("usda"), text=True, share=0.05),
+    "usdc": Layer("a.usdc", _whole("usdc"), share=0.05),
+    "usdz": Layer("a.usdz", _whole("usdz"), share=0.05),
+    **camera_layers.LAYERS,
 }
