@@ -7,6 +7,7 @@ left half-written. Nothing here imports pycolmap.
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -23,9 +24,16 @@ def count_done(database: Path, step: str) -> int | None:
     """
     if not database.exists():
         return None
+    done = _count(database, _COUNTED[step])
+    if done is None or step != "matching":
+        return done
+    return done + sum(_count(share, _COUNTED[step]) or 0 for share in shares(database))
+
+
+def _count(database: Path, table: str) -> int | None:
     try:
         with closing(_open_without_lock(database)) as connection:
-            return int(connection.execute(f"SELECT COUNT(*) FROM {_COUNTED[step]}").fetchone()[0])
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
     except sqlite3.Error:
         return None
 
@@ -87,6 +95,74 @@ def copy(source: Path, target: Path) -> None:
         old.backup(new)
     delete(target)
     partial.replace(target)
+
+
+def share_path(database: Path, number: int) -> Path:
+    """Where the process with this number matches its pairs."""
+    return database.with_name(f"{database.stem}.share-{number}.db")
+
+
+def shares(database: Path) -> list[Path]:
+    """The databases of such processes that are there."""
+    return sorted(database.parent.glob(f"{database.stem}.share-*.db"))
+
+
+def pairs_done(database: Path) -> set[tuple[int, int]]:
+    """(first, second) ids of the pairs that were matched and verified."""
+    with closing(_open_read_only(database)) as connection:
+        rows = connection.execute("SELECT pair_id FROM two_view_geometries")
+        return {(pair_id // _MAX_IMAGES, pair_id % _MAX_IMAGES) for (pair_id,) in rows}
+
+
+def make_share(database: Path, share: Path, pairs: Sequence[tuple[int, int]]) -> None:
+    """A database for matching `pairs`: cameras, the features of their photographs, and matches that
+    are there without a geometry. Photographs are named by their ids, because COLMAP's lists of
+    pairs have no place for names with spaces."""
+    partial = share.with_name(share.name + ".partial")
+    delete(partial)
+    with closing(sqlite3.connect(partial)) as new:
+        new.execute("ATTACH ? AS whole", (str(database),))
+        schema = new.execute(
+            "SELECT sql FROM whole.sqlite_master "
+            "WHERE sql IS NOT NULL AND name NOT LIKE 'sqlite_%' ORDER BY type DESC"
+        ).fetchall()  # tables before their indices
+        for (sql,) in schema:
+            new.execute(sql)
+        version = new.execute("PRAGMA whole.user_version").fetchone()[0]
+        new.execute(f"PRAGMA main.user_version = {version}")  # COLMAP's
+        for table in ("rigs", "cameras", "frames", "frame_data"):
+            new.execute(f"INSERT INTO {table} SELECT * FROM whole.{table}")
+        new.execute(
+            "INSERT INTO images (image_id, name, camera_id) "
+            "SELECT image_id, CAST(image_id AS TEXT), camera_id FROM whole.images"
+        )
+        photographs = {(image_id,) for pair in pairs for image_id in pair}
+        for table in ("keypoints", "descriptors"):
+            query = f"INSERT INTO {table} SELECT * FROM whole.{table} WHERE image_id = ?"
+            new.executemany(query, sorted(photographs))
+        new.executemany(
+            "INSERT INTO matches SELECT * FROM whole.matches WHERE pair_id = ?",
+            [(first * _MAX_IMAGES + second,) for first, second in pairs],
+        )
+        new.commit()
+    delete(share)
+    partial.replace(share)
+
+
+def merge(database: Path, share: Path) -> None:
+    """Take over every pair that a share has matched and verified. Raises sqlite3.DatabaseError if
+    the share is none."""
+    with closing(sqlite3.connect(database, timeout=30.0)) as connection:
+        connection.execute("ATTACH ? AS share", (str(share),))
+        for table, other in (
+            ("matches", "two_view_geometries"),
+            ("two_view_geometries", "matches"),
+        ):
+            connection.execute(
+                f"INSERT OR IGNORE INTO {table} SELECT * FROM share.{table} "
+                f"WHERE pair_id IN (SELECT pair_id FROM share.{other})"
+            )
+        connection.commit()
 
 
 def forget_geometries(database: Path) -> None:

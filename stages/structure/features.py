@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
 from stages.structure import database as sqlite
 from stages.structure.job import CameraGuess, Job
+from stages.structure.shares import match_in_shares, pairs_path
 
 FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess where EXIF says nothing
 SEQUENTIAL_OVERLAP = 20
@@ -37,23 +37,33 @@ def extract(job: Job) -> None:
 
 def match(job: Job) -> None:
     """Match and verify pairs of photographs; pairs that the database holds are not done again."""
+    with pycolmap.Database.open(job.database) as database:
+        if job.matching == "sequential":
+            options = pycolmap.SequentialPairingOptions()
+            options.overlap = SEQUENTIAL_OVERLAP
+            options.quadratic_overlap = True
+            pairs = pycolmap.SequentialPairGenerator(options, database).all_pairs()
+        else:
+            every = pycolmap.ExhaustivePairingOptions()
+            pairs = pycolmap.ExhaustivePairGenerator(every, database).all_pairs()
+    wanted = sorted({(min(pair), max(pair)) for pair in pairs})
+    match_in_shares(job, wanted, 1 if pycolmap.has_cuda else job.threads)
+
+
+def match_share(job: Job) -> None:
+    """Match and verify the pairs of one share; see `shares`."""
     matching = pycolmap.FeatureMatchingOptions()
-    # Threads that build their search indices at the same time now and then build wrong ones: in one
-    # of some hundred processes all matches of two photographs, one a thread, were others.
     matching.num_threads = 1
     matching.use_gpu = pycolmap.has_cuda
-    common: dict[str, Any] = {
-        "matching_options": matching,
-        "verification_options": _verification(job),
-        "device": _device(),
-    }
-    if job.matching == "sequential":
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = SEQUENTIAL_OVERLAP
-        pairing.quadratic_overlap = True
-        pycolmap.match_sequential(job.database, pairing_options=pairing, **common)
-    else:
-        pycolmap.match_exhaustive(job.database, **common)
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = pairs_path(Path(job.database))
+    pycolmap.match_image_pairs(
+        job.database,
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=_verification(job),
+        device=_device(),
+    )
 
 
 def _verification(job: Job) -> pycolmap.TwoViewGeometryOptions:

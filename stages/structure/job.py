@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-STEPS = ("features", "matching", "mapping")
+STEPS = ("features", "matching", "share", "mapping")
 
 
 @dataclass(frozen=True)

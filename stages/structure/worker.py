@@ -25,6 +25,7 @@ def main(arguments: list[str]) -> int:
     steps = {
         "features": features.extract,
         "matching": features.match,
+        "share": features.match_share,
         "mapping": mapping.map_photographs,
     }
     steps[job.step](job)
