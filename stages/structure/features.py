@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 import pycolmap
 
+from stages.run import memory
+from stages.run.memory import MIB
 from stages.structure import database as sqlite
 from stages.structure.job import CameraGuess, Job
 from stages.structure.shares import match_in_shares, pairs_path
 
 FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess where EXIF says nothing
 SEQUENTIAL_OVERLAP = 20
+# Of a process that matches: at its start, and for each feature its descriptor in bytes and in the
+# search index in floats.
+PROCESS_MIB = 80.0
+FEATURE_BYTES = 5 * 128
 
 
 def extract(job: Job) -> None:
@@ -47,7 +54,16 @@ def match(job: Job) -> None:
             every = pycolmap.ExhaustivePairingOptions()
             pairs = pycolmap.ExhaustivePairGenerator(every, database).all_pairs()
     wanted = sorted({(min(pair), max(pair)) for pair in pairs})
-    match_in_shares(job, wanted, 1 if pycolmap.has_cuda else job.threads)
+    match_in_shares(job, wanted, _processes(job))
+
+
+def _processes(job: Job) -> int:
+    """One a core, as long as half of the free memory holds what they keep of every photograph."""
+    if pycolmap.has_cuda:
+        return 1
+    each_mib = PROCESS_MIB + len(job.names) * job.max_features * FEATURE_BYTES / MIB
+    available_mib = memory.available_mib() or math.inf
+    return max(1, int(min(job.threads, 0.5 * available_mib / each_mib)))
 
 
 def match_share(job: Job) -> None:
