@@ -231,7 +231,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=1,
+    version=2,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,

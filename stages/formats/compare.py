@@ -64,18 +64,19 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
         placed = replace(splats, means=splats.means * FLIP.astype(splats.means.dtype))
     rows = matched_rows(placed, file, _orders(placed, file, names))
     degree = 0 if "splat" in names else max(splats.sh_degree, file.sh_degree)
-    errors: dict[str, list[NDArray[np.floating]]] = {}
+    errors: dict[str, NDArray[np.floating]] = {}
     sums = np.zeros(3)
     for start in range(0, len(file), _BLOCK):
         a = splats.take(rows[start : start + _BLOCK]).with_sh_degree(degree)
         b = file.take(np.arange(start, start + len(a))).with_sh_degree(degree)
         a = turned(a) if upright else a
         for name, values in _block(a, b).items():
-            errors.setdefault(name, []).append(values)
+            if name not in errors:
+                errors[name] = np.empty(len(file), np.float32)
+            errors[name][start : start + len(a)] = values
         pair = a.sh[:, 1:].astype(np.float64), b.sh[:, 1:].astype(np.float64)
         sums += [np.square(x).sum() for x in (pair[0] - pair[1], *pair)]
-    whole = {name: np.concatenate(parts) for name, parts in errors.items()}
-    return _summary(whole, sums, extent_of(splats), rows)
+    return _summary(errors, sums, extent_of(splats), rows)
 
 
 def _orders(truth: Splats, file: Splats, names: tuple[str, ...]) -> Iterator[Rows]:

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.gltf_file import EXTENSION, Attribute, write_file
+from stages.formats.blocks import blocks
+from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
 from stages.formats.gltf_read import read
 from stages.formats.rows import (
     kept_rows,
@@ -20,7 +21,7 @@ from stages.formats.rows import (
     linear_scales,
     unit_quaternions,
 )
-from stages.formats.turn import turned
+from stages.formats.turn import SH_SIGNS, turned
 from stages.scene import Splats, dc_to_rgb
 
 __all__ = ["fallback_colours", "read", "sh_attributes", "write"]
@@ -36,21 +37,25 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
     """
     splats, dropped = kept_rows(splats)
-    upright = turned(splats).with_sh_degree(int(splats.sh_degrees.max(initial=0)))
-    primitives = [_attributes(upright)] if len(upright) else []
-    write_file(Path(path), primitives, upright.origin, units)
+    splats = splats.with_sh_degree(int(splats.sh_degrees.max(initial=0)))
+    primitives = [_attributes(splats)] if len(splats) else []
+    write_file(Path(path), primitives, turned(splats.take(slice(0))).origin, units)
     return dropped
 
 
 def _attributes(splats: Splats) -> dict[str, Attribute]:
-    """splats: upright, all of one degree."""
+    """splats: y down, all of one degree."""
+    upright = turned(splats.with_sh_degree(0))
     opacities = linear_opacities(splats)
-    colours = np.rint(65535 * fallback_colours(splats, opacities)).astype("<u2")
+    colours = np.empty((len(splats), 4), "<u2")
+    for rows in blocks(len(splats)):
+        linear = fallback_colours(splats.take(rows), opacities[rows])
+        colours[rows] = np.rint(65535 * linear)
     return {
-        "POSITION": Attribute(splats.means.astype("<f4"), 3),
+        "POSITION": Attribute(upright.means.astype("<f4"), 3),
         "COLOR_0": Attribute(colours, 4),
         f"{EXTENSION}:ROTATION": Attribute(
-            unit_quaternions(splats.quaternions)[:, [1, 2, 3, 0]].astype("<f4"), 4
+            unit_quaternions(upright.quaternions)[:, [1, 2, 3, 0]].astype("<f4"), 4
         ),
         f"{EXTENSION}:SCALE": Attribute(linear_scales(splats).astype("<f4"), 3),
         f"{EXTENSION}:OPACITY": Attribute(opacities[:, None].astype("<f4"), 1),
@@ -59,14 +64,15 @@ def _attributes(splats: Splats) -> dict[str, Attribute]:
 
 
 def sh_attributes(splats: Splats) -> dict[str, Attribute]:
-    """All bands that `splats` has room for; the specification allows float32 only."""
-    return {
-        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}": Attribute(
-            splats.sh[:, band * band + i].astype("<f4"), 3
-        )
-        for band in range(splats.sh_degree + 1)
-        for i in range(2 * band + 1)
-    }
+    """All bands that `splats` (y down) has room for; the specification allows float32 only."""
+    found = {}
+    for band in range(splats.sh_degree + 1):
+        for i in range(2 * band + 1):
+            k = band * band + i
+            values = splats.sh[:, k].astype("<f4", copy=False)
+            rows = Negated(values) if SH_SIGNS[k] < 0 else values
+            found[f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}"] = Attribute(rows, 3)
+    return found
 
 
 def fallback_colours(splats: Splats, opacities: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import passing
 from stages.run.atomic import replacing
 from stages.run.errors import Family, SplatError
 
@@ -24,12 +26,33 @@ _POINTS = 0
 
 
 @dataclass(frozen=True)
-class Attribute:
-    """rows [N, W]: what the buffer holds, little-endian; integers stand for 0..1 or -1..1.
-    width: how many of the W columns are the attribute's; the others fill a row up to a multiple
-    of 4 bytes, as glTF 2.0 wants it (section 3.6.2.4)."""
+class Negated:
+    """An array whose values change their sign when they are looked at, so that the splats need no
+    second copy of it."""
 
-    rows: NDArray[Any]
+    array: NDArray[Any]
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        return -self.array[rows]
+
+    dtype = property(lambda self: self.array.dtype)
+    nbytes = property(lambda self: self.array.nbytes)
+    shape = property(lambda self: self.array.shape)
+
+
+Rows = NDArray[Any] | Negated
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """rows [N, W]: what the buffer holds, little-endian, in memory in any order; integers stand
+    for 0..1 or -1..1. width: how many of the W columns are the attribute's; the others fill a row
+    up to a multiple of 4 bytes, as glTF 2.0 wants it (section 3.6.2.4)."""
+
+    rows: Rows
     width: int
 
 
@@ -60,11 +83,11 @@ def _document(
     origin: NDArray[np.float64],
     units: str,
     node_scale: float,
-) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+) -> tuple[dict[str, Any], list[Rows]]:
     """(the JSON, its first buffer still without size and name; the arrays in buffer order)."""
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
-    arrays: list[NDArray[Any]] = []
+    arrays: list[Rows] = []
     offset = 0
     described = []
     for attributes in primitives:
@@ -72,7 +95,7 @@ def _document(
         for name, attribute in attributes.items():
             names[name] = len(accessors)
             accessors.append(accessor(name, attribute, len(views)))
-            array = np.ascontiguousarray(attribute.rows)
+            array = attribute.rows
             view = {
                 "buffer": 0,
                 "byteOffset": offset,
@@ -80,7 +103,7 @@ def _document(
                 "target": _ARRAY_BUFFER,
             }
             if array.shape[1] > attribute.width:
-                view["byteStride"] = array.strides[0]
+                view["byteStride"] = array.nbytes // len(array)
             views.append(view)
             arrays.append(array)
             offset += array.nbytes
@@ -123,8 +146,9 @@ def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
     if rows.dtype.kind in "iu":
         described["normalized"] = True
     if name == "POSITION":
-        described["min"] = [float(v) for v in rows.min(axis=0)]
-        described["max"] = [float(v) for v in rows.max(axis=0)]
+        every = rows[:]
+        described["min"] = [float(v) for v in every.min(axis=0)]
+        described["max"] = [float(v) for v in every.max(axis=0)]
     return described
 
 
@@ -143,7 +167,7 @@ def _primitive(names: dict[str, int]) -> dict[str, Any]:
     }
 
 
-def write_glb(path: Path, document: dict[str, Any], arrays: list[NDArray[Any]], size: int) -> None:
+def write_glb(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size: int) -> None:
     """`document` and, as its one buffer, `arrays` one after the other: `size` bytes in all, a
     multiple of 4 each. Raises SplatError when it cannot be written or would pass 4 GiB."""
     if arrays:
@@ -164,20 +188,22 @@ def write_glb(path: Path, document: dict[str, Any], arrays: list[NDArray[Any]], 
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
         if arrays:  # every array is a multiple of 4 bytes, so the chunk needs no padding
             file.write(struct.pack("<I4s", size, b"BIN\0"))
-            for array in arrays:
-                file.write(array.data)
+            _write_arrays(file, arrays)
 
 
-def _write_pair(
-    path: Path, document: dict[str, Any], arrays: list[NDArray[Any]], size: int
-) -> None:
+def _write_pair(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size: int) -> None:
     """The .bin first: whoever finds the .gltf finds what it names."""
     binary = path.with_suffix(".bin")
     if arrays:
         document["buffers"] = [{"uri": quote(binary.name), "byteLength": size}]
         with replacing(binary) as temporary, temporary.open("wb") as file:
-            for array in arrays:
-                file.write(array.data)
+            _write_arrays(file, arrays)
     text = json.dumps(document, indent=1, allow_nan=False) + "\n"
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _write_arrays(file: BinaryIO, arrays: Sequence[Rows]) -> None:
+    for array in arrays:
+        for rows in passing(len(array)):
+            file.write(np.ascontiguousarray(array[rows]).data)

@@ -13,12 +13,12 @@ smaller than a uint16. On a room of 216,000 splats rotation, scale and opacity c
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import blocks
 from stages.formats.gltf import fallback_colours, sh_attributes
 from stages.formats.gltf_file import EXTENSION, Attribute, write_file
 from stages.formats.gltf_read import read
@@ -46,10 +46,10 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     divided by it, which costs no bits. Raises SplatError as `gltf.write`.
     """
     splats, dropped = kept_rows(splats)
-    upright = turned(splats.take(order(splats)))
-    unit = _unit(linear_scales(upright))
-    primitives = [_attributes(group, unit) for group in _groups(upright)]
-    write_file(Path(path), primitives, upright.origin, units, node_scale=unit or 1.0)
+    unit = _unit(linear_scales(splats))
+    primitives = [_attributes(group, unit) for group in _groups(splats)]
+    origin = turned(splats.take(slice(0))).origin
+    write_file(Path(path), primitives, origin, units, node_scale=unit or 1.0)
     return dropped
 
 
@@ -61,8 +61,8 @@ def order(splats: Splats) -> NDArray[np.intp]:
 def _groups(splats: Splats) -> Iterator[Splats]:
     """The splats of each degree in use, with no more bands than they use."""
     for degree in np.unique(splats.sh_degrees):
-        group = splats.take(splats.sh_degrees == degree)
-        yield replace(group, sh=group.sh[:, : (int(degree) + 1) ** 2])
+        chosen = splats.sh_degrees == degree
+        yield splats.with_sh_degree(int(degree)).take(slice(None) if chosen.all() else chosen)
 
 
 def _unit(scales: NDArray[np.float32]) -> float | None:
@@ -75,10 +75,13 @@ def _unit(scales: NDArray[np.float32]) -> float | None:
 
 
 def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
-    """splats: upright, all of one degree. unit: see `_unit`."""
+    """splats: y down, all of one degree. unit: see `_unit`."""
+    upright = turned(splats.with_sh_degree(0))
     opacities = linear_opacities(splats)
-    colours = np.rint(255 * fallback_colours(splats, opacities)).astype("u1")
-    rotations = np.rint(32767.0 * unit_quaternions(splats.quaternions)).astype("<i2")
+    colours = np.empty((len(splats), 4), "u1")
+    for rows in blocks(len(splats)):
+        colours[rows] = np.rint(255 * fallback_colours(splats.take(rows), opacities[rows]))
+    rotations = np.rint(32767.0 * unit_quaternions(upright.quaternions)).astype("<i2")
     scales = linear_scales(splats)
     if unit is None:
         scale = Attribute(scales.astype("<f4"), 3)
@@ -88,7 +91,7 @@ def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
         scale = Attribute(_padded(steps.astype("<u2"), 4), 3)
     opacity = np.rint(float(_U16) * opacities[:, None]).astype("<u2")
     return {
-        "POSITION": Attribute((splats.means / np.float32(unit or 1.0)).astype("<f4"), 3),
+        "POSITION": Attribute((upright.means / np.float32(unit or 1.0)).astype("<f4"), 3),
         "COLOR_0": Attribute(colours, 4),
         f"{EXTENSION}:ROTATION": Attribute(rotations[:, [1, 2, 3, 0]], 4),
         f"{EXTENSION}:SCALE": scale,

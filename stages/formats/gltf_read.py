@@ -18,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.far import recentred
 from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, joined, logits_of, logs_of
 from stages.formats.turn import turned
@@ -32,7 +33,8 @@ _LEAST_BYTES = 12 + 4 + 3 + 1 + 12  # of one splat, with every attribute at its 
 def read(path: Path) -> Splats:
     """All splats of the file's scene, turned to y down, float32.
 
-    Node transforms may move and scale evenly. Raises SplatError "splats-unreadable" for a damaged
+    Node transforms may move and scale evenly; what they place far from zero keeps its precision in
+    `origin`. Raises SplatError "splats-unreadable" for a damaged
     file, one without splats, one that reaches outside its folder, or a feature that is not read
     (sparse accessors, compression, rotated nodes).
     """
@@ -53,7 +55,10 @@ def read(path: Path) -> Splats:
         origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
         if not parts and "meshes" in document:
             raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
-        return checked(turned(replace(joined(parts), origin=origin)))
+        splats = joined(parts)
+        del parts
+        means, origin = recentred(splats.means.astype(np.float64), origin)
+        return checked(turned(replace(splats, means=means, origin=origin), reuse=True))
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
@@ -242,19 +247,22 @@ class _Source:
         rotations = values(f"{_EXTENSION}:ROTATION", 4)
         scales = values(f"{_EXTENSION}:SCALE", 3)
         opacities = values(f"{_EXTENSION}:OPACITY", 1)
-        bands = [
-            values(f"{_EXTENSION}:SH_DEGREE_{d}_COEF_{i}", 3)
-            for d in range(degree + 1)
-            for i in range(2 * d + 1)
-        ]
-        if len({len(array) for array in (means, rotations, scales, opacities, *bands)}) != 1:
+        if len({len(array) for array in (means, rotations, scales, opacities)}) != 1:
             raise BadFileError("the attributes of a primitive differ in length")
+        sh = np.empty((len(means), (degree + 1) ** 2, 3), np.float32)
+        for band in range(degree + 1):
+            for i in range(2 * band + 1):
+                coefficient = values(f"{_EXTENSION}:SH_DEGREE_{band}_COEF_{i}", 3)
+                if len(coefficient) != len(means):
+                    raise BadFileError("the attributes of a primitive differ in length")
+                sh[:, band * band + i] = coefficient
         return Splats(
-            means=(means * move.scale + np.array(move.offset)).astype(np.float32),
+            # float64: `read` brings them near zero
+            means=means.astype(np.float64) * move.scale + np.array(move.offset),
             quaternions=rotations[:, [3, 0, 1, 2]],
-            log_scales=logs_of(scales.astype(np.float64) * move.scale),
+            log_scales=logs_of(scales, move.scale),
             opacity_logits=logits_of(opacities[:, 0]),
-            sh=np.stack(bands, axis=1),
+            sh=sh,
             sh_degrees=np.full(len(means), degree, np.uint8),
         )
 

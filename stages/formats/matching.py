@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.blocks import blocks, passing
 from stages.scene import Splats, dc_to_rgb
 
 Rows = NDArray[np.intp]
@@ -48,8 +49,12 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
     values = _values(truth), _values(file)
     unit = _APART * extent / _SHARPER
     for index in (np.arange(n), *orders):
-        apart = np.abs(truth.means[index] - file.means).max(axis=1, initial=0.0)
-        odd = (apart > _APART * extent) | _unlike(values[0][index], values[1])
+        apart, odd = np.empty(n, np.float32), np.empty(n, bool)
+        for rows in passing(n):
+            moved = np.abs(truth.means[index[rows]] - file.means[rows])
+            apart[rows] = moved.max(axis=1, initial=0.0)
+            unlike = _unlike(values[0][index[rows]], values[1][rows])
+            odd[rows] = (apart[rows] > _APART * extent) | unlike
         if np.count_nonzero(odd) <= _MAY_BE_ODD * n:
             if np.median(apart) <= _EXACT * extent:  # then neighbours can be told apart
                 odd |= apart > _EXACT * extent
@@ -62,12 +67,13 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
 
 def _values(splats: Splats) -> NDArray[np.float32]:
     """[N, 7] opacity, colour and sizes, each as a multiple of what may differ."""
-    parts = (
-        splats.opacities[:, None] / _OPACITY,
-        np.minimum(dc_to_rgb(splats.sh[:, 0]), 1) / _COLOUR,
-        splats.log_scales / _LOG_SCALE,
-    )
-    return np.concatenate(parts, axis=1).astype(np.float32)
+    values = np.empty((len(splats), 7), np.float32)
+    for rows in blocks(len(splats)):
+        block = splats.take(rows)
+        values[rows, 0] = block.opacities / _OPACITY
+        values[rows, 1:4] = np.minimum(dc_to_rgb(block.sh[:, 0]), 1) / _COLOUR
+        values[rows, 4:] = block.log_scales / _LOG_SCALE
+    return values
 
 
 def _unlike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:

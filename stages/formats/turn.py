@@ -18,7 +18,7 @@ FLIP = np.array([1.0, -1.0, -1.0])
 # in the order m = -l..l (Kerbl et al. 2023, and KHR_gaussian_splatting appendix A):
 # 1 | y z x | xy yz 2zz-xx-yy xz xx-yy |
 # y(3xx-yy) xyz y(4zz-xx-yy) z(2zz-3xx-3yy) x(4zz-xx-yy) z(xx-yy) x(xx-3yy)
-_SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 # Rotating by q after a half turn h gives h q. We store h q h* instead: the factor h* turns the
 # ellipsoid by 180 degrees about one of its own axes, which it does not notice, and an unrotated
@@ -34,7 +34,7 @@ def turned(splats: Splats, *, reuse: bool = False) -> Splats:
     signs = {
         "means": FLIP.astype(splats.means.dtype),
         "quaternions": _QUATERNION_SIGNS,
-        "sh": _SH_SIGNS[: splats.sh.shape[1], None],
+        "sh": SH_SIGNS[: splats.sh.shape[1], None],
     }
     arrays = {}
     for name, sign in signs.items():

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from stages.formats import FORMATS
 from tests.sample import ROOT
 
 pytestmark = pytest.mark.slow
@@ -32,3 +33,10 @@ def test_the_step_benchmark_passes_its_gate_and_prints_every_kernel():
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ to build the yardstick with")
 def test_the_raster_benchmark_draws_what_its_yardstick_draws():
     assert "1,000 at 1920x1080" in run("tests.benchmarks.raster", "--largest", "1000")
+
+
+def test_the_format_benchmark_passes_its_gate_and_prints_every_format():
+    printed = run("tests.benchmarks.formats", "--splats", "2000")
+    assert "hold what was written" in printed
+    for name in FORMATS:
+        assert name in printed

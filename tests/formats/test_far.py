@@ -11,7 +11,7 @@ from stages import formats
 from stages.formats import usd_read
 from stages.formats.far import recentred
 from stages.formats.ply import property_names
-from tests.formats.test_round_trip import ply_bytes
+from tests.formats.test_round_trip import edited_glb, ply_bytes
 from tests.formats.truth import many_splats, red_splat
 
 UTM = np.array([431_234.567, 5_412_345.678, 312.25])
@@ -95,5 +95,14 @@ def test_a_usd_prim_may_be_placed_in_a_survey(tmp_path: Path) -> None:
     path.write_text(text.replace(start, start + moved))
     back = usd_read.parse(path)
     # the splat at (1, 2, 3) is (1, -2, -3) upright; placed there, and turned back
+    wanted = (np.array([1, -2, -3]) + UTM) * [1, -1, -1]
+    np.testing.assert_allclose((back.means + back.origin)[0], wanted, atol=MILLIMETRE)
+
+
+def test_a_gltf_node_may_be_placed_in_a_survey(tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
+    formats.write(path, red_splat())
+    edited_glb(path, lambda document: document["nodes"][0].update(translation=list(UTM)))
+    back = formats.read(path)
     wanted = (np.array([1, -2, -3]) + UTM) * [1, -1, -1]
     np.testing.assert_allclose((back.means + back.origin)[0], wanted, atol=MILLIMETRE)
