@@ -106,7 +106,9 @@ def _our_poses(data: dict[str, Any], saved: NDArray[np.float64]) -> NDArray[np.f
     applied = np.array(data.get("applied_transform", np.eye(4)[:3]), np.float64)[:3]
     scale = float(data.get("applied_scale", 1.0))
     turn = applied[:, :3] if applied.shape == (3, 4) else np.zeros((3, 3))
-    if not (np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6 and math.isfinite(applied.sum())):
+    with np.errstate(over="ignore", invalid="ignore"):
+        orthogonal = np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6
+    if not (orthogonal and math.isfinite(applied.sum())):
         raise BadFileError("its applied_transform is not a rotation and a shift")
     if not (math.isfinite(scale) and scale > 0):
         raise BadFileError("its applied_scale is not a positive number")

@@ -39,6 +39,7 @@ def turned(splats: Splats, *, reuse: bool = False) -> Splats:
     arrays = {}
     for name, sign in signs.items():
         values = getattr(splats, name)
-        arrays[name] = np.multiply(values, sign, out=values if reuse else None)
+        with np.errstate(invalid="ignore"):  # a damaged file's NaN; `checked` refuses it
+            arrays[name] = np.multiply(values, sign, out=values if reuse else None)
     # + 0.0: an origin of -0 would be written as such
     return replace(splats, **arrays, origin=splats.origin * FLIP + 0.0)
