@@ -39,6 +39,7 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--format", action="append", choices=tuple(formats.FORMATS))
+    parser.add_argument("--no-pictures", action="store_true", help="leave out the web engines")
     given = parser.parse_args()
     splats, views = _source(given.source)
     with tempfile.TemporaryDirectory() as temporary:
@@ -50,7 +51,8 @@ def main() -> None:
         _sizes(splats, views, drawn, folder, names)
         _readers(splats, folder, names)
         _validators(folder, names)
-        _engines(views[0].camera, drawn[0], folder, names)
+        if not given.no_pictures:
+            _engines(views[0].camera, drawn[0], folder, names)
 
 
 def _source(path: Path) -> tuple[Splats, tuple[View, ...]]:
