@@ -104,7 +104,7 @@ def _disk_full(folder: Path) -> SplatError:
     return SplatError(
         "disk-full",
         given=f"The disk of {folder} became full during structure from motion.",
-        wanted="About 5 MB a photograph are needed while it works.",
+        wanted="About 10 MB a photograph are needed while it works.",
         hint="Free some space and give the same command again: finished work is kept.",
         family=Family.RESOURCES,
     )
