@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stages.viewer.server import LocalServer
 
 WATCHED = "train"
-_FAREWELL_S = 2.0  # for an open page to hear how it ended; it asks twice a second
+_FAREWELL_S = 5.0  # for an open page to hear how it ended; it asks twice a second, a busy one less
 
 
 class Watching(Listener):

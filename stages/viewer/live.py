@@ -84,6 +84,7 @@ class LivePage:
         self._state = {**self._state, "end": how}
 
     def _answer_state(self, query: dict[str, str]) -> Item:
+        self.pictures.looked()
         state = self._state
         self._end_told = state["end"] != ""
         spent = state.get("spent_s", 0.0)

@@ -19,7 +19,7 @@ from stages.run.stage import Draw
 from stages.scene import Camera
 
 SHARE = 0.2  # of the worker's time, at most, goes into pictures
-LOOKING_S = 5.0  # how long after asking somebody is taken to be there still
+LOOKING_S = 5.0  # how long after a sign of life somebody is taken to be there still
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Pictures:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._wishes: queue.Queue[_Wish] = queue.Queue(maxsize=1)
-        self._not_before = self._asked = -np.inf
+        self._not_before = self._seen = -np.inf
         self._camera: Camera | None = None
         self._last: Picture | None = None
         self._closed = False
@@ -57,7 +57,8 @@ class Pictures:
     def ask(self, camera: Camera, patience_s: float) -> Picture | None:
         """The next picture from `camera`; None if there is none within twice `patience_s`. After
         the end of the work, its last picture, whatever the camera."""
-        self._camera, self._asked = camera, self._clock()
+        self._camera = camera
+        self.looked()
         if self._closed:
             return self._last
         wish = _Wish(camera)
@@ -68,9 +69,13 @@ class Pictures:
         wish.given_up = not wish.answered.wait(patience_s)
         return wish.picture or self._last
 
+    def looked(self) -> None:
+        """Somebody is there, even if the picture that they have will do for a while."""
+        self._seen = self._clock()
+
     def watched(self) -> bool:
-        """Whether somebody asked a moment ago."""
-        return self._clock() - self._asked < LOOKING_S
+        """Whether somebody was there a moment ago."""
+        return self._clock() - self._seen < LOOKING_S
 
     def offer(self, draw: Draw, step: int) -> None:
         """Draw what is wanted, if anything is and the time for it has come."""

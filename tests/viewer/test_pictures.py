@@ -132,6 +132,23 @@ def test_the_last_picture_stays_for_those_who_were_looking() -> None:
     assert (last.step, last.pixels.shape) == (99, (30, 40, 3))
 
 
+def test_who_rests_on_a_picture_that_took_long_is_still_looking() -> None:
+    clock = SimpleNamespace(s=0.0)
+    pictures = Pictures(lambda: clock.s)
+    asker = Asker(pictures, scenes.camera(40, 30))
+    waiting(pictures)
+    pictures.offer(flat, 1)
+    asker.join(WAIT_S)
+    for _ in range(20):
+        clock.s += 1.0
+        pictures.looked()
+    assert pictures.watched()
+    pictures.offer_last(flat, 99)
+    last = pictures.ask(scenes.camera(40, 30), WAIT_S)
+    assert last is not None
+    assert last.step == 99
+
+
 def test_nobody_waits_for_work_that_has_ended() -> None:
     pictures = Pictures()
     asker = Asker(pictures, scenes.camera(), patience_s=60)
