@@ -268,7 +268,7 @@ def test_killed_at_any_moment_a_run_ends_in_the_same_bytes(tmp_path: Path) -> No
     folder = tmp_path / "killed"
     folder.mkdir()
     random = np.random.default_rng(int.from_bytes(os.urandom(4), "little"))
-    for _ in range(8):
+    for _ in range(5):
         child = subprocess.Popen([sys.executable, "-c", code, str(folder)])
         time.sleep(float(random.uniform(0.5, 5.0)))
         child.send_signal(signal.SIGKILL)

@@ -56,7 +56,8 @@ def test_engines_draw_what_render_draws(
             path = tmp_path / f"scene.{suffix}"
             formats.write(path, splats)
             assert engine.open(path.name) == len(splats), suffix
-            for view in views()[:2]:
+            # From another side, an engine sorts anew; that is the same for every format.
+            for view in views()[: 2 if suffix == ENGINES[name][0] else 1]:
                 ours = np.clip(render(splats, view.camera).image, 0, 1)
                 theirs = engine.draw(camera_for(path, view.camera))
                 right = psnr(theirs, ours)

@@ -59,7 +59,7 @@ def features(tmp_path_factory: pytest.TempPathFactory) -> Job:
         names=tuple(names),
         camera_of=(0,) * len(names),
         cameras=(CameraGuess(640, 480, None),),
-        max_features=1500,
+        max_features=800,
         threads=2,
     )
     work(job)
