@@ -34,7 +34,7 @@ def test_the_raster_benchmark_draws_what_its_yardstick_draws():
     assert "1,000 at 1920x1080" in run("tests.benchmarks.raster", "--largest", "1000")
 
 
-def test_the_format_benchmark_passes_its_gate_and_prints_every_format():
+def test_the_format_benchmark_passes_its_gate_and_prints_each_format():
     names = ("ply", "glb", "spz")
     wanted = [word for name in names for word in ("--format", name)]
     printed = run("tests.benchmarks.formats", "--splats", "2000", *wanted)
