@@ -64,6 +64,8 @@ class Trainer:
             step += 1
             if step % max(1, self.schedule.steps // EVALUATIONS) == 0:
                 self._record(model, step)
+            if self.schedule.resets_after(step - 1):  # once its pictures have been judged
+                reset_opacities(model)
             if self.report.stop_requested.is_set() and step < self.schedule.steps:
                 save_checkpoint(self.folder, model, step, self.history)
                 raise Interrupted(f"train stopped after step {step} of {self.schedule.steps}")
@@ -149,8 +151,6 @@ class Trainer:
             model = model.take(neighbours_together(model.means))
             if self.smooth:
                 model.smoothing[:] = self.widths(model.means)
-        if self.schedule.resets_after(step):
-            reset_opacities(model)
         return model
 
     def _tick(self, model: Model, step: int, loss: float) -> None:

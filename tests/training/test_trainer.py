@@ -18,7 +18,7 @@ from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from stages.training.schedule import RESOLUTIONS, Schedule
-from stages.training.trainer import Trainer
+from stages.training.trainer import EVALUATIONS, Trainer
 from stages.training.views import Level, TrainingView
 from tests.scenes import camera, cloud, splats
 from tests.small_scene import small_scene
@@ -185,6 +185,21 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     levels = np.rint(np.clip(image, 0, 1) * 255)
     assert np.abs(seen[-1] - levels).max() <= 1  # rounding of halves
     assert np.abs(seen[0] - levels).mean() > 5  # the first step looked different
+
+
+def test_quality_is_judged_before_an_opacity_reset(tmp_path, monkeypatch):
+    steps = 2 * EVALUATIONS
+    histories = []
+    for name, reset in (("without", 0), ("with", 4)):
+        monkeypatch.setattr(Schedule, "resets_after", lambda _, step, at=reset: step + 1 == at)
+        view = view_of("a", disc_and_square(), camera(48, 48, 48.0))
+        (tmp_path / name).mkdir()
+        toy = trainer([view], grid(12), steps, tmp_path / name)
+        toy.run(grid(12))
+        histories.append({entry["step"]: entry["psnr_db"] for entry in toy.history})
+    without, after = histories
+    assert after[4] == without[4]
+    assert after[6] < without[6] - 1.0
 
 
 def test_a_torn_checkpoint_means_a_fresh_start(tmp_path):
