@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatcli import console
 from stages.run import runfolder
+from stages.run.atomic import make_folder
 from stages.run.errors import Family, SplatError
 from stages.run.pipeline import Pipeline
 
@@ -37,7 +38,7 @@ def convert(source: Path, out: Path, as_json: bool) -> None:
     else:
         if model is None:
             model, pictures = _without_points(found)
-        _make(out)
+        make_folder(out)
         cameras_colmap.write_colmap_model(out, model)
     facts = {
         "out": str(out),
@@ -115,16 +116,3 @@ def _without_points(found: CameraFile) -> tuple[ColmapModel, Path]:
         observed_px=np.zeros((0, 2)),
     )
     return model, Path(root)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SplatError(
-            "folder-not-made",
-            given=f"{folder} cannot be made: {error.strerror or error}.",
-            wanted="A place where a folder may be made.",
-            hint="Choose another one.",
-            family=Family.RESOURCES,
-        ) from error

@@ -240,5 +240,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="train", version=1, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=2, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -37,6 +37,20 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def make_folder(folder: Path) -> None:
+    """Make `folder`, and those that it lies in. Raises SplatError "folder-not-made"."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SplatError(
+            "folder-not-made",
+            given=f"{folder} cannot be made: {error.strerror or error}.",
+            wanted="A place where a folder may be made.",
+            hint="Name another one.",
+            family=Family.RESOURCES,
+        ) from error
+
+
 def _refused(path: Path, error: OSError) -> SplatError:
     reason = error.strerror or str(error)
     if error.errno in (errno.ENOSPC, errno.EDQUOT) or (error.errno is None and _is_full(path)):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import sqlite3
 import subprocess
 import sys
@@ -46,7 +47,7 @@ def split(pairs: Sequence[Pair], parts: int) -> list[list[Pair]]:
 
 def match_in_shares(job: Job, wanted: Sequence[Pair], processes: int) -> None:
     """Match and verify those of the `wanted` pairs (first < second) that the job's database does
-    not hold. Ends this process with the status of a share that fails."""
+    not hold. Ends this process as a share ends that fails."""
     database = Path(job.database)
     _gather(database)
     done = sqlite.pairs_done(database)
@@ -82,12 +83,19 @@ def _run_all(jobs: list[Job]) -> None:
             time.sleep(_POLL_SECONDS)
             for process in running:
                 if process.poll():
-                    # Its words are in the log, which all of them share.
-                    raise SystemExit(abs(process.returncode))
+                    _end_like(process.returncode)
             running = [process for process in running if process.poll() is None]
     finally:
         for process in running:
             process.kill()
+
+
+def _end_like(status: int) -> None:
+    """End as a share did, by its signal if it was one; its words are in the log, which all share,
+    and the other shares end with this process."""
+    if status < 0:
+        os.kill(os.getpid(), -status)
+    raise SystemExit(status)
 
 
 def _start(job: Job) -> subprocess.Popen[bytes]:

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from stages.raster import Rendering
-from stages.run.errors import Family, SplatError
+from stages.run.atomic import make_folder
 from stages.scene import Camera
 from stages.viewer.film import film
 from stages.viewer.picture_files import (
@@ -40,16 +40,7 @@ def picture_sink(path: Path, depth: bool) -> Iterator[Put]:
 def folder_sink(folder: Path, frames: int, depth: bool) -> Iterator[Put]:
     """frame_0001.png and so on in `folder`, which is made; frames that are there are written
     again. With `depth` also frame_0001.depth.tiff. Raises SplatError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SplatError(
-            "folder-not-made",
-            given=f"{folder} cannot be made: {error.strerror or error}.",
-            wanted="A place where a folder may be made.",
-            hint="Choose another --out.",
-            family=Family.RESOURCES,
-        ) from error
+    make_folder(folder)
     number = 0
 
     def put(rendering: Rendering) -> None:

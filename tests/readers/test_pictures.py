@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +13,13 @@ from stages.formats.rows import degrees_in_use
 from stages.measure.images import psnr
 from stages.raster import render
 from stages.scene import Splats
-from tests.packages import UnavailableError
 from tests.readers.pictures import ENGINES, Engine, camera_for, served
 from tests.tolerances import ENGINE_DB
-from tests.viewer.browser import Browser, chromium
-from tests.viewer.pictures import SIZE, coloured_scene, views, wrong_versions
+from tests.viewer.browser import Browser
+from tests.viewer.pictures import coloured_scene, views, wrong_versions
+from tests.viewer.test_in_browser import browser
+
+__all__ = ["browser"]
 
 pytestmark = pytest.mark.slow
 WORSE_DB = 5.0
@@ -32,17 +33,6 @@ def scene() -> Splats:
     sh[:, 1:] *= 0.4
     sh[:, 0] *= 0.8
     return replace(splats, sh=sh, sh_degrees=degrees_in_use(sh))
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    try:
-        program = chromium()
-    except UnavailableError as reason:
-        pytest.skip(str(reason))
-    opened = Browser(program, tmp_path_factory.mktemp("profile"), SIZE)
-    yield opened
-    opened.close()
 
 
 @pytest.mark.parametrize("name", ENGINES)
