@@ -97,6 +97,8 @@ def _watch(
 
 def _tail(log: Path) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    # COLMAP follows what went wrong by the addresses of its stack, which tell a user nothing.
+    lines = [line for line in lines if not line.lstrip().startswith(("@ ", "PC: @", "***"))]
     return "\n".join(lines[-_TAIL_LINES:])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
+import signal
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
@@ -148,4 +149,5 @@ def test_a_share_that_fails_ends_the_work_with_its_words(features: Job, tmp_path
     with pytest.raises(WorkerCrashed) as crash:
         work(job)
     assert crash.value.step == "matching"
-    assert crash.value.tail
+    assert crash.value.status == -signal.SIGABRT
+    assert "Check failed" in crash.value.tail.splitlines()[-1]
