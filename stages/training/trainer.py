@@ -55,7 +55,7 @@ class Trainer:
 
         Raises Interrupted at a step boundary, checkpoint written, when the report asks to stop.
         """
-        self.report.progress(0, self.schedule.steps, "compiling kernels")
+        self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
         model, step = self._begin(start)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
