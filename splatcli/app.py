@@ -150,13 +150,11 @@ def render(
     Frames that are in the folder already are written again. Depth is z in world units, 0 where
     there is nothing; in films it is light where near.
     """
-    from splatcli import rendering
+    from splatcli.commands import render as work
 
-    rendering.render(
+    work.render(
         target,
-        rendering.Wanted(
-            out, camera, path, frames, seconds, fps, width, depth, backend, quiet, as_json
-        ),
+        work.Wanted(out, camera, path, frames, seconds, fps, width, depth, backend, quiet, as_json),
     )
 
 
@@ -176,9 +174,9 @@ def view(
 
     The page is served to this machine only and needs no network. Ctrl-C ends it.
     """
-    from splatcli import viewing
+    from splatcli.commands import view as work
 
-    viewing.show(target, port, open_browser)
+    work.show(target, port, open_browser)
 
 
 def info(
@@ -188,7 +186,7 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """Count the splats of a file or a run: degrees, bounds, bytes, and what is wrong with them."""
-    from splatcli import info as work
+    from splatcli.commands import info as work
 
     work.show(target, as_json)
 
@@ -203,7 +201,7 @@ def convert(
 
     Endings: .ply .splat .glb .gltf .usda .usdc .usdz .quantised.glb .compressed.ply .spz .sog .html
     """
-    from splatcli import convert as work
+    from splatcli.commands import convert as work
 
     work.convert(source, target, quiet, as_json)
 
@@ -229,7 +227,7 @@ def verify(
     A file outside a run, without --against, is compared with itself: two parsers that share no
     code must read the same. Exit status 7 if a file is wrong.
     """
-    from splatcli import verify as work
+    from splatcli.commands import verify as work
 
     work.verify(target, against, quiet, as_json)
 
@@ -248,16 +246,16 @@ def cameras(
     A run's cameras belong to its undistorted photographs, which the file names; sparse points go
     with them. nerfstudio's world is z up, COLMAP's is ours: y down.
     """
-    from splatcli import cameras as work
+    from splatcli.commands import cameras as work
 
     work.convert(source, out, as_json)
 
 
 def doctor(as_json: AsJson = False) -> None:
     """Check what this machine has, and what is missing."""
-    from splatcli import checkup
+    from splatcli.commands import doctor as work
 
-    raise typer.Exit(checkup.show(as_json))
+    raise typer.Exit(work.show(as_json))
 
 
 def _register() -> None:

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from stages.run.errors import Interrupted, SplatError
+from stages.base.errors import Interrupted, SplatError
 from stages.run.failures import as_splat_error
 
 STOPPED = 130  # what shells expect after Ctrl-C

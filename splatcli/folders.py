@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stages.base.errors import Family, SplatError
 from stages.run import runfolder
-from stages.run.errors import Family, SplatError
 
 DEFAULT = Path("run")
 

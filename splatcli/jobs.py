@@ -9,11 +9,18 @@ from typing import Any
 
 import typer
 
-from splatcli import options, progress, summary, watching
+from splatcli import (
+    live_view as watching,
+)
+from splatcli import (
+    options,
+    progress,
+    summary,
+)
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
+from stages.base.errors import Family, SplatError
 from stages.run import runfolder
-from stages.run.errors import Family, SplatError
 from stages.run.pipeline import Pipeline
 
 DEFAULT_PRESET = "standard"

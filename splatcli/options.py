@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import typer
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 
 _METAVARS = {int: "N", float: "X", bool: None, str: "TEXT", Path: "PATH"}
 

@@ -20,9 +20,9 @@ from rich.progress import (
 from rich.text import Text
 
 from splatcli import console
+from stages.base.stage import Numbers, Stage
 from stages.run.manifest import Manifest, plain
 from stages.run.pipeline import Listener
-from stages.run.stage import Numbers, Stage
 
 _LINE_EVERY_S = 10.0
 _EVENT_EVERY_S = 0.5

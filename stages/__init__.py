@@ -4,8 +4,8 @@
 import importlib
 import zlib  # noqa: F401
 
-from stages.run.stage import Stage
-from stages.run.threads import configure
+from stages.base.stage import Stage
+from stages.base.threads import configure
 
 configure()
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report, Stage
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
-    from stages.formats.proof import Prover
+    from stages.proof.prover import Prover
     from stages.scene import ExportedAssets, QuantisedSplats, Reconstruction, Splats
 
 FORMATS = (
@@ -92,8 +92,8 @@ def run(
     file from being written.
     """
     from stages import formats
-    from stages.formats.proof import Prover, cameras_for
     from stages.formats.rows import kept_rows
+    from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
     check(settings)

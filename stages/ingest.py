@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.run import threads
-from stages.run.errors import Family, Interrupted, SplatError
-from stages.run.stage import Report, Stage
+from stages.base import threads
+from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
     from stages.photos.decode import PixelBudget

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.run.stage import Report, Stage
+from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -93,7 +93,7 @@ def mean_psnr(splats: Splats, photographs: Photographs, raster: RasterSettings) 
     import numpy as np
 
     from stages.measure.images import psnr
-    from stages.raster.cpu import CpuRasteriser, splat_arrays
+    from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
 
     rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
     values = []

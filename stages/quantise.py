@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report, Stage
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
     import numpy as np

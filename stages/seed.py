@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report, Stage
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -99,7 +99,7 @@ def _filled(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.structure.coverage import fill_cells
+    from stages.seeding.coverage import fill_cells
 
     training, _ = split_held_out(reconstruction.views)
     cameras = tuple(view.camera for view in reconstruction.views)
@@ -125,7 +125,7 @@ def _outliers(
     """[P] masks of points not to start from, by reason."""
     import numpy as np
 
-    from stages.structure.neighbours import nearest_distance
+    from stages.seeding.neighbours import nearest_distance
 
     points = np.where(finite[:, None], reconstruction.points, 0.0)
     errors = np.nan_to_num(reconstruction.errors_px, nan=np.inf, posinf=np.inf)
@@ -156,7 +156,7 @@ def _scales(
     """
     import numpy as np
 
-    from stages.structure.neighbours import mean_neighbour_distance, nearest_distance
+    from stages.seeding.neighbours import mean_neighbour_distance, nearest_distance
 
     raw = mean_neighbour_distance(points, NEIGHBOURS)
     positive = raw[raw > 0]

@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.run import threads
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report, Stage
+from stages.base import threads
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
     from stages.scene import Capture, Reconstruction
@@ -288,7 +288,7 @@ def _model_metrics(
 
 
 def _write_finished(folder: Path, report: Report) -> None:
-    from stages.run.atomic import replacing
+    from stages.base.atomic import replacing
 
     data = {"metrics": report.metrics, "warnings": report.warnings}
     with replacing(folder / _FINISHED) as path:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report, Stage
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
     from stages.scene import Reconstruction, Splats
@@ -121,7 +121,7 @@ def make_trainer(
     report: Report,
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
-    from stages.run.memory import available_mib
+    from stages.base.memory import available_mib
     from stages.scene import scene_extent, split_held_out
     from stages.training.densify import splat_cap
     from stages.training.schedule import Schedule
@@ -188,8 +188,8 @@ def write_quality(trainer: Trainer, model: Model, folder: Path, report: Report) 
     """Final held-out figures into the report; table, plot and contact sheet into the folder."""
     import numpy as np
 
-    from stages.run.atomic import replacing
-    from stages.training.pictures import contact_sheet, training_plot
+    from stages.base.atomic import replacing
+    from stages.training.charts import contact_sheet, training_plot
 
     scores = trainer.evaluate(model)
     if scores:

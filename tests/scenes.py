@@ -77,7 +77,7 @@ def gradients(backend, scene, view, v_image, settings=None, smoothing=None):
     settings = settings or RasterSettings()
     if backend == "reference":
         return _reference_gradients(scene, view, v_image, settings, smoothing)
-    from stages.raster.cpu import NO_SMOOTHING, CpuRasteriser, splat_arrays
+    from stages.raster.cpu.rasteriser import NO_SMOOTHING, CpuRasteriser, splat_arrays
 
     widths = NO_SMOOTHING if smoothing is None else smoothing
     rasteriser = CpuRasteriser()

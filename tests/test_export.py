@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from stages import export, formats
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report
 from stages.export import FORMATS, ExportSettings
-from stages.formats import verify
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report
+from stages.proof import second_readers
 from stages.scene import ExportedAssets, QuantisedSplats, Splats
 from stages.surface import fuse
 from tests.small_scene import SmallScene, small_scene
@@ -93,8 +93,8 @@ def test_a_wrong_file_does_not_pass(
 ) -> None:
     """As if the writer had made a common mistake: the check must see each of them."""
 
-    def wrong(path: Path) -> verify.FileContent:
-        content = verify._READERS[formats.format_of(path)](path)
+    def wrong(path: Path) -> second_readers.FileContent:
+        content = second_readers._READERS[formats.format_of(path)](path)
         splats = content.splats
         if damage == "quaternion order":
             splats = replace(splats, quaternions=np.roll(splats.quaternions, 1, axis=1))
@@ -108,7 +108,7 @@ def test_a_wrong_file_does_not_pass(
             splats = splats.take(np.arange(1, len(splats)))
         return replace(content, splats=splats)
 
-    monkeypatch.setattr(verify, "read_back", wrong)
+    monkeypatch.setattr(second_readers, "read_back", wrong)
     with pytest.raises(SplatError) as caught:
         exported(scene, tmp_path, formats=(name,))
     assert caught.value.code == "export-verify-failed"

@@ -16,14 +16,19 @@ import pytest
 from PIL import Image, ImageCms
 
 from stages import ingest
+from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.stage import Report
 from stages.ingest import IngestSettings
 from stages.photos import write
 from stages.photos.load import load_image
 from stages.run.digests import record_files
-from stages.run.errors import Family, Interrupted, SplatError
-from stages.run.stage import Report
 from stages.scene import Capture
-from tests.photos.pictures import exif, folder_of, save, textured
+from tests.photos.made_files import (
+    exif,
+    folder_of,
+    save,
+    textured,
+)
 
 
 @pytest.fixture

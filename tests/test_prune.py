@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stages import prune
+from stages.base.stage import Report
 from stages.measure.worth import Worth, floaters, measure_worth, unneeded
 from stages.raster import RasterSettings
-from stages.run.stage import Report
 from stages.scene import Splats, scene_extent
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene

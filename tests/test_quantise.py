@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from stages import quantise
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report
 from stages.measure.sh import cut, degrees_at, tail_rms
 from stages.quantise import QuantiseSettings
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report
 from stages.scene import QuantisedSplats
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene

@@ -15,7 +15,7 @@ from PIL import Image
 from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
 from stages import ingest, sfm
-from stages.run.stage import Report
+from stages.base.stage import Report
 from stages.scene import Reconstruction
 
 CAPTURE = Path(__file__).parents[1] / "sample_captures" / "still_life"

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages import seed
-from stages.run.errors import Family, SplatError
-from stages.run.stage import Report
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report
 from stages.scene import Camera, Reconstruction, Splats, View, dc_to_rgb, look_at
-from stages.structure.neighbours import mean_neighbour_distance, nearest_distance
+from stages.seeding.neighbours import mean_neighbour_distance, nearest_distance
 
 BARE = seed.SeedSettings(fill=False)  # the scenes below have no photographs
 

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from stages import sfm
-from stages.run.errors import Family, Interrupted, SplatError
-from stages.run.stage import Report
+from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.stage import Report
 from stages.scene import Capture, Reconstruction
 from stages.structure import ladder
 from tests.structure import bad_captures
@@ -260,7 +260,7 @@ def test_killed_at_any_moment_a_run_ends_in_the_same_bytes(tmp_path: Path) -> No
     whole = tmp_path / "whole"
     sfm.run({"ingest": bad_captures.sample(9)}, FEW, whole, Report())
     code = (
-        "from pathlib import Path; from stages import sfm; from stages.run.stage import Report;"
+        "from pathlib import Path; from stages import sfm; from stages.base.stage import Report;"
         "from tests.structure import bad_captures as b; import sys;"
         "s = sfm.SfmSettings(max_features=2000);"
         "sfm.run({'ingest': b.sample(9)}, s, Path(sys.argv[1]), Report())"

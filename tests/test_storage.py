@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 from stages.scene import Splats, load_splats, save_splats
 from stages.scene.storage import FIELDS
 

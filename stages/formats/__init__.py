@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import morton, smallest_three
+from stages.base.atomic import replacing
+from stages.base.bad_files import BadFileError, reading
+from stages.formats import smallest_three
 from stages.formats.blocks import allocated, passing
 from stages.formats.ply_header import Header, binary_rows, read_header
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, kept_rows, linear_opacities, logits_of, unit_quaternions
-from stages.run.atomic import replacing
-from stages.scene import SH_C0, Splats
+from stages.scene import SH_C0, Splats, morton
 
 CHUNK = 256
 # A flat splat's logarithm of -87 would take the precision of its whole chunk; what is smaller than

@@ -14,9 +14,9 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.atomic import replacing
+from stages.base.errors import Family, SplatError
 from stages.formats.blocks import passing
-from stages.run.atomic import replacing
-from stages.run.errors import Family, SplatError
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121}

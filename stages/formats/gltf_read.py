@@ -18,8 +18,8 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.bad_files import BadFileError, reading
 from stages.formats.far import recentred
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, joined, logits_of, logs_of
 from stages.formats.turn import turned
 from stages.scene import Splats

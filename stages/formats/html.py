@@ -14,14 +14,14 @@ import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from stages.base.atomic import replacing
+from stages.base.bad_files import BadFileError, reading
 from stages.formats import ply
 from stages.formats.blocks import tell
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import kept_rows
-from stages.run.atomic import replacing
+from stages.page import document
+from stages.page.shots import shots_of
 from stages.scene import Splats, View
-from stages.viewer import compose
-from stages.viewer.shots import shots_of
 
 _GZIP = 31  # zlib's name for the gzip container; its header holds no time then
 _LEVEL = 6
@@ -39,14 +39,14 @@ def write(
     views: cameras to look from. Raises SplatError when the file cannot be written.
     """
     splats, dropped = kept_rows(splats)
-    scene = compose.scene_data(path.stem, splats, shots_of(views, splats), units=units)
+    scene = document.scene_data(path.stem, splats, shots_of(views, splats), units=units)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(compose.head(scene).encode("utf-8"))
+        file.write(document.head(scene).encode("utf-8"))
         for chunk in _chunks(_zipped(ply.blocks(splats, units))):
-            file.write(compose.CHUNK_START.encode("ascii"))
+            file.write(document.CHUNK_START.encode("ascii"))
             file.write(base64.b64encode(chunk))
-            file.write(compose.CHUNK_END.encode("ascii"))
-        file.write(compose.tail().encode("utf-8"))
+            file.write(document.CHUNK_END.encode("ascii"))
+        file.write(document.tail().encode("utf-8"))
     return dropped
 
 
@@ -82,13 +82,13 @@ def read(path: Path) -> Splats:
 
 def _unzipped(path: Path) -> Iterator[bytes]:
     """The .ply inside, a part at a time; each script element is a line of its own."""
-    start, end = (re.escape(t.encode("ascii")) for t in (compose.CHUNK_START, compose.CHUNK_END))
+    start, end = (re.escape(t.encode("ascii")) for t in (document.CHUNK_START, document.CHUNK_END))
     wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)
     unpacker = zlib.decompressobj(_GZIP)
     with path.open("rb") as page:
         size = page.seek(0, 2)
         page.seek(max(0, size - _END_BYTES))
-        if not page.read().rstrip().endswith(compose.PAGE_END.strip().encode("ascii")):
+        if not page.read().rstrip().endswith(document.PAGE_END.strip().encode("ascii")):
             raise BadFileError("it is no whole page: its end is missing")
         page.seek(0)
         try:

@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.problems import BadFileError
+from stages.base.bad_files import BadFileError
 
 # Packed splats gzip to a half or a third. What claims more than this is refused before memory is
 # taken for it; little files may, for all their splats can be equal.

@@ -16,13 +16,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.atomic import replacing
+from stages.base.bad_files import BadFileError, reading
 from stages.formats import compressed_ply
 from stages.formats.blocks import allocated, forget, passing
 from stages.formats.far import recentred
 from stages.formats.ply_header import Header, binary_rows, read_header
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, kept_rows
-from stages.run.atomic import replacing
 from stages.scene import Splats
 
 _ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3: the columns of a block are gathered from the cache

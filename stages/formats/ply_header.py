@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.problems import BadFileError
+from stages.base.bad_files import BadFileError
 
 HEADER_LIMIT_BYTES = 1 << 20
 TYPES = {

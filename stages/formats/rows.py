@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.bad_files import BadFileError
 from stages.formats.blocks import blocks
-from stages.formats.problems import BadFileError
-from stages.raster.api import LOG_SCALE_MAX, QUATERNION_MIN
+from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
 
 LOG_SCALE_MIN = -87.0  # below it a scale is no normal float32 any more

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import codebook, morton, smallest_three
+from stages.base.atomic import replacing
+from stages.formats import codebook, smallest_three
 from stages.formats.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE, read
-from stages.run.atomic import replacing
-from stages.scene import Splats
+from stages.scene import Splats, morton
 
 __all__ = ["order", "read", "write"]
 

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.bad_files import BadFileError, reading
 from stages.formats import smallest_three
 from stages.formats.blocks import allocated, passing
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, logits_of
 from stages.scene import Splats
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.atomic import replacing
+from stages.base.bad_files import BadFileError, reading
 from stages.formats.blocks import allocated, passing
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import (
     checked,
     kept_rows,
@@ -23,7 +24,6 @@ from stages.formats.rows import (
     logs_of,
     unit_quaternions,
 )
-from stages.run.atomic import replacing
 from stages.scene import Splats, dc_to_rgb, rgb_to_dc
 
 RECORD = np.dtype(

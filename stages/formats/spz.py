@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.atomic import replacing
 from stages.formats import smallest_three
 from stages.formats.blocks import block_of, passing
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE, read
 from stages.formats.turn import FLIP, turned
-from stages.run.atomic import replacing
 from stages.scene import Splats
 
 __all__ = ["read", "write"]

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.atomic import replacing
 from stages.formats.blocks import block_of, passing
 from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
 from stages.formats.turn import turned
 from stages.formats.usd_read import read
-from stages.run.atomic import replacing
 from stages.scene import Splats
 
 __all__ = ["read", "write"]

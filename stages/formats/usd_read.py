@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.bad_files import BadFileError, reading
 from stages.formats.far import recentred
-from stages.formats.problems import BadFileError, reading
 from stages.formats.rows import checked, damage_kept, joined, keeps_damage, logits_of, logs_of
 from stages.formats.turn import turned
 from stages.scene import Splats, load_splats, save_splats

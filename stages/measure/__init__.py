@@ -1,0 +1,1 @@
+"""How good a picture is, and what each splat is worth to it."""

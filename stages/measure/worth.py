@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.api import RasterSettings
-from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
+from stages.raster.definition import RasterSettings
 from stages.scene import Camera, Splats
 
 SEEN = 1.0 / 255.0  # a weight below it cannot change an 8-bit picture

@@ -1,0 +1,1 @@
+"""Reading photographs: decoding, EXIF, colour, and what to shoot again."""

@@ -8,8 +8,8 @@ from dataclasses import asdict, fields
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from stages.run.atomic import replacing
-from stages.run.errors import Family, SplatError
+from stages.base.atomic import replacing
+from stages.base.errors import Family, SplatError
 from stages.scene import Capture, Photo
 
 FILE = "capture.json"

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 
 LOSSY = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".heic", ".heif", ".hif", ".avif"})
 LOSSLESS = frozenset({".png", ".tif", ".tiff", ".bmp"})

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 
 
 def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from stages.base.atomic import replacing
 from stages.photos.decode import Decoded
-from stages.run.atomic import replacing
 
 _JPEG_QUALITY = 95
 

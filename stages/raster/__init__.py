@@ -1,5 +1,6 @@
 """The rasteriser: several backends, one definition (`reference`)."""
 
-from stages.raster.api import RasterSettings, Rendering, render, renderer
+from stages.raster.definition import RasterSettings, Rendering
+from stages.raster.draw import render, renderer
 
 __all__ = ["RasterSettings", "Rendering", "render", "renderer"]

@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.raster.api import (
+from stages.raster.definition import (
     ALPHA_MAX,
     ALPHA_MIN,
     LOG_SCALE_MAX,

@@ -1,0 +1,1 @@
+"""Run folders: manifests, digests, what runs again and why, and the run itself."""

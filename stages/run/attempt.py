@@ -10,14 +10,19 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+from stages.base.errors import Interrupted
+from stages.base.libraries import versions
+from stages.base.memory import PeakMemory
+from stages.base.stage import (
+    Draw,
+    Numbers,
+    Report,
+    Stage,
+)
 from stages.run.digests import combined_digest, record_files
-from stages.run.errors import Interrupted
 from stages.run.failures import as_splat_error
-from stages.run.libraries import versions
 from stages.run.manifest import Manifest, plain, write_json
-from stages.run.memory import PeakMemory
 from stages.run.request import Request
-from stages.run.stage import Draw, Numbers, Report, Stage
 from stages.run.workspace import BOOKKEEPING, USAGE, Workspace
 
 _NOTE_EVERY_S = 5.0

@@ -6,7 +6,7 @@ import errno
 import shutil
 from pathlib import Path
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 
 _DISK = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 
 LOCK = ".lock"
 

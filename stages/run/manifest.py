@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from stages.base.errors import Family, SplatError
 from stages.run.digests import FileRecords, records_from_data, records_to_data
-from stages.run.errors import Family, SplatError
 
 SCHEMA = 1  # raised when an older program could not read what this one writes
 MANIFEST = "manifest.json"

@@ -8,16 +8,16 @@ from threading import Event
 from typing import Any
 
 from stages import STAGE_NAMES, load_stage
+from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.interrupt import stop_on_signals
+from stages.base.stage import Stage
 from stages.run import runfolder
 from stages.run.attempt import Listener, attempt
-from stages.run.errors import Family, Interrupted, SplatError
 from stages.run.failures import as_splat_error
-from stages.run.interrupt import stop_on_signals
 from stages.run.lock import holder
 from stages.run.manifest import Manifest
 from stages.run.planning import PHOTOS, Planner, Step
 from stages.run.runfile import RunFile
-from stages.run.stage import Stage
 from stages.run.workspace import Layout
 
 __all__ = ["Listener", "Pipeline", "Step"]

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from stages.base.errors import SplatError
+from stages.base.stage import Stage
 from stages.run.digests import FileRecords, combined_digest, damage, record_files
-from stages.run.errors import SplatError
 from stages.run.manifest import Manifest
 from stages.run.request import Request, request_for, why_again
-from stages.run.stage import Stage
 from stages.run.workspace import Layout
 
 PHOTOS = "photos"  # the input of a stage that reads no other

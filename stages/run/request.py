@@ -8,9 +8,9 @@ from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from stages.base.stage import Stage
 from stages.run.digests import FileRecords, differences
 from stages.run.manifest import Manifest, plain, write_json
-from stages.run.stage import Stage
 
 REQUEST = "request.json"
 

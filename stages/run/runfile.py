@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from stages.base.stage import Stage
 from stages.run.manifest import read_sealed, write_sealed
 from stages.run.request import settings_from_data, settings_to_data
-from stages.run.stage import Stage
 
 RUN_FILE = "run.json"
 

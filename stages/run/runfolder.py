@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from stages.base.errors import Family, SplatError
 from stages.run.digests import combined_digest, record_files
-from stages.run.errors import Family, SplatError
 from stages.run.lock import LOCK, locked
 from stages.run.manifest import Manifest
 from stages.run.planning import PHOTOS

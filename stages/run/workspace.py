@@ -11,9 +11,9 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from stages.base.stage import Stage
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.request import REQUEST, Request
-from stages.run.stage import Stage
 
 USAGE = "usage.json"
 _FILES = (MANIFEST, REQUEST, USAGE)

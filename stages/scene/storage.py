@@ -15,8 +15,8 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from stages.run.atomic import replacing
-from stages.run.errors import Family, SplatError
+from stages.base.atomic import replacing
+from stages.base.errors import Family, SplatError
 from stages.scene.splats import Splats
 
 MAGIC = b"SPLATS1\n"

@@ -1,0 +1,1 @@
+"""Structure from motion: features, matches, mapping, and the gates it must pass."""

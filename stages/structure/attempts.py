@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
-from stages.run.stage import Report
+from stages.base.stage import Report
 from stages.structure import database as sqlite
 from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
 from stages.structure.job import Job

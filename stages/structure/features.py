@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pycolmap
 
-from stages.run import memory
-from stages.run.memory import MIB
+from stages.base import memory
+from stages.base.memory import MIB
 from stages.structure import database as sqlite
 from stages.structure.job import CameraGuess, Job
 from stages.structure.shares import match_in_shares, pairs_path

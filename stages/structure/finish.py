@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stages.formats.cameras_colmap import ColmapModel, write_colmap_model
-from stages.run.atomic import replacing
-from stages.run.errors import Interrupted, SplatError
-from stages.run.stage import Report
+from stages.base.atomic import replacing
+from stages.base.errors import Interrupted, SplatError
+from stages.base.stage import Report
+from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.scene import Camera, Capture, Photo, Reconstruction, View
 from stages.structure.levelling import upright
 from stages.structure.sparse_model import SparseModel, point_errors

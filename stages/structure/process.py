@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
-from stages.run.errors import Family, Interrupted, SplatError
+from stages.base.errors import Family, Interrupted, SplatError
 from stages.structure.job import Job
 
 _POLL_SECONDS = 0.1

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from stages.run.atomic import replacing
-from stages.run.errors import Family, SplatError
+from stages.base.atomic import replacing
+from stages.base.errors import Family, SplatError
 from stages.scene import Camera, Reconstruction, View
 
 FILE_NAME = "reconstruction.json"

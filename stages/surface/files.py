@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 from stages.surface import gltf, ply
 from stages.surface.mesh import Mesh
 

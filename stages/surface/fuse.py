@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.pool import default_pool
-from stages.run.memory import MIB, available_mib
+from stages.base.memory import MIB, available_mib
+from stages.kernels.pool import default_pool
 from stages.surface.depth_maps import DepthMap
 from stages.surface.fuse_kernels import CAMERA_ROW, integrate
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import Interrupted
+from stages.base.stage import Report
 from stages.raster import RasterSettings
-from stages.run.errors import Interrupted
-from stages.run.stage import Report
 from stages.scene import Reconstruction, Splats, scene_extent, split_held_out
 from stages.surface import colour, depth_maps, extract, fuse
 from stages.surface.depth_maps import DepthMap

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.run.atomic import replacing
+from stages.base.atomic import replacing
 from stages.surface.mesh import NOTE, Mesh
 
 _VERTEX = np.dtype([("place", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])

@@ -1,0 +1,1 @@
+"""Fitting splats to photographs: the step, its loss and optimiser, growth, schedule."""

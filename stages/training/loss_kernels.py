@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from stages.raster.simd import (
+from stages.kernels.simd import (
     kernel,
     splat16,
     take_ticket,

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.cpu import Backward, gradient_columns
-from stages.raster.pool import Pool
-from stages.raster.simd import (
+from stages.kernels.pool import Pool
+from stages.kernels.simd import (
     kernel,
     splat16,
     take_ticket,
@@ -27,6 +26,7 @@ from stages.raster.simd import (
     vsqrt,
     vstore,
 )
+from stages.raster.cpu.rasteriser import Backward, gradient_columns
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean

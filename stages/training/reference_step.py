@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.raster.api import RasterSettings
-from stages.raster.cpu import Backward, gradient_columns
-from stages.raster.pool import Pool
+from stages.kernels.pool import Pool
+from stages.raster.cpu.rasteriser import Backward, gradient_columns
+from stages.raster.definition import RasterSettings
 from stages.raster.reference import Parameters, project, render_projected
 from stages.scene import Camera
 from stages.training.loss import image_loss

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import Interrupted
+from stages.base.stage import Report
 from stages.measure.images import psnr, ssim
-from stages.raster.api import RasterSettings
-from stages.raster.cpu import NO_SMOOTHING, CpuRasteriser
+from stages.raster.cpu.rasteriser import NO_SMOOTHING, CpuRasteriser
+from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.run.errors import Interrupted
-from stages.run.stage import Report
 from stages.scene import Camera, Splats
 from stages.training.checkpoint import load_checkpoint, save_checkpoint
 from stages.training.densify import densify, neighbours_together, reset_opacities

@@ -1,5 +1,1 @@
-"""A page to look at splats with, and a server of this machine only that shows it.
-
-The viewer in `vendor/` draws, orbits and flies; what is ours adds the capture's cameras, the
-photographs beside the picture, and figures.
-"""
+"""A server of this machine only, and what it shows: a finished scene, or one in training."""

@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.run.stage import Numbers
+from stages.base.stage import Numbers
+from stages.page import document
+from stages.page.shots import Shot
 from stages.scene import Camera, View
-from stages.viewer import compose
-from stages.viewer.pictures import Picture, Pictures
+from stages.scene.framing import depth_of_interest
+from stages.viewer.onlookers import Picture, Pictures
 from stages.viewer.server import Answer, Item
-from stages.viewer.shots import Shot, depth_of_interest
 from stages.viewer.site import with_photographs
 
 SIDES = (16, 1280)  # pixels of a picture's longer side
@@ -54,7 +55,7 @@ class LivePage:
         self._start, self._first = time.monotonic(), 0
         shown, photographs = with_photographs(shots, views, photos)
         scene = {"title": title, "shots": [_plain(shot, points) for shot in shown]}
-        page = compose.live(scene).encode("utf-8")
+        page = document.live(scene).encode("utf-8")
         self.items: dict[str, Item | Answer] = {
             **photographs,
             "/": Item(page, "text/html; charset=utf-8"),

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from stages.page import document
+from stages.page.shots import Shot, shots_of
 from stages.scene import Splats, View
-from stages.viewer import compose
 from stages.viewer.server import Item
-from stages.viewer.shots import Shot, shots_of
 
 
 def site(
@@ -25,8 +25,8 @@ def site(
     a photograph that is not there is left out."""
     shots, items = with_photographs(shots_of(views, splats), views, photos)
     items["/scene.ply"] = Item(content, "application/octet-stream")
-    scene = compose.scene_data(title, splats, shots, units=units, content="scene.ply")
-    page = compose.head(scene) + compose.tail()
+    scene = document.scene_data(title, splats, shots, units=units, content="scene.ply")
+    page = document.head(scene) + document.tail()
     items["/"] = Item(page.encode("utf-8"), "text/html; charset=utf-8")
     return items
 

@@ -19,9 +19,9 @@ from rich.console import Console
 from rich.table import Table
 
 from stages import formats
-from stages.formats.compare import differences
-from stages.formats.verify import read_back
-from stages.run.memory import PeakMemory, resident_mib
+from stages.base.memory import PeakMemory, resident_mib
+from stages.proof.compare import differences
+from stages.proof.second_readers import read_back
 from stages.scene import Splats, load_splats, save_splats
 from tests.benchmarks.scenes import random_scene, view
 from tests.benchmarks.timing import machine

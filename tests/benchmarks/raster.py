@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from stages.raster import RasterSettings
-from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
 from stages.scene import Camera, Splats
 from tests.benchmarks.gate import check_kernels
 from tests.benchmarks.scenes import PICTURES, equal_scene, random_scene, trained_scene, view

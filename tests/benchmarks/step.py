@@ -15,9 +15,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from stages.raster.cpu import gradient_columns
-from stages.raster.pool import Pool
-from stages.run.stage import Report
+from stages.base.stage import Report
+from stages.kernels.pool import Pool
+from stages.raster.cpu.rasteriser import gradient_columns
 from stages.scene import Camera, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import Model, new_model

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.raster.pool import Pool
+from stages.kernels.pool import Pool
 
 Job = Callable[[], Any]
 

@@ -10,11 +10,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.binning import TILE
-from stages.raster.cpu import Forward
-from stages.raster.pool import Pool
-from stages.raster.projection import GA, GB, GK, GL, GVX, GVY, GX, GY
-from stages.raster.simd import kernel
+from stages.kernels.pool import Pool
+from stages.kernels.simd import kernel
+from stages.raster.cpu.binning import TILE
+from stages.raster.cpu.projection import (
+    GA,
+    GB,
+    GK,
+    GL,
+    GVX,
+    GVY,
+    GX,
+    GY,
+)
+from stages.raster.cpu.rasteriser import Forward
 from tests.benchmarks.timing import Job
 
 SOURCE = Path(__file__).with_name("yardstick.cpp")

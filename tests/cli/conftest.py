@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 import stages
 from splatcli.app import app
+from stages.base.stage import Stage
 from stages.run import pipeline
-from stages.run.stage import Stage
 
 Splat = Callable[..., Any]
 

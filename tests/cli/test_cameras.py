@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.formats.cameras import read_cameras
-from stages.formats.cameras_colmap import read_model, write_colmap_model
-from tests.formats.test_cameras_colmap import example
+from stages.cameras.camera_file import read_cameras
+from stages.cameras.colmap import read_model, write_colmap_model
+from tests.cameras.test_colmap import example
 
 
 def poses(path: Path) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.run.errors import Interrupted, SplatError
+from stages.base.errors import Interrupted, SplatError
 from stages.run.lock import locked
 
 STAGES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")

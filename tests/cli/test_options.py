@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from splatcli import console, options
-from stages.run.errors import SplatError
+from stages.base.errors import SplatError
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatcli import rendering, routes
+from splatcli import viewpoints
+from splatcli.commands import render as command
 from stages import formats
-from stages.formats import cameras_nerfstudio
+from stages.cameras import nerfstudio
+from stages.film.image_files import eight_bits
 from stages.raster import render
 from stages.scene import Camera, View, look_at
-from stages.viewer.picture_files import eight_bits
 from tests import scenes
 from tests.tolerances import FILM_LEVELS
 
@@ -46,7 +47,7 @@ def around(count: int = 8) -> tuple[View, ...]:
 @pytest.fixture
 def captured(monkeypatch: pytest.MonkeyPatch) -> tuple[View, ...]:
     """As if the file lay in a run with these photographs."""
-    monkeypatch.setattr(routes, "views_of", lambda pipeline: around())
+    monkeypatch.setattr(viewpoints, "views_of", lambda pipeline: around())
     return around()
 
 
@@ -116,7 +117,7 @@ def test_the_capture_path_passes_the_photographs(splat, scene: Path, captured) -
 
 
 def test_a_camera_file_is_drawn_camera_by_camera(splat, scene: Path, captured) -> None:
-    cameras_nerfstudio.write(Path("transforms.json"), captured, Path("images"))
+    nerfstudio.write(Path("transforms.json"), captured, Path("images"))
     splat("render", str(scene), "--path", "transforms.json", "--out", "f")
     pictures = sorted(Path("f").iterdir())
     for path, view in zip(pictures, captured, strict=True):
@@ -131,7 +132,7 @@ def test_a_camera_file_is_drawn_camera_by_camera(splat, scene: Path, captured) -
 
 
 def test_a_distorted_camera_file_is_drawn_and_said(splat, scene: Path, captured) -> None:
-    cameras_nerfstudio.write(Path("t.json"), captured, Path("images"))
+    nerfstudio.write(Path("t.json"), captured, Path("images"))
     data = json.loads(Path("t.json").read_text())
     Path("t.json").write_text(json.dumps(data | {"k1": 0.1}))
     result = splat("render", str(scene), "--path", "t.json", "--out", "a.mp4")
@@ -148,7 +149,7 @@ def test_frames_of_a_longer_path_are_counted_and_kept(splat, scene: Path) -> Non
 
 
 def test_half_a_capture_is_said(splat, scene: Path, monkeypatch) -> None:
-    monkeypatch.setattr(routes, "views_of", lambda pipeline: around(8)[:3])
+    monkeypatch.setattr(viewpoints, "views_of", lambda pipeline: around(8)[:3])
     result = splat("render", str(scene), "--frames", "2", "--width", "16", "--out", "f")
     assert "81 degrees" in result.stderr
 
@@ -181,7 +182,7 @@ def test_what_cannot_be_drawn_is_said(splat, scene: Path, words, code: int, said
 
 
 def test_a_picture_larger_than_memory_is_refused_at_once(splat, scene: Path, monkeypatch) -> None:
-    monkeypatch.setattr(rendering.memory, "available_mib", lambda: 100.0)
+    monkeypatch.setattr(command.memory, "available_mib", lambda: 100.0)
     result = splat("render", str(scene), "--out", "a.png", "--width", "4000")
     assert result.exit_code == 6
     assert "smaller --width" in result.stderr

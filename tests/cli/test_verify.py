@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from splatcli import verify as command
-from splatcli import views
+from splatcli import sources
 from splatcli.app import app
+from splatcli.commands import verify as command
 from stages import formats
-from stages.run.errors import SplatError
+from stages.base.errors import SplatError
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -69,7 +69,7 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
             run_folder=path, manifest=outputs.get, load=lambda name: outputs[name]
         )
 
-    monkeypatch.setattr(views, "Pipeline", pipeline)
+    monkeypatch.setattr(sources, "Pipeline", pipeline)
     monkeypatch.setattr(command, "Pipeline", pipeline)
     return folder
 

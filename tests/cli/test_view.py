@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from splatcli import viewing
+from splatcli.commands import view as command
 from stages import formats
 from tests.formats.truth import many_splats
 
@@ -94,10 +94,10 @@ def test_only_what_trains_can_be_watched(splat) -> None:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others always have a screen")
 def test_no_browser_is_tried_without_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(viewing.webbrowser, "open", lambda a: opened.append(a) is None)
+    monkeypatch.setattr(command.webbrowser, "open", lambda a: opened.append(a) is None)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
-    assert not viewing.open_page("http://127.0.0.1:1/")
+    assert not command.open_page("http://127.0.0.1:1/")
     monkeypatch.setenv("DISPLAY", ":0")
-    assert viewing.open_page("http://127.0.0.1:2/")
+    assert command.open_page("http://127.0.0.1:2/")
     assert opened == ["http://127.0.0.1:2/"]

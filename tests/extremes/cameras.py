@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from stages import train
+from stages.base.stage import Report
 from stages.raster import RasterSettings, render
-from stages.run.stage import Report
 from stages.scene import Camera, look_at, scene_extent
 from tests.extremes.measured import Measured, broken, difference, worst
 from tests.extremes.oracles import centre_in_picture, inside_clamp, means2d, textbook_picture

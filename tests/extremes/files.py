@@ -12,7 +12,7 @@ import numpy as np
 
 from stages import formats
 from stages.formats import usd_read
-from stages.formats.verify import FileContent, read_back
+from stages.proof.second_readers import FileContent, read_back
 from stages.raster import RasterSettings, Rendering, render
 from stages.scene import Camera, Splats, look_at
 from tests.extremes.measured import Measured, worst

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from stages.raster.cpu import splat_arrays
-from stages.raster.projection import AXES, COMPENSATION, camera_row, footprint_values
+from stages.raster.cpu.projection import (
+    AXES,
+    COMPENSATION,
+    camera_row,
+    footprint_values,
+)
+from stages.raster.cpu.rasteriser import splat_arrays
 
 
 def rotation(scene, view, settings):

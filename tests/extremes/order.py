@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from stages import train
+from stages.base.stage import Report
+from stages.kernels.pool import Pool
 from stages.raster import RasterSettings, render
-from stages.raster.cpu import CpuRasteriser, splat_arrays
-from stages.raster.pool import Pool
-from stages.run.stage import Report
+from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative
 from tests.small_scene import small_scene

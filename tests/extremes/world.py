@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from stages import formats, seed
+from stages.base.stage import Report
 from stages.formats import usd_read
 from stages.raster import RasterSettings, render
-from stages.run.stage import Report
 from stages.scene import Camera, Reconstruction, Splats, View, look_at, scene_extent
 from stages.structure.levelling import upright
 from tests.extremes.measured import Measured, difference, worst

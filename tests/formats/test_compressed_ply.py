@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from stages import formats
-from stages.formats import compressed_ply, morton
-from stages.run.errors import SplatError
-from stages.scene import Splats
+from stages.base.errors import SplatError
+from stages.formats import compressed_ply
+from stages.scene import Splats, morton
 from tests.formats.truth import C0, many_splats
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from stages import formats
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 from tests.formats.test_round_trip import edited_glb, ply_bytes
 from tests.formats.truth import many_splats, red_splat
 

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stages import formats
-from stages.formats.verify import read_back
+from stages.proof.second_readers import read_back
 from tests.formats.truth import (
     C0,
     MEAN,

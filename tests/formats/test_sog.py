@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stages import formats
-from stages.formats import codebook, morton
-from stages.run.errors import SplatError
+from stages.base.errors import SplatError
+from stages.formats import codebook
+from stages.scene import morton
 from tests.formats.test_compressed_ply import angles, three_splats
 from tests.formats.truth import C0, many_splats
 

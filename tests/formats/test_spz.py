@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from stages import formats
+from stages.base.errors import SplatError
 from stages.formats import spz
-from stages.formats.proof import Prover, cameras_for
-from stages.run.errors import SplatError
+from stages.proof.prover import Prover, cameras_for
 from stages.scene import Splats
 from tests.formats.test_compressed_ply import angles
 from tests.formats.truth import C0, many_splats, red_splat

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from stages import formats
+from stages.base.errors import SplatError
 from stages.formats import spz_read
-from stages.run.errors import SplatError
 from tests.formats.truth import many_splats
 
 FOLDER = Path(__file__).parent / "spz4"

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.formats import cameras_colmap, cameras_nerfstudio
+from stages.cameras import colmap, nerfstudio
 from stages.scene import Camera, View
-from tests.formats.test_cameras_colmap import example
+from tests.cameras.test_colmap import example
 from tests.fuzz.layer import Layer
 
 _MOST = 1 << 12  # more cannot come out of files of some 20 kB
@@ -25,9 +25,9 @@ def _files(kind: str) -> dict[str, bytes]:
         folder = Path(name)
         if kind == "json":
             views = [View(n, n, c) for n, c in zip(model.names, model.cameras, strict=True)]
-            cameras_nerfstudio.write(folder / "transforms.json", views, folder)
+            nerfstudio.write(folder / "transforms.json", views, folder)
         else:
-            cameras_colmap.write_colmap_model(folder, model)
+            colmap.write_colmap_model(folder, model)
         if kind == "txt":
             import pycolmap
 
@@ -45,11 +45,11 @@ def _checked(cameras: list[Camera]) -> int:
 
 
 def _read_transforms(path: Path) -> int:
-    return _checked([view.camera for view in cameras_nerfstudio.read(path).views])
+    return _checked([view.camera for view in nerfstudio.read(path).views])
 
 
 def _read_model(path: Path) -> int:
-    found, model = cameras_colmap.read_model(path.parent)
+    found, model = colmap.read_model(path.parent)
     assert len(model.points) <= _MOST
     assert len(model.observed_px) <= _MOST
     assert np.isfinite(model.points).all()

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, given, settings
 
-from stages.run.errors import SplatError
+from stages.base.errors import SplatError
 from tests.fuzz.changes import damaged
 from tests.fuzz.layers import LAYERS
 

@@ -12,7 +12,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from stages.photos.exif import Exif, read_exif
-from tests.photos.pictures import exif
+from tests.photos.made_files import exif
 
 
 def read_back(tags: Image.Exif, size: tuple[int, int] = (80, 60)) -> Exif:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.base.errors import SplatError
 from stages.photos.load import load_image
-from stages.run.errors import SplatError
 
 
 def test_colours_arrive_as_red_green_blue(tmp_path: Path) -> None:

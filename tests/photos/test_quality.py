@@ -13,7 +13,7 @@ from stages.photos.advice import about_capture, listed
 from stages.photos.load import load_image
 from stages.photos.quality import measure, near_duplicates
 from stages.scene import Photo
-from tests.photos.pictures import textured
+from tests.photos.made_files import textured
 
 SAMPLE = Path(__file__).parents[2] / "sample_captures/still_life/images/IMG_0012.jpg"
 

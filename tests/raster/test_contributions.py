@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stages.raster import RasterSettings
-from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
 from stages.raster.reference import blend_weights, parameters_of, project, render_tensors
 from tests.scenes import camera, cloud, relative, splats
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from stages.kernels.pool import Pool
 from stages.raster import RasterSettings, render
-from stages.raster.cpu import CpuRasteriser, splat_arrays
-from stages.raster.pool import Pool
+from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stages.raster import RasterSettings, render
-from stages.raster.api import LOG_SCALE_MAX, QUATERNION_MIN
+from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import rgb_to_dc
 from tests.extremes.table import NO_GPU, ROWS, measured
 from tests.scenes import BACKENDS, PARAMETERS, camera, cloud, gradients, join, relative, splats

@@ -5,10 +5,16 @@ import pytest
 import torch
 
 from stages.raster import RasterSettings, render
-from stages.raster.cpu import CpuRasteriser, splat_arrays
-from stages.raster.projection import A, B, C, camera_row, footprint_values
+from stages.raster.cpu.projection import (
+    A,
+    B,
+    C,
+    camera_row,
+    footprint_values,
+)
+from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
+from stages.raster.cpu.splat_kernels import sh_basis_values as kernel_basis
 from stages.raster.reference import parameters_of, project, sh_basis
-from stages.raster.splat_kernels import sh_basis_values as kernel_basis
 from stages.scene import Camera
 from tests.scenes import BACKENDS, camera, splats
 from tests.tolerances import WORKED

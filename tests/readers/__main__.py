@@ -18,14 +18,19 @@ import numpy as np
 from PIL import Image
 
 from stages import formats, quantise, sfm
-from stages.formats.compare import differences
 from stages.formats.rows import kept_rows
-from stages.formats.verify import read_back
 from stages.measure.images import psnr
+from stages.proof.compare import differences
+from stages.proof.second_readers import read_back
 from stages.raster import render
 from stages.scene import Camera, Splats, View, look_at, split_held_out
 from tests.packages import UnavailableError, installed
-from tests.readers.pictures import ENGINES, Engine, camera_for, served
+from tests.readers.engines import (
+    ENGINES,
+    Engine,
+    camera_for,
+    served,
+)
 from tests.readers.validators import gltf_complaints, usd_complaints
 from tests.readers.values import READERS
 from tests.viewer.browser import Browser, chromium

@@ -13,10 +13,15 @@ from stages.formats.rows import degrees_in_use
 from stages.measure.images import psnr
 from stages.raster import render
 from stages.scene import Splats
-from tests.readers.pictures import ENGINES, Engine, camera_for, served
+from tests.readers.engines import (
+    ENGINES,
+    Engine,
+    camera_for,
+    served,
+)
 from tests.tolerances import ENGINE_DB
 from tests.viewer.browser import Browser
-from tests.viewer.pictures import coloured_scene, views, wrong_versions
+from tests.viewer.screenshots import coloured_scene, views, wrong_versions
 from tests.viewer.test_in_browser import browser
 
 __all__ = ["browser"]

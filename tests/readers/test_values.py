@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from stages import formats
-from stages.formats.compare import differences
-from stages.formats.verify import read_back
+from stages.proof.compare import differences
+from stages.proof.second_readers import read_back
 from tests.formats.truth import many_splats
 from tests.packages import UnavailableError
 from tests.readers.values import READERS, Reader

@@ -11,8 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from stages.formats.verify import read_back
-from stages.formats.verify_content import Y_UP, FileContent, logits, splats_of
+from stages.proof.content import (
+    Y_UP,
+    FileContent,
+    logits,
+    splats_of,
+)
+from stages.proof.second_readers import read_back
 from tests.packages import UnavailableError, installed, node
 
 HERE = Path(__file__).parent

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from stages.run.stage import Report, Stage
+from stages.base.stage import Report, Stage
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stages.base.errors import SplatError
 from stages.run.digests import FileRecord, combined_digest, differences, record_files
-from stages.run.errors import SplatError
 from stages.run.manifest import plain, read_sealed, write_sealed
 
 values = st.recursive(

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.run.errors import Family, Interrupted, SplatError
+from stages.base.errors import Family, Interrupted, SplatError
 from stages.run.lock import locked
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Listener, Pipeline

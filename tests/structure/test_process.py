@@ -13,7 +13,7 @@ from threading import Event, Timer
 
 import pytest
 
-from stages.run.errors import Interrupted, SplatError
+from stages.base.errors import Interrupted, SplatError
 from stages.structure import process
 from stages.structure.job import CameraGuess, Job
 

@@ -12,7 +12,7 @@ from plyfile import PlyData
 from pygltflib import GLTF2
 
 from stages import formats
-from stages.run.errors import Family, SplatError
+from stages.base.errors import Family, SplatError
 from stages.surface import files
 from stages.surface.files import write_meshes
 from stages.surface.mesh import Mesh

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.raster.pool import Pool
-from stages.run.errors import Interrupted
-from stages.run.stage import Report
+from stages.base.errors import Interrupted
+from stages.base.stage import Report
+from stages.kernels.pool import Pool
 from stages.scene import Reconstruction, Splats
 from stages.surface import fuse
 from stages.surface.make import MadeMesh, make

@@ -5,8 +5,8 @@ import pytest
 import torch
 import torch.nn.functional as functional
 
+from stages.kernels.pool import Pool
 from stages.measure.images import psnr, ssim
-from stages.raster.pool import Pool
 from stages.training.loss import SSIM_WEIGHT, image_loss
 from tests.tolerances import LOSS_GRADIENT
 

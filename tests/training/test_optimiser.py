@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.raster.cpu import Backward, gradient_columns
-from stages.raster.pool import Pool
+from stages.kernels.pool import Pool
+from stages.raster.cpu.rasteriser import Backward, gradient_columns
 from stages.training.optimiser import (
     EPSILON,
     LearningRates,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from stages import train
+from stages.base.errors import Interrupted, SplatError
+from stages.base.stage import Report
 from stages.measure.images import psnr
 from stages.raster import RasterSettings, render
-from stages.raster.cpu import CpuRasteriser, splat_arrays
+from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
 from stages.raster.smoothing import smoothing_widths
-from stages.run.errors import Interrupted, SplatError
-from stages.run.stage import Report
 from stages.scene import Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training.densify import densify

@@ -17,7 +17,13 @@ from stages.viewer.server import LocalServer
 from stages.viewer.site import site
 from tests.packages import UnavailableError
 from tests.viewer.browser import Browser, chromium
-from tests.viewer.pictures import SIZE, coloured_scene, drawn, views, wrong_versions
+from tests.viewer.screenshots import (
+    SIZE,
+    coloured_scene,
+    drawn,
+    views,
+    wrong_versions,
+)
 
 SAME_DB = 30.0
 """The viewer keeps scales and rotations as 16-bit floats, cuts splats off earlier and blends in 8

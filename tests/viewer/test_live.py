@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.page.shots import Shot, shots_of
 from stages.scene import Camera
 from stages.viewer.live import SIDES, LivePage
 from stages.viewer.server import LocalServer
-from stages.viewer.shots import Shot, shots_of
 from tests import scenes
 from tests.viewer.test_page import HOSTILE, Elements, views
 from tests.viewer.test_server import ask

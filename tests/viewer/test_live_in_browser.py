@@ -18,17 +18,18 @@ import pytest
 from PIL import Image
 
 from stages.measure.images import psnr
+from stages.page.shots import shots_of
 from stages.raster import RasterSettings, render
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Splats, scene_extent
+from stages.scene.framing import depth_of_interest
 from stages.training.trainer import NEAR
 from stages.viewer.live import LivePage
 from stages.viewer.server import LocalServer
-from stages.viewer.shots import depth_of_interest, shots_of
 from tests.sample import command, environment, process_words
 from tests.tolerances import LIVE_PICTURE_DB
 from tests.viewer.browser import Browser
-from tests.viewer.pictures import coloured_scene, views, wrong_versions
+from tests.viewer.screenshots import coloured_scene, views, wrong_versions
 from tests.viewer.test_in_browser import WORSE_DB, browser
 
 __all__ = ["browser"]

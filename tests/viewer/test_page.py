@@ -14,10 +14,10 @@ import pytest
 
 from stages import formats
 from stages.formats import html
-from stages.formats.verify import read_back
+from stages.page import document
+from stages.page.shots import Shot, as_plain, shots_of
+from stages.proof.second_readers import read_back
 from stages.scene import Camera, Splats, View, look_at
-from stages.viewer import compose
-from stages.viewer.shots import Shot, as_plain, shots_of
 from stages.viewer.site import site
 from tests import scenes
 
@@ -67,7 +67,7 @@ def test_a_page_fetches_nothing_from_anywhere(tmp_path: Path) -> None:
             assert not (attrs.get(name) or "").strip().startswith(("http", "//", ".", "/")), tag
     styles = "".join(re.findall(r"<style>(.*?)</style>", text, re.S))
     assert not re.search(r"@import|url\((?!['\"]?data:)", styles)
-    ours = text.replace(compose._asset("vendor", "supersplat-viewer.min.js"), "")
+    ours = text.replace(document._asset("vendor", "supersplat-viewer.min.js"), "")
     assert not re.search(r"https?://", ours)
     (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)
     assert "default-src 'none'" in policy
@@ -94,7 +94,7 @@ def test_a_page_says_how_many_splats_it_holds_and_holds_them(tmp_path: Path) -> 
 def test_many_chunks_are_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(html, "_CHUNK_BYTES", 999)
     splats = scenes.cloud(200)
-    assert page_of(tmp_path, splats).count(compose.CHUNK_START) > 10
+    assert page_of(tmp_path, splats).count(document.CHUNK_START) > 10
     np.testing.assert_array_equal(formats.read(tmp_path / "a.html").means, splats.means)
     np.testing.assert_array_equal(read_back(tmp_path / "a.html").splats.means, splats.means)
 
@@ -103,15 +103,15 @@ def test_many_chunks_are_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_damaged_page_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
-    from stages.run.errors import SplatError
+    from stages.base.errors import SplatError
 
     monkeypatch.setattr(html, "_CHUNK_BYTES", 999)
     text = page_of(tmp_path, scenes.cloud(200))
-    start = text.index(compose.CHUNK_START, text.index(compose.CHUNK_START) + 1)
-    start += len(compose.CHUNK_START)
-    end = text.index(compose.CHUNK_END, start)
+    start = text.index(document.CHUNK_START, text.index(document.CHUNK_START) + 1)
+    start += len(document.CHUNK_START)
+    end = text.index(document.CHUNK_END, start)
     if damage == "a chunk less":
-        text = text[: start - len(compose.CHUNK_START)] + text[end + len(compose.CHUNK_END) :]
+        text = text[: start - len(document.CHUNK_START)] + text[end + len(document.CHUNK_END) :]
     elif damage == "another letter":
         text = text[:start] + ("B" if text[start] == "A" else "A") + text[start + 1 :]
     elif damage == "not base64":
@@ -127,7 +127,7 @@ def test_a_damaged_page_is_refused(
 def test_names_cannot_break_out_of_the_page() -> None:
     splats = scenes.cloud(3)
     shots = [Shot(HOSTILE, scenes.camera())]
-    text = compose.head(compose.scene_data(HOSTILE, splats, shots, units="arbitrary"))
+    text = document.head(document.scene_data(HOSTILE, splats, shots, units="arbitrary"))
     elements = Elements(text)
     assert elements.scene()["shots"][0]["name"] == HOSTILE
     assert elements.scene()["title"] == HOSTILE

@@ -1,0 +1,118 @@
+"""`splat cameras`: those of a run, of nerfstudio or of COLMAP, for programs that train on them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli import console
+from stages.base.atomic import make_folder
+from stages.base.errors import Family, SplatError
+from stages.run import runfolder
+from stages.run.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from stages.cameras.camera_file import CameraFile
+    from stages.cameras.colmap import ColmapModel
+
+
+def convert(source: Path, out: Path, as_json: bool) -> None:
+    """Read cameras from `source` and write them to `out`: a .json file for nerfstudio, or a folder
+    for COLMAP. Raises SplatError."""
+    from stages.cameras import colmap, nerfstudio
+
+    to_nerfstudio = _is_json(out)
+    found, model = _read(source)
+    if found.distorted:
+        raise SplatError(
+            "cameras-distorted",
+            given=f"The lenses of {found.distorted} of {len(found.views)} cameras distort.",
+            wanted="Pinhole cameras: other ones would not fit their photographs.",
+            hint="Undistort the photographs first, or make a run of them with `splat process`.",
+        )
+    pictures = found.folder
+    if to_nerfstudio:
+        points = (model.points, model.colours) if model is not None else (None, None)
+        nerfstudio.write(out, found.views, pictures, *points)
+    else:
+        if model is None:
+            model, pictures = _without_points(found)
+        make_folder(out)
+        colmap.write_colmap_model(out, model)
+    facts = {
+        "out": str(out),
+        "cameras": len(found.views),
+        "points": len(model.points) if model is not None else 0,
+        "pictures": str(pictures),
+        "pictures_found": (found.folder / found.views[0].image).is_file(),
+    }
+    _tell(facts, as_json)
+
+
+def _tell(facts: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        console.emit("cameras", **facts)
+        return
+    points = f", {facts['points']:,} points" if facts["points"] else ""
+    console.note(f"{facts['out']}: {facts['cameras']} cameras{points}")
+    if facts["pictures_found"]:
+        console.note(f"Their pictures are in {facts['pictures']}")
+    else:
+        console.note(f"Warning: their pictures are not in {facts['pictures']}.", "yellow")
+
+
+def _is_json(out: Path) -> bool:
+    if out.suffix.lower() == ".json" and not out.is_dir():
+        return True
+    if out.is_dir() or (not out.suffix and not out.exists()):
+        return False
+    raise SplatError(
+        "cameras-target",
+        given=f"{out} is to hold cameras.",
+        wanted="A name that ends in .json for nerfstudio, or a folder's for COLMAP.",
+        hint="For example transforms.json, or sparse",
+        family=Family.USAGE,
+    )
+
+
+def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
+    """The cameras, and the model with its points if it is one."""
+    from stages.cameras.camera_file import read_cameras
+    from stages.cameras.colmap import model_folder, read_model
+
+    if runfolder.is_run_folder(source):
+        pipeline = Pipeline(source)
+        if pipeline.manifest("sfm") is None:
+            raise SplatError(
+                "no-cameras-yet",
+                given=f"No cameras of {source} have been found yet.",
+                wanted="A run in which `sfm` has finished.",
+                hint="Run `splat process` to go on.",
+                family=Family.USAGE,
+            )
+        source = pipeline.stage_folder("sfm") / "colmap"
+    folder = model_folder(source)
+    return (read_cameras(source), None) if folder is None else read_model(folder)
+
+
+def _without_points(found: CameraFile) -> tuple[ColmapModel, Path]:
+    """(a model, the folder that its picture names start from): the innermost that holds all."""
+    import numpy as np
+
+    from stages.cameras.colmap import ColmapModel
+
+    paths = [os.path.normpath(found.folder / view.image) for view in found.views]
+    root = os.path.commonpath([os.path.dirname(path) for path in paths])
+    none = np.zeros(0)
+    model = ColmapModel(
+        names=tuple(Path(path).relative_to(root).as_posix() for path in paths),
+        cameras=tuple(view.camera for view in found.views),
+        points=np.zeros((0, 3)),
+        colours=np.zeros((0, 3), np.uint8),
+        errors_px=none,
+        observed_points=none.astype(np.int32),
+        observing_views=none.astype(np.int32),
+        observed_px=np.zeros((0, 2)),
+    )
+    return model, Path(root)

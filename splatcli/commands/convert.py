@@ -1,0 +1,138 @@
+"""`splat convert`: a splat file of one format made into another, and the difference told."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli import console
+from stages.base.errors import Family, SplatError
+
+if TYPE_CHECKING:
+    from stages.scene import Splats
+
+Say = Callable[[str], None]
+_STEPS = 3
+
+
+def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
+    """Read `source`, write `target`, read that again with another parser, draw it and compare.
+
+    Raises SplatError: what keeps a file from being read or written, "convert-mesh", and
+    "convert-verify-failed".
+    """
+    from stages import formats
+    from stages.formats.rows import kept_rows
+
+    if target.name.lower().endswith((".mesh.glb", ".mesh.ply")):
+        raise _no_mesh(target)
+    names = formats.format_of(source), formats.format_of(target)  # before any work is done
+    begun = time.monotonic()
+    with _progress(quiet, as_json) as say:
+        say(f"reading {source}")
+        splats = formats.read(source)
+        say(f"writing {target}")
+        dropped = formats.write(target, splats)
+        say(f"comparing {target}")
+        found = _proven(source, target, kept_rows(splats)[0])
+    size = target.stat().st_size
+    if names[1] == "gltf" and len(splats) > dropped:
+        size += target.with_suffix(".bin").stat().st_size
+    facts: dict[str, Any] = {
+        "source": str(source),
+        "target": str(target),
+        "splats": len(splats) - dropped,
+        "dropped": dropped,
+        "size_bytes": size,
+        "bytes_per_splat": round(size / max(1, len(splats) - dropped), 2),
+        "seconds": round(time.monotonic() - begun, 2),
+        **found,
+    }
+    if as_json:
+        console.emit("converted", **facts)
+        return
+    if dropped:
+        console.note(f"Warning: {dropped} splats that no viewer can draw were left out.", "yellow")
+    _show(facts, found, quiet)
+
+
+def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
+    told = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
+    quality = console.figure("verify_db", found["verify_db"])
+    console.note(f"{facts['target']}: {told}, {facts['bytes_per_splat']:.1f} bytes each, {quality}")
+    worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}
+    if worst and not quiet:
+        console.note(f"Largest differences: {console.figures(worst)}", "dim")
+
+
+def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
+    """What the proof found. Raises SplatError "convert-verify-failed"."""
+    from splatcli.sources import views_around
+    from stages.formats import format_of
+    from stages.proof.prover import Prover, cameras_for
+
+    cameras = cameras_for(splats, views_around(source))
+    proof = Prover.of(splats, cameras, came_as=format_of(source)).prove(target)
+    if proof.fault:
+        raise _failed(target, proof.fault)
+    return proof.figures
+
+
+def _no_mesh(target: Path) -> SplatError:
+    return SplatError(
+        "convert-mesh",
+        given=f"{target} is the name of a mesh.",
+        wanted="A format of splats: a mesh is made with the cameras of a run.",
+        hint="In the run's folder: splat export --format mesh",
+        family=Family.USAGE,
+    )
+
+
+def _failed(path: Path, reason: str) -> SplatError:
+    return SplatError(
+        "convert-verify-failed",
+        given=f"{path} came out wrong: {reason}.",
+        wanted="A file that another program reads as the same splats.",
+        hint="Convert to another format, and report this with the file that was read.",
+        family=Family.QUALITY,
+    )
+
+
+@contextlib.contextmanager
+def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
+    """What tells the steps: lines, or events for machines; on a terminal a bar that also shows how
+    far each step is."""
+    done = 0
+    if as_json or quiet or not console.err.is_terminal:
+
+        def say(label: str) -> None:
+            nonlocal done
+            if as_json:
+                console.emit("progress", label=label, done=done, total=_STEPS)
+            elif not quiet:
+                console.note(label)
+            done += 1
+
+        yield say
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    from stages.formats.blocks import watched
+
+    columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
+    with Progress(*columns, console=console.err, transient=True) as bar:
+        task = bar.add_task("", total=None)
+
+        def show(label: str) -> None:
+            nonlocal done
+            done += 1
+            bar.reset(task, total=None, description=f"{done}/{_STEPS} {label}")
+
+        def pass_over(rows: int, total: int) -> None:
+            bar.update(task, completed=rows, total=total)
+
+        with watched(pass_over):
+            yield show

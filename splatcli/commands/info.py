@@ -1,0 +1,143 @@
+"""`splat info`: what is in a run or a splat file, and what in it may cause trouble."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli import console
+from splatcli.sources import newest_with_splats, splats_of
+from stages.run.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from stages.proof.census import Census
+    from stages.scene import ExportedFile, Splats
+
+_ATTRIBUTES = {
+    "means": "positions",
+    "quaternions": "rotations",
+    "log_scales": "sizes",
+    "opacity_logits": "opacities",
+    "sh": "colours",
+}
+
+
+def show(target: Path | None, as_json: bool) -> None:
+    """Print counts, degrees, bounds, bytes and warnings of a file or of a run's newest splats.
+
+    Raises SplatError for what cannot be read; values that are not finite are warned of.
+    """
+    from stages.proof.census import census_of
+
+    splats, pipeline = splats_of(target, strict=False)
+    census = census_of(splats)
+    facts = describe(splats, census)
+    if pipeline is None and target is not None:
+        facts = {**_about_file(target, len(splats)), **facts}
+    if pipeline is not None:
+        facts = {**_about_run(pipeline), **facts}
+    warnings = warnings_of(census)
+    if as_json:
+        console.emit("info", **facts, warnings=dict(warnings))
+        return
+    rows = [(console.label(k), console.figure(k, _flat(v))) for k, v in facts.items()]
+    console.table(("", ""), rows)
+    for code, sentence in warnings:
+        console.note(f"Warning: {sentence} ({code})", "yellow")
+
+
+def describe(splats: Splats, census: Census) -> dict[str, Any]:
+    """Plain facts: count, SH degrees, bounds of the centres, typical size and opacity."""
+    facts: dict[str, Any] = {"splats": census.count, "sh_degree": splats.sh_degree}
+    if not census.count:
+        return facts
+    facts["splats_by_degree"] = {str(degree): n for degree, n in census.by_degree.items()}
+    facts["not_finite"] = census.count - census.whole
+    if census.whole:
+        facts["bounds_low"], facts["bounds_high"] = _rounded(census.low), _rounded(census.high)
+        facts["middle_98_percent_low"] = _rounded(census.middle_low)
+        facts["middle_98_percent_high"] = _rounded(census.middle_high)
+        facts["median_centre"] = _rounded(census.median_centre)
+        facts["median_scale"] = census.median_scale
+        facts["median_opacity"] = census.median_opacity
+    facts["origin"] = [float(value) for value in splats.origin]
+    return facts
+
+
+def warnings_of(census: Census) -> list[tuple[str, str]]:
+    """(code, sentence) for each kind of trouble that is there."""
+    from stages.proof.census import GIANT_PART, NEEDLE_ASPECT, OUTLIER_BOXES
+
+    found = []
+    for name, count in census.not_finite.items():
+        told = f"{_share(count, census)} not finite in their {_ATTRIBUTES[name]}"
+        found.append((f"not-finite-{_ATTRIBUTES[name]}", f"{told}: no viewer can draw them."))
+    kinds = {
+        "no-rotation": (census.no_rotation, "without a rotation: no viewer can draw them."),
+        "too-large": (census.too_large, "larger than numbers go: no viewer can draw them."),
+        "transparent": (census.transparent, "below an opacity of 1/255, and so never seen."),
+        "needles": (census.needles, f"needles, over {NEEDLE_ASPECT:g} times as long as wide."),
+        "giants": (census.giants, f"giants, larger than {GIANT_PART:g} of the scene."),
+        "outliers": (
+            census.outliers,
+            f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
+        ),
+        "duplicates": (census.duplicates, "duplicates of others."),
+    }
+    for code, (count, what) in kinds.items():
+        if count:
+            found.append((code, f"{_share(count, census)} {what}"))
+    return found
+
+
+def _share(count: int, census: Census) -> str:
+    """ "12 splats (0.03 %) are"."""
+    return f"{count:,} splats ({100 * count / census.count:.2g} %) are"
+
+
+def _about_file(path: Path, count: int) -> dict[str, Any]:
+    from stages.proof.anatomy import anatomy_of
+
+    facts: dict[str, Any] = {"file": str(path), "size": console.size(path.stat().st_size)}
+    anatomy = anatomy_of(path)
+    if anatomy is not None and count:
+        name = "bytes_per_splat_unpacked" if anatomy.unpacked else "bytes_per_splat"
+        facts[name] = {what: round(n / count, 2) for what, n in anatomy.parts.items()}
+    return facts
+
+
+def _about_run(pipeline: Pipeline) -> dict[str, Any]:
+    name = newest_with_splats(pipeline)
+    facts: dict[str, Any] = {"run": str(pipeline.run_folder), "splats_from": name}
+    if pipeline.manifest("sfm") is not None:
+        reconstruction = pipeline.load("sfm")
+        facts["photographs"] = len(reconstruction.views)
+        facts["units"] = reconstruction.units
+        facts["levelled"] = bool(reconstruction.levelled)
+    manifest = pipeline.manifest("export")
+    if manifest is not None:
+        folder = pipeline.stage_folder("export")
+        proven = manifest.metrics.get("formats", {})
+        facts["assets"] = {
+            str(folder / file.path): _size_and_quality(file, proven.get(file.format, {}))
+            for file in pipeline.load("export").files
+        }
+    return facts
+
+
+def _size_and_quality(file: ExportedFile, proven: dict[str, Any]) -> str:
+    """proven: what export found when it read the file back and drew it."""
+    told = [console.size(file.size_bytes)]
+    if "verify_db" in proven:
+        told.append(console.figure("verify_db", proven["verify_db"]))
+    return ", ".join(told)
+
+
+def _rounded(values: Any) -> list[float]:
+    return [float(f"{value:.5g}") for value in values]
+
+
+def _flat(value: Any) -> Any:
+    if isinstance(value, dict):
+        return ", ".join(f"{key}: {item}" for key, item in value.items())
+    return " ".join(map(str, value)) if isinstance(value, list) else value

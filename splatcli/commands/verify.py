@@ -1,0 +1,203 @@
+"""`splat verify`: does a file hold what was trained?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli import console, sources
+from stages.base import threads
+from stages.base.errors import Family, SplatError
+from stages.run import runfolder
+from stages.run.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from stages.proof.prover import Proof
+    from stages.scene import Splats, View
+
+_ITSELF = "itself"
+_ONLY_ITSELF = (
+    "Two readers that share no code were compared: the file is whole and says the same to both. "
+    "That it is what was trained is not shown by this; name the original with --against."
+)
+
+
+@dataclass(frozen=True)
+class _Original:
+    """What files are compared with. name: in words. came_as: the format that it was read from.
+    itself: whether that was the file in question."""
+
+    splats: Splats
+    views: tuple[View, ...]
+    name: str
+    came_as: str = ""
+    itself: bool = False
+
+
+def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool) -> None:
+    """Prove one file, or all that a run exported. Raises SplatError: what keeps a file from being
+    read, and "verify-failed" for one that is wrong."""
+    from stages import formats
+    from stages.proof.prover import Prover, cameras_for
+
+    files = _files(target)
+    for file in files:
+        formats.format_of(file)  # before any work is done
+    quiet = quiet or as_json
+    if not quiet and not threads.kernels_are_compiled():
+        console.note("Compiling the kernels; this is done once and takes about half a minute.")
+    original, prover, found = None, None, []
+    for number, file in enumerate(files):
+        _tell(f"verifying {file}", number, len(files), quiet, as_json)
+        # Our own reader first: it survives what ends other parsers, and says what is damaged.
+        read = formats.read(file)
+        if original is None or prover is None:
+            original = _original(file, against, read)
+            cameras = cameras_for(original.splats, original.views)
+            prover = Prover.of(original.splats, cameras, came_as=original.came_as)
+        del read
+        proof = prover.prove(file, exact=original.itself)
+        found.append((file, proof))
+        if as_json:
+            console.emit("verified", **_facts(file, proof, original))
+    assert original is not None
+    if not as_json:
+        _show(found, original, quiet)
+    _judge(found, original)
+
+
+def _files(target: Path | None) -> list[Path]:
+    """The file itself; of a run folder, what it exported but for meshes, which hold no splats."""
+    if target is not None and not target.is_dir():
+        return [target]
+    from splatcli.folders import find_run_folder
+
+    assets = Pipeline(find_run_folder(target)).load("export")
+    files = [file for file in assets.files if not file.format.startswith("mesh.")]
+    if not files:
+        raise SplatError(
+            "verify-no-splats",
+            given=f"{assets.folder} holds meshes only.",
+            wanted="Files of splats: meshes were read back and compared when they were written.",
+            hint="Export one, for example: splat export --format ply",
+            family=Family.USAGE,
+        )
+    return [assets.folder / file.path for file in files]
+
+
+def _original(file: Path, against: Path | None, read: Splats) -> _Original:
+    """read: what our own reader finds in `file`."""
+    from stages import formats
+    from stages.formats.rows import kept_rows
+
+    if against is not None and not against.is_dir():
+        seen = sources.views_around(against) or sources.views_around(file)
+        splats = kept_rows(formats.read(against))[0]
+        return _Original(splats, seen, str(against), formats.format_of(against))
+    if against is not None and not runfolder.is_run_folder(against):
+        raise runfolder.missing(against)
+    run = Pipeline(against) if against is not None else sources.pipeline_around(file)
+    if run is None or (against is None and run.manifest("quantise") is None):
+        return _Original(kept_rows(read)[0], (), _ITSELF, formats.format_of(file), itself=True)
+    seen = run.load("sfm").views
+    splats = kept_rows(run.load("quantise").splats)[0]
+    return _Original(splats, seen, f"the run {run.run_folder}")
+
+
+def _tell(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:
+    if as_json:
+        console.emit("progress", label=label, done=done, total=total)
+    elif not quiet:
+        console.note(label)
+
+
+def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
+    from stages.formats import format_of
+
+    size = file.stat().st_size
+    if format_of(file) == "gltf" and file.with_suffix(".bin").is_file():
+        size += file.with_suffix(".bin").stat().st_size
+    return {
+        "file": str(file),
+        "format": format_of(file),
+        "against": original.name,
+        "splats": proof.splats,
+        "size_bytes": size,
+        "bytes_per_splat": round(size / max(1, proof.splats), 2),
+        **proof.figures,
+        "right": not proof.fault,
+        "fault": proof.fault,
+    }
+
+
+def _show(found: list[tuple[Path, Proof]], original: _Original, quiet: bool) -> None:
+    facts = [_facts(file, proof, original) for file, proof in found]
+    if quiet:
+        for each in facts:
+            what = each["fault"] or console.figure("verify_db", each["verify_db"])
+            console.out.print(f"{each['file']}: {what}", markup=False)
+        return
+    shown = dict.fromkeys(name for each in facts for name in each)
+    for name in (
+        "file",
+        "size_bytes",
+        "against",
+        "right",
+        "fault",
+        "worst_attribute",
+        "worst_splat",
+    ):
+        shown.pop(name, None)
+    rows = [
+        (_label(name), *(console.figure(name, each.get(name, "-")) for each in facts))
+        for name in shown
+    ]
+    rows.append(("worst", *map(_worst, facts)))
+    rows.append(("verdict", *("wrong" if each["fault"] else "right" for each in facts)))
+    console.table(
+        ("", *(file.name for file, _ in found)), rows, title=f"Compared with {original.name}"
+    )
+    if original.itself:
+        console.note(_ONLY_ITSELF, "dim")
+    for file, proof in found:
+        if proof.loss_db is not None:
+            loss = f"{file.name} shows: it differs by {proof.loss_db:.1f} dB. {_why(file)}"
+            console.note(f"Warning: {loss}", "yellow")
+
+
+def _worst(facts: dict[str, Any]) -> str:
+    name = facts.get("worst_attribute")
+    return f"{console.label(name)} of splat {facts['worst_splat']:,}" if name else "-"
+
+
+def _label(name: str) -> str:
+    words = {"verify_db": "worst PSNR", "verify_mean_db": "mean PSNR", "verify_cameras": "cameras"}
+    if name.startswith("max_"):
+        what, _, unit = name.removeprefix("max_").partition("_error")
+        return f"{console.label(what)} off by" + unit.replace("_", ", ")
+    return words.get(name, console.label(name))
+
+
+def _why(file: Path) -> str:
+    from stages.formats import LOSSY, format_of
+
+    why = LOSSY.get(format_of(file))
+    return f"The format {why}." if why else "The original had lost more already."
+
+
+def _judge(found: list[tuple[Path, Proof]], original: _Original) -> None:
+    wrong = [(file, proof.fault) for file, proof in found if proof.fault]
+    if not wrong:
+        return
+    raise SplatError(
+        "verify-failed",
+        given="; ".join(f"{file.name} is wrong: {fault}" for file, fault in wrong) + ".",
+        wanted="A file that two readers understand alike."
+        if original.itself
+        else f"The same splats as in {original.name}.",
+        hint="Report this with the file."
+        if original.itself
+        else "Write it again with `splat export` or `splat convert`.",
+        family=Family.QUALITY,
+    )

@@ -1,0 +1,63 @@
+"""The splats and cameras that commands look at: of a run or of a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatcli.folders import find_run_folder
+from splatcli.viewpoints import views_of
+from stages.base.errors import Family, SplatError
+from stages.run import runfolder
+from stages.run.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from stages.scene import Splats, View
+
+_STAGES_WITH_SPLATS = ("quantise", "prune", "train", "seed")
+
+
+def splats_of(target: Path | None, strict: bool = True) -> tuple[Splats, Pipeline | None]:
+    """(splats, the pipeline if `target` is a run): from a file, or a run's newest stage. strict:
+    whether a value that is not finite makes a file unreadable."""
+    if target is not None and target.is_file():
+        from stages.formats import read
+
+        return read(target, strict=strict), None
+    if target is not None and not target.exists():
+        raise SplatError(
+            "file-missing",
+            given=f"{target} does not exist.",
+            wanted="A run folder or a splat file.",
+            hint="Check the path.",
+        )
+    pipeline = Pipeline(find_run_folder(target))
+    name = newest_with_splats(pipeline)
+    output = pipeline.load(name)
+    return (output.splats if name == "quantise" else output), pipeline
+
+
+def newest_with_splats(pipeline: Pipeline) -> str:
+    """The last finished stage whose output is splats. Raises SplatError (no-splats-yet)."""
+    for name in _STAGES_WITH_SPLATS:
+        if pipeline.manifest(name) is not None:
+            return name
+    raise SplatError(
+        "no-splats-yet",
+        given=f"No stage of {pipeline.run_folder} has made splats yet.",
+        wanted="A run in which at least `seed` has finished.",
+        hint="Run `splat process` to go on.",
+        family=Family.USAGE,
+    )
+
+
+def pipeline_around(file: Path | None) -> Pipeline | None:
+    """The run whose export folder a file lies in: its cameras fit the file."""
+    if file is None or not runfolder.is_run_folder(file.absolute().parent.parent):
+        return None
+    return Pipeline(file.absolute().parent.parent)
+
+
+def views_around(file: Path | None) -> tuple[View, ...]:
+    """Those of the run whose export folder a file lies in; none elsewhere."""
+    return views_of(pipeline_around(file))

@@ -1,0 +1,78 @@
+"""Files appear under their final names whole, or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from stages.base.errors import Family, SplatError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a name beside `path` to write to; it takes the place of `path` when the block ends.
+
+    The name keeps the suffix, because some writers choose the format by it. If the block raises,
+    the temporary file is deleted and `path` is as it was. Raises SplatError "disk-full" or
+    "file-not-written" for what the operating system refuses.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".partial-{os.getpid()}-{path.name}")
+    try:
+        if not path.parent.is_dir():  # said here, because some writers would make the folder
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise _refused(path, error) from error
+    finally:
+        # The error that matters is already on its way if even this is refused.
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def make_folder(folder: Path) -> None:
+    """Make `folder`, and those that it lies in. Raises SplatError "folder-not-made"."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SplatError(
+            "folder-not-made",
+            given=f"{folder} cannot be made: {error.strerror or error}.",
+            wanted="A place where a folder may be made.",
+            hint="Name another one.",
+            family=Family.RESOURCES,
+        ) from error
+
+
+def _refused(path: Path, error: OSError) -> SplatError:
+    reason = error.strerror or str(error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or (error.errno is None and _is_full(path)):
+        return SplatError(
+            "disk-full",
+            given=f"{path} could not be written: {reason}.",
+            wanted="The disk must have room for it.",
+            hint="Free some space, or choose a folder on another disk, and run the command again.",
+            family=Family.RESOURCES,
+        )
+    return SplatError(
+        "file-not-written",
+        given=f"{path} could not be written: {reason}.",
+        wanted="Its folder must exist and be writable.",
+        hint="Check the folder's permissions, or choose another one.",
+        family=Family.RESOURCES,
+    )
+
+
+def _is_full(path: Path) -> bool:
+    """NumPy and the USD library do not say why a write failed: look."""
+    try:
+        return shutil.disk_usage(path.parent).free < 1 << 20
+    except OSError:
+        return False

@@ -1,0 +1,79 @@
+"""What a reader says about a file that it cannot use."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from stages.base.errors import SplatError
+
+
+class BadFileError(ValueError):
+    """A reader's own finding; `reading` adds which file it was."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a file was to be read as."""
+
+    code: str
+    what: str
+    wanted: str
+    hint: str
+
+
+SPLATS = Kind(
+    "splats-unreadable",
+    "splats",
+    "A whole file of Gaussian splats in the format that its suffix names.",
+    "Copy or export the file again; if it comes from another program, try its .ply.",
+)
+CAMERAS = Kind(
+    "cameras-unreadable",
+    "cameras",
+    "A transforms.json of nerfstudio's, or a COLMAP model with pinhole cameras.",
+    "Export the cameras again; a run's own are written by `splat cameras RUN OUT`.",
+)
+
+
+@contextmanager
+def reading(path: Path, kind: Kind = SPLATS) -> Iterator[None]:
+    """Turn what goes wrong inside the block into the SplatError of `kind` that names `path`.
+
+    Besides `BadFileError` these are the exceptions that damaged bytes raise in Python and NumPy;
+    RecursionError comes from deeply nested JSON, MemoryError from a file larger than memory.
+    """
+    try:
+        if not path.exists():
+            raise BadFileError("there is no such file")
+        if not path.is_file():  # a folder; or a pipe or device, on which a reader would hang
+            raise BadFileError("it is not a regular file")
+        if path.stat().st_size == 0:
+            raise BadFileError("it is empty")
+        yield
+    except OSError as error:
+        raise _unreadable(path, kind, error.strerror or str(error)) from error
+    except MemoryError as error:
+        raise _unreadable(path, kind, "it needs more memory than there is") from error
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        OverflowError,
+        RecursionError,
+        struct.error,
+    ) as error:
+        reason = str(error) if isinstance(error, BadFileError) else f"it is damaged ({error})"
+        raise _unreadable(path, kind, reason) from error
+
+
+def _unreadable(path: Path, kind: Kind, reason: str) -> SplatError:
+    return SplatError(
+        kind.code,
+        given=f"{path} cannot be read as {kind.what}: {reason}.",
+        wanted=kind.wanted,
+        hint=kind.hint,
+    )

@@ -1,0 +1,97 @@
+"""Camera files of other programs: which module reads one, and what all of them must pass.
+
+What is read comes in our own conventions: world to camera, x right, y down, z forward. The world
+is the file's own; see each module for what it does to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.bad_files import BadFileError
+from stages.base.errors import Family, SplatError
+from stages.scene import Camera, View
+
+LARGEST_SIDE = 100_000  # pixels; no lens shows more
+FARTHEST = 1e12  # world units; squares of it are still far from overflowing
+ROTATION_TOLERANCE = 1e-3  # of R^T R: three decimals of text; beyond, it is not a rotation
+_ROUNDED = 1e-9  # of R^T R: more than float64 leaves
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """views: pinhole cameras, in the file's order; a lens's distortion is left out.
+    folder: where `View.image` starts. distorted: how many views have a lens that distorts."""
+
+    views: tuple[View, ...]
+    folder: Path
+    distorted: int
+
+
+def read_cameras(path: Path) -> CameraFile:
+    """The cameras of a transforms.json or of a COLMAP model's folder (or of one that has it as
+    sparse/0). Raises SplatError "cameras-unknown" or "cameras-unreadable"."""
+    from stages.cameras import colmap, nerfstudio
+
+    if path.suffix.lower() == ".json":
+        return nerfstudio.read(path)
+    folder = colmap.model_folder(path)
+    if folder is not None:
+        return colmap.read(folder)
+    raise SplatError(
+        "cameras-unknown",
+        given=f"{path} is neither a .json file nor a folder with a COLMAP model.",
+        wanted="nerfstudio's transforms.json, or a folder with COLMAP's images.bin or images.txt.",
+        hint="Check the path; a run's cameras are written by `splat cameras RUN OUT`.",
+        family=Family.USAGE,
+    )
+
+
+def make_views(
+    names: Sequence[str],
+    sizes: NDArray[np.floating],
+    intrinsics: NDArray[np.float64],
+    world_to_camera: NDArray[np.float64],
+    images: Sequence[str] | None = None,
+) -> tuple[View, ...]:
+    """Views of plain arrays. names [V]; images [V], if they differ; sizes [V, 2] width and height;
+    intrinsics [V, 4] fx, fy, cx, cy; world_to_camera [V, 3 or 4, 4], rounding in its rotation
+    taken out. Raises BadFileError for what no camera can be."""
+    if not len(names):
+        raise BadFileError("it holds no camera")
+    poses = np.asarray(world_to_camera, np.float64)[:, :3]
+    _refuse(names, ~((sizes >= 1) & (sizes <= LARGEST_SIDE)).all(1), "a size in pixels")
+    bad = ~np.isfinite(intrinsics).all(1) | (intrinsics[:, :2] <= 0).any(1)
+    _refuse(names, bad, "a focal length and a principal point")
+    _refuse(names, ~(np.abs(poses) < FARTHEST).all((1, 2)), "a position and a direction")
+    rotations = poses[:, :, :3]
+    error = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
+    _refuse(
+        names, (error > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0), "a rotation matrix"
+    )
+    rough = error > _ROUNDED
+    left, _, right = np.linalg.svd(rotations[rough])
+    matrices = np.tile(np.eye(4), (len(names), 1, 1))
+    matrices[:, :3] = poses
+    matrices[rough, :3, :3] = left @ right
+    return tuple(
+        View(
+            name=name,
+            image=image,
+            camera=Camera(int(size[0]), int(size[1]), *lens.tolist(), matrix),  # type: ignore[call-arg]
+        )
+        for name, image, size, lens, matrix in zip(
+            names, images or names, sizes, intrinsics, matrices, strict=True
+        )
+    )
+
+
+def _refuse(names: Sequence[str], bad: Any, wanted: str) -> None:
+    if bad.any():
+        raise BadFileError(f"camera {names[int(np.argmax(bad))][:80]!r} lacks {wanted}")

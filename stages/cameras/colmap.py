@@ -1,0 +1,173 @@
+"""COLMAP's sparse model: cameras, images and points, read as binary or text, written as binary.
+
+Layout: https://colmap.github.io/format.html (binary files hold the same fields as the text files,
+little-endian). Records are written in order of id, so that equal models give equal bytes. The axes
+are ours; so is the world, as long as nobody turned it.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.atomic import replacing
+from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.cameras import colmap_records as records
+from stages.cameras.camera_file import CameraFile, make_views
+from stages.cameras.colmap_records import POINT2D, Image
+from stages.scene import Camera
+from stages.scene.rotations import matrices_of, quaternions_of
+
+_PINHOLE = 1
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Pinhole views and points. Ids in the files are positions + 1.
+
+    names [V] picture paths, from the folder of pictures. cameras [V]: the pose of each view; views
+    with equal intrinsics share one camera. points [P, 3], colours [P, 3] uint8, errors_px [P].
+    observed_points [O], observing_views [O], observed_px [O, 2]; sorted by point, then view.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    points: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    errors_px: NDArray[np.float64]
+    observed_points: NDArray[np.int32]
+    observing_views: NDArray[np.int32]
+    observed_px: NDArray[np.float64]
+
+
+def write_colmap_model(folder: Path, model: ColmapModel) -> None:
+    """Write the three files into `folder`, which is made. Raises SplatError when it cannot be."""
+    folder.mkdir(parents=True, exist_ok=True)
+    intrinsics = [_intrinsics(camera) for camera in model.cameras]
+    distinct = sorted(set(intrinsics), key=intrinsics.index)
+    camera_ids = {values: number for number, values in enumerate(distinct, 1)}
+    with replacing(folder / "cameras.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(distinct)))
+        for (width, height, *params), number in camera_ids.items():
+            file.write(struct.pack("<IiQQ4d", number, _PINHOLE, width, height, *params))
+    # by_view lists observations view by view; rank is an observation's number within its view.
+    by_view = np.argsort(model.observing_views, kind="stable")
+    counts = np.bincount(model.observing_views, minlength=len(model.names))
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    rank = np.empty(len(by_view), np.int64)
+    rank[by_view] = np.arange(len(by_view)) - np.repeat(starts[:-1], counts)
+    with replacing(folder / "images.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(model.names)))
+        for view, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
+            pose = (
+                *quaternions_of(camera.world_to_camera[:3, :3]),
+                *camera.world_to_camera[:3, 3],
+            )
+            file.write(struct.pack("<I7dI", view + 1, *pose, camera_ids[intrinsics[view]]))
+            file.write(name.encode() + b"\0")
+            rows = by_view[starts[view] : starts[view + 1]]
+            points2d = np.empty(len(rows), POINT2D)
+            points2d["xy"] = model.observed_px[rows]
+            points2d["point"] = model.observed_points[rows] + 1
+            file.write(struct.pack("<Q", len(rows)) + points2d.tobytes())
+    _write_points(folder / "points3D.bin", model, rank)
+
+
+def _write_points(target: Path, model: ColmapModel, rank: NDArray[np.int64]) -> None:
+    starts = np.searchsorted(model.observed_points, np.arange(len(model.points) + 1))
+    elements = np.stack([model.observing_views + 1, rank], axis=1).astype("<u4")
+    with replacing(target) as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(model.points)))
+        for point, (xyz, rgb, error) in enumerate(
+            zip(model.points, model.colours, model.errors_px, strict=True)
+        ):
+            track = elements[starts[point] : starts[point + 1]]
+            file.write(struct.pack("<Q3d3BdQ", point + 1, *xyz, *rgb, error, len(track)))
+            file.write(track.tobytes())
+
+
+def _intrinsics(camera: Camera) -> tuple[int, int, float, float, float, float]:
+    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+
+
+def model_folder(path: Path) -> Path | None:
+    """Where the model lies: `path` itself, or inside as COLMAP and its users lay it out."""
+    for folder in (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0"):
+        if any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
+            return folder
+    return None
+
+
+def read(folder: Path) -> CameraFile:
+    """The cameras of a model, in the order of the file. The pictures are looked for in a folder
+    `images` beside the model. Raises SplatError "cameras-unreadable"."""
+    return _read(folder)[0]
+
+
+def read_model(folder: Path) -> tuple[CameraFile, ColmapModel]:
+    """Cameras and points; 2D points that belong to none are left out. Raises SplatError
+    "cameras-unreadable"."""
+    found, images = _read(folder)
+    path, text = _part(folder, "points3D")
+    with reading(path, CAMERAS):
+        rows = np.array(
+            list((records.text_points if text else records.binary_points)(path)), np.float64
+        )
+        rows = rows.reshape(-1, 8)
+        if not np.isfinite(rows).all() or (np.abs(rows[:, 4:7] - 127.5) > 127.5).any():
+            raise BadFileError("a point has a value that is not a number or not a colour")
+        ids = rows[:, 0].astype(np.int64)
+        order = np.argsort(ids, kind="stable")
+        views = np.repeat(np.arange(len(images)), [len(image.seen) for image in images])
+        seen = np.concatenate([image.seen for image in images])
+        place = np.searchsorted(ids[order], seen["point"])
+        known = np.isin(seen["point"], ids)
+        points = order[place[known]].astype(np.int32)
+        sort = np.lexsort((views[known], points))
+        return found, ColmapModel(
+            names=tuple(view.name for view in found.views),
+            cameras=tuple(view.camera for view in found.views),
+            points=rows[:, 1:4],
+            colours=rows[:, 4:7].astype(np.uint8),
+            errors_px=rows[:, 7],
+            observed_points=points[sort],
+            observing_views=views[known][sort].astype(np.int32),
+            observed_px=seen["xy"][known][sort],
+        )
+
+
+def _part(folder: Path, name: str) -> tuple[Path, bool]:
+    """(the file, whether it is text); the binary one where there are both, as COLMAP does."""
+    binary = folder / f"{name}.bin"
+    text = folder / f"{name}.txt"
+    return (text, True) if text.is_file() and not binary.is_file() else (binary, False)
+
+
+def _read(folder: Path) -> tuple[CameraFile, list[Image]]:
+    path, text = _part(folder, "cameras")
+    with reading(path, CAMERAS):
+        lenses = dict((records.text_cameras if text else records.binary_cameras)(path))
+    path, text = _part(folder, "images")
+    with reading(path, CAMERAS):
+        images = list((records.text_images if text else records.binary_images)(path))
+        missing = {image.camera for image in images} - lenses.keys()
+        if missing:
+            raise BadFileError(f"there is no camera {min(missing)}")
+        numbers = np.array([lenses[image.camera][:6] for image in images]).reshape(-1, 6)
+        poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
+        with np.errstate(invalid="ignore"):  # `make_views` refuses a quaternion of length 0
+            rotations = matrices_of(poses[:, :4])
+        views = make_views(
+            [image.name for image in images],
+            numbers[:, :2],
+            numbers[:, 2:],
+            np.concatenate([rotations, poses[:, 4:, None]], axis=2),
+        )
+    bent = sum(any(lenses[image.camera][6:]) for image in images)
+    near = [base / "images" for base in (folder, folder.parent, folder.parent.parent)]
+    pictures = next((path for path in near if path.is_dir()), near[0])
+    return CameraFile(views, pictures, bent), images

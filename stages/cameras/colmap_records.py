@@ -1,0 +1,117 @@
+"""The records of COLMAP's model files, binary and text: https://colmap.github.io/format.html.
+
+Read here and not by pycolmap (4.2), which never comes back from a points file that was cut short,
+and takes whatever lies in memory for the lens if the cameras file was. Nothing is allocated by a
+count that the file claims.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.bad_files import BadFileError
+
+_PERSPECTIVE = {  # by number: name and how many parameters; the others are fisheyes
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    6: ("FULL_OPENCV", 12),
+}
+_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+
+
+@dataclass(frozen=True)
+class Image:
+    """camera: its number. pose [7]: quaternion w, x, y, z and translation. seen [n]: 2D points of
+    type `POINT2D`; point -1 is none."""
+
+    name: str
+    camera: int
+    pose: tuple[float, ...]
+    seen: NDArray[np.void]
+
+
+def _lens(model: str, width: int, height: int, params: tuple[float, ...]) -> tuple[float, ...]:
+    """width, height, fx, fy, cx, cy, then what distorts."""
+    if model in _ONE_FOCAL:
+        params = params[:1] + params
+    return width, height, *params
+
+
+def binary_cameras(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """(number, lens) of cameras.bin; see `_lens`. Raises BadFileError and struct.error."""
+    data, at = path.read_bytes(), 8
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        number, kind, width, height = struct.unpack_from("<IiQQ", data, at)
+        if kind not in _PERSPECTIVE:
+            raise BadFileError(f"its camera model {kind} is no perspective")
+        model, count = _PERSPECTIVE[kind]
+        yield number, _lens(model, width, height, struct.unpack_from(f"<{count}d", data, at + 24))
+        at += 24 + 8 * count
+
+
+def binary_images(path: Path) -> Iterator[Image]:
+    """Of images.bin. Raises struct.error and ValueError."""
+    data, at = path.read_bytes(), 8
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        _, *pose, camera = struct.unpack_from("<I7dI", data, at)
+        end = data.index(b"\0", at + 64)
+        (count,) = struct.unpack_from("<Q", data, end + 1)
+        seen = np.frombuffer(data, POINT2D, count, end + 9)
+        yield Image(data[at + 64 : end].decode(), camera, tuple(pose), seen)
+        at = end + 9 + POINT2D.itemsize * count
+
+
+def binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+    """Number, x, y, z, r, g, b, error of points3D.bin. Raises BadFileError and struct.error."""
+    data, at = path.read_bytes(), 8
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        *row, track = struct.unpack_from("<Q3d3BdQ", data, at)
+        at += 51 + 8 * track
+        if at > len(data):
+            raise BadFileError("it was cut short")
+        yield tuple(row)
+
+
+def _lines(path: Path) -> Iterator[str]:
+    with path.open(encoding="utf-8") as file:
+        yield from (line.rstrip("\r\n") for line in file if not line.startswith("#"))
+
+
+def text_cameras(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """As `binary_cameras`, of cameras.txt. Raises BadFileError and ValueError."""
+    counts = dict(_PERSPECTIVE.values())
+    for line in filter(str.strip, _lines(path)):
+        number, model, width, height, *params = line.split()
+        if counts.get(model) != len(params):
+            raise BadFileError(f"its camera model {model[:40]} is no perspective that is known")
+        yield int(number), _lens(model, int(width), int(height), tuple(map(float, params)))
+
+
+def text_images(path: Path) -> Iterator[Image]:
+    """Of images.txt: two lines each, the second empty if nothing is seen. Raises BadFileError
+    and ValueError."""
+    lines = _lines(path)
+    for line in filter(str.strip, lines):
+        _, *pose, camera, name = words = line.split(maxsplit=9)
+        if len(words) != 10:
+            raise BadFileError("an image lacks a part of its line")
+        seen = np.array(next(lines, "").split(), np.float64).reshape(-1, 3)
+        points = np.empty(len(seen), POINT2D)
+        points["xy"], points["point"] = seen[:, :2], seen[:, 2]
+        yield Image(name.strip(), int(camera), tuple(map(float, pose)), points)
+
+
+def text_points(path: Path) -> Iterator[tuple[float, ...]]:
+    """As `binary_points`, of points3D.txt. Raises ValueError."""
+    for line in filter(str.strip, _lines(path)):
+        yield tuple(map(float, line.split(maxsplit=8)[:8]))

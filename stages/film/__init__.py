@@ -1,0 +1,1 @@
+"""Paths through a scene, and the pictures and films drawn along them."""

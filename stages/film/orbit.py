@@ -1,0 +1,78 @@
+"""A turn around the scene, as a path of cameras with one lens. The world is ours: up is -Y."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Camera, Splats, look_at
+from stages.scene.framing import depth_of_interest
+
+_STEEPEST_DEG = 80.0  # seen from straight above, left and right lose their meaning
+_INSIDE = 0.9  # of an arc: at its very ends a single photograph looks
+
+
+def orbit(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
+    """A level turn around what `cameras` look at, from their median distance and elevation; to and
+    fro over the arc that they saw where they left out much of the turn. A loop: the frame after
+    the last would be the first.
+    """
+    middle = focus(cameras, splats)
+    away = np.array([camera.centre for camera in cameras]) - middle
+    distance = max(float(np.median(np.linalg.norm(away, axis=1))), 1e-6)
+    limit = np.radians(_STEEPEST_DEG)
+    heights = np.arctan2(-away[:, 1], np.hypot(away[:, 0], away[:, 2]))
+    height = float(np.clip(np.median(heights), -limit, limit))
+    start, half = arc_seen(cameras, splats)
+    phase = 2 * np.pi * np.arange(frames) / frames
+    angles = start + (phase if half >= np.pi else half * np.sin(phase))
+    lens = common_lens(cameras)
+    made = []
+    for angle in angles:
+        ray = (np.cos(height) * np.sin(angle), -np.sin(height), np.cos(height) * np.cos(angle))
+        eye = middle + distance * np.array(ray)
+        made.append(replace(lens, world_to_camera=look_at(eye, middle)))
+    return tuple(made)
+
+
+def arc_seen(cameras: Sequence[Camera], splats: Splats) -> tuple[float, float]:
+    """(middle, half its width) of the arc around what `cameras` look at that they look from well,
+    radians from +z towards +x. The whole turn, from the first camera on, unless a third of it or
+    more is left out; also of one camera."""
+    away = np.array([camera.centre for camera in cameras]) - focus(cameras, splats)
+    angles = np.arctan2(away[:, 0], away[:, 2])
+    ordered = np.sort(angles)
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    widest = int(np.argmax(gaps))
+    if len(cameras) == 1 or gaps[widest] < 2 * np.pi / 3:
+        return float(angles[0]), np.pi
+    half = (2 * np.pi - gaps[widest]) / 2
+    return float(ordered[(widest + 1) % len(ordered)] + half), float(_INSIDE * half)
+
+
+def focus(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.float64]:
+    """[3] the point nearest to the cameras' axes (least squares), if most look towards it; else
+    the median of what lies in the middle of each picture."""
+    centres = np.array([camera.centre for camera in cameras])
+    ahead = np.array([camera.forward for camera in cameras])
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    normal = across.sum(0)
+    if np.linalg.cond(normal) < 1e4:
+        point = np.linalg.solve(normal, np.einsum("vij,vj->i", across, centres))
+        if np.mean(np.einsum("vi,vi->v", point - centres, ahead) > 0) > 0.5:
+            return np.asarray(point)
+    depths = [depth_of_interest(camera, splats.means) for camera in cameras]
+    return np.asarray(np.median(centres + np.array(depths)[:, None] * ahead, axis=0))
+
+
+def common_lens(cameras: Sequence[Camera]) -> Camera:
+    """A camera with the commonest size and the median focal lengths of that size, looking through
+    the middle of its picture."""
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    width, height = max(sizes, key=sizes.count)
+    alike = [c for c, size in zip(cameras, sizes, strict=True) if size == (width, height)]
+    fx, fy = (float(np.median([getattr(c, name) for c in alike])) for name in ("fx", "fy"))
+    return Camera(width, height, fx, fy, width / 2, height / 2, np.eye(4))

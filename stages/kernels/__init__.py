@@ -1,0 +1,1 @@
+"""What compiled kernels stand on: vectors, threads, and where they are kept."""

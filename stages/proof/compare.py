@@ -1,0 +1,150 @@
+"""How far the values of a file lie from the splats that it was made from."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats import FORMATS
+from stages.formats.turn import FLIP, turned
+from stages.proof.matching import Rows, extent_of, matched_rows
+from stages.proof.second_readers import FileContent
+from stages.scene import SH_C0, Splats
+
+_BLOCK = 1 << 16  # rows compared at a time: copies stay small however large the file is
+
+# What one can begin to see, for naming the worst: a part of the scene's extent, natural
+# logarithms, degrees, and one step of 8 bits.
+_VISIBLE = {
+    "position": 0.001,
+    "log_scale": 0.02,
+    "opacity": 1 / 255,
+    "rotation": 1.0,
+    "sh": 1 / 255 / SH_C0,
+}
+_ROUNDING = 0.01  # less than this part of it is not worth a name
+# Beyond it half of all splats are wrong, which no format does to them but a mistake does: a part
+# of the extent, natural logarithms, 0..1, degrees, 0..1.
+_WRONG = {"position": 0.01, "log_scale": 0.5, "opacity": 0.1, "rotation": 10.0, "colour": 0.1}
+# Squared error of the view-dependent colours over their own squares: 1 where they are left out,
+# about 2 where they are others'.
+_WRONG_SH = 1.1
+_LONG = 0.2  # a splat has a direction if its axes differ by this logarithm
+
+
+@dataclass(frozen=True)
+class Differences:
+    """largest: by attribute; positions in world units, scales in natural logarithms, opacities
+    in 0..1, rotations in degrees, SH as stored. worst: the attribute whose largest difference shows
+    most, "" if it is only rounding; worst_row: where in the file. wrong: what of most splats is
+    wrong.
+    rows [N]: for each row of the file the row of the original.
+    """
+
+    largest: dict[str, float]
+    worst: str
+    worst_row: int
+    wrong: tuple[str, ...]
+    rows: Rows
+
+
+def differences(splats: Splats, content: FileContent, *names: str) -> Differences:
+    """Compare a file with the `splats` that it should hold: as many, finite, in any order.
+
+    names: of the formats through which either went; some sort the rows, .splat keeps degree 0.
+    """
+    file = content.splats
+    upright = content.world_from_file[1, 1] < 0
+    placed = splats
+    if upright:
+        placed = replace(splats, means=splats.means * FLIP.astype(splats.means.dtype))
+    rows = matched_rows(placed, file, _orders(placed, file, names))
+    degree = 0 if "splat" in names else max(splats.sh_degree, file.sh_degree)
+    errors: dict[str, NDArray[np.floating]] = {}
+    sums = np.zeros(3)
+    for start in range(0, len(file), _BLOCK):
+        a = splats.take(rows[start : start + _BLOCK]).with_sh_degree(degree)
+        b = file.take(np.arange(start, start + len(a))).with_sh_degree(degree)
+        a = turned(a) if upright else a
+        for name, values in _block(a, b).items():
+            if name not in errors:
+                errors[name] = np.empty(len(file), np.float32)
+            errors[name][start : start + len(a)] = values
+        pair = a.sh[:, 1:].astype(np.float64), b.sh[:, 1:].astype(np.float64)
+        sums += [np.square(x).sum() for x in (pair[0] - pair[1], *pair)]
+    return _summary(errors, sums, extent_of(splats), rows)
+
+
+def _orders(truth: Splats, file: Splats, names: tuple[str, ...]) -> Iterator[Rows]:
+    """How a format may have sorted either side; made one by one, as the first often fits."""
+    for name in names:
+        order = getattr(importlib.import_module(f"stages.formats.{FORMATS[name]}"), "order", None)
+        if order is not None:
+            yield order(truth)
+            yield np.argsort(order(file))
+
+
+def _block(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
+    """By attribute, [N] the difference of each splat."""
+    both = a.sh[:, 0], b.sh[:, 0]
+    seen = [np.clip(0.5 + SH_C0 * dc.astype(np.float64), 0, 1) for dc in both]
+    return {
+        "position": _apart(a.means, b.means),
+        "log_scale": _apart(a.log_scales, b.log_scales),
+        "opacity": _apart(a.opacities[:, None], b.opacities[:, None]),
+        "rotation": rotations_apart(a.quaternions, b.quaternions),
+        "sh": _apart(a.sh.reshape(len(a), -1), b.sh.reshape(len(b), -1)),
+        "colour": np.abs(seen[0] - seen[1]).max(axis=1, initial=0.0),
+        "length": a.log_scales.max(axis=1) - a.log_scales.min(axis=1),
+    }
+
+
+def _apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N] largest difference in each row of [N, K]."""
+    return np.abs(a.astype(np.float64) - b.astype(np.float64)).max(axis=1, initial=0.0)
+
+
+def rotations_apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N] degrees between rotations [N, 4] of ellipsoids, which half turns about their own axes
+    leave as they are: of the four turns from a to b, the least."""
+    a, b = (q.astype(np.float64) for q in (a, b))
+    a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
+    real = (a * b).sum(axis=1, keepdims=True)
+    imaginary = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
+    between = np.sort(np.abs(np.concatenate([real, imaginary], axis=1)), axis=1)
+    # The largest component is the cosine of half the angle; the sine is exact for small ones.
+    sine = np.linalg.norm(between[:, :3], axis=1)
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(sine, 1))))
+
+
+def _summary(
+    errors: dict[str, NDArray[np.floating]], sums: NDArray[np.float64], extent: float, rows: Rows
+) -> Differences:
+    if not errors:
+        return Differences(_named(dict.fromkeys(_VISIBLE, 0.0)), "", 0, (), rows)
+    largest = {name: float(errors[name].max()) for name in _VISIBLE}
+    units = {**_VISIBLE, "position": _VISIBLE["position"] * extent}
+    worst = max(_VISIBLE, key=lambda name: largest[name] / units[name])
+    shows = largest[worst] > _ROUNDING * units[worst]
+    row = int(errors[worst].argmax()) if shows else 0
+    typical = {name: float(np.median(errors[name])) for name in _WRONG}
+    typical["position"] /= extent
+    long = errors["length"] > _LONG
+    typical["rotation"] = float(np.median(errors["rotation"][long])) if long.any() else 0.0
+    wrong = [name for name in _WRONG if typical[name] > _WRONG[name]]
+    if sums[0] > _WRONG_SH * max(sums[1], sums[2]):
+        wrong.append("sh")
+    return Differences(_named(largest), worst if shows else "", row, tuple(wrong), rows)
+
+
+def _named(largest: dict[str, float]) -> dict[str, float]:
+    """With units in the names, three digits each."""
+    names = {"rotation": "max_rotation_error_degrees"}
+    return {
+        names.get(name, f"max_{name}_error"): float(f"{value:.3g}")
+        for name, value in largest.items()
+    }

@@ -1,0 +1,135 @@
+"""Which of the mistakes that files in the wild are made with would explain a wrong one.
+
+A wrong order of axes, of quaternion components or of SH coefficients looks consistent to every
+reader; only what the file should hold tells it. Each is tried, and one that explains is named.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+
+from stages.formats.turn import FLIP, turned
+from stages.proof.compare import Differences, rotations_apart
+from stages.proof.content import FileContent
+from stages.proof.matching import extent_of
+from stages.scene import Splats
+
+_WORDS = {
+    "position": "positions",
+    "log_scale": "sizes",
+    "opacity": "opacities",
+    "rotation": "rotations",
+    "colour": "colours",
+    "sh": "view-dependent colours",
+}
+_SAMPLE = 20_000  # splats that a guess is tried on
+_FITS_EXTENT = 0.02
+_FITS_DEGREES = 3.0
+_FITS_ENERGY = 0.3  # of the squares of the coefficients
+_QUANTILES = np.linspace(3, 97, 33)
+
+
+def explained(splats: Splats, content: FileContent, found: Differences) -> str:
+    """What most splats of a file have wrong, and what it looks like; "" if nothing."""
+    if not found.wrong:
+        return ""
+    if "position" in found.wrong:  # then the wrong splats are paired, and all else differs too
+        return _joined("most positions are wrong", _axes(splats, content))
+    what = f"most {' and '.join(_WORDS[name] for name in found.wrong)} are wrong"
+    rows = np.arange(0, len(splats), max(1, len(splats) // _SAMPLE))
+    truth, file = splats.take(found.rows[rows]), content.splats.take(rows)
+    pairs = [(truth, file)]
+    if content.world_from_file[1, 1] < 0:  # the mistake was made after the turn, or before
+        pairs = [(turned(truth), file), (truth, turned(file))]
+    for tried, name in ((_quaternions, "rotation"), (_sh, "sh")):
+        if name in found.wrong:
+            what = _joined(what, next(filter(None, (tried(*pair) for pair in pairs)), ""))
+    return what
+
+
+def _joined(what: str, guess: str) -> str:
+    return f"{what}: {guess}" if guess else what
+
+
+def _axes(splats: Splats, content: FileContent) -> str:
+    """From the spread along each axis alone, so in any order of the rows."""
+    means = splats.means * (FLIP if content.world_from_file[1, 1] < 0 else np.ones(3))
+    wanted = np.percentile(means, _QUANTILES, axis=0)
+    given = np.percentile(content.splats.means, _QUANTILES, axis=0)
+    extent = extent_of(splats)
+    best, least = "", _FITS_EXTENT * extent
+    for axes in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            # the quantiles of -x are those of x, negated and from the other end
+            tried = [
+                wanted[:, axis] if sign > 0 else -wanted[::-1, axis]
+                for axis, sign in zip(axes, signs, strict=True)
+            ]
+            apart = float(np.abs(np.stack(tried, axis=1) - given).max())
+            if apart < least:
+                least = apart
+                best = ", ".join(
+                    ("" if sign > 0 else "-") + "xyz"[axis]
+                    for axis, sign in zip(axes, signs, strict=True)
+                )
+    if best and best != "x, y, z":
+        return f"its x, y, z look like {best}"
+    if best:
+        return ""
+    # not turned: moved, or of another size
+    times = float(np.ptp(given, axis=0).sum() / max(float(np.ptp(wanted, axis=0).sum()), 1e-30))
+    moved = np.median(given - times * wanted, axis=0)
+    if float(np.abs(given - times * wanted - moved).max()) > _FITS_EXTENT * extent * times:
+        return ""
+    if abs(times - 1) > _FITS_EXTENT:
+        return f"the scene is {times:.3g} times as large"
+    steps = np.round(moved / extent, 3) * extent + 0.0
+    return f"all lie {', '.join(f'{value:.3g}' for value in steps)} away"
+
+
+def _quaternions(truth: Splats, file: Splats) -> str:
+    q = file.quaternions
+    tried = (
+        ("they look like x, y, z, w taken for w, x, y, z", np.roll(q, 1, axis=1)),
+        ("they look like w, x, y, z taken for x, y, z, w", np.roll(q, -1, axis=1)),
+        ("they look like their inverses", q * np.array([1, -1, -1, -1], q.dtype)),
+    )
+    return _first_below(
+        _FITS_DEGREES,
+        (
+            (words, float(np.median(rotations_apart(truth.quaternions, guess))))
+            for words, guess in tried
+        ),
+    )
+
+
+def _sh(truth: Splats, file: Splats) -> str:
+    degree = max(truth.sh_degree, file.sh_degree)
+    right, given = (s.with_sh_degree(degree).sh[:, 1:].astype(np.float64) for s in (truth, file))
+    n = len(given)
+    tried = [
+        ("they look as if not turned with the axes", turned(file).with_sh_degree(degree).sh[:, 1:])
+    ]
+    # a reader may have made room for more bands than the file holds
+    for width in {(d + 1) ** 2 - 1 for d in range(1, degree + 1)}:
+        part, rest = given[:, :width], np.zeros_like(given[:, width:])
+        in_turn = part.transpose(0, 2, 1).reshape(n, width, 3)
+        apart = part.reshape(n, 3, width).transpose(0, 2, 1)
+        for words, guess in (
+            ("red, green, blue in turn, taken for all reds first", in_turn),
+            ("all reds first, taken for red, green, blue in turn", apart),
+        ):
+            tried.append((f"the coefficients look like {words}", np.concatenate([guess, rest], 1)))
+    energy = max(float(np.square(right).sum()), 1e-30)
+    return _first_below(
+        _FITS_ENERGY,
+        ((words, float(np.square(guess - right).sum()) / energy) for words, guess in tried),
+    )
+
+
+def _first_below(bound: float, found: Iterable[tuple[str, float]]) -> str:
+    words, value = min(found, key=lambda pair: pair[1])
+    return words if value < bound else ""

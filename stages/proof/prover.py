@@ -1,0 +1,162 @@
+"""Proof that a file holds the splats that it was made from.
+
+A parser that did not write it reads it back, the rasteriser draws it from cameras that training
+never saw, and every value is compared with the original's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.formats import LOSSY, format_of
+from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
+from stages.measure.images import psnr
+from stages.proof import diagnosis, second_readers, usd_validators
+from stages.proof.compare import differences
+from stages.proof.content import FileContent
+from stages.raster import render
+from stages.scene import Camera, Splats, View, split_held_out
+from stages.scene.framing import around
+
+_SIDE_PX = 480
+_CAMERAS = 3
+_MIDDLE = 0.5  # of the splats, to look at where no photographs tell: the rest is background
+_CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
+_LOSSLESS_DB = 45.0  # below it a file that should hold everything is wrong
+_LOSSY_DB = 30.0  # below it the loss is worth a warning
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What was found about one file.
+
+    splats: how many it holds. figures: verify_db (PSNR between pictures of the original and of the
+    file, the worst camera), verify_mean_db, verify_cameras, and the largest errors of the values;
+    worst_attribute and worst_splat: whose largest error shows most, and its row in the file.
+    fault: why the file is wrong, "" if it is not; the figures are empty where nothing could be
+    compared. loss_db: what a lossy file lost if that is worth a warning, else None.
+    """
+
+    splats: int
+    figures: dict[str, Any]
+    fault: str = ""
+    loss_db: float | None = None
+
+
+def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...]:
+    """Three cameras to compare from: of held-out views spread over the capture, of other views
+    where none are held out, around the splats where there are none at all."""
+    training, held = split_held_out(tuple(views))
+    chosen = held or training
+    if not chosen:
+        return tuple(camera.fitted(_SIDE_PX) for camera in around(splats, _CAMERAS, _MIDDLE))
+    count = min(_CAMERAS, len(chosen))
+    spread = (chosen[i * len(chosen) // count] for i in range(count))
+    return tuple(view.camera.fitted(_SIDE_PX) for view in spread)
+
+
+@dataclass(frozen=True)
+class Prover:
+    """Compares files with one original, whose pictures are drawn once.
+
+    splats: the original, as `rows.kept_rows` leaves it. came_as: the format of the file that it was
+    read from, "" if it was not; after a lossy one nothing can be asked of float32.
+    """
+
+    splats: Splats
+    cameras: tuple[Camera, ...]
+    pictures: tuple[NDArray[np.float32], ...]
+    backend: str
+    came_as: str
+
+    @classmethod
+    def of(
+        cls,
+        splats: Splats,
+        cameras: tuple[Camera, ...],
+        backend: str = "auto",
+        came_as: str = "",
+    ) -> Prover:
+        pictures = tuple(render(splats, camera, backend=backend).image for camera in cameras)
+        return cls(splats, cameras, pictures, backend, came_as)
+
+    def prove(self, path: Path, exact: bool = False) -> Proof:
+        """Read `path` with a second parser, draw it and compare. Nothing is raised for a file
+        that is wrong.
+
+        exact: whether even a format that keeps less than float32 has to give the same, because the
+        original was read from the file itself.
+        """
+        name = format_of(path)
+        try:
+            content = _drawable(second_readers.read_back(path))
+            said = usd_validators.complaints(path) if name.startswith("usd") else []
+        except Exception as error:  # whatever another parser raises: the file is wrong
+            return Proof(0, {}, f"another reader refused it ({_words(error)})")
+        count = len(content.splats)
+        if said:
+            return Proof(count, {}, f"the USD library's validators say: {said[0]}")
+        if count != len(self.splats):
+            return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
+        lossy = not exact and (name in LOSSY or self.came_as in LOSSY)
+        return self._compared(content, name, lossy)
+
+    def _compared(self, content: FileContent, name: str, lossy: bool) -> Proof:
+        by_camera = self._decibels(content)
+        worst = min(by_camera, default=_CAP_DB)
+        found = differences(self.splats, content, *filter(None, (name, self.came_as)))
+        figures = {
+            "verify_db": round(worst, 2),
+            "verify_mean_db": round(float(np.mean(by_camera)), 2) if by_camera else worst,
+            "verify_cameras": len(by_camera),
+            **found.largest,
+            "worst_attribute": found.worst,
+            "worst_splat": found.worst_row,
+        }
+        fault = diagnosis.explained(self.splats, content, found)
+        if not lossy and worst < _LOSSLESS_DB:
+            drawn = f"drawn again it differs by {worst:.1f} dB"
+            fault = f"{drawn}; {fault}" if fault else drawn
+        loss_db = worst if lossy and worst < _LOSSY_DB and not fault else None
+        return Proof(len(content.splats), figures, fault, loss_db)
+
+    def _decibels(self, content: FileContent) -> list[float]:
+        """By camera. The camera is moved into the file's axes, not the file's splats into ours:
+        so the turn of positions, rotations and SH is checked by something other than itself."""
+        found = []
+        for camera, picture in zip(self.cameras, self.pictures, strict=True):
+            moved = camera.moved(content.world_from_file)
+            drawn = render(content.splats, moved, backend=self.backend).image
+            decibels = psnr(drawn, picture)
+            found.append(0.0 if math.isnan(decibels) else min(decibels, _CAP_DB))
+        return found
+
+
+def _drawable(content: FileContent) -> FileContent:
+    """Without what no viewer can draw. Infinite logarithms, of flat and of opaque splats, become
+    numbers, as the readers that are checked make them."""
+    splats = content.splats
+    if not (np.isfinite(splats.log_scales).all() and np.isfinite(splats.opacity_logits).all()):
+        splats = replace(
+            splats,
+            log_scales=np.where(
+                np.isneginf(splats.log_scales), np.float32(LOG_SCALE_MIN), splats.log_scales
+            ),
+            opacity_logits=np.where(
+                np.isinf(splats.opacity_logits),
+                np.clip(splats.opacity_logits, LOGIT_MIN, LOGIT_MAX),
+                splats.opacity_logits,
+            ),
+        )
+    return replace(content, splats=kept_rows(splats)[0])
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

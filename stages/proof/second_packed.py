@@ -1,0 +1,161 @@
+"""Second readers of the packed formats: plyfile, gzip, zipfile and Pillow, and plain arithmetic."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.proof.content import (
+    Y_UP,
+    FileContent,
+    logits,
+    splats_by_rows,
+)
+
+
+def compressed_ply(path: Path) -> FileContent:
+    from plyfile import PlyData
+
+    data = PlyData.read(str(path), mmap="c")
+    ranges, rest = data["chunk"], data["sh"].data if "sh" in data else np.zeros(0, "u1")
+    names = rest.dtype.names or ()
+    per_channel = len(names) // 3
+    axes = [("x", 21, 11), ("y", 11, 10), ("z", 0, 11)]
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        words = data["vertex"].data[rows]
+        chunk = np.arange(rows.start, rows.start + len(words)) // 256
+
+        def unpacked(name: str, columns: list[tuple[str, int, int]]) -> NDArray[np.float64]:
+            """columns: (suffix of the range's names, lowest bit, bits)."""
+            parts = []
+            for suffix, shift, bits in columns:
+                fraction = (words[name].astype(np.int64) >> shift) % 2**bits / (2**bits - 1)
+                low, high = (ranges[e + suffix].astype(float)[chunk] for e in ("min_", "max_"))
+                parts.append(low * (1 - fraction) + high * fraction)
+            return np.stack(parts, axis=1)
+
+        turns = words["packed_rotation"].astype(np.int64)
+        others = [((turns >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
+        colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
+        sh = np.zeros((len(words), per_channel + 1, 3), np.float32)
+        sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
+        for i, name in enumerate(names):
+            sh[:, 1 + i % per_channel, i // per_channel] = (rest[name][rows] + 0.5) / 32 - 4
+        return {
+            "means": unpacked("packed_position", axes),
+            "quaternions": _with_largest(turns >> 30, np.stack(others, axis=1)),
+            "log_scales": unpacked("packed_scale", [("scale_" + s, low, n) for s, low, n in axes]),
+            "opacity_logits": logits(words["packed_color"].astype(np.int64) % 256 / 255),
+            "sh": sh,
+        }
+
+    return FileContent(splats_by_rows(data["vertex"].count, values_of), np.eye(4))
+
+
+def spz(path: Path) -> FileContent:
+    import gzip
+    import struct
+
+    content = gzip.decompress(path.read_bytes())
+    magic, version, n, degree, fraction = struct.unpack_from("<IIIBB", content)
+    assert magic == 0x5053474E, "the header does not begin with NGSP"
+    assert version in (2, 3), f"the version is {version}, not 2 or 3"
+    k = (degree + 1) ** 2 - 1
+    turn_bytes = 3 if version == 2 else 4
+    ends = 16 + np.cumsum([0, 9 * n, n, 3 * n, 3 * n, turn_bytes * n, 3 * k * n])
+    assert len(content) == ends[-1], "the length is not that of the header"
+    parts = [
+        np.frombuffer(content, np.uint8, b - a, a).reshape(n, (b - a) // max(1, n))
+        for a, b in itertools.pairwise(ends.tolist())
+    ]
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        places, alphas, colours, sizes, turns, rest = (part[rows] for part in parts)
+        low, middle, high = places.reshape(-1, 3, 3).astype(np.int64).transpose(2, 0, 1)
+        fixed = low + 256 * middle + 65536 * high
+        sh = np.zeros((len(alphas), k + 1, 3), np.float32)
+        sh[:, 0] = (colours.reshape(-1, 3) / 255 - 0.5) / 0.15
+        sh[:, 1:] = rest.reshape(len(alphas), k, 3) / 128 - 1
+        xyzw = _xyz_in_bytes(turns) if version == 2 else _smallest_three(turns)
+        return {
+            "means": np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
+            "quaternions": np.roll(xyzw, 1, axis=1),
+            "log_scales": sizes.reshape(-1, 3) / 16 - 10,
+            "opacity_logits": logits(alphas.reshape(-1) / 255),
+            "sh": sh,
+        }
+
+    return FileContent(splats_by_rows(n, values_of), Y_UP)
+
+
+def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """[N, 4] x, y, z, w, where w is what is missing to 1 and never negative."""
+    xyz = parts.reshape(-1, 3).astype(np.float64) * 2 / 255 - 1
+    return np.insert(xyz, 3, np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1))), axis=1)
+
+
+def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """[N, 4] x, y, z, w from two bits for the largest and a sign and nine bits for the others."""
+    words = np.ascontiguousarray(parts).view("<u4").reshape(-1).astype(np.int64)
+    tens = [words >> shift & 1023 for shift in (20, 10, 0)]
+    others = [math.sqrt(0.5) / 511 * np.where(t < 512, t, 512 - t) for t in tens]
+    return _with_largest(words >> 30, np.stack(others, axis=1))
+
+
+def sog(path: Path) -> FileContent:
+    import json
+    import zipfile
+
+    from PIL import Image
+
+    with zipfile.ZipFile(path) as package:
+        meta = json.loads(package.read("meta.json"))
+
+        def pixels(part: str, number: int = 0) -> NDArray[np.uint8]:
+            with package.open(meta[part]["files"][number]) as file:
+                return np.array(Image.open(file).convert("RGBA"))
+
+        def a_splat(part: str, number: int = 0) -> NDArray[np.uint8]:
+            return pixels(part, number).reshape(-1, 4)[: meta["count"]]
+
+        lows, highs = a_splat("means"), a_splat("means", 1)
+        turns, colours, sizes = a_splat("quats"), a_splat("sh0"), a_splat("scales")
+        k, palette, halves = 0, np.zeros((1, 0, 3), np.uint8), np.zeros_like(turns)
+        if "shN" in meta:
+            k = (meta["shN"]["bands"] + 1) ** 2 - 1
+            halves, palette = a_splat("shN", 1), pixels("shN")[:, :, :3].reshape(-1, k, 3)
+    low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
+    books = {part: np.array(meta[part]["codebook"]) for part in ("sh0", "scales")}
+    book = np.array(meta["shN"]["codebook"]) if k else np.zeros(256)
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        part = (lows[rows, :3] + 256.0 * highs[rows, :3]) / 65535
+        bent = low * (1 - part) + high * part
+        sh = np.zeros((len(bent), k + 1, 3), np.float32)
+        sh[:, 0] = books["sh0"][colours[rows, :3]]
+        sh[:, 1:] = book[palette[halves[rows, 0] + 256 * halves[rows, 1].astype(np.int64)]]
+        others = (turns[rows, :3] / 127.5 - 1) / 2**0.5
+        return {
+            "means": np.where(bent < 0, -1, 1) * (np.exp(np.abs(bent)) - 1),
+            "quaternions": _with_largest(turns[rows, 3].astype(np.int64) - 252, others),
+            "log_scales": books["scales"][sizes[rows, :3]],
+            "opacity_logits": logits(colours[rows, 3] / 255),
+            "sh": sh,
+        }
+
+    return FileContent(splats_by_rows(meta["count"], values_of), np.eye(4))
+
+
+def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N, 4] where `others` [N, 3] leave out the component `column`, which is the largest."""
+    quaternions = np.zeros((len(others), 4))
+    for k in range(4):
+        rows = column == k
+        largest = np.sqrt(np.maximum(0, 1 - np.square(others[rows]).sum(axis=1)))
+        quaternions[rows] = np.insert(others[rows], k, largest, axis=1)
+    return quaternions

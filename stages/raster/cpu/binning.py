@@ -1,0 +1,366 @@
+"""Which splats touch which 16x16 tile, in blending order. Exact to 4x4 pixels: ellipses, not boxes.
+
+Tiles are first found splat by splat, in the order of rows, then laid out tile by tile, nearest
+first.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.kernels.simd import kernel, prefetch, take_ticket
+from stages.kernels.simd64 import (
+    dceil,
+    dfloor,
+    dgt,
+    dload,
+    dmax,
+    dmin,
+    dselect,
+    dsqrt,
+    istore,
+)
+from stages.raster.cpu.projection import (
+    GB,
+    GK,
+    GL,
+    GVX,
+    GVY,
+    GX,
+    GY,
+)
+from stages.raster.definition import ALPHA_MIN
+
+TILE = 16  # pixels across and down
+BLOCK = 4  # a tile is 4x4 blocks of 4x4 pixels
+CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
+# Columns of `places`, one line for each visible splat: its row, where its tiles were written, how
+# many they are, and the slot of its first gradient.
+ROW, FOUND, COUNT, SLOT = range(4)
+_LN2 = math.log(2.0)
+_FAINTEST = math.log2(ALPHA_MIN)
+_FAR = 1e9
+BATCH = 32  # splats whose spans are found together
+_EIGHT = np.arange(8.0)
+
+
+@kernel
+def radix_order(keys, order, keys2, order2):
+    """Sort `order` by uint32 `keys` (both changed), stably, 11 bits a pass."""
+    n = len(keys)
+    counts = np.zeros(2048, np.int64)
+    for bit in (0, 11, 22):
+        counts[:] = 0
+        for i in range(n):
+            counts[(keys[i] >> np.uint32(bit)) & np.uint32(2047)] += 1
+        total = 0
+        for k in range(2048):
+            here = counts[k]
+            counts[k] = total
+            total += here
+        for i in range(n):
+            digit = (keys[i] >> np.uint32(bit)) & np.uint32(2047)
+            to = counts[digit]
+            counts[digit] = to + 1
+            keys2[to] = keys[i]
+            order2[to] = order[i]
+        keys[:], order[:] = keys2, order2
+
+
+@kernel
+def sort_by_depth(visible, paint, arrays, keys, order, keys2, order2):
+    """order [V]: places in `visible`, nearest first; see `_comes_before` for equal depths."""
+    for place in range(len(visible)):
+        keys[place] = paint[visible[place], 3]
+        order[place] = place
+    # depths are positive, so their bits sort as they do
+    radix_order(keys.view(np.uint32), order, keys2, order2)
+    settle_ties(keys.view(np.uint32), order, visible, *arrays)
+
+
+@kernel
+def _comes_before(p, q, visible, means, quaternions, log_scales, opacity_logits, sh):
+    """The documented order of equal depths: by the splats' own values, place against place."""
+    i, j = visible[p], visible[q]
+    for k in range(3):
+        if means[i, k] != means[j, k]:
+            return means[i, k] < means[j, k]
+    if opacity_logits[i] != opacity_logits[j]:
+        return opacity_logits[i] < opacity_logits[j]
+    for k in range(3):
+        if log_scales[i, k] != log_scales[j, k]:
+            return log_scales[i, k] < log_scales[j, k]
+    for k in range(4):
+        if quaternions[i, k] != quaternions[j, k]:
+            return quaternions[i, k] < quaternions[j, k]
+    for band in range(sh.shape[1]):
+        for channel in range(3):
+            if sh[i, band, channel] != sh[j, band, channel]:
+                return sh[i, band, channel] < sh[j, band, channel]
+    return False
+
+
+@kernel
+def settle_ties(keys, order, visible, means, quaternions, log_scales, opacity_logits, sh):
+    """Sort runs of equal keys by value (a heap sort: a flat wall can hold thousands of ties).
+
+    order: places in `visible`, which holds the rows.
+    """
+    n = len(order)
+    start = 0
+    while start < n:
+        end = start + 1
+        while end < n and keys[end] == keys[start]:
+            end += 1
+        if end - start > 1:
+            run = order[start:end]
+            _heap_sort(run, visible, means, quaternions, log_scales, opacity_logits, sh)
+        start = end
+
+
+@kernel
+def _heap_sort(run, visible, means, quaternions, log_scales, opacity_logits, sh):
+    n = len(run)
+    for step in range(n // 2 - 1 + n):
+        # first build the heap from the last parent up, then move the largest to the end
+        if step < n // 2:
+            root, size = n // 2 - 1 - step, n
+        else:
+            size = n - 1 - (step - n // 2)
+            run[0], run[size] = run[size], run[0]
+            root = 0
+        while True:
+            child = 2 * root + 1
+            if child >= size:
+                break
+            a, b = run[child], run[min(child + 1, size - 1)]
+            if _comes_before(a, b, visible, means, quaternions, log_scales, opacity_logits, sh):
+                child += 1
+            if not _comes_before(
+                run[root], run[child], visible, means, quaternions, log_scales, opacity_logits, sh
+            ):
+                break
+            run[root], run[child] = run[child], run[root]
+            root = child
+
+
+@kernel
+def _pixel_range(low, high, n):
+    """Indices of the first and last pixel whose centre lies in [low, high], within 0..n-1."""
+    first = math.ceil(min(max(low, 0.0), n + 1.0) - 0.5)
+    last = math.floor(min(max(high, -1.0), n + 1.0) - 0.5)
+    return max(np.int64(first), 0), min(np.int64(last), n - 1)
+
+
+@kernel
+def _reach2(level):
+    """Squared reach, in sigmas, of a splat of log2 opacity `level`; a hair more, so that rounding
+    never takes a pixel that the blending would draw."""
+    return 2.0 * _LN2 * max(level - _FAINTEST, 0.0) * 1.00001 + 1e-5
+
+
+@kernel
+def bound_tiles(ticket, visible, geometry, width, height, bounds):
+    """bounds[place]: tiles of a visible splat's bounding box and one more: what `find_tiles` may
+    write."""
+    n = len(visible)
+    size = (n + CHUNKS - 1) // CHUNKS
+    while True:
+        chunk = take_ticket(ticket)
+        if chunk >= CHUNKS:
+            break
+        for place in range(chunk * size, min((chunk + 1) * size, n)):
+            row = visible[place]
+            reach2 = _reach2(geometry[row, GL])
+            x, half_x = geometry[row, GX], math.sqrt(reach2 * geometry[row, GVX])
+            y, half_y = geometry[row, GY], math.sqrt(reach2 * geometry[row, GVY])
+            x0, x1 = _pixel_range(x - half_x, x + half_x, width)
+            y0, y1 = _pixel_range(y - half_y, y + half_y, height)
+            bounds[place] = 1
+            if x1 >= x0 and y1 >= y0:
+                bounds[place] += (x1 // TILE - x0 // TILE + 1) * (y1 // TILE - y0 // TILE + 1)
+
+
+@kernel
+def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
+    """First (spans[at : at + 8]) and last (the 8 after) of the 4-pixel columns that a splat touches
+    in each of the eight block rows from pixel row `top` on; far and -1 where none.
+
+    y0, y1: the pixel rows that it touches. In a slab of y the ellipse reaches furthest right where
+    its right end lies, or as near to it as the slab goes: at y there, to
+    slope y + sqrt((reach^2 - y^2 / c) det / c).
+    """
+    x, y = geometry[row, GX], geometry[row, GY]
+    a, c = geometry[row, GVX], geometry[row, GVY]
+    major = max(a, c)
+    b, det = geometry[row, GK] * major, 0.5 * major / geometry[row, GB]
+    per_c = 1.0 / c
+    slope, rest = b * per_c, det * per_c
+    right_end = b * math.sqrt(reach2 / a)
+    first_row = BLOCK * dload(_EIGHT, 0) + top
+    low, high = dmax(first_row, y0), dmin(first_row + (BLOCK - 1), y1)
+    empty = dgt(low, high)
+    low, high = low + (0.5 - y), high + (0.5 - y)
+    y_at = dmin(dmax(low, right_end), high)
+    right = slope * y_at + dsqrt(dmax(rest * (reach2 - y_at * y_at * per_c), 0.0))
+    y_at = dmin(dmax(low, -right_end), high)
+    left = slope * y_at - dsqrt(dmax(rest * (reach2 - y_at * y_at * per_c), 0.0))
+    # first and last pixel whose centre lies within, then their blocks
+    first = dmax(dceil(dmin(left + (x - 0.5), width + 1.0)), 0.0)
+    last = dmin(dfloor(dmax(right + (x - 0.5), -2.0)), width - 1.0)
+    first_block, last_block = dfloor(first * (1.0 / BLOCK)), dfloor(last * (1.0 / BLOCK))
+    nothing = dgt(first, last)
+    istore(spans, at, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
+    istore(spans, at + 8, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
+
+
+@kernel
+def _mask(spans, q0, tile_x):
+    """Which blocks of tile column tile_x the four block rows from spans[q0] on touch."""
+    mask = 0
+    for q in range(4):
+        low = min(max(spans[q0 + q] - 4 * tile_x, 0), 4)
+        end = max(min(spans[q0 + q + 8] - 4 * tile_x + 1, 4), low)
+        mask |= ((1 << end) - (1 << low)) << (4 * q)
+    return mask
+
+
+@kernel
+def _emit_tile_row(spans, q0, tile_row, at, tiles, masks):
+    """Write the tiles of one tile row, whose block rows are the four from spans[q0] on, from
+    position `at` on; the position after them. tile_row: number of the row's first tile.
+
+    Two tiles are written without asking whether they are touched, and taken back if not.
+    """
+    least = min(min(spans[q0], spans[q0 + 1]), min(spans[q0 + 2], spans[q0 + 3]))
+    most = max(max(spans[q0 + 8], spans[q0 + 9]), max(spans[q0 + 10], spans[q0 + 11]))
+    first = least // 4
+    for tile_x in (first, first + 1):
+        mask = _mask(spans, q0, tile_x)
+        tiles[at], masks[at] = tile_row + tile_x, mask
+        at += mask != 0
+    for tile_x in range(first + 2, most // 4 + 1):
+        mask = _mask(spans, q0, tile_x)
+        tiles[at], masks[at] = tile_row + tile_x, mask
+        at += mask != 0
+    return at
+
+
+@kernel
+def _span_batch(first, last, visible, geometry, width, height, places, groups, spans):
+    """Block spans of the places first..last, two tile rows a group; the number of groups.
+
+    groups [G, 2]: the place, and its upper tile row. spans [16 G]: see `_block_spans`.
+    """
+    n = 0
+    for place in range(first, last):
+        row = visible[place]
+        reach2 = _reach2(geometry[row, GL])
+        y, half_y = geometry[row, GY], math.sqrt(reach2 * geometry[row, GVY])
+        y0, y1 = _pixel_range(y - half_y, y + half_y, height)
+        for tile_y in range(y0 // TILE, y1 // TILE + 1 if y1 >= y0 else 0, 2):
+            top = tile_y * TILE
+            _block_spans(geometry, row, width, y0, y1, reach2, top, spans, 16 * n)
+            groups[n, 0], groups[n, 1] = place, tile_y
+            n += 1
+        places[place, ROW], places[place, COUNT] = row, 0
+    return n
+
+
+@kernel
+def find_tiles(ticket, visible, geometry, width, height, places, tiles, masks):
+    """The tiles that each visible splat touches, from places[place, FOUND] on; ROW and COUNT.
+
+    tiles: number of the tile. masks: which of its 4x4-pixel blocks, bit 4 row + column.
+
+    Spans are computed for a batch of splats before any is walked through: how many tiles a splat
+    has cannot be guessed, and a wrong guess is cheap only once the numbers are at hand.
+    """
+    tiles_x = (width + TILE - 1) // TILE
+    most = BATCH * ((height + TILE - 1) // TILE // 2 + 1)
+    groups, spans = np.empty((most, 2), np.int64), np.empty(16 * most, np.int64)
+    n = len(visible)
+    size = (n + CHUNKS - 1) // CHUNKS
+    while True:
+        chunk = take_ticket(ticket)
+        if chunk >= CHUNKS:
+            break
+        end = min((chunk + 1) * size, n)
+        for first in range(chunk * size, end, BATCH):
+            last = min(first + BATCH, end)
+            found = _span_batch(
+                first, last, visible, geometry, width, height, places, groups, spans
+            )
+            for group in range(found):
+                place, tile_y = groups[group, 0], groups[group, 1]
+                start = np.int64(places[place, FOUND])
+                at = start + places[place, COUNT]
+                at = _emit_tile_row(spans, 16 * group, tile_y * tiles_x, at, tiles, masks)
+                at = _emit_tile_row(spans, 16 * group + 4, (tile_y + 1) * tiles_x, at, tiles, masks)
+                places[place, COUNT] = at - start
+
+
+@kernel
+def _look_ahead(rank, last, order, places, tiles):
+    """Ask for what later ranks will read; it may lie anywhere."""
+    prefetch(places, 4 * np.int64(order[min(rank + 16, last)]))
+    prefetch(tiles, np.int64(places[order[min(rank + 8, last)], FOUND]))
+
+
+@kernel
+def count_tiles(ticket, order, places, tiles, tile_counts):
+    """tile_counts[chunk, tile]: entries, by chunk of the blending order."""
+    n = len(order)
+    size = (n + CHUNKS - 1) // CHUNKS
+    while True:
+        chunk = take_ticket(ticket)
+        if chunk >= CHUNKS:
+            break
+        for rank in range(chunk * size, min((chunk + 1) * size, n)):
+            _look_ahead(rank, n - 1, order, places, tiles)
+            start = places[order[rank], FOUND]
+            for at in range(start, start + places[order[rank], COUNT]):
+                tile_counts[chunk, tiles[at]] += 1
+
+
+@kernel
+def scan_counts(tile_counts, tile_starts):
+    """Turn counts into positions: tile_counts becomes where each chunk writes in each tile's list.
+
+    tile_starts [tiles + 1]. Returns the number of intersections.
+    """
+    total = 0
+    for tile in range(tile_counts.shape[1]):
+        tile_starts[tile] = total
+        for chunk in range(CHUNKS):
+            here = tile_counts[chunk, tile]
+            tile_counts[chunk, tile] = total
+            total += here
+    tile_starts[tile_counts.shape[1]] = total
+    return total
+
+
+@kernel
+def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, slots, masks):
+    """Write each tile's list, nearest first: the row, the slot where its gradient goes (splat by
+    splat, in the order of rows), the mask of its blocks."""
+    n = len(order)
+    size = (n + CHUNKS - 1) // CHUNKS
+    while True:
+        chunk = take_ticket(ticket)
+        if chunk >= CHUNKS:
+            break
+        for rank in range(chunk * size, min((chunk + 1) * size, n)):
+            _look_ahead(rank, n - 1, order, places, tiles)
+            place = order[rank]
+            start, slot = places[place, FOUND], places[place, SLOT]
+            prefetch(found_masks, np.int64(places[order[min(rank + 8, n - 1)], FOUND]))
+            for k in range(places[place, COUNT]):
+                tile = tiles[start + k]
+                position = positions[chunk, tile]
+                positions[chunk, tile] = position + 1
+                members[position] = places[place, ROW]
+                slots[position] = slot + k
+                masks[position] = found_masks[start + k]

@@ -1,0 +1,340 @@
+"""Blending the splats of a tile, near to far, and the gradient back through it, far to near.
+
+A tile is 16x16 pixels in blocks of 4x4; a block is one vector. A splat is drawn in those blocks
+only that its ellipse touches. Per (splat, tile) the exponent is rewritten in float64 around the
+tile's first pixel, so that everything that runs in float32 is small:
+    log2 alpha = log2 opacity - (A u^2 + B t^2) / ln 2,
+u the pixel's offset along the axis of the larger variance, t across. `alpha_of` is the one
+function for both directions: alpha must be the same to the last bit, since the way back divides by
+1 - alpha.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.kernels.simd import (
+    bits16,
+    kernel,
+    lowest_bit,
+    prefetch,
+    splat16,
+    store_sums8,
+    take_ticket,
+    vand,
+    vany,
+    vexp2,
+    vfma,
+    vge,
+    vgt,
+    vload,
+    vmax,
+    vmin,
+    vselect,
+    vstore,
+    vsum,
+)
+from stages.raster.cpu.binning import BLOCK, TILE
+from stages.raster.cpu.projection import (
+    GA,
+    GB,
+    GEOMETRY_ROW,
+    GK,
+    GL,
+    GVX,
+    GVY,
+    GX,
+    GY,
+)
+from stages.raster.cpu.tile import (
+    BLOCKS,
+    PIXELS,
+    last_of_blocks,
+    load_plane,
+    start_light,
+    store_plane,
+)
+from stages.raster.definition import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+
+# Planes of a tile's work, forward and backward.
+RED, GREEN, BLUE, ALPHA, DEPTH, MEDIAN, LIGHT, LAST = (k * PIXELS for k in range(8))
+V_RED, V_GREEN, V_BLUE, PASSING, BEHIND = (k * PIXELS for k in range(5))
+AHEAD = 6  # entries: how early a splat's record is asked for
+_LOG2E = 1.4426950408889634
+_F = np.float32
+_ALPHA_MIN, _ALPHA_MAX, _T_MIN = _F(ALPHA_MIN), _F(ALPHA_MAX), _F(TRANSMITTANCE_MIN)
+_FAINTEST = _F(-115.0)  # log2 of alpha: below it `vexp2` would leave its range
+_HALF = _F(0.5)
+
+
+def _offsets() -> tuple[np.ndarray, np.ndarray]:
+    """Offsets from a tile's first pixel of a block's pixels (lanes) and of the blocks, along and
+    across: [0] along x, [1] along y."""
+    k = np.arange(16)
+    lanes = np.stack([k % BLOCK, k // BLOCK]).astype(np.float32)
+    return lanes.ravel(), (BLOCK * lanes).ravel()
+
+
+_LANES, _STEPS = _offsets()
+
+
+@kernel
+def tile_frame(geometry, row, tile_x, tile_y):
+    """The record of a row around the tile's first pixel centre.
+
+    Returns (major, A', B', K, log2 opacity, U, T): major, 0 where the major axis is x, 16 where it
+    is y; A', B': of the exponent to base 2, negative; U, T: vectors of the first block's offsets
+    along the major axis and across it.
+    """
+    dx = tile_x * TILE + 0.5 - geometry[row, GX]
+    dy = tile_y * TILE + 0.5 - geometry[row, GY]
+    k = geometry[row, GK]
+    wide = geometry[row, GVX] >= geometry[row, GVY]
+    major = 0 if wide else 16
+    u = dx if wide else dy
+    t = dy - k * dx if wide else dx - k * dy
+    along, across = vload(_LANES, major), vload(_LANES, 16 - major)
+    us = splat16(_F(u)) + along
+    ts = splat16(_F(t)) + across - splat16(_F(k)) * along
+    return (
+        major,
+        splat16(_F(geometry[row, GA] * -_LOG2E)),
+        splat16(_F(geometry[row, GB] * -_LOG2E)),
+        splat16(_F(-k)),
+        splat16(_F(geometry[row, GL])),
+        us,
+        ts,
+    )
+
+
+@kernel
+def alpha_of(frame, block):
+    """(alpha before the cap, u, t) of the 16 pixels of a block."""
+    major, a, b, slope, level, us, ts = frame
+    along = splat16(_STEPS[major + block])
+    u = us + along
+    t = vfma(slope, along, ts + splat16(_STEPS[16 - major + block]))
+    level = vfma(b * t, t, vfma(a * u, u, level))
+    return vexp2(vmax(level, splat16(_FAINTEST))), u, t
+
+
+@kernel
+def blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, paint, depths, work):
+    """Blend entries start..end of the lists into `work` (planes as above).
+
+    alive: mask of the blocks that still want light. depths: whether the depth planes are wanted.
+
+    Rows of arrays are reached by index, never sliced: a slice counts references, and threads would
+    fight over the counter. Nothing is skipped for want of a drawn pixel: a wrongly guessed branch
+    costs more than a block.
+    """
+    zero, one = splat16(_F(0.0)), splat16(_F(1.0))
+    for entry in range(start, end):
+        blocks = np.int64(masks[entry]) & alive
+        ahead = members[min(entry + AHEAD, end - 1)]
+        prefetch(geometry, ahead * GEOMETRY_ROW)
+        prefetch(paint, ahead * 4)
+        if blocks == 0:
+            continue
+        row = members[entry]
+        frame = tile_frame(geometry, row, tile_x, tile_y)
+        r, g = splat16(paint[row, 0]), splat16(paint[row, 1])
+        bl, z = splat16(paint[row, 2]), splat16(paint[row, 3])
+        while blocks:
+            block = lowest_bit(blocks)
+            blocks &= blocks - 1
+            at = 16 * block
+            alpha, _, _ = alpha_of(frame, block)
+            passing = vload(work, LIGHT + at)
+            drawn = vand(vge(alpha, splat16(_ALPHA_MIN)), vge(passing, splat16(_T_MIN)))
+            alpha = vselect(drawn, vmin(alpha, splat16(_ALPHA_MAX)), zero)
+            weight = alpha * passing
+            left = passing * (one - alpha)
+            vstore(work, LIGHT + at, left)
+            vstore(work, RED + at, vfma(weight, r, vload(work, RED + at)))
+            vstore(work, GREEN + at, vfma(weight, g, vload(work, GREEN + at)))
+            vstore(work, BLUE + at, vfma(weight, bl, vload(work, BLUE + at)))
+            if depths:
+                vstore(work, DEPTH + at, vfma(weight, z, vload(work, DEPTH + at)))
+                halved = vand(vge(passing, splat16(_HALF)), vgt(splat16(_HALF), left))
+                vstore(work, MEDIAN + at, vselect(halved, z, vload(work, MEDIAN + at)))
+            finished = vand(drawn, vgt(splat16(_T_MIN), left))
+            if vany(finished):
+                number = splat16(_F(entry - start + 1))
+                vstore(work, LAST + at, vselect(finished, number, vload(work, LAST + at)))
+                if not vany(vge(left, splat16(_T_MIN))):
+                    alive &= ~(np.int64(1) << block)
+        if alive == 0:
+            break
+
+
+@kernel
+def _finish_tile(background, depths, work):
+    """Background behind what was blended; alpha; sums of depths to means."""
+    one, least = splat16(_F(1.0)), splat16(_F(0.5) * _ALPHA_MIN)
+    for at in range(0, PIXELS, 16):
+        passed = vload(work, LIGHT + at)
+        alpha = one - passed
+        vstore(work, ALPHA + at, alpha)
+        for channel in range(3):
+            plane = channel * PIXELS + at
+            behind = splat16(background[channel])
+            vstore(work, plane, vfma(passed, behind, vload(work, plane)))
+        if depths:
+            vstore(work, DEPTH + at, vload(work, DEPTH + at) / vmax(alpha, least))
+
+
+@kernel
+def blend_tiles(
+    ticket,
+    width,
+    height,
+    tile_starts,
+    members,
+    masks,
+    geometry,
+    paint,
+    background,
+    depths,
+    image,
+    light,
+    last,
+):
+    """Draw every tile. image [4 or 6, H, W] float32: red, green, blue, alpha; if `depths`, then
+    expected and median depth.
+
+    light, last [tiles, 256] float32, block by block: what the way back needs: the light that
+    passes at the end and the number of the last entry drawn, NEVER where a pixel was not finished.
+    """
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
+    work = np.empty(8 * PIXELS, np.float32)
+    while True:
+        tile = take_ticket(ticket)
+        if tile >= tiles_x * tiles_y:
+            break
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        work[:] = 0.0
+        alive = start_light(tile_x, tile_y, width, height, work, LIGHT, LAST)
+        start, end = tile_starts[tile], tile_starts[tile + 1]
+        blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, paint, depths, work)
+        for at in range(0, PIXELS, 16):
+            vstore(light, tile * PIXELS + at, vload(work, LIGHT + at))
+            vstore(last, tile * PIXELS + at, vload(work, LAST + at))
+        _finish_tile(background, depths, work)
+        for channel in range(image.shape[0]):
+            store_plane(image, channel, tile_x, tile_y, work, channel * PIXELS)
+
+
+@kernel
+def _start_gradient(v_image, tile, tile_x, tile_y, background, light, work):
+    for channel in range(3):
+        load_plane(v_image, channel, tile_x, tile_y, work, channel * PIXELS)
+    for at in range(0, PIXELS, 16):
+        passed = vload(light, tile * PIXELS + at)
+        vstore(work, PASSING + at, passed)
+        behind = vload(work, V_RED + at) * splat16(background[0])
+        behind = vfma(vload(work, V_GREEN + at), splat16(background[1]), behind)
+        behind = vfma(vload(work, V_BLUE + at), splat16(background[2]), behind)
+        vstore(work, BEHIND + at, behind * passed)
+
+
+@kernel
+def blend_gradient_tiles(
+    ticket,
+    width,
+    height,
+    tile_starts,
+    members,
+    slots,
+    masks,
+    geometry,
+    paint,
+    background,
+    light,
+    last,
+    v_image,
+    gradients,
+):
+    """gradients [intersections, 9] at each entry's slot, from v_image [3, H, W]."""
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
+    work = np.empty(5 * PIXELS, np.float32)
+    block_last = np.empty(BLOCKS, np.float32)
+    while True:
+        tile = take_ticket(ticket)
+        if tile >= tiles_x * tiles_y:
+            break
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        _start_gradient(v_image, tile, tile_x, tile_y, background, light, work)
+        furthest = last_of_blocks(last, tile, block_last)
+        start, end = tile_starts[tile], tile_starts[tile + 1]
+        for entry in range(end - 1, start - 1, -1):
+            number = _F(entry - start + 1)
+            if number > furthest:
+                for k in range(9):
+                    gradients[slots[entry], k] = 0.0
+                continue
+            ahead = members[max(entry - AHEAD, start)]
+            prefetch(geometry, ahead * GEOMETRY_ROW)
+            prefetch(paint, ahead * 4)
+            prefetch(gradients, slots[max(entry - AHEAD, start)] * 9)
+            alive = bits16(vge(vload(block_last, 0), splat16(number)))
+            entry_gradient(
+                tile_frame(geometry, members[entry], tile_x, tile_y),
+                number,
+                np.int64(masks[entry]) & alive,
+                paint,
+                members[entry],
+                work,
+                last,
+                tile * PIXELS,
+                gradients,
+                slots[entry],
+            )
+
+
+@kernel
+def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradients, slot):
+    """Gradient of one splat in one tile into gradients[slot, :9].
+
+    With v the gradient that reaches the exponent of a pixel, u and t its offsets along and across
+    the splat's major axis, the sums over pixels of: v u, v t, v u^2, v t^2, v u t, v, and of the
+    gradients of red, green and blue.
+
+    work: the incoming gradient, the light that passes behind the splat, and what lies behind
+    weighted by the incoming gradient (a suffix sum). The last two move in front of it.
+    """
+    r, g, bl = splat16(paint[row, 0]), splat16(paint[row, 1]), splat16(paint[row, 2])
+    zero, one = splat16(_F(0.0)), splat16(_F(1.0))
+    v_u, v_t, v_uu, v_tt, v_ut, v_1 = zero, zero, zero, zero, zero, zero
+    s_r, s_g, s_b = zero, zero, zero
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - 1
+        at = 16 * block
+        raw, u, t = alpha_of(frame, block)
+        drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, last_at + at), splat16(number)))
+        alpha = vselect(drawn, vmin(raw, splat16(_ALPHA_MAX)), zero)
+        inverse = one / (one - alpha)
+        before = vload(work, PASSING + at) * inverse
+        vstore(work, PASSING + at, before)
+        weight = alpha * before
+        vr, vg, vb = vload(work, V_RED + at), vload(work, V_GREEN + at), vload(work, V_BLUE + at)
+        s_r = vfma(weight, vr, s_r)
+        s_g = vfma(weight, vg, s_g)
+        s_b = vfma(weight, vb, s_b)
+        shade = vfma(vr, r, vfma(vg, g, vb * bl))
+        after = vload(work, BEHIND + at)
+        vstore(work, BEHIND + at, vfma(weight, shade, after))
+        v = alpha * (after * inverse - before * shade)
+        v = vselect(vgt(splat16(_ALPHA_MAX), raw), v, zero)  # the cap passes nothing on
+        by_u, by_t = v * u, v * t
+        v_1 = v_1 + v
+        v_u = v_u + by_u
+        v_t = v_t + by_t
+        v_uu = vfma(by_u, u, v_uu)
+        v_tt = vfma(by_t, t, v_tt)
+        v_ut = vfma(by_u, t, v_ut)
+    store_sums8(gradients, slot * 9, v_u, v_t, v_uu, v_tt, v_ut, v_1, s_r, s_g)
+    gradients[slot, 8] = vsum(s_b)

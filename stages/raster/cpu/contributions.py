@@ -1,0 +1,152 @@
+"""What each splat is worth to a picture: its weights, and the exact change of the squared error if
+it were removed.
+
+Colour is affine in each alpha, so removing one splat changes a pixel by
+    dI = -w c + behind alpha / (1 - alpha),
+w its blend weight, c its colour, "behind" what is composited behind it (background included, light
+at its place included); the squared error against a photograph changes by 2 r dI + dI^2, r the
+residual. Exact but for pixels that the stopping rule or the alpha cut-off would treat otherwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.kernels.simd import (
+    bits16,
+    kernel,
+    lowest_bit,
+    splat16,
+    take_ticket,
+    vand,
+    vfma,
+    vge,
+    vload,
+    vmax,
+    vmin,
+    vselect,
+    vstore,
+    vsum,
+)
+from stages.raster.cpu.binning import COUNT, SLOT, TILE
+from stages.raster.cpu.blend import alpha_of, tile_frame
+from stages.raster.cpu.tile import (
+    BLOCKS,
+    PIXELS,
+    last_of_blocks,
+    load_plane,
+)
+from stages.raster.definition import ALPHA_MAX, ALPHA_MIN
+
+COLUMNS = 3  # change of the squared error, sum of weights, largest weight
+_F = np.float32
+_ALPHA_MIN, _ALPHA_MAX = _F(ALPHA_MIN), _F(ALPHA_MAX)
+# Planes of the work: residual, colour behind the splat, light behind it.
+RESIDUAL, BEHIND, PASSING = 0, 3 * PIXELS, 6 * PIXELS
+
+
+@kernel
+def _start(residual, tile, tile_x, tile_y, background, light, work):
+    for channel in range(3):
+        load_plane(residual, channel, tile_x, tile_y, work, RESIDUAL + channel * PIXELS)
+    for at in range(0, PIXELS, 16):
+        passed = vload(light, tile * PIXELS + at)
+        vstore(work, PASSING + at, passed)
+        for channel in range(3):
+            behind = passed * splat16(background[channel])
+            vstore(work, BEHIND + channel * PIXELS + at, behind)
+
+
+@kernel
+def contribution_tiles(
+    ticket,
+    width,
+    height,
+    tile_starts,
+    members,
+    slots,
+    masks,
+    geometry,
+    paint,
+    background,
+    light,
+    last,
+    residual,
+    out,
+):
+    """out [intersections, 3] at each entry's slot; residual [3, H, W]: render - photograph."""
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
+    work = np.empty(7 * PIXELS, np.float32)
+    block_last = np.empty(BLOCKS, np.float32)
+    lanes = np.empty(16, np.float32)
+    while True:
+        tile = take_ticket(ticket)
+        if tile >= tiles_x * tiles_y:
+            break
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        _start(residual, tile, tile_x, tile_y, background, light, work)
+        last_of_blocks(last, tile, block_last)
+        start, end = tile_starts[tile], tile_starts[tile + 1]
+        for entry in range(end - 1, start - 1, -1):
+            number = _F(entry - start + 1)
+            alive = bits16(vge(vload(block_last, 0), splat16(number)))
+            _entry(
+                tile_frame(geometry, members[entry], tile_x, tile_y),
+                number,
+                np.int64(masks[entry]) & alive,
+                paint,
+                members[entry],
+                work,
+                last,
+                tile * PIXELS,
+                lanes,
+                out,
+                slots[entry],
+            )
+
+
+@kernel
+def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, slot):
+    zero, one, two = splat16(_F(0.0)), splat16(_F(1.0)), splat16(_F(2.0))
+    change, total, largest = zero, zero, zero
+    while blocks:
+        block = lowest_bit(blocks)
+        blocks &= blocks - 1
+        at = 16 * block
+        raw, _, _ = alpha_of(frame, block)
+        drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, last_at + at), splat16(number)))
+        alpha = vselect(drawn, vmin(raw, splat16(_ALPHA_MAX)), zero)
+        inverse = one / (one - alpha)
+        before = vload(work, PASSING + at) * inverse
+        vstore(work, PASSING + at, before)
+        weight = alpha * before
+        total = total + weight
+        largest = vmax(largest, weight)
+        ratio = alpha * inverse
+        for channel in range(3):
+            plane = channel * PIXELS + at
+            painted = weight * splat16(paint[row, channel])
+            behind = vload(work, BEHIND + plane)
+            shift = behind * ratio - painted
+            change = vfma(shift, shift + two * vload(work, RESIDUAL + plane), change)
+            vstore(work, BEHIND + plane, behind + painted)
+    out[slot, 0], out[slot, 1] = vsum(change), vsum(total)
+    vstore(lanes, 0, largest)
+    top = lanes[0]
+    for lane in range(1, 16):
+        top = max(top, lanes[lane])
+    out[slot, 2] = top
+
+
+@kernel
+def gather_contributions(raw, places, out):
+    """out [V, 3] float64: sums (and the largest weight) over each visible splat's tiles."""
+    for place in range(len(out)):
+        change, total, largest = 0.0, 0.0, 0.0
+        first = places[place, SLOT]
+        for slot in range(first, first + places[place, COUNT]):
+            change += raw[slot, 0]
+            total += raw[slot, 1]
+            largest = max(largest, np.float64(raw[slot, 2]))
+        out[place, 0], out[place, 1], out[place, 2] = change, total, largest

@@ -1,0 +1,376 @@
+"""Footprints of splats on the picture, and the way back to their parameters, eight at a time.
+
+All of it in float64: eight lanes of it cost little beside blending, and it takes overflow, the loss
+of the determinant and far-away centres off the list of worries. Formulas as in `reference`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.kernels.simd import kernel
+from stages.kernels.simd64 import (
+    LANES,
+    bits8,
+    dand,
+    deq,
+    dexp,
+    dge,
+    dgt,
+    dload,
+    dlog,
+    dmax,
+    dmin,
+    dselect,
+    dsqrt,
+    dstore,
+    gather8,
+    scatter8,
+    spread8,
+)
+from stages.raster.definition import (
+    ALPHA_MIN,
+    LOG_SCALE_MAX,
+    QUATERNION_MIN,
+    RasterSettings,
+)
+from stages.scene import Camera
+
+# Camera row: rotation 0:9, translation 9:12, fx fy cx cy 12:16, clamp limits 16:20 (low x, high x,
+# low y, high y), near 20, dilation 21, antialias 22, centre 23:26, width 26, height 27.
+CAMERA_ROW = 28
+
+# Work of eight splats (float64[WORK_ROW x 8], one a thread): entry k of all lanes lies at 8 k.
+# Filled by `footprint`, read by `footprint_gradient`.
+AT = 0  # 0:3 position in the camera
+V0, V1 = 3, 6  # rows of V = J W R diag(s)
+AXES = 9  # 9:18 W R
+SCALES = 18  # 18:21
+CROSS = 21  # 21:24 V0 x V1
+A, B, C, DET, MINORS = 24, 25, 26, 27, 28
+OPACITY, COMPENSATION = 29, 30
+NORM, QUATERNION = 31, 32  # 32:36 unit
+SLOPE = 36  # 36:38 clamped x/z, y/z
+INSIDE = 38  # 38:40 1 where the slope is inside its limits, else 0
+SMOOTHING = 40  # opacity factor of the 3D smoothing filter
+RATIOS = 41  # 41:44 scale before that filter over scale after it
+WORK_ROW = 44
+
+# Geometry record of a splat, float64[8]: mean in pixels, the three numbers of the exponent
+# A u^2 + B (v - K u)^2 (u along the axis of the larger variance), log2 of the opacity, variances.
+GEOMETRY_ROW = 8
+GX, GY, GA, GB, GK, GL, GVX, GVY = range(8)
+
+_LOG2E = 1.0 / math.log(2.0)
+_FAINTEST = math.log(ALPHA_MIN)
+
+
+def camera_row(camera: Camera, settings: RasterSettings) -> NDArray[np.float64]:
+    """The camera and the settings as the numbers that kernels read."""
+    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
+    limits = (
+        -camera.cx / camera.fx - margin_x,
+        (camera.width - camera.cx) / camera.fx + margin_x,
+        -camera.cy / camera.fy - margin_y,
+        (camera.height - camera.cy) / camera.fy + margin_y,
+    )
+    return np.concatenate(
+        [
+            camera.world_to_camera[:3, :3].ravel(),
+            camera.world_to_camera[:3, 3],
+            (camera.fx, camera.fy, camera.cx, camera.cy),
+            limits,
+            (settings.near, settings.dilation_px2, float(settings.antialias)),
+            camera.centre,
+            (camera.width, camera.height),
+        ]
+    )
+
+
+@kernel
+def at(w, k):
+    """Entry k of the work of eight splats."""
+    return dload(w, LANES * k)
+
+
+@kernel
+def put(w, k, value):
+    dstore(w, LANES * k, value)
+
+
+@kernel
+def drawable(rows, means, quaternions, log_scales, opacity_logits):
+    """Mask: all values but the colours are finite and in the range that can be drawn."""
+    zero = spread8(0.0)
+    good = dge(LOG_SCALE_MAX, gather8(log_scales, rows, 3, 0))
+    largest = zero
+    # 0 x value is 0 for finite values only
+    nothing = 0.0 * gather8(opacity_logits, rows, 1, 0)
+    for k in range(3):
+        log_scale = gather8(log_scales, rows, 3, k)
+        good = dand(good, dge(LOG_SCALE_MAX, log_scale))
+        nothing = nothing + 0.0 * log_scale + 0.0 * gather8(means, rows, 3, k)
+    for k in range(4):
+        q = gather8(quaternions, rows, 4, k)
+        nothing = nothing + 0.0 * q
+        largest = dmax(largest, dmax(q, -q))
+    return dand(dand(good, deq(nothing, zero)), dge(largest, QUATERNION_MIN))
+
+
+@kernel
+def footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w):
+    """Fill the work `w` of eight rows; the mask of those in front of the camera.
+
+    smoothing [N], or [0] for none: see `raster.smoothing`.
+    """
+    mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
+    x = cam[0] * mx + cam[1] * my + cam[2] * mz + cam[9]
+    y = cam[3] * mx + cam[4] * my + cam[5] * mz + cam[10]
+    z = cam[6] * mx + cam[7] * my + cam[8] * mz + cam[11]
+    put(w, 0, x)
+    put(w, 1, y)
+    put(w, 2, z)
+    _axes(rows, cam, quaternions, w)
+    slope_x, slope_y = x / z, y / z
+    u = dmin(dmax(slope_x, cam[16]), cam[17])
+    v = dmin(dmax(slope_y, cam[18]), cam[19])
+    put(w, SLOPE, u)
+    put(w, SLOPE + 1, v)
+    put(w, INSIDE, dselect(deq(u, slope_x), 1.0, 0.0))
+    put(w, INSIDE + 1, dselect(deq(v, slope_y), 1.0, 0.0))
+    _scales(rows, log_scales, smoothing, w)
+    _covariance(cam, u, v, z, w)
+    put(w, OPACITY, 1.0 / (1.0 + dexp(-gather8(opacity_logits, rows, 1, 0))))
+    return dgt(z, cam[20])
+
+
+@kernel
+def _scales(rows, log_scales, smoothing, w):
+    """Scales, widened by the smoothing filter f to sqrt(s^2 + f^2), and what that takes from the
+    opacity: the product of s / sqrt(s^2 + f^2) over the axes. No square under- or overflows."""
+    factor = spread8(1.0)
+    for k in range(3):
+        s = dexp(gather8(log_scales, rows, 3, k))
+        if len(smoothing) > 0:
+            f = gather8(smoothing, rows, 1, 0)
+            larger, smaller = dmax(s, f), dmin(s, f)
+            quotient = smaller / larger
+            widened = larger * dsqrt(1.0 + quotient * quotient)
+            put(w, RATIOS + k, s / widened)
+            factor = factor * (s / widened)
+            s = widened
+        put(w, SCALES + k, s)
+    put(w, SMOOTHING, factor)
+
+
+@kernel
+def _covariance(cam, u, v, z, w):
+    """V = J W R diag(s), cov2d = V V^T + e I, its determinant by Cauchy-Binet."""
+    j00, j02 = cam[12] / z, -cam[12] * u / z
+    j11, j12 = cam[13] / z, -cam[13] * v / z
+    a, b, c = spread8(0.0), spread8(0.0), spread8(0.0)
+    for k in range(3):
+        s = at(w, SCALES + k)
+        v0 = (j00 * at(w, AXES + k) + j02 * at(w, AXES + 6 + k)) * s
+        v1 = (j11 * at(w, AXES + 3 + k) + j12 * at(w, AXES + 6 + k)) * s
+        put(w, V0 + k, v0)
+        put(w, V1 + k, v1)
+        a, b, c = a + v0 * v0, b + v0 * v1, c + v1 * v1
+    minors = spread8(0.0)
+    for k in range(3):
+        n, m = (k + 1) % 3, (k + 2) % 3
+        minor = at(w, V0 + n) * at(w, V1 + m) - at(w, V0 + m) * at(w, V1 + n)
+        put(w, CROSS + k, minor)
+        minors = minors + minor * minor
+    e = cam[21]
+    det = minors + e * (a + c) + e * e
+    put(w, A, a + e)
+    put(w, B, b)
+    put(w, C, c + e)
+    put(w, MINORS, minors)
+    put(w, DET, det)
+    if cam[22] != 0.0:
+        put(w, COMPENSATION, dsqrt(dmax(minors, 1e-60) / det))
+    else:
+        put(w, COMPENSATION, spread8(1.0))
+
+
+@kernel
+def _axes(rows, cam, quaternions, w):
+    """W R(q) into the work; scaled before it is normalised, so that no square overflows."""
+    q0, q1 = gather8(quaternions, rows, 4, 0), gather8(quaternions, rows, 4, 1)
+    q2, q3 = gather8(quaternions, rows, 4, 2), gather8(quaternions, rows, 4, 3)
+    top = dmax(dmax(dmax(q0, -q0), dmax(q1, -q1)), dmax(dmax(q2, -q2), dmax(q3, -q3)))
+    q0, q1, q2, q3 = q0 / top, q1 / top, q2 / top, q3 / top
+    norm = dsqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    q0, q1, q2, q3 = q0 / norm, q1 / norm, q2 / norm, q3 / norm
+    put(w, NORM, norm * top)
+    put(w, QUATERNION, q0)
+    put(w, QUATERNION + 1, q1)
+    put(w, QUATERNION + 2, q2)
+    put(w, QUATERNION + 3, q3)
+    r00 = 1.0 - 2.0 * (q2 * q2 + q3 * q3)
+    r01 = 2.0 * (q1 * q2 - q0 * q3)
+    r02 = 2.0 * (q1 * q3 + q0 * q2)
+    r10 = 2.0 * (q1 * q2 + q0 * q3)
+    r11 = 1.0 - 2.0 * (q1 * q1 + q3 * q3)
+    r12 = 2.0 * (q2 * q3 - q0 * q1)
+    r20 = 2.0 * (q1 * q3 - q0 * q2)
+    r21 = 2.0 * (q2 * q3 + q0 * q1)
+    r22 = 1.0 - 2.0 * (q1 * q1 + q2 * q2)
+    for row in range(3):
+        c0, c1, c2 = cam[3 * row], cam[3 * row + 1], cam[3 * row + 2]
+        put(w, AXES + 3 * row, c0 * r00 + c1 * r10 + c2 * r20)
+        put(w, AXES + 3 * row + 1, c0 * r01 + c1 * r11 + c2 * r21)
+        put(w, AXES + 3 * row + 2, c0 * r02 + c1 * r12 + c2 * r22)
+
+
+@kernel
+def used_opacity(w):
+    """Opacity as it is drawn: with what antialiasing and smoothing make of it."""
+    return at(w, OPACITY) * at(w, COMPENSATION) * at(w, SMOOTHING)
+
+
+@kernel
+def geometry_records(cam, w, rows, geometry):
+    """geometry[rows] from their work; the mask of those that touch a pixel of the picture."""
+    opacity = used_opacity(w)
+    a, b, c, det, z = at(w, A), at(w, B), at(w, C), at(w, DET), at(w, 2)
+    drawn = dand(dge(opacity, ALPHA_MIN), dand(dgt(1e300, det), dgt(det, 0.0)))
+    x = cam[12] * at(w, 0) / z + cam[14]
+    y = cam[13] * at(w, 1) / z + cam[15]
+    level = dlog(dmax(opacity, ALPHA_MIN))
+    reach2 = 2.0 * (level - _FAINTEST)
+    half_x, half_y = dsqrt(reach2 * a), dsqrt(reach2 * c)
+    drawn = dand(drawn, dand(dge(x + half_x, 0.5), dge(cam[26] - 0.5, x - half_x)))
+    drawn = dand(drawn, dand(dge(y + half_y, 0.5), dge(cam[27] - 0.5, y - half_y)))
+    major = dmax(a, c)
+    scatter8(geometry, rows, GEOMETRY_ROW, GX, x)
+    scatter8(geometry, rows, GEOMETRY_ROW, GY, y)
+    scatter8(geometry, rows, GEOMETRY_ROW, GA, 0.5 / major)
+    scatter8(geometry, rows, GEOMETRY_ROW, GB, 0.5 * major / det)
+    scatter8(geometry, rows, GEOMETRY_ROW, GK, b / major)
+    scatter8(geometry, rows, GEOMETRY_ROW, GL, level * _LOG2E)
+    scatter8(geometry, rows, GEOMETRY_ROW, GVX, a)
+    scatter8(geometry, rows, GEOMETRY_ROW, GVY, c)
+    return drawn
+
+
+@kernel
+def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_opacity, smoothed, out):
+    """Chain rule from the footprints of eight splats to their parameters.
+
+    Gradients of mean x, mean y (px), A, B, K of the exponent and of the opacity drawn.
+    smoothed: whether a smoothing filter was used.
+    out (work of 11 entries): gradients of mean (3), quaternion (4), log-scales (3), opacity logit.
+    """
+    a, b, c, det = at(w, A), at(w, B), at(w, C), at(w, DET)
+    major = dmax(a, c)
+    g_major = (0.5 * g_b / det) - (0.5 * g_a + g_k * b) / (major * major)
+    g_cov = g_k / major
+    g_det = -0.5 * g_b * major / (det * det)
+    wide = dge(a, c)
+    g_var_x, g_var_y = dselect(wide, g_major, 0.0), dselect(wide, 0.0, g_major)
+    g_minors = spread8(0.0)
+    opacity, drawn = at(w, OPACITY), used_opacity(w)
+    if cam[22] != 0.0:
+        g_compensation = g_opacity * opacity * at(w, SMOOTHING)
+        compensation, minors = at(w, COMPENSATION), at(w, MINORS)
+        g_det = g_det - 0.5 * g_compensation * compensation / det
+        g_minors = dselect(dgt(minors, 1e-60), 0.5 * g_compensation / (compensation * det), 0.0)
+    put(out, 10, g_opacity * drawn * (1.0 - opacity))
+    g_minors = g_minors + g_det
+    e2 = 2.0 * cam[21] * g_det
+    z = at(w, 2)
+    fx, fy = cam[12], cam[13]
+    u, v = at(w, SLOPE), at(w, SLOPE + 1)
+    j00, j02, j11, j12 = fx / z, -fx * u / z, fy / z, -fy * v / z
+    zero = spread8(0.0)
+    g00, g02, g11, g12 = zero, zero, zero, zero
+    for k in range(3):
+        n, m = (k + 1) % 3, (k + 2) % 3
+        v0, v1 = at(w, V0 + k), at(w, V1 + k)
+        # d|V0 x V1|^2 / dV0 = 2 V1 x (V0 x V1), and / dV1 = 2 (V0 x V1) x V0
+        d0 = at(w, V1 + n) * at(w, CROSS + m) - at(w, V1 + m) * at(w, CROSS + n)
+        d1 = at(w, CROSS + n) * at(w, V0 + m) - at(w, CROSS + m) * at(w, V0 + n)
+        g_v0 = (2.0 * g_var_x + e2) * v0 + g_cov * v1 + 2.0 * g_minors * d0
+        g_v1 = (2.0 * g_var_y + e2) * v1 + g_cov * v0 + 2.0 * g_minors * d1
+        g_log_scale = g_v0 * v0 + g_v1 * v1
+        if smoothed:
+            kept = at(w, RATIOS + k) * at(w, RATIOS + k)
+            g_log_scale = g_log_scale * kept + g_opacity * drawn * (1.0 - kept)
+        put(out, 7 + k, g_log_scale)
+        t0, t1 = g_v0 * at(w, SCALES + k), g_v1 * at(w, SCALES + k)
+        x_axis, y_axis, z_axis = at(w, AXES + k), at(w, AXES + 3 + k), at(w, AXES + 6 + k)
+        g00, g02 = g00 + t0 * x_axis, g02 + t0 * z_axis
+        g11, g12 = g11 + t1 * y_axis, g12 + t1 * z_axis
+        # from here on these entries hold the gradient of W R
+        put(w, AXES + k, j00 * t0)
+        put(w, AXES + 3 + k, j11 * t1)
+        put(w, AXES + 6 + k, j02 * t0 + j12 * t1)
+    _quaternion_gradient(cam, w, out)
+    _mean_gradient(cam, w, g_x, g_y, g00, g02, g11, g12, out)
+
+
+@kernel
+def _mean_gradient(cam, w, g_px, g_py, g00, g02, g11, g12, out):
+    """out[0:3] from the gradients of the mean on the picture and of the Jacobian."""
+    fx, fy = cam[12], cam[13]
+    x, y, z, u, v = at(w, 0), at(w, 1), at(w, 2), at(w, SLOPE), at(w, SLOPE + 1)
+    g_x, g_y = g_px * fx / z, g_py * fy / z
+    g_z = -(g_px * fx * x + g_py * fy * y) / (z * z)
+    g_z = g_z + (g02 * fx * u - g00 * fx + g12 * fy * v - g11 * fy) / (z * z)
+    # a slope inside its limits moves with the mean; a clamped one does not
+    g_u = dselect(dgt(at(w, INSIDE), 0.5), -g02 * fx / z, 0.0)
+    g_v = dselect(dgt(at(w, INSIDE + 1), 0.5), -g12 * fy / z, 0.0)
+    g_x, g_y = g_x + g_u / z, g_y + g_v / z
+    g_z = g_z - (g_u * u + g_v * v) / z
+    for k in range(3):
+        put(out, k, cam[k] * g_x + cam[3 + k] * g_y + cam[6 + k] * g_z)
+
+
+@kernel
+def _quaternion_gradient(cam, w, out):
+    """out[3:7] from the gradient of W R that stands in the work's AXES."""
+    q0, q1 = at(w, QUATERNION), at(w, QUATERNION + 1)
+    q2, q3 = at(w, QUATERNION + 2), at(w, QUATERNION + 3)
+    g0, g1, g2 = at(w, AXES), at(w, AXES + 3), at(w, AXES + 6)
+    r00 = cam[0] * g0 + cam[3] * g1 + cam[6] * g2
+    r10 = cam[1] * g0 + cam[4] * g1 + cam[7] * g2
+    r20 = cam[2] * g0 + cam[5] * g1 + cam[8] * g2
+    g0, g1, g2 = at(w, AXES + 1), at(w, AXES + 4), at(w, AXES + 7)
+    r01 = cam[0] * g0 + cam[3] * g1 + cam[6] * g2
+    r11 = cam[1] * g0 + cam[4] * g1 + cam[7] * g2
+    r21 = cam[2] * g0 + cam[5] * g1 + cam[8] * g2
+    g0, g1, g2 = at(w, AXES + 2), at(w, AXES + 5), at(w, AXES + 8)
+    r02 = cam[0] * g0 + cam[3] * g1 + cam[6] * g2
+    r12 = cam[1] * g0 + cam[4] * g1 + cam[7] * g2
+    r22 = cam[2] * g0 + cam[5] * g1 + cam[8] * g2
+    n0 = 2.0 * (q1 * (r21 - r12) + q2 * (r02 - r20) + q3 * (r10 - r01))
+    n1 = 2.0 * (q2 * (r01 + r10) + q3 * (r02 + r20) + q0 * (r21 - r12)) - 4.0 * q1 * (r11 + r22)
+    n2 = 2.0 * (q1 * (r01 + r10) + q3 * (r12 + r21) + q0 * (r02 - r20)) - 4.0 * q2 * (r00 + r22)
+    n3 = 2.0 * (q1 * (r02 + r20) + q2 * (r12 + r21) + q0 * (r10 - r01)) - 4.0 * q3 * (r00 + r11)
+    along = n0 * q0 + n1 * q1 + n2 * q2 + n3 * q3
+    norm = at(w, NORM)
+    put(out, 3, (n0 - along * q0) / norm)
+    put(out, 4, (n1 - along * q1) / norm)
+    put(out, 5, (n2 - along * q2) / norm)
+    put(out, 6, (n3 - along * q3) / norm)
+
+
+@kernel
+def _fill(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w):
+    return bits8(footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w))
+
+
+def footprint_values(
+    row: int, cam: NDArray[np.float64], arrays: tuple[NDArray[np.float32], ...]
+) -> NDArray[np.float64]:
+    """[WORK_ROW] what `footprint` makes of one row, for looking at."""
+    work = np.zeros(WORK_ROW * LANES)
+    rows = np.full(LANES, row, np.int64)
+    _fill(rows, cam, *arrays[:4], np.zeros(0, np.float32), work)
+    return work.reshape(WORK_ROW, LANES)[:, 0].copy()

@@ -1,0 +1,359 @@
+"""The CPU backend: Numba kernels, forward and backward, with buffers that are kept and reused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.kernels.pool import Pool, default_pool
+from stages.raster.cpu import binning, blend, contributions
+from stages.raster.cpu.projection import GEOMETRY_ROW, camera_row
+from stages.raster.cpu.splat_kernels import (
+    CULLED,
+    SUMS,
+    VISIBLE,
+    project_splats,
+    splat_gradients,
+)
+from stages.raster.definition import RasterSettings, Rendering
+from stages.scene import Camera, Splats
+
+CHUNK = 512  # splats a ticket; whole vectors
+NO_SMOOTHING = np.zeros(0, np.float32)
+
+
+class Buffers:
+    """Arrays by name that only ever grow, so that a training step allocates next to nothing."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def get(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        """An uninitialised C-contiguous array of this shape; valid until the next call."""
+        size = int(np.prod(shape))
+        have = self._arrays.get(name)
+        if have is None or have.size < size or have.dtype != np.dtype(dtype):
+            have = np.empty(size + size // 8 + 16, dtype)
+            self._arrays[name] = have
+        return have[:size].reshape(shape)
+
+    def carve(self, *wanted: tuple[tuple[int, ...], Any]) -> list[NDArray[Any]]:
+        """Uninitialised arrays of (shape, dtype) out of one buffer that all such calls share: what
+        the last call gave is overwritten by the next."""
+        sizes = [int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in wanted]
+        ends = np.cumsum([-(-size // 64) * 64 for size in sizes])
+        arena = self.get("scratch", (int(ends[-1]),), np.uint8)
+        parts = []
+        for (shape, dtype), size, end in zip(wanted, sizes, ends, strict=True):
+            start = int(end) + -(-size // 64) * -64
+            parts.append(arena[start : start + size].view(dtype).reshape(shape))
+        return parts
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """What each tile draws, nearest first: entries starts[t]..starts[t + 1].
+
+    members [I]: row of the splat. slots [I]: where the entry's gradient goes; the slots of a splat
+    follow each other. masks [I]: which 4x4 blocks of the tile the splat touches. places [V, 4]: for
+    each visible splat its row, its slots' number and first; see `binning`.
+    """
+
+    starts: NDArray[np.int64]
+    members: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    masks: NDArray[np.uint16]
+    places: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+
+@dataclass(frozen=True)
+class Forward:
+    """What a forward pass leaves for the way back.
+
+    image [4 or 6, H, W]: RGB, alpha, and if asked for expected and median depth. visible [V] int32:
+    rows of the splats that touch the picture, ascending. geometry, paint: of all rows (of visible
+    ones filled). light, last: see `blend.blend_tiles`. The arrays belong to the rasteriser's
+    buffers: valid until its next forward pass.
+    """
+
+    image: NDArray[np.float32]
+    visible: NDArray[np.int32]
+    lists: TileLists
+    culled: int
+    geometry: NDArray[np.float64]
+    paint: NDArray[np.float32]
+    light: NDArray[np.float32]
+    last: NDArray[np.float32]
+    cam: NDArray[np.float64]
+    degree: int
+    background: NDArray[np.float32]
+    width: int
+    height: int
+
+    @property
+    def n_intersections(self) -> int:
+        return len(self.lists)
+
+
+@dataclass(frozen=True)
+class Backward:
+    """Gradients of the visible splats, in the order of their rows.
+
+    rows [V] int32. parameters [V, gradient_columns]: mean 0:3, quaternion 3:7, log-scales 7:10,
+    opacity logit 10, then SH, basis function by basis function with RGB last, then zeros.
+    means2d [V, 2]: of the mean on the picture, per pixel.
+    """
+
+    rows: NDArray[np.int32]
+    parameters: NDArray[np.float32]
+    means2d: NDArray[np.float32]
+
+
+def gradient_columns(bands: int) -> int:
+    """Columns of a gradient row with room for `bands` of SH: whole vectors."""
+    return -(-(11 + 3 * bands) // 16) * 16
+
+
+class CpuRasteriser:
+    """Draws and differentiates. One instance a thread of control; it owns its buffers."""
+
+    def __init__(self, pool: Pool | None = None) -> None:
+        self.pool = pool or default_pool()
+        self.buffers = Buffers()
+
+    def forward(
+        self,
+        arrays: tuple[NDArray[np.float32], ...],
+        camera: Camera,
+        settings: RasterSettings,
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
+        depths: bool = False,
+    ) -> Forward:
+        """arrays: means, quaternions, log_scales, opacity_logits, sh (C-contiguous).
+
+        smoothing [N]: see `raster.smoothing`. depths: whether to draw the depth planes.
+        """
+        cam = camera_row(camera, settings)
+        degree = min(settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1)
+        width, height = camera.width, camera.height
+        n, get = len(arrays[0]), self.buffers.get
+        geometry = get("geometry", (n, GEOMETRY_ROW), np.float64)
+        paint = get("paint", (n, 4), np.float32)
+        status = get("status", (n,), np.uint8)
+        self.pool.share(
+            project_splats, CHUNK, cam, degree, *arrays, smoothing, geometry, paint, status
+        )
+        visible = np.flatnonzero(status == VISIBLE).astype(np.int32)
+        lists = self._lists(visible, arrays, geometry, paint, width, height)
+        background = np.asarray(settings.background, np.float32)
+        tiles = len(lists.starts) - 1
+        image = get("image", (6 if depths else 4, height, width), np.float32)
+        light = get("light", (tiles, blend.PIXELS), np.float32)
+        last = get("last", (tiles, blend.PIXELS), np.float32)
+        self.pool.share(
+            blend.blend_tiles,
+            width,
+            height,
+            lists.starts,
+            lists.members,
+            lists.masks,
+            geometry,
+            paint,
+            background,
+            depths,
+            image,
+            light,
+            last,
+        )
+        return Forward(
+            image,
+            visible,
+            lists,
+            int(np.count_nonzero(status == CULLED)),
+            geometry,
+            paint,
+            light,
+            last,
+            cam,
+            degree,
+            background,
+            width,
+            height,
+        )
+
+    def backward(
+        self,
+        arrays: tuple[NDArray[np.float32], ...],
+        forward: Forward,
+        v_image: NDArray[np.float32],
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
+    ) -> Backward:
+        """Gradients of the visible splats, from v_image [3, H, W]."""
+        n = len(forward.visible)
+        get = self.buffers.get
+        (raw,) = self.buffers.carve(((forward.n_intersections, SUMS), np.float32))
+        self._over_tiles(blend.blend_gradient_tiles, forward, v_image, raw)
+        out = get("out", (n, gradient_columns((forward.degree + 1) ** 2)), np.float32)
+        means2d = get("means2d", (n, 2), np.float32)
+        self.pool.share(
+            splat_gradients,
+            CHUNK,
+            forward.visible,
+            forward.cam,
+            forward.degree,
+            *arrays,
+            smoothing,
+            forward.geometry,
+            forward.paint,
+            forward.lists.places,
+            raw,
+            out,
+            means2d,
+        )
+        return Backward(forward.visible, out, means2d)
+
+    def contributions(self, forward: Forward, residual: NDArray[np.float32]) -> NDArray[np.float64]:
+        """[V, 3] for the visible splats: change of the squared error against the photograph if
+        the splat were removed, sum of its weights, its largest weight.
+
+        residual [3, H, W]: render less photograph.
+        """
+        shape = (forward.n_intersections, contributions.COLUMNS)
+        (raw,) = self.buffers.carve((shape, np.float32))
+        self._over_tiles(contributions.contribution_tiles, forward, residual, raw)
+        out = np.empty((len(forward.visible), contributions.COLUMNS))
+        contributions.gather_contributions(raw, forward.lists.places, out)
+        return out
+
+    def _over_tiles(
+        self,
+        kernel: Any,
+        forward: Forward,
+        planes: NDArray[np.float32],
+        out: NDArray[np.float32],
+    ) -> None:
+        """A pass from far to near over every tile's list; one row of `out` for each entry."""
+        self.pool.share(
+            kernel,
+            forward.width,
+            forward.height,
+            forward.lists.starts,
+            forward.lists.members,
+            forward.lists.slots,
+            forward.lists.masks,
+            forward.geometry,
+            forward.paint,
+            forward.background,
+            forward.light,
+            forward.last,
+            planes,
+            out,
+        )
+
+    def _lists(
+        self,
+        visible: NDArray[np.int32],
+        arrays: tuple[NDArray[np.float32], ...],
+        geometry: NDArray[np.float64],
+        paint: NDArray[np.float32],
+        width: int,
+        height: int,
+    ) -> TileLists:
+        n, get, share = len(visible), self.buffers.get, self.pool.share
+        bounds = get("bounds", (n,), np.int32)
+        share(binning.bound_tiles, visible, geometry, width, height, bounds)
+        places = get("places", (n, 4), np.int32)
+        most = _starts(bounds, places[:, binning.FOUND])
+        tiles, masks, order, keys, order2, keys2 = self.buffers.carve(
+            *(((most,), np.int32), ((most,), np.uint16), ((n,), np.int32), ((n,), np.float32)),
+            *(((n,), np.int32), ((n,), np.uint32)),
+        )
+        share(
+            *(binning.find_tiles, visible, geometry, width, height, places, tiles, masks),
+            beside=lambda: binning.sort_by_depth(
+                visible, paint, arrays, keys, order, keys2, order2
+            ),
+        )
+        total = _starts(places[:, binning.COUNT], places[:, binning.SLOT])
+
+        n_tiles = -(-width // binning.TILE) * -(-height // binning.TILE)
+        positions = get("tile_counts", (binning.CHUNKS, n_tiles), np.int64)
+        positions[:] = 0
+        share(binning.count_tiles, order, places, tiles, positions)
+        starts = get("tile_starts", (n_tiles + 1,), np.int64)
+        binning.scan_counts(positions, starts)
+        lists = TileLists(
+            starts,
+            get("members", (total,), np.int32),
+            get("slots", (total,), np.int32),
+            get("masks", (total,), np.uint16),
+            places,
+        )
+        share(
+            binning.fill_tiles,
+            order,
+            places,
+            tiles,
+            masks,
+            positions,
+            lists.members,
+            lists.slots,
+            lists.masks,
+        )
+        return lists
+
+
+def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:
+    """starts: the sum of all counts before; returns the sum of all.
+
+    Raises MemoryError where it does not fit into 31 bits: 2 billion entries take 90 GB.
+    """
+    total = int(counts.sum(dtype=np.int64))
+    if total >= 2**31:
+        raise MemoryError(f"{total:,} splat-tile intersections; at most 2**31 - 1 can be drawn")
+    if len(counts):
+        starts[0] = 0
+        np.cumsum(counts[:-1], out=starts[1:])
+    return total
+
+
+def splat_arrays(splats: Splats) -> tuple[NDArray[np.float32], ...]:
+    """The five parameter arrays, C-contiguous float32."""
+    return tuple(
+        np.ascontiguousarray(a, dtype=np.float32)
+        for a in (
+            splats.means,
+            splats.quaternions,
+            splats.log_scales,
+            splats.opacity_logits,
+            splats.sh,
+        )
+    )
+
+
+def renderer_cpu(
+    splats: Splats, settings: RasterSettings, smoothing: NDArray[np.float32] | None = None
+) -> Callable[[Camera], Rendering]:
+    """`renderer` by the kernels."""
+    widths = NO_SMOOTHING if smoothing is None else np.ascontiguousarray(smoothing, np.float32)
+    rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
+
+    def draw(camera: Camera) -> Rendering:
+        forward = rasteriser.forward(arrays, camera, settings, widths, depths=True)
+        image = forward.image
+        return Rendering(
+            np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
+            image[3].copy(),
+            image[4].copy(),
+            image[5].copy(),
+            forward.culled,
+        )
+
+    return draw

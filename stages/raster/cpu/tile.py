@@ -1,0 +1,88 @@
+"""One tile of 16x16 pixels while it is worked on: planes of 256 floats, 4x4 pixels a vector.
+
+Plane p of a tile's work holds block b (b % 4 across, b // 4 down) at p + 16 b, row by row.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.kernels.simd import (
+    kernel,
+    vload,
+    vload4x4,
+    vstore,
+    vstore4x4,
+)
+from stages.raster.cpu.binning import BLOCK, TILE
+
+PIXELS = TILE * TILE
+BLOCKS = 16
+NEVER = np.float32(3e38)  # "last entry drawn" of a pixel that was never finished
+_F = np.float32
+
+
+@kernel
+def load_plane(picture, channel, tile_x, tile_y, work, plane):
+    """A tile of picture[channel] into a plane of `work`; 0 beyond the picture's rim."""
+    height, width = picture.shape[1], picture.shape[2]
+    left, top = tile_x * TILE, tile_y * TILE
+    if left + TILE <= width and top + TILE <= height:
+        for block in range(BLOCKS):
+            y, x = top + BLOCK * (block // 4), left + BLOCK * (block % 4)
+            at = (channel * height + y) * width + x
+            vstore(work, plane + 16 * block, vload4x4(picture, at, width))
+        return
+    for block in range(BLOCKS):
+        for k in range(16):
+            y, x = top + BLOCK * (block // 4) + k // 4, left + BLOCK * (block % 4) + k % 4
+            inside = y < height and x < width
+            work[plane + 16 * block + k] = picture[channel, y, x] if inside else _F(0.0)
+
+
+@kernel
+def store_plane(picture, channel, tile_x, tile_y, work, plane):
+    """The way back of `load_plane`."""
+    height, width = picture.shape[1], picture.shape[2]
+    left, top = tile_x * TILE, tile_y * TILE
+    if left + TILE <= width and top + TILE <= height:
+        for block in range(BLOCKS):
+            y, x = top + BLOCK * (block // 4), left + BLOCK * (block % 4)
+            at = (channel * height + y) * width + x
+            vstore4x4(picture, at, width, vload(work, plane + 16 * block))
+        return
+    for block in range(BLOCKS):
+        for k in range(16):
+            y, x = top + BLOCK * (block // 4) + k // 4, left + BLOCK * (block % 4) + k % 4
+            if y < height and x < width:
+                picture[channel, y, x] = work[plane + 16 * block + k]
+
+
+@kernel
+def start_light(tile_x, tile_y, width, height, work, light, last):
+    """Light 1 and last NEVER in the tile's pixels; 0 and 0 in those beyond the picture's rim.
+
+    light, last: planes of `work`. Returns the mask of blocks that lie in the picture.
+    """
+    alive = 0
+    for block in range(BLOCKS):
+        y, x = tile_y * TILE + BLOCK * (block // 4), tile_x * TILE + BLOCK * (block % 4)
+        if y < height and x < width:
+            alive |= 1 << block
+        for k in range(16):
+            inside = y + k // 4 < height and x + k % 4 < width
+            work[light + 16 * block + k] = _F(1.0) if inside else _F(0.0)
+            work[last + 16 * block + k] = NEVER if inside else _F(0.0)
+    return alive
+
+
+@kernel
+def last_of_blocks(last, tile, block_last):
+    """block_last [16]: the last entry drawn in each block of a tile. Returns the largest."""
+    furthest = _F(0.0)
+    for block in range(BLOCKS):
+        block_last[block] = _F(0.0)
+        for k in range(16):
+            block_last[block] = max(block_last[block], last[tile, 16 * block + k])
+        furthest = max(furthest, block_last[block])
+    return furthest

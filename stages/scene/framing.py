@@ -1,0 +1,50 @@
+"""Places to look at splats from, where no photograph says."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene.camera import Camera, look_at
+from stages.scene.splats import Splats
+
+_WIDTH_WITHOUT_A_PHOTOGRAPH_PX = 960
+_MEANS_FOR_DEPTH = 4000
+
+
+def in_front_of(splats: Splats) -> Camera:
+    """A camera that sees the middle nine tenths of the splats, from -z and a little above."""
+    return around(splats, 1, 0.9)[0]
+
+
+def around(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
+    """`count` cameras evenly around the middle `part` of the splats, the first in front; each sees
+    all of that part."""
+    means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
+    if len(means) == 0:
+        means = np.zeros((1, 3))
+    low, high = np.quantile(means, (0.5 - part / 2, 0.5 + part / 2), axis=0)
+    middle = (low + high) / 2
+    distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
+    width = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX
+    height = width * 3 // 4
+    cameras = []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        eye = middle + distance * np.array([np.sin(angle), -0.3, -np.cos(angle)])
+        pose = look_at(eye, middle)
+        cameras.append(Camera(width, height, width, width, width / 2, height / 2, pose))
+    return tuple(cameras)
+
+
+def depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
+    """The median z of what lies in the picture; of all in front if nothing does."""
+    points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
+    x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+    ahead = z > 0.01
+    with np.errstate(all="ignore"):
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = ahead & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+    for chosen in (inside, ahead):
+        if chosen.any():
+            return float(np.median(z[chosen]))
+    return 1.0

@@ -1,0 +1,1 @@
+"""Where splats may start besides at the sparse points."""

@@ -1,0 +1,86 @@
+"""Pictures for people: held-out photographs beside their renders, and the course of training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SHEET_COLUMN = 480  # pixels, at most
+ERROR_GAIN = 4.0
+
+
+def contact_sheet(
+    path: Path, rows: list[tuple[str, float, NDArray[np.float32], NDArray[np.float32]]]
+) -> None:
+    """A PNG with a row for each (name, PSNR in dB, render, photograph): photograph, render,
+    absolute error x 4."""
+    import cv2
+
+    strips = []
+    for name, decibel, image, truth in rows:
+        error = np.clip(np.abs(image - truth) * ERROR_GAIN, 0, 1)
+        tiles = [_fitted(tile) for tile in (truth, image, error)]
+        strip = np.hstack(tiles)
+        title = np.full((26, strip.shape[1], 3), 24, np.uint8)
+        text = f"{_ascii(name)}   photograph | render {decibel:.2f} dB | error x{ERROR_GAIN:.0f}"
+        cv2.putText(title, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (220,) * 3, 1, cv2.LINE_AA)
+        strips.append(np.vstack([title, strip]))
+    if not strips:
+        return
+    width = max(strip.shape[1] for strip in strips)
+    padded = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0))) for s in strips]
+    _write_png(path, np.vstack(padded))
+
+
+def training_plot(path: Path, history: list[dict[str, Any]]) -> None:
+    """A PNG of held-out PSNR (dB) and number of splats over the steps."""
+    import cv2
+
+    points = [h for h in history if "psnr_db" in h]
+    if len(points) < 2:
+        return
+    height, width, margin = 360, 640, 56
+    canvas = np.full((height, width, 3), 255, np.uint8)
+    steps = np.array([h["step"] for h in points], float)
+    for values, colour, label, x in (
+        (np.array([h["psnr_db"] for h in points]), (200, 60, 20), "held-out PSNR, dB", margin),
+        (np.array([h["splats"] for h in points], float), (40, 110, 200), "splats", width // 2),
+    ):
+        low, high = float(values.min()), float(max(values.max(), values.min() + 1e-9))
+        xs = margin + (steps - steps[0]) / (steps[-1] - steps[0]) * (width - 2 * margin)
+        ys = height - margin - (values - low) / (high - low) * (height - 2 * margin)
+        line = np.round(np.stack([xs, ys], 1)).astype(np.int32)
+        cv2.polylines(canvas, [line], False, colour, 2, cv2.LINE_AA)
+        text = f"{label}: {low:.4g} to {values[-1]:.4g}"
+        cv2.putText(canvas, text, (x, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    cv2.rectangle(canvas, (margin, margin), (width - margin, height - margin), (180,) * 3, 1)
+    text = f"step {int(steps[0])} to {int(steps[-1])}"
+    at = (width // 2 - 60, height - 20)
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60,) * 3, 1, cv2.LINE_AA)
+    _write_png(path, canvas)
+
+
+def _ascii(name: str) -> str:
+    """OpenCV's font knows no other letters."""
+    return name.encode("ascii", "replace").decode()
+
+
+def _fitted(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    import cv2
+
+    scale = min(1.0, SHEET_COLUMN / image.shape[1])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    small = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(np.round(np.clip(small, 0, 1) * 255), np.uint8)
+
+
+def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    from PIL import Image
+
+    from stages.base.atomic import replacing
+
+    with replacing(path) as temporary:
+        Image.fromarray(image).save(temporary, format="PNG")

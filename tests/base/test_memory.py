@@ -1,0 +1,38 @@
+"""Peak memory of a stretch of work, children included."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from stages.base.memory import PeakMemory, resident_mib
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells it exactly")
+HOLD_MIB = 120
+
+
+def test_peak_counts_memory_given_back_before_the_end() -> None:
+    before = resident_mib()
+    with PeakMemory() as memory:
+        held = b"x" * (HOLD_MIB * 2**20)
+        del held
+    assert memory.peak_mib > before + 0.9 * HOLD_MIB
+
+
+def test_peak_of_one_stretch_is_not_inherited_by_the_next() -> None:
+    with PeakMemory() as first:
+        held = b"x" * (HOLD_MIB * 2**20)
+        del held
+    with PeakMemory() as second:
+        pass
+    assert second.peak_mib < first.peak_mib - 0.5 * HOLD_MIB
+
+
+def test_peak_counts_child_processes() -> None:
+    code = f"import time; x = b'x' * ({HOLD_MIB} * 2**20); time.sleep(0.6)"
+    before = resident_mib()
+    with PeakMemory(interval_s=0.02) as memory:
+        subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+    assert memory.peak_mib > before + 0.9 * HOLD_MIB

@@ -1,0 +1,210 @@
+"""COLMAP models: COLMAP itself reads what we write, and writes what we read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.base.errors import SplatError
+from stages.cameras.colmap import (
+    ColmapModel,
+    model_folder,
+    read,
+    read_model,
+    write_colmap_model,
+)
+from stages.scene import Camera
+from tests.structure.synthetic import orbit_model
+
+
+def example() -> ColmapModel:
+    """Five views, two of them with another focal length; pinhole observations."""
+    model = orbit_model(views=5, points=30)
+    focals = (500.0, 500.0, 510.0, 510.0, 500.0)
+    cameras = tuple(
+        Camera(640, 480, focal, focal, 320.0, 240.0, pose)
+        for focal, pose in zip(focals, model.world_to_camera, strict=True)
+    )
+    keep = (model.observed_points + model.observing_views) % 4 != 0
+    points, views = model.observed_points[keep], model.observing_views[keep]
+    poses = model.world_to_camera[views]
+    xyz = np.einsum("oij,oj->oi", poses[:, :3, :3], model.points[points]) + poses[:, :3, 3]
+    px = np.array(focals)[views, None] * xyz[:, :2] / xyz[:, 2:] + (320.0, 240.0)
+    return ColmapModel(
+        names=("a.jpg", "day 1/b.jpg", "ü.jpg", "d.jpg", "e.jpg"),
+        cameras=cameras,
+        points=model.points,
+        colours=model.colours,
+        errors_px=np.linspace(0, 1, 30),
+        observed_points=points,
+        observing_views=views,
+        observed_px=px,
+    )
+
+
+def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    model = example()
+    write_colmap_model(tmp_path / "0", model)
+    read = pycolmap.Reconstruction(tmp_path / "0")
+    assert sorted(path.name for path in (tmp_path / "0").iterdir()) == [
+        "cameras.bin",
+        "images.bin",
+        "points3D.bin",
+    ]
+    assert (read.num_cameras(), read.num_reg_images(), read.num_points3D()) == (2, 5, 30)
+    for i, camera in enumerate(model.cameras):
+        image = read.images[i + 1]
+        assert image.name == model.names[i]
+        assert np.allclose(image.cam_from_world().matrix(), camera.world_to_camera[:3], atol=1e-12)
+        assert read.cameras[image.camera_id].focal_length_x == camera.fx
+    for number, point in read.points3D.items():
+        assert (point.xyz == model.points[number - 1]).all()
+        assert (point.color == model.colours[number - 1]).all()
+    # Tracks and observations name each other rightly: COLMAP finds no reprojection error.
+    read.update_point_3d_errors()
+    assert read.compute_mean_reprojection_error() < 1e-9
+    assert read.compute_num_observations() == len(model.observed_points)
+
+
+def test_equal_models_give_equal_bytes(tmp_path: Path) -> None:
+    write_colmap_model(tmp_path / "a", example())
+    write_colmap_model(tmp_path / "b", example())
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_a_model_without_points_is_still_a_model(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    none = np.zeros(0, np.int32)
+    model = replace(
+        example(),
+        points=np.zeros((0, 3)),
+        colours=np.zeros((0, 3), np.uint8),
+        errors_px=np.zeros(0),
+        observed_points=none,
+        observing_views=none,
+        observed_px=np.zeros((0, 2)),
+    )
+    write_colmap_model(tmp_path, model)
+    assert pycolmap.Reconstruction(tmp_path).num_reg_images() == 5
+
+
+def assert_same(found: ColmapModel, wanted: ColmapModel) -> None:
+    assert found.names == wanted.names
+    for ours, theirs in zip(found.cameras, wanted.cameras, strict=True):
+        assert replace(ours, world_to_camera=None) == replace(theirs, world_to_camera=None)
+        np.testing.assert_allclose(ours.world_to_camera, theirs.world_to_camera, atol=1e-14)
+    for name in ("points", "colours", "observed_points", "observing_views", "observed_px"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    write_colmap_model(tmp_path / "sparse" / "0", example())
+    folder = model_folder(tmp_path)
+    assert folder == tmp_path / "sparse" / "0"
+    cameras, model = read_model(folder)
+    assert_same(model, example())
+    np.testing.assert_array_equal(model.errors_px, example().errors_px)
+    assert [view.name for view in cameras.views] == list(example().names)
+    assert cameras.distorted == 0
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_what_colmap_writes_is_read(tmp_path: Path, text: bool) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    write_colmap_model(tmp_path / "ours", example())
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    loaded = pycolmap.Reconstruction(tmp_path / "ours")
+    (loaded.write_text if text else loaded.write_binary)(str(theirs))
+    _, model = read_model(theirs)
+    order = np.argsort(model.names)
+    wanted = np.argsort(example().names)
+    assert [model.names[i] for i in order] == [example().names[i] for i in wanted]
+    for i, j in zip(order, wanted, strict=True):
+        ours, known = model.cameras[i], example().cameras[j]
+        assert (ours.width, ours.height, ours.fx, ours.cy) == (640, 480, known.fx, 240.0)
+        np.testing.assert_allclose(ours.world_to_camera, known.world_to_camera, atol=1e-13)
+    assert len(model.points) == 30
+    assert len(model.observed_points) == len(example().observed_points)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "lens", "distorted"),
+    [
+        ("SIMPLE_PINHOLE", "500 320 240", (500, 500, 320, 240), 0),
+        ("PINHOLE", "500 510 320 240", (500, 510, 320, 240), 0),
+        ("SIMPLE_RADIAL", "500 320 240 0.1", (500, 500, 320, 240), 1),
+        ("SIMPLE_RADIAL", "500 320 240 0", (500, 500, 320, 240), 0),
+        ("RADIAL", "500 320 240 0 0.1", (500, 500, 320, 240), 1),
+        ("OPENCV", "500 510 320 240 0 0 0 0.1", (500, 510, 320, 240), 1),
+        ("FULL_OPENCV", "500 510 320 240 0 0 0 0 0 0 0 1", (500, 510, 320, 240), 1),
+    ],
+)
+def test_lenses_are_read_and_distortion_is_counted(
+    tmp_path: Path, model: str, params: str, lens: tuple[float, ...], distorted: int
+) -> None:
+    (tmp_path / "cameras.txt").write_text(f"# a comment\n7 {model} 640 480 {params}\n")
+    (tmp_path / "images.txt").write_text("3 1 0 0 0 0.5 0 2 7 my photo.jpg\n\n")
+    found = read(tmp_path)
+    (view,) = found.views
+    camera = view.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == lens
+    assert view.name == "my photo.jpg"
+    np.testing.assert_array_equal(camera.centre, [-0.5, 0, -2])
+    assert found.distorted == distorted
+
+
+def damaged(folder: Path, name: str, change) -> None:
+    write_colmap_model(folder, example())
+    path = folder / f"{name}.bin"
+    path.write_bytes(change(path.read_bytes()))
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda b: b"",
+        lambda b: b[: len(b) // 2],
+        lambda b: b[:-1],
+        lambda b: (1 << 60).to_bytes(8, "little") + b[8:],
+        lambda b: b"\xff" * len(b),
+        lambda b: b[:8] + b"\xff" * (len(b) - 8),
+    ],
+    ids=["empty", "half", "one byte less", "huge count", "ones", "ones after the count"],
+)
+def test_damaged_models_are_refused_quickly(tmp_path: Path, name: str, change) -> None:
+    damaged(tmp_path, name, change)
+    with pytest.raises(SplatError) as caught:
+        read_model(tmp_path)
+    assert caught.value.code == "cameras-unreadable"
+    assert name in caught.value.given
+
+
+@pytest.mark.parametrize(
+    ("cameras", "images", "said"),
+    [
+        ("1 OPENCV_FISHEYE 64 48 50 50 32 24 0 0 0 0", "1 1 0 0 0 0 0 0 1 a", "OPENCV_FISHEYE"),
+        ("1 PINHOLE 64 48 50 50 32", "1 1 0 0 0 0 0 0 1 a", "PINHOLE"),
+        ("1 PINHOLE 64 48 50 50 32 24", "1 1 0 0 0 0 0 0 2 a", "no camera 2"),
+        ("1 PINHOLE 64 48 50 50 32 24", "1 0 0 0 0 0 0 0 1 a", "direction"),
+        ("1 PINHOLE 64 48 50 50 32 24", "1 1 0 0 0 nan 0 0 1 a", "position"),
+        ("1 PINHOLE 64 48 -50 50 32 24", "1 1 0 0 0 0 0 0 1 a", "focal"),
+        ("1 PINHOLE 0 48 50 50 32 24", "1 1 0 0 0 0 0 0 1 a", "size"),
+        ("1 PINHOLE 9999999999 48 50 50 32 24", "1 1 0 0 0 0 0 0 1 a", "size"),
+        ("1 PINHOLE 64 48 50 50 32 24", "", "empty"),
+        ("1 PINHOLE 64 48 50 50 32 24", "# nothing", "no camera"),
+        ("1 PINHOLE 64 48 50 50 32 24", "1 1 0 0 0 0 0", "lacks a part"),
+    ],
+)
+def test_what_is_no_camera_is_refused(tmp_path: Path, cameras: str, images: str, said: str) -> None:
+    (tmp_path / "cameras.txt").write_text(cameras + "\n")
+    (tmp_path / "images.txt").write_text(images and images + "\n\n")
+    with pytest.raises(SplatError) as caught:
+        read(tmp_path)
+    assert said in caught.value.given

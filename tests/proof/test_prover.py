@@ -1,0 +1,267 @@
+"""A file is proven by what it draws and by every value in it; mistakes are seen and named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from stages import formats
+from stages.formats import splat32
+from stages.proof import usd_validators
+from stages.proof.prover import Proof, Prover, cameras_for
+from stages.scene import Splats
+from tests.small_scene import SmallScene, small_scene
+
+Change = Callable[[Splats], Splats]
+DIFFERENT_KINDS = ("ply", "splat", "glb", "spz", "sog", "compressed.ply")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
+    """A ball of splats that is no mirror image of itself, where most change with the view."""
+    made = small_scene(tmp_path_factory.mktemp("photos"))
+    rng = np.random.default_rng(7)
+    n = len(made.splats)
+    means = made.splats.means + 0.4 * np.square(made.splats.means)
+    sh = made.splats.sh.copy()
+    sh[:, 1:] = rng.normal(0, 0.25, (n, 8, 3))
+    return replace(made, splats=replace(made.splats, means=means, sh=sh))
+
+
+@pytest.fixture(scope="module")
+def prover(scene: SmallScene) -> Prover:
+    return Prover.of(scene.splats, cameras_for(scene.splats, scene.reconstruction.views))
+
+
+def written(prover: Prover, folder: Path, name: str, splats: Splats) -> Proof:
+    formats.write(folder / f"a.{name}", splats)
+    return prover.prove(folder / f"a.{name}")
+
+
+def turned_about_x(splats: Splats) -> Splats:
+    return replace(splats, means=splats.means * np.float32([1, -1, -1]))
+
+
+def mirrored(splats: Splats) -> Splats:
+    return replace(splats, means=splats.means * np.float32([-1, 1, 1]))
+
+
+def rolled(splats: Splats) -> Splats:
+    return replace(splats, quaternions=np.roll(splats.quaternions, -1, axis=1))
+
+
+def interleaved(splats: Splats) -> Splats:
+    n, k = len(splats), splats.sh.shape[1] - 1
+    sh = splats.sh.copy()
+    # read as all coefficients of red first, although written red, green, blue, red, ...
+    sh[:, 1:] = sh[:, 1:].reshape(n, 3, k).transpose(0, 2, 1)
+    return replace(splats, sh=sh)
+
+
+def shrunk(splats: Splats) -> Splats:
+    return replace(splats, means=splats.means / 10, log_scales=splats.log_scales - np.log(10))
+
+
+def moved(splats: Splats) -> Splats:
+    return replace(splats, means=splats.means + np.float32([7, 0, 0]))
+
+
+@pytest.mark.parametrize("name", formats.FORMATS)
+def test_what_was_written_is_proven_in_every_format(
+    prover: Prover, scene: SmallScene, tmp_path: Path, name: str
+) -> None:
+    proof = written(prover, tmp_path, name, scene.splats)
+    assert proof.fault == ""
+    assert proof.splats == len(scene.splats)
+    assert proof.figures["verify_db"] <= proof.figures["verify_mean_db"] <= 99
+    assert proof.figures["verify_cameras"] == 2  # of ten photographs two are held out
+    if name not in formats.LOSSY:
+        assert proof.figures["verify_db"] > 80
+        assert proof.figures["worst_attribute"] == ""
+
+
+@pytest.mark.parametrize("name", DIFFERENT_KINDS)
+def test_the_order_of_the_rows_does_not_matter(
+    prover: Prover, scene: SmallScene, tmp_path: Path, name: str
+) -> None:
+    rows = np.random.default_rng(2).permutation(len(scene.splats))
+    same = written(prover, tmp_path, name, scene.splats).figures
+    other = written(prover, tmp_path, name, scene.splats.take(rows)).figures
+    for figure in ("max_position_error", "max_opacity_error", "max_rotation_error_degrees"):
+        assert other[figure] == pytest.approx(same[figure], rel=0.05, abs=1e-6), figure
+
+
+@pytest.mark.parametrize("name", DIFFERENT_KINDS)
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (mirrored, "positions are wrong: its x, y, z look like -x, y, z"),
+        (turned_about_x, "positions are wrong: its x, y, z look like x, -y, -z"),
+        (moved, "positions are wrong: all lie 7"),
+        (shrunk, "the scene is 0.1 times as large"),
+        (rolled, "rotations are wrong: they look like x, y, z, w taken for w, x, y, z"),
+        (interleaved, "colours are wrong: the coefficients look like red, green, blue in turn"),
+    ],
+    ids=lambda value: value.__name__ if callable(value) else "",
+)
+def test_a_common_mistake_is_seen_and_named(
+    prover: Prover, scene: SmallScene, tmp_path: Path, name: str, change: Change, words: str
+) -> None:
+    proof = written(prover, tmp_path, name, change(scene.splats))
+    if name == "splat" and change is interleaved:  # it has no view-dependent colours
+        assert proof.fault == ""
+    else:
+        assert words in proof.fault
+
+
+def test_bytes_of_f_rest_in_the_wrong_order_are_seen(
+    prover: Prover, scene: SmallScene, tmp_path: Path
+) -> None:
+    """The mistake as it is made: another writer's column order under the right names."""
+    formats.write(tmp_path / "a.ply", scene.splats)
+    data = PlyData.read(tmp_path / "a.ply", mmap=False)
+    names = [f"f_rest_{i}" for i in range(24)]
+    columns = np.stack([data["vertex"][name].copy() for name in names], axis=1)
+    in_turn = columns.reshape(-1, 3, 8).transpose(0, 2, 1).reshape(-1, 24)
+    for name, column in zip(names, in_turn.T, strict=True):
+        data["vertex"][name] = column
+    data.write(tmp_path / "a.ply")
+    proof = prover.prove(tmp_path / "a.ply")
+    assert "red, green, blue in turn, taken for all reds first" in proof.fault
+    assert proof.figures["verify_db"] < 45
+
+
+@pytest.mark.parametrize(
+    ("column", "add", "attribute", "figure"),
+    [
+        ("x", 0.5, "position", "max_position_error"),
+        ("scale_1", 0.5, "log_scale", "max_log_scale_error"),
+        ("f_rest_3", 0.5, "sh", "max_sh_error"),
+    ],
+)
+def test_one_altered_value_is_named(
+    prover: Prover,
+    scene: SmallScene,
+    tmp_path: Path,
+    column: str,
+    add: float,
+    attribute: str,
+    figure: str,
+) -> None:
+    formats.write(tmp_path / "a.ply", scene.splats)
+    data = PlyData.read(tmp_path / "a.ply", mmap=False)
+    data["vertex"][column][123] += add
+    data.write(tmp_path / "a.ply")
+    found = prover.prove(tmp_path / "a.ply").figures
+    assert (found["worst_attribute"], found["worst_splat"]) == (attribute, 123)
+    assert found[figure] == pytest.approx(add, rel=1e-3)
+    others = [name for name in found if name.startswith("max_") and name != figure]
+    assert [found[name] for name in others] == [0, 0, 0, 0]
+
+
+def test_one_altered_opacity_is_named(prover: Prover, scene: SmallScene, tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
+    splats = replace(scene.splats, opacity_logits=scene.splats.opacity_logits.copy())
+    splats.opacity_logits[40] = 0 if abs(splats.opacity_logits[40]) > 1 else 3
+    formats.write(path, splats)
+    found = prover.prove(path).figures
+    assert (found["worst_attribute"], found["worst_splat"]) == ("opacity", 40)
+
+
+@pytest.mark.parametrize("name", formats.FORMATS)
+def test_a_missing_splat_is_counted(
+    prover: Prover, scene: SmallScene, tmp_path: Path, name: str
+) -> None:
+    n = len(scene.splats)
+    proof = written(prover, tmp_path, name, scene.splats.take(np.arange(1, n)))
+    assert proof.fault == f"it holds {n - 1} of {n} splats"
+
+
+def test_one_splat_twice_for_another_is_found_though_the_count_is_right(
+    prover: Prover, scene: SmallScene, tmp_path: Path
+) -> None:
+    rows = np.arange(len(scene.splats))
+    rows[30] = 31
+    found = written(prover, tmp_path, "ply", scene.splats.take(rows)).figures
+    assert found["max_position_error"] > 0.01
+    assert found["worst_attribute"]
+
+
+@pytest.mark.parametrize("name", ["splat", "spz", "sog", "compressed.ply"])
+def test_a_file_that_must_equal_itself_is_held_to_more(
+    scene: SmallScene, tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / f"a.{name}"
+    formats.write(path, scene.splats)
+    back = formats.read(path)
+    prover = Prover.of(back, cameras_for(back), came_as=name)
+    proof = prover.prove(path, exact=True)
+    assert (proof.fault, proof.loss_db) == ("", None)
+    assert proof.figures["verify_db"] > 80
+    dimmed = Prover.of(replace(back, opacity_logits=back.opacity_logits - 0.3), prover.cameras)
+    assert "drawn again it differs" in dimmed.prove(path, exact=True).fault
+
+
+def test_flat_and_opaque_splats_are_numbers_to_both_readers(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    """Other programs write a scale of 0 and an opacity of 1."""
+    records = splat32.encode(scene.splats)
+    records["scale"][:, 2] = 0
+    records["rgba"][:9, 3] = 255
+    (tmp_path / "a.splat").write_bytes(records.tobytes())
+    back = formats.read(tmp_path / "a.splat")
+    proof = Prover.of(back, cameras_for(back), came_as="splat").prove(tmp_path / "a.splat", True)
+    assert proof.fault == ""
+    assert proof.splats == len(scene.splats)
+    assert proof.figures["max_log_scale_error"] == 0
+
+
+def test_without_photographs_the_middle_of_the_splats_is_seen_from_three_sides(
+    scene: SmallScene,
+) -> None:
+    cameras = cameras_for(scene.splats)
+    assert len(cameras) == 3
+    low, high = np.quantile(scene.splats.means, (0.25, 0.75), axis=0)
+    middle = (low + high) / 2
+    bearings = []
+    for camera in cameras:
+        assert max(camera.width, camera.height) == 480
+        x, y, z = camera.world_to_camera[:3] @ [*middle, 1]
+        assert z > 0
+        np.testing.assert_allclose([x, y], 0, atol=1e-6)
+        bearings.append(np.arctan2(*(camera.centre - middle)[[0, 2]]))
+    gaps = np.diff(np.unwrap(np.sort(bearings)))
+    np.testing.assert_allclose(np.degrees(gaps), 120, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["usda", "usdc", "usdz"])
+def test_the_usd_librarys_own_validators_have_nothing_to_say(
+    scene: SmallScene, tmp_path: Path, name: str
+) -> None:
+    formats.write(tmp_path / f"a.{name}", scene.splats)
+    assert usd_validators.complaints(tmp_path / f"a.{name}") == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ('upAxis = "Y"', "", "UpAxis"),
+        ('defaultPrim = "Scene"', "", "DefaultPrim"),
+        ("float[] opacities", "double[] opacities", "TypeMismatch"),
+    ],
+)
+def test_what_the_usd_librarys_validators_find_is_a_fault(
+    prover: Prover, scene: SmallScene, tmp_path: Path, old: str, new: str, word: str
+) -> None:
+    path = tmp_path / "a.usda"
+    formats.write(path, scene.splats)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    assert word in prover.prove(path).fault
