@@ -8,11 +8,12 @@ from typing import Annotated, Any
 
 import typer
 
-from splatcli import jobs, summary
+from splatcli import jobs, options, summary
 from splatcli.console import guarded
 from splatcli.folders import find_run_folder
 from splatcli.options import with_parameters
 from stages import STAGE_NAMES
+from stages.raster.backends import CHOICES
 from stages.run.pipeline import Pipeline
 
 app = typer.Typer(
@@ -40,6 +41,15 @@ Out = Annotated[
 ]
 Run = Annotated[
     Path | None, typer.Argument(help="Run folder; by default the one in the current folder.")
+]
+Backend = Annotated[
+    str | None,
+    typer.Option(
+        help=f"What draws: {', '.join(CHOICES)}; by default what the run was trained with.",
+        callback=options.one_of(CHOICES),
+        show_default=False,
+        metavar="NAME",
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Events and results as lines of JSON.")]
@@ -141,7 +151,7 @@ def render(
         bool,
         typer.Option("--depth", help="Depth too: .depth.tiff of 32-bit floats, or .depth.mp4."),
     ] = False,
-    backend: Annotated[str, typer.Option(help="auto, cpu or reference.")] = "auto",
+    backend: Backend = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -154,7 +164,9 @@ def render(
 
     work.render(
         target,
-        work.Wanted(out, camera, path, frames, seconds, fps, width, depth, backend, quiet, as_json),
+        work.Wanted(
+            *(out, camera, path, frames, seconds, fps, width, depth, backend, quiet, as_json)
+        ),
     )
 
 

@@ -10,7 +10,7 @@ import enum
 import inspect
 import sys
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import MISSING, Field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -80,6 +80,17 @@ def keyword(name: str, accepted: Any, option: Any, default: Any = None) -> inspe
 def choice(name: str, values: Iterable[str]) -> type[enum.Enum]:
     """A type that accepts only these words."""
     return enum.Enum(name, {value: value for value in values})  # type: ignore[return-value]
+
+
+def one_of(words: Collection[str]) -> Callable[[str | None], str | None]:
+    """A check, as typer calls it, that an option is one of `words` or was not given."""
+
+    def checked(value: str | None) -> str | None:
+        if value is not None and value not in words:
+            raise typer.BadParameter(f"{value!r} is not one of {', '.join(words)}.")
+        return value
+
+    return checked
 
 
 def _is_many(hint: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ def splats_of(target: Path | None, strict: bool = True) -> tuple[Splats, Pipelin
     if target is not None and target.is_file():
         from stages.formats import read
 
-        return read(target, strict=strict), None
+        return _as_in_its_run(target, read(target, strict=strict)), None
     if target is not None and not target.exists():
         raise SplatError(
             "file-missing",
@@ -35,6 +36,19 @@ def splats_of(target: Path | None, strict: bool = True) -> tuple[Splats, Pipelin
     name = newest_with_splats(pipeline)
     output = pipeline.load(name)
     return (output.splats if name == "quantise" else output), pipeline
+
+
+def _as_in_its_run(file: Path, splats: Splats) -> Splats:
+    """A file says nothing of how it is drawn; the run whose export folder it lies in does."""
+    from stages.scene import Look, near_plane
+
+    views = views_around(file)
+    return replace(splats, look=Look(near_plane(views))) if views else splats
+
+
+def backend_of(pipeline: Pipeline | None) -> str:
+    """The backend that a run was trained with, as it was asked for; without a run "auto"."""
+    return str(pipeline.recorded_settings()["train"].backend) if pipeline is not None else "auto"
 
 
 def newest_with_splats(pipeline: Pipeline) -> str:

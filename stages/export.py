@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.raster.backends import backend_of, backend_setting
 
 if TYPE_CHECKING:
     from stages.proof.prover import Prover
@@ -45,13 +46,7 @@ class ExportSettings:
         },
     )
     name: str = field(default="scene", metadata={"help": "Name of the files, without a suffix."})
-    backend: str = field(
-        default="auto",
-        metadata={
-            "help": "What draws the files for checking: auto, cpu or reference.",
-            "choices": ("auto", "cpu", "reference"),
-        },
-    )
+    backend: str = backend_setting()
     mesh_triangles: int = field(
         default=50_000, metadata={"help": "Triangles of the mesh, at most about.", "min": 100}
     )
@@ -125,6 +120,7 @@ def run(
     for name, path, size in _write_meshes(splats, reconstruction, settings, folder, report):
         files.append(ExportedFile(name, path.name, size))
         figures[name] = {"size_bytes": size}
+    report.metric("backend", backend_of(settings.backend).name)
     report.metric("files", len(files))
     report.metric("splats", len(splats))
     report.metric("dropped", dropped)
@@ -231,7 +227,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=2,
+    version=3,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.stage import Report, Stage
+from stages.raster.backends import backend_of, backend_setting
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from stages.measure.judge import Photograph
+    from stages.scene import Reconstruction, Splats
 
-    from stages.raster import RasterSettings
-    from stages.scene import Camera, Reconstruction, Splats
-
-    Photographs = list[tuple[Camera, NDArray[np.float32]]]
-
-SIDE = 480  # pixels, longer side of the pictures that decide
 SHARE_A_ROUND = 0.10  # predictions for single splats add up only while few go at once
 BACK_OFFS = 5
 
@@ -29,33 +24,35 @@ class PruneSettings:
     max_loss_db: float = field(
         default=0.05, metadata={"help": "Held-out PSNR that pruning may cost in all (dB)."}
     )
+    backend: str = backend_setting()
 
 
 def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report) -> Splats:
     """Fewer splats, written to `folder`; counts and PSNR before and after into the report."""
     import numpy as np
 
-    from stages.raster import RasterSettings
-    from stages.scene import scene_extent, split_held_out
+    from stages.measure.judge import load_photographs, mean_psnr_db
+    from stages.scene import split_held_out
     from stages.scene.storage import save_splats
 
     reconstruction: Reconstruction = inputs["sfm"]
     splats: Splats = inputs["train"]
     kept, held = split_held_out(reconstruction.views)
-    raster = RasterSettings(near=0.01 * scene_extent(reconstruction.views))
-    photographs = _photographs(reconstruction, kept)
-    judges = _photographs(reconstruction, held) or photographs
-    before = mean_psnr(splats, judges, raster)
+    photographs = load_photographs(reconstruction.folder, kept, splats.look)
+    judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
+    before = mean_psnr_db(splats, judges, settings.backend)
     start, counts = len(splats), {"floaters": 0, "unneeded": 0}
     for number in range(settings.rounds):
         report.progress(number, settings.rounds, "pruning", splats=len(splats))
         floor = before - settings.max_loss_db
-        splats, found = _one_round(splats, photographs, judges, raster, floor)
+        splats, found = _one_round(splats, photographs, judges, settings.backend, floor)
         for name, count in found.items():
             counts[name] += count
         if not sum(found.values()):
             break
-    after = mean_psnr(splats, judges, raster)
+    after = mean_psnr_db(splats, judges, settings.backend)
+    report.metric("backend", backend_of(settings.backend).name)
+    report.metric("judged_side_px", splats.look.side)
     report.metric("splats_before", start)
     report.metric("splats", len(splats))
     report.metric("floaters_removed", counts["floaters"])
@@ -75,48 +72,21 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     return splats
 
 
-def _photographs(reconstruction: Reconstruction, views: Any) -> Photographs:
-    import numpy as np
-
-    from stages.photos.load import load_image
-
-    loaded = []
-    for view in views:
-        camera = view.camera.fitted(SIDE)
-        picture = load_image(reconstruction.folder / view.image, camera.width, camera.height)
-        loaded.append((camera, np.ascontiguousarray(picture.transpose(2, 0, 1))))
-    return loaded
-
-
-def mean_psnr(splats: Splats, photographs: Photographs, raster: RasterSettings) -> float:
-    """Mean PSNR in dB over photographs, renders clipped to what a screen can show."""
-    import numpy as np
-
-    from stages.measure.images import psnr
-    from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
-
-    rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
-    values = []
-    for camera, photograph in photographs:
-        image = rasteriser.forward(arrays, camera, raster).image[:3]
-        values.append(min(psnr(np.clip(image, 0, 1), photograph), 99.0))
-    return float(np.mean(values))
-
-
 def _one_round(
     splats: Splats,
-    photographs: Photographs,
-    judges: Photographs,
-    raster: RasterSettings,
+    photographs: Sequence[Photograph],
+    judges: Sequence[Photograph],
+    backend: str,
     floor_db: float,
 ) -> tuple[Splats, dict[str, int]]:
     """Remove what a round may, most harmful first; less of it while the judges lose too much."""
     import numpy as np
 
+    from stages.measure.judge import mean_psnr_db
     from stages.measure.worth import floaters, measure_worth, unneeded
 
-    worth = measure_worth(splats, photographs, raster)
-    floating = floaters(splats, worth, [camera for camera, _ in photographs])
+    worth = measure_worth(splats, photographs, backend)
+    floating = floaters(splats, worth, [photograph.camera for photograph in photographs])
     candidates = np.flatnonzero(floating | unneeded(worth))
     order = np.lexsort((candidates, worth.sse_change[candidates], ~floating[candidates]))
     chosen = candidates[order][: max(1, int(SHARE_A_ROUND * len(splats)))]
@@ -126,7 +96,7 @@ def _one_round(
         keep = np.ones(len(splats), bool)
         keep[chosen] = False
         fewer = splats.take(keep)
-        if mean_psnr(fewer, judges, raster) >= floor_db:
+        if mean_psnr_db(fewer, judges, backend) >= floor_db:
             n_floating = int(floating[chosen].sum())
             return fewer, {"floaters": n_floating, "unneeded": len(chosen) - n_floating}
         chosen = chosen[: len(chosen) // 2]
@@ -141,5 +111,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=1, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=2, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

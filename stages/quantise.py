@@ -8,22 +8,20 @@ measured, so that nobody has to guess.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.raster.backends import backend_of, backend_setting
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from stages.scene import Camera, QuantisedSplats, Reconstruction, Splats
+    from stages.measure.judge import Photograph
+    from stages.scene import Look, QuantisedSplats, Reconstruction, Splats
 
 _DECISIONS = "decisions.json"
-_CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
 # Colour that a splat may lose with its higher bands, in steps of 8 bits; the largest that passes.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
 
@@ -36,20 +34,10 @@ class QuantiseSettings:
         default=0.02,
         metadata={"help": "Held-out PSNR that smaller files may cost (dB)."},
     )
-    measure_side: int = field(
-        default=640,
-        metadata={"help": "Longer side of the photographs to measure on (pixels).", "min": 16},
-    )
     max_views: int = field(
         default=12, metadata={"help": "Photographs to measure on, at most.", "min": 1}
     )
-    backend: str = field(
-        default="auto",
-        metadata={
-            "help": "What draws: auto, cpu or reference.",
-            "choices": ("auto", "cpu", "reference"),
-        },
-    )
+    backend: str = backend_setting()
 
 
 def check(settings: QuantiseSettings) -> None:
@@ -73,7 +61,7 @@ def run(
 
     check(settings)
     splats: Splats = inputs["prune"]
-    judge = _Judge.on(inputs["sfm"], settings, report)
+    judge = _Judge.on(inputs["sfm"], splats.look, settings, report)
     raw_db = judge.psnr(splats)
     by_degree = {splats.sh_degree: raw_db}
     degree, kept = splats.sh_degree, splats
@@ -85,7 +73,8 @@ def run(
             break
     kept, kept_db, threshold = _cut_each(kept, by_degree[degree], raw_db, settings, judge)
     drawn, _ = kept_rows(kept)
-    splat32_db = judge.psnr(splat32.decode(splat32.encode(drawn)))
+    in_32_bytes = splat32.decode(splat32.encode(drawn))
+    splat32_db = judge.psnr(replace(in_32_bytes, look=splats.look))
 
     counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
     decisions: dict[str, object] = {
@@ -94,7 +83,7 @@ def run(
         "max_loss_db": settings.max_loss_db,
         "colour_loss_of_255": threshold,
         "measured_on": judge.what,
-        "views": len(judge.pairs),
+        "views": len(judge.photographs),
         "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
         "psnr_raw_db": raw_db,
         "psnr_kept_db": kept_db,
@@ -106,6 +95,8 @@ def run(
     report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
     report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("measured_on", judge.what)
+    report.metric("judged_side_px", splats.look.side)
+    report.metric("backend", backend_of(settings.backend).name)
     save_splats(folder, kept)
     (folder / _DECISIONS).write_text(json.dumps(decisions, indent=1) + "\n", encoding="utf-8")
     return QuantisedSplats(kept, kept.sh_degree, decisions)
@@ -142,7 +133,7 @@ def _bytes(splats: Splats) -> int:
 class _Judge:
     """Measures splats on photographs that are loaded once."""
 
-    pairs: list[tuple[Camera, NDArray[np.float32]]]
+    photographs: Sequence[Photograph]
     what: str
     backend: str
     report: Report
@@ -150,9 +141,9 @@ class _Judge:
 
     @classmethod
     def on(
-        cls, reconstruction: Reconstruction, settings: QuantiseSettings, report: Report
+        cls, reconstruction: Reconstruction, look: Look, settings: QuantiseSettings, report: Report
     ) -> _Judge:
-        from stages.photos.load import load_image
+        from stages.measure.judge import load_photographs
         from stages.scene import split_held_out
 
         training, held = split_held_out(reconstruction.views)
@@ -168,26 +159,15 @@ class _Judge:
         # Spread over the capture: views next to each other say the same.
         count = min(settings.max_views, len(chosen))
         chosen = tuple(chosen[i * len(chosen) // count] for i in range(count))
-        pairs = []
-        for view in chosen:
-            camera = view.camera.fitted(settings.measure_side)
-            image = load_image(reconstruction.folder / view.image, camera.width, camera.height)
-            pairs.append((camera, image))
-        return cls(pairs, "held out" if held else "training", settings.backend, report)
+        photographs = load_photographs(reconstruction.folder, chosen, look)
+        return cls(photographs, "held out" if held else "training", settings.backend, report)
 
     def psnr(self, splats: Splats) -> float:
-        """Mean PSNR over the photographs (dB), at most 99."""
-        import numpy as np
+        """Mean PSNR over the photographs (dB)."""
+        from stages.measure.judge import mean_psnr_db
 
-        from stages.measure.images import psnr
-        from stages.raster import render
-
-        values = []
-        for camera, image in self.pairs:
-            drawn = render(splats, camera, backend=self.backend).image
-            values.append(min(psnr(np.clip(drawn, 0, 1), image), _CAP_DB))
+        mean = round(mean_psnr_db(splats, self.photographs, self.backend), 4)
         self.done += 1
-        mean = round(float(np.mean(values)), 4)
         # At most: raw, three lower degrees, each threshold, .splat.
         total = 5 + len(_THRESHOLDS_OF_255)
         self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
@@ -214,7 +194,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=1,
+    version=2,
     reads=("sfm", "prune"),
     settings_type=QuantiseSettings,
     run=run,

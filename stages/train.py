@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.raster.backends import backend_of, backend_setting
 
 if TYPE_CHECKING:
-    from stages.scene import Reconstruction, Splats
+    from stages.scene import Look, Reconstruction, Splats
     from stages.training.optimiser import Model
     from stages.training.trainer import Trainer
 
@@ -38,7 +39,7 @@ class TrainSettings:
         },
     )
     seed: int = field(default=0, metadata={"help": "Seed of all random numbers."})
-    backend: str = field(default="auto", metadata={"help": "Rasteriser: auto, cpu or reference."})
+    backend: str = backend_setting()
 
 
 PRESETS: dict[str, TrainSettings] = {
@@ -59,17 +60,17 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
-    report.metric("backend", "reference" if trainer.use_reference else "cpu")
+    report.metric("backend", backend_of(settings.backend).name)
     report.metric("splat_cap", trainer.cap)
     report.metric("train_photographs", len(trainer.train))
     report.metric("held_out_photographs", len(trainer.held_out))
     model = trainer.run(start)
-    splats = finished(model, settings.sh_degree, start)
+    splats = finished(model, settings.sh_degree, start, trainer.look)
     if settings.smooth:
         splats = smoothed(splats, trainer.widths(splats.means))
     if len(splats) == 0:
         raise _nothing_left()
-    write_quality(trainer, model, folder, report)
+    write_quality(trainer, folder, report)
     save_splats(folder, splats)
     remove_checkpoint(folder)
     report.metric("steps", settings.steps)
@@ -102,15 +103,6 @@ def check(settings: TrainSettings) -> None:
                 hint="Leave the option out to get the preset's value.",
                 family=Family.USAGE,
             )
-    if settings.backend not in ("auto", "cpu", "reference"):
-        given = f"--backend {settings.backend}."
-        raise SplatError(
-            "train-backend-unavailable",
-            given=given,
-            wanted="auto, cpu or reference: this version has no GPU kernels.",
-            hint="Leave --backend out; the CPU kernels run everywhere.",
-            family=Family.USAGE,
-        )
 
 
 def make_trainer(
@@ -122,7 +114,8 @@ def make_trainer(
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
     from stages.base.memory import available_mib
-    from stages.scene import scene_extent, split_held_out
+    from stages.measure.judge import load_photographs
+    from stages.scene import Look, near_plane, scene_extent, split_held_out
     from stages.training.densify import splat_cap
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
@@ -130,7 +123,8 @@ def make_trainer(
 
     kept, held = split_held_out(reconstruction.views)
     train = load_views(reconstruction.folder, kept, settings.train_side)
-    held_out = load_views(reconstruction.folder, held, settings.train_side)
+    look = Look(near_plane(reconstruction.views), settings.train_side)
+    held_out = load_photographs(reconstruction.folder, held, look)
     smaller = [
         v
         for v in reconstruction.views
@@ -154,15 +148,16 @@ def make_trainer(
         ),
         train=train,
         held_out=held_out,
+        look=look,
         cap=cap,
         folder=folder,
         report=report,
         smooth=settings.smooth,
-        use_reference=settings.backend == "reference",
+        backend=settings.backend,
     )
 
 
-def finished(model: Model, sh_degree: int, start: Splats) -> Splats:
+def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
     """The model as splats: unit quaternions, without rows that are not finite."""
     import numpy as np
 
@@ -181,31 +176,36 @@ def finished(model: Model, sh_degree: int, start: Splats) -> Splats:
         model.sh[good],
         np.full(int(good.sum()), sh_degree, np.uint8),
         start.origin,
+        look,
     )
 
 
-def write_quality(trainer: Trainer, model: Model, folder: Path, report: Report) -> None:
+def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
     """Final held-out figures into the report; table, plot and contact sheet into the folder."""
     import numpy as np
 
     from stages.base.atomic import replacing
+    from stages.measure.judge import scores
     from stages.training.charts import contact_sheet, training_plot
 
-    scores = trainer.evaluate(model)
-    if scores:
-        values = [s["psnr_db"] for s in scores]
-        worst = min(scores, key=lambda s: s["psnr_db"])
+    found = scores(trainer.drawn, trainer.held_out)
+    if found:
+        values = [score.psnr_db for score in found]
+        worst = min(found, key=lambda score: score.psnr_db)
         report.metric("psnr_db", round(float(np.mean(values)), 3))
-        report.metric("psnr_worst_db", round(worst["psnr_db"], 3))
-        report.metric("psnr_worst_photograph", worst["name"])
+        report.metric("psnr_worst_db", round(worst.psnr_db, 3))
+        report.metric("psnr_worst_photograph", worst.name)
         report.metric("psnr_spread_db", round(float(np.std(values)), 3))
-        report.metric("ssim", round(float(np.mean([s["ssim"] for s in scores])), 4))
+        report.metric("ssim", round(float(np.mean([score.ssim for score in found])), 4))
     else:
         report.warn(
             "train-nothing-held-out",
             "Too few photographs to hold one out: quality was not measured.",
         )
-    report.metric("held_out", scores)
+    report.metric("held_out", [asdict(score) for score in found])
+    report.metric(
+        "judged_side_px", max((max(p.pixels.shape[:2]) for p in trainer.held_out), default=0)
+    )
     lines = ["step,splats,psnr_db,ssim"]
     for h in trainer.history:
         lines.append(
@@ -216,8 +216,9 @@ def write_quality(trainer: Trainer, model: Model, folder: Path, report: Report) 
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     training_plot(folder / "training.png", trainer.history)
     rows = []
-    for view, score in zip(trainer.held_out, scores, strict=True):
-        rows.append((view.name, score["psnr_db"], *trainer.picture(model, view)))
+    for photograph, score in zip(trainer.held_out, found, strict=True):
+        image = np.clip(trainer.drawn(photograph.camera), 0.0, 1.0)
+        rows.append((photograph.name, score.psnr_db, image, photograph.image))
     contact_sheet(folder / "held_out.png", rows)
 
 
@@ -240,5 +241,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="train", version=2, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=3, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.raster import RasterSettings
+from stages.raster import backends
+from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
 from stages.scene import Camera, Splats, logit, rgb_to_dc
 
-BACKENDS = ("reference", "cpu")
+BACKENDS = tuple(backend.name for backend in backends.BACKENDS)
 
 
 def camera(width=64, height=48, focal=60.0, cx=None, cy=None, matrix=None):
@@ -73,24 +74,19 @@ PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 def gradients(backend, scene, view, v_image, settings=None, smoothing=None):
-    """{parameter: gradient of sum(image x v_image)}, each in the shape of its parameter."""
+    """{parameter: gradient of sum(image x v_image)}, each in the shape of its parameter, as the
+    backend of that name gives them."""
     settings = settings or RasterSettings()
-    if backend == "reference":
-        return _reference_gradients(scene, view, v_image, settings, smoothing)
-    from stages.raster.cpu.rasteriser import NO_SMOOTHING, CpuRasteriser, splat_arrays
-
     widths = NO_SMOOTHING if smoothing is None else smoothing
-    rasteriser = CpuRasteriser()
+    rasteriser = backends.rasteriser_of(backend)
     arrays = splat_arrays(scene)
     forward = rasteriser.forward(arrays, view, settings, widths)
-    # what the buffers held before must not matter
-    rasteriser.buffers.get("out", (4_000_000,), np.float32)[:] = np.nan
-    rasteriser.buffers.carve(((4_000_000,), np.float32))[0][:] = np.nan
+    poison(rasteriser)
     planar = np.ascontiguousarray(np.asarray(v_image, np.float32).transpose(2, 0, 1))
-    rows = rasteriser.backward(arrays, forward, planar, widths).parameters
-    full = np.zeros((len(scene), rows.shape[1]))
-    full[forward.visible] = rows
-    bands = (forward.degree + 1) ** 2
+    found = rasteriser.backward(arrays, forward, planar, widths)
+    full = np.zeros((len(scene), found.parameters.shape[1]))
+    full[found.rows] = found.parameters
+    bands = (min(settings.sh_degree, scene.sh_degree) + 1) ** 2
     sh = np.zeros(scene.sh.shape)
     sh[:, :bands] = full[:, 11 : 11 + 3 * bands].reshape(len(scene), bands, 3)
     return {
@@ -102,14 +98,23 @@ def gradients(backend, scene, view, v_image, settings=None, smoothing=None):
     }
 
 
-def _reference_gradients(scene, view, v_image, settings, smoothing):
+def poison(rasteriser):
+    """What buffers held before must not matter."""
+    buffers = getattr(rasteriser, "buffers", None)
+    if buffers is not None:
+        buffers.get("out", (4_000_000,), np.float32)[:] = np.nan
+        buffers.carve(((4_000_000,), np.float32))[0][:] = np.nan
+
+
+def exact_gradients(scene, view, v_image, settings=None, smoothing=None):
+    """As `gradients`, in float64 by autograd through the definition: what backends are held to."""
     import torch
 
     from stages.raster.reference import parameters_of, render_tensors
 
     p = parameters_of(scene)
     widths = None if smoothing is None else torch.tensor(smoothing, dtype=torch.float64)
-    image, _, _, _ = render_tensors(p, view, settings, widths)
+    image, _, _, _ = render_tensors(p, view, settings or RasterSettings(), widths)
     if image.requires_grad:
         image.backward(torch.tensor(np.asarray(v_image, np.float64)))
     return {

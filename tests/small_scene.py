@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from stages.raster import render
+from stages.raster.draw import render
 from stages.scene import Camera, Reconstruction, Splats, View, look_at
 
 

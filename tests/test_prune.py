@@ -8,9 +8,9 @@ import pytest
 
 from stages import prune
 from stages.base.stage import Report
+from stages.measure.judge import load_photographs
 from stages.measure.worth import Worth, floaters, measure_worth, unneeded
-from stages.raster import RasterSettings
-from stages.scene import Splats, scene_extent
+from stages.scene import Splats
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -70,9 +70,9 @@ def test_splats_that_no_photograph_sees_go(scene, tmp_path) -> None:
 
 def test_most_of_a_true_scene_stays(scene, tmp_path) -> None:
     """What the photographs were drawn from, less what none of them shows."""
-    extent = scene_extent(scene.reconstruction.views)
-    photographs = prune._photographs(scene.reconstruction, scene.reconstruction.views)
-    worth = measure_worth(scene.splats, photographs, RasterSettings(near=0.01 * extent))
+    views = scene.reconstruction.views
+    photographs = load_photographs(scene.reconstruction.folder, views, scene.splats.look)
+    worth = measure_worth(scene.splats, photographs, "cpu")
     needed = worth.sse_change > 0.01 * np.median(worth.sse_change)
     result, _ = run(scene, scene.splats, tmp_path)
     assert rows_of(scene.splats.take(needed), result).all()

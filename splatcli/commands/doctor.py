@@ -16,6 +16,7 @@ from stages.base import threads
 from stages.base.errors import Family
 from stages.base.libraries import versions
 from stages.base.memory import available_mib
+from stages.raster.backends import BACKENDS, Backend, loaded
 
 _MODULES = {
     "av": "av",
@@ -70,8 +71,8 @@ def checks() -> Iterator[Check]:
     yield _memory()
     yield _disk()
     yield _numba_cache()
-    yield _backend("reference")
-    yield _backend("cpu")
+    for backend in BACKENDS:
+        yield _backend(backend)
 
 
 def _library(distribution: str) -> Check:
@@ -112,10 +113,10 @@ def _numba_cache() -> Check:
         return Check("kernel cache", where, advice="Kernels are kept in your home folder instead.")
 
 
-def _backend(name: str) -> Check:
-    label = f"backend {name}"
+def _backend(backend: Backend) -> Check:
+    label = f"backend {backend.name}"
     try:
-        importlib.import_module(f"stages.raster.{name}")
+        loaded(backend.rasteriser)
     except Exception as error:
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         return Check(label, f"not present ({said})", ok=False)

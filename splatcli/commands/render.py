@@ -15,7 +15,7 @@ from stages.base import memory, threads
 from stages.base.errors import Family, SplatError
 
 if TYPE_CHECKING:
-    from stages.raster import Rendering
+    from stages.raster.definition import Rendering
     from stages.scene import Camera
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
@@ -35,7 +35,7 @@ class Wanted:
     fps: float = 30.0
     width: int | None = None
     depth: bool = False
-    backend: str = "auto"
+    backend: str | None = None
     quiet: bool = False
     as_json: bool = False
 
@@ -43,7 +43,7 @@ class Wanted:
 def render(target: Path | None, wanted: Wanted) -> None:
     """Draw what was asked for. Raises SplatError."""
     from stages.film import sinks
-    from stages.raster import renderer
+    from stages.raster.draw import renderer
 
     kind = _kind_of(wanted)
     splats, pipeline = sources.splats_of(target)
@@ -56,10 +56,8 @@ def render(target: Path | None, wanted: Wanted) -> None:
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
     if not threads.kernels_are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    try:
-        draw = renderer(splats, backend=wanted.backend)
-    except ValueError as error:
-        raise _no_backend(error) from error
+    backend = wanted.backend or sources.backend_of(pipeline or sources.pipeline_around(target))
+    draw = renderer(splats, backend=backend)
     out = wanted.out
     facts: dict[str, Any] = {}
     if kind == "film":
@@ -182,15 +180,5 @@ def _clash(given: str, example: str) -> SplatError:
         given=given,
         wanted="One picture of one camera, or many along a path.",
         hint=f"For example --out {example}",
-        family=Family.USAGE,
-    )
-
-
-def _no_backend(error: ValueError) -> SplatError:
-    return SplatError(
-        "render-backend",
-        given=f"{error}.",
-        wanted="A backend that this machine has.",
-        hint="Leave --backend away, or see `splat doctor`.",
         family=Family.USAGE,
     )

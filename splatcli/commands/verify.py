@@ -26,13 +26,14 @@ _ONLY_ITSELF = (
 @dataclass(frozen=True)
 class _Original:
     """What files are compared with. name: in words. came_as: the format that it was read from.
-    itself: whether that was the file in question."""
+    itself: whether that was the file in question. backend: what draws."""
 
     splats: Splats
     views: tuple[View, ...]
     name: str
     came_as: str = ""
     itself: bool = False
+    backend: str = "auto"
 
 
 def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool) -> None:
@@ -55,7 +56,7 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
         if original is None or prover is None:
             original = _original(file, against, read)
             cameras = cameras_for(original.splats, original.views)
-            prover = Prover.of(original.splats, cameras, came_as=original.came_as)
+            prover = Prover.of(original.splats, cameras, original.backend, original.came_as)
         del read
         proof = prover.prove(file, exact=original.itself)
         found.append((file, proof))
@@ -102,7 +103,8 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
         return _Original(kept_rows(read)[0], (), _ITSELF, formats.format_of(file), itself=True)
     seen = run.load("sfm").views
     splats = kept_rows(run.load("quantise").splats)[0]
-    return _Original(splats, seen, f"the run {run.run_folder}")
+    backend = sources.backend_of(run)
+    return _Original(splats, seen, f"the run {run.run_folder}", backend=backend)
 
 
 def _tell(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:

@@ -15,7 +15,7 @@ from stages.film.image_files import (
     save_depth,
     save_picture,
 )
-from stages.raster import Rendering
+from stages.raster.definition import Rendering
 from stages.scene import Camera
 
 _SAMPLED = 12  # frames that say how near and far a path sees

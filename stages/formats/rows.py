@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,7 +170,7 @@ def joined(parts: list[Splats]) -> Splats:
     degree = max((part.sh_degree for part in parts), default=0)
     wide = [part.with_sh_degree(degree) for part in parts]
     empty = {"opacity_logits": (0,), "sh_degrees": (0,), "sh": (0, 1, 3), "quaternions": (0, 4)}
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees"):
         dtype = np.uint8 if name == "sh_degrees" else np.float32
         rows = [getattr(part, name) for part in wide]

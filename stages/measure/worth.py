@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
-from stages.raster.definition import RasterSettings
+from stages.measure.judge import Photograph
+from stages.raster.backends import rasteriser_of
+from stages.raster.definition import splat_arrays
+from stages.raster.draw import settings_of
 from stages.scene import Camera, Splats
 
 SEEN = 1.0 / 255.0  # a weight below it cannot change an 8-bit picture
@@ -33,19 +35,17 @@ class Worth:
     scene_depth: NDArray[np.float64]
 
 
-def measure_worth(
-    splats: Splats,
-    photographs: Iterable[tuple[Camera, NDArray[np.float32]]],
-    settings: RasterSettings,
-) -> Worth:
-    """photographs: (camera, [3, H, W] in 0..1)."""
+def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: str) -> Worth:
+    """What each splat does for the photographs, drawn by its own look."""
     n = len(splats)
     change, weight, largest = np.zeros(n), np.zeros(n), np.zeros(n)
     seen_in, sse, depths = np.zeros(n, np.int32), 0.0, []
-    rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
-    for camera, photograph in photographs:
-        forward = rasteriser.forward(arrays, camera, settings, depths=True)
-        residual = np.ascontiguousarray(forward.image[:3] - photograph)
+    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    settings = settings_of(splats)
+    for photograph in photographs:
+        forward = rasteriser.forward(arrays, photograph.camera, settings, depths=True)
+        target = photograph.image.transpose(2, 0, 1)
+        residual = np.ascontiguousarray(forward.image[:3] - target)
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
         depths.append(float(np.median(solid)) if solid.size else np.inf)

@@ -59,8 +59,8 @@ def _head(scene: dict[str, Any], style: str) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<link rel="icon" href="data:,">\n'
         f"<title>{html.escape(scene['title'])}</title>\n"
-        f"<style>\n{style}\n{_asset('page', 'page.css')}</style>\n</head>\n<body>\n"
-        f"{_asset('page', 'body.html')}"
+        f"<style>\n{style}\n{_asset('parts', 'page.css')}</style>\n</head>\n<body>\n"
+        f"{_asset('parts', 'body.html')}"
         f'<script type="application/json" id="scene">{data}</script>\n'
     )
 

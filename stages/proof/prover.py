@@ -6,7 +6,6 @@ never saw, and every value is compared with the original's.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,18 +16,18 @@ from numpy.typing import NDArray
 
 from stages.formats import LOSSY, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
-from stages.measure.images import psnr
+from stages.measure.judge import CAP_DB, decibels
 from stages.proof import diagnosis, second_readers, usd_validators
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
-from stages.raster import render
+from stages.raster.backends import AUTO
+from stages.raster.draw import renderer, settings_of
 from stages.scene import Camera, Splats, View, split_held_out
 from stages.scene.framing import around
 
 _SIDE_PX = 480
 _CAMERAS = 3
 _MIDDLE = 0.5  # of the splats, to look at where no photographs tell: the rest is background
-_CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
 _LOSSLESS_DB = 45.0  # below it a file that should hold everything is wrong
 _LOSSY_DB = 30.0  # below it the loss is worth a warning
 
@@ -81,10 +80,11 @@ class Prover:
         cls,
         splats: Splats,
         cameras: tuple[Camera, ...],
-        backend: str = "auto",
+        backend: str = AUTO,
         came_as: str = "",
     ) -> Prover:
-        pictures = tuple(render(splats, camera, backend=backend).image for camera in cameras)
+        draw = renderer(splats, backend=backend)
+        pictures = tuple(draw(camera).image for camera in cameras)
         return cls(splats, cameras, pictures, backend, came_as)
 
     def prove(self, path: Path, exact: bool = False) -> Proof:
@@ -110,7 +110,7 @@ class Prover:
 
     def _compared(self, content: FileContent, name: str, lossy: bool) -> Proof:
         by_camera = self._decibels(content)
-        worst = min(by_camera, default=_CAP_DB)
+        worst = min(by_camera, default=CAP_DB)
         found = differences(self.splats, content, *filter(None, (name, self.came_as)))
         figures = {
             "verify_db": round(worst, 2),
@@ -130,13 +130,12 @@ class Prover:
     def _decibels(self, content: FileContent) -> list[float]:
         """By camera. The camera is moved into the file's axes, not the file's splats into ours:
         so the turn of positions, rotations and SH is checked by something other than itself."""
-        found = []
-        for camera, picture in zip(self.cameras, self.pictures, strict=True):
-            moved = camera.moved(content.world_from_file)
-            drawn = render(content.splats, moved, backend=self.backend).image
-            decibels = psnr(drawn, picture)
-            found.append(0.0 if math.isnan(decibels) else min(decibels, _CAP_DB))
-        return found
+        draw = renderer(content.splats, settings_of(self.splats), self.backend)
+        moved = (camera.moved(content.world_from_file) for camera in self.cameras)
+        return [
+            decibels(draw(camera).image, np.clip(picture, 0.0, 1.0))
+            for camera, picture in zip(moved, self.pictures, strict=True)
+        ]
 
 
 def _drawable(content: FileContent) -> FileContent:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from stages.scene import Camera, Splats
 
 ALPHA_MIN = 1.0 / 255.0  # below it a splat is not drawn in a pixel: it could not change 8 bits
 ALPHA_MAX = 0.99  # as every viewer caps it
@@ -47,3 +50,87 @@ class Rendering:
     depth: NDArray[np.float32]
     median_depth: NDArray[np.float32]
     culled: int
+
+
+NO_SMOOTHING = np.zeros(0, np.float32)
+Arrays = tuple[NDArray[np.float32], ...]  # means, quaternions, log_scales, opacity_logits, sh
+
+
+class Forward(Protocol):
+    """What a forward pass leaves. Its arrays are valid until the rasteriser's next pass.
+
+    image [4 or 6, H, W] float32: RGB, alpha, and if asked for expected and median depth.
+    visible [V] int32: rows of the splats that touch the picture. culled: how many splats hold
+    values that cannot be drawn. What else the way back needs is the backend's own.
+    """
+
+    @property
+    def image(self) -> NDArray[np.float32]: ...
+    @property
+    def visible(self) -> NDArray[np.int32]: ...
+    @property
+    def culled(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class Backward:
+    """Gradients of the visible splats, in the order of their rows.
+
+    rows [V] int32. parameters [V, gradient_columns]: mean 0:3, quaternion 3:7, log-scales 7:10,
+    opacity logit 10, then SH, basis function by basis function with RGB last, then zeros.
+    means2d [V, 2]: of the mean on the picture, per pixel.
+    """
+
+    rows: NDArray[np.int32]
+    parameters: NDArray[np.float32]
+    means2d: NDArray[np.float32]
+
+
+def gradient_columns(bands: int) -> int:
+    """Columns of a gradient row with room for `bands` of SH: whole vectors."""
+    return -(-(11 + 3 * bands) // 16) * 16
+
+
+def splat_arrays(splats: Splats) -> Arrays:
+    """The five parameter arrays, C-contiguous float32."""
+    return tuple(
+        np.ascontiguousarray(a, dtype=np.float32)
+        for a in (
+            splats.means,
+            splats.quaternions,
+            splats.log_scales,
+            splats.opacity_logits,
+            splats.sh,
+        )
+    )
+
+
+class Rasteriser(Protocol):
+    """What drawing, judging and training ask of a backend. One instance a thread of control."""
+
+    def forward(
+        self,
+        arrays: Arrays,
+        camera: Camera,
+        settings: RasterSettings,
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
+        depths: bool = False,
+    ) -> Any:
+        """Draw; a `Forward` of this backend's own. arrays: C-contiguous float32. smoothing [N]:
+        see `raster.smoothing`. depths: whether to draw the depth planes."""
+
+    def backward(
+        self,
+        arrays: Arrays,
+        forward: Any,
+        v_image: NDArray[np.float32],
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
+    ) -> Backward:
+        """Gradients of the visible splats, from v_image [3, H, W]."""
+
+    def contributions(self, forward: Any, residual: NDArray[np.float32]) -> NDArray[np.float64]:
+        """[V, 3] for the visible splats: change of the squared error against the photograph if
+        the splat alone were removed, sum of its weights, its largest weight.
+
+        residual [3, H, W]: render less photograph.
+        """

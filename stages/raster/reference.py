@@ -14,12 +14,12 @@ opacity, scales, rotation, SH), so that the order of rows in a file never shows.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import (
@@ -29,7 +29,6 @@ from stages.raster.definition import (
     QUATERNION_MIN,
     TRANSMITTANCE_MIN,
     RasterSettings,
-    Rendering,
 )
 from stages.raster.sh import C0, C1, C2, C3
 from stages.scene import Camera, Splats
@@ -203,11 +202,9 @@ def _order(p: Parameters, z: Tensor) -> Tensor:
     return torch.from_numpy(np.lexsort(table.T[::-1])).to(z.device)
 
 
-def blend_weights(
-    projected: Projected, rows: Tensor, pixels: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """([M, P] blend weights, [P] light that still passes, [P] median depth) of splats `rows` at
-    pixel centres [P, 2].
+def alphas_at(projected: Projected, rows: Tensor, pixels: Tensor) -> Tensor:
+    """[M, P] alpha of splats `rows`, nearest first, at pixel centres [P, 2]; 0 where a splat is
+    left out, being too faint or behind the one that finished the pixel.
 
     The exponent in Cholesky form: never negative, whatever the rounding.
     """
@@ -221,13 +218,30 @@ def blend_weights(
     exponent = 0.5 * (u * u / major + across * across * (major / q.det[:, None]))
     alpha = (q.opacities[:, None] * torch.exp(-exponent)).clamp_max(ALPHA_MAX)
     alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
+    before = _light_before(alpha)
+    return torch.where(before >= TRANSMITTANCE_MIN, alpha, torch.zeros_like(alpha))
+
+
+def _light_before(alpha: Tensor) -> Tensor:
     through = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(through[:1]), through[:-1]])
-    alive = before >= TRANSMITTANCE_MIN
-    passed = torch.where(alive, 1 - alpha, torch.ones_like(alpha)).prod(0)
-    halved = (before >= 0.5) & (through < 0.5)  # once at most
-    median = (halved * q.depths[:, None]).sum(0)
-    return torch.where(alive, alpha * before, torch.zeros_like(alpha)), passed, median
+    return torch.cat([torch.ones_like(through[:1]), through[:-1]])
+
+
+def weights_of(alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """([M, P] blend weights, [P] light that still passes) of alphas, nearest first."""
+    return alpha * _light_before(alpha), (1 - alpha).prod(0)
+
+
+def blend_weights(
+    projected: Projected, rows: Tensor, pixels: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """([M, P] blend weights, [P] light that still passes, [P] median depth) of splats `rows` at
+    pixel centres [P, 2]."""
+    alpha = alphas_at(projected, rows, pixels)
+    weights, passed = weights_of(alpha)
+    before = _light_before(alpha)
+    halved = (before >= 0.5) & (before * (1 - alpha) < 0.5)  # once at most
+    return weights, passed, (halved * projected.depths[rows][:, None]).sum(0)
 
 
 def render_tensors(
@@ -245,14 +259,37 @@ def render_projected(
     centre = torch.tensor(camera.centre, **like)
     rgb = colours(p.rows(projected.index), centre, settings.sh_degree)
     background = torch.tensor(settings.background, **like)
-    reach = (2 * torch.log(255 * projected.opacities.detach())).clamp_min(0).sqrt()
-    extent = torch.stack([projected.a, projected.c], 1).detach().sqrt() * reach[:, None]
-    low, high = projected.means2d.detach() - extent, projected.means2d.detach() + extent
-
     image = torch.zeros(camera.height, camera.width, 3, **like)
     alpha = torch.zeros(camera.height, camera.width, **like)
     depth = torch.zeros(camera.height, camera.width, **like)
     median = torch.zeros(camera.height, camera.width, **like)
+    for (top, bottom, left, right), rows, pixels in picture_blocks(projected, camera):
+        weights, passed, halfway = blend_weights(projected, rows, pixels)
+        shape = (bottom - top, right - left)
+        colour = weights.T @ rgb[rows] + passed[:, None] * background
+        image[top:bottom, left:right] = colour.reshape(*shape, 3)
+        hit = weights.sum(0)
+        alpha[top:bottom, left:right] = (1 - passed).reshape(shape)
+        mean_depth = (weights.T @ projected.depths[rows]) / hit.clamp_min(ALPHA_MIN / 2)
+        depth[top:bottom, left:right] = mean_depth.reshape(shape)
+        median[top:bottom, left:right] = halfway.reshape(shape)
+    return image, alpha, depth, median
+
+
+def boxes(projected: Projected) -> tuple[Tensor, Tensor]:
+    """([M, 2] low, [M, 2] high): in pixels, the box outside which a splat is too faint to show."""
+    reach = (2 * torch.log(255 * projected.opacities.detach())).clamp_min(0).sqrt()
+    extent = torch.stack([projected.a, projected.c], 1).detach().sqrt() * reach[:, None]
+    return projected.means2d.detach() - extent, projected.means2d.detach() + extent
+
+
+def picture_blocks(
+    projected: Projected, camera: Camera
+) -> Iterator[tuple[tuple[int, int, int, int], Tensor, Tensor]]:
+    """The picture in blocks: ((top, bottom, left, right), rows of `projected` that can touch it,
+    nearest first, its pixel centres [P, 2])."""
+    like: dict[str, Any] = {"dtype": projected.depths.dtype, "device": projected.depths.device}
+    low, high = boxes(projected)
     for top in range(0, camera.height, BLOCK):
         for left in range(0, camera.width, BLOCK):
             bottom, right = min(top + BLOCK, camera.height), min(left + BLOCK, camera.width)
@@ -263,30 +300,4 @@ def render_projected(
                 torch.arange(left, right, **like) + 0.5,
                 indexing="ij",
             )
-            pixels = torch.stack([xs, ys], -1).flatten(0, 1)
-            weights, passed, halfway = blend_weights(projected, rows, pixels)
-            shape = ys.shape
-            colour = weights.T @ rgb[rows] + passed[:, None] * background
-            image[top:bottom, left:right] = colour.reshape(*shape, 3)
-            hit = weights.sum(0)
-            alpha[top:bottom, left:right] = (1 - passed).reshape(shape)
-            mean_depth = (weights.T @ projected.depths[rows]) / hit.clamp_min(ALPHA_MIN / 2)
-            depth[top:bottom, left:right] = mean_depth.reshape(shape)
-            median[top:bottom, left:right] = halfway.reshape(shape)
-    return image, alpha, depth, median
-
-
-def render_reference(
-    splats: Splats,
-    camera: Camera,
-    settings: RasterSettings,
-    smoothing: NDArray[np.float32] | None = None,
-) -> Rendering:
-    """`render` in float64 by the definition itself."""
-    p = parameters_of(splats)
-    widths = None if smoothing is None else torch.tensor(smoothing, dtype=torch.float64)
-    with torch.no_grad():
-        planes = render_tensors(p, camera, settings, widths)
-        culled = int((~drawable(p)).sum())
-    image, alpha, depth, median = (t.numpy().astype(np.float32) for t in planes)
-    return Rendering(image, alpha, depth, median, culled)
+            yield (top, bottom, left, right), rows, torch.stack([xs, ys], -1).flatten(0, 1)

@@ -15,6 +15,7 @@ from stages.scene.capture import (
     scene_extent,
     split_held_out,
 )
+from stages.scene.look import Look, near_plane
 from stages.scene.splats import SH_C0, QuantisedSplats, Splats, dc_to_rgb, logit, rgb_to_dc
 from stages.scene.storage import load_splats, save_splats
 
@@ -24,6 +25,7 @@ __all__ = [
     "Capture",
     "ExportedAssets",
     "ExportedFile",
+    "Look",
     "Photo",
     "QuantisedSplats",
     "Reconstruction",
@@ -34,6 +36,7 @@ __all__ = [
     "load_splats",
     "logit",
     "look_at",
+    "near_plane",
     "rgb_to_dc",
     "save_splats",
     "scene_extent",

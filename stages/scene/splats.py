@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
+from stages.scene.look import Look
 
 SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
@@ -25,6 +26,7 @@ class Splats:
     sh_degrees [N] uint8: the degree that each splat uses; coefficients above it are zero.
     origin [3] float64: what to add to `means` to be back in the capture's coordinates. float32
         positions near zero keep their precision however far away the capture lies.
+    look: how they are drawn and judged.
     """
 
     means: NDArray[np.floating]
@@ -34,6 +36,7 @@ class Splats:
     sh: NDArray[np.floating]
     sh_degrees: NDArray[np.uint8]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    look: Look = field(default_factory=Look)
 
     def __post_init__(self) -> None:
         n = len(self.means)

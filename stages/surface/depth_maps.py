@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from stages.scene import Camera, Splats
 
 SIDE_PX = 480

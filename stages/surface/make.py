@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.raster import RasterSettings
-from stages.scene import Reconstruction, Splats, scene_extent, split_held_out
+from stages.raster.draw import settings_of
+from stages.scene import Reconstruction, Splats, split_held_out
 from stages.surface import colour, depth_maps, extract, fuse
 from stages.surface.depth_maps import DepthMap
 from stages.surface.distance import distances
 from stages.surface.mesh import Mesh
 
-_NEAR = 0.01  # of the scene's extent, as in training
 _WITHIN_VOXELS = 2.0  # how far a surface may lie from the mesh and count as covered
 _SAMPLES = 200_000  # pixels that the covered share is measured on
 _POOR_SHARE = 0.7
@@ -50,14 +49,14 @@ def make(
     """
     training, _ = split_held_out(reconstruction.views)
     cameras = depth_maps.chosen([view.camera for view in training])
-    near = _NEAR * scene_extent(training) if training else _NEAR
+    settings = settings_of(splats)
 
     def tick(number: int) -> None:
         if report.stop_requested.is_set():
             raise Interrupted(f"stopped after {number} of {len(cameras)} cameras")
         report.progress(number, len(cameras), "drawing depth")
 
-    maps = depth_maps.draw(splats, cameras, RasterSettings(near=near), backend, tick)
+    maps = depth_maps.draw(splats, cameras, settings, backend, tick)
     report.progress(len(cameras), len(cameras), "fusing depth")
     region = fuse.seen_region(maps)
     if region is None:
@@ -69,7 +68,7 @@ def make(
             f"Memory is short: the mesh was made of {voxels:,} voxels instead of "
             f"{fuse.VOXELS:,}. Close other programs and export again for a finer one.",
         )
-    volume = fuse.fuse(maps, fuse.empty_volume(*region, voxels), near)
+    volume = fuse.fuse(maps, fuse.empty_volume(*region, voxels), settings.near)
     fine, crumbs = extract.without_crumbs(extract.surface_of(volume))
     mesh = extract.simplified(fine, triangles)
     if not len(mesh.faces):

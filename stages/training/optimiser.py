@@ -26,12 +26,13 @@ from stages.kernels.simd import (
     vsqrt,
     vstore,
 )
-from stages.raster.cpu.rasteriser import Backward, gradient_columns
+from stages.raster.definition import Arrays, Backward, gradient_columns
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
 # loss: 1e-15, as often used, turns rounding noise into whole steps.
 EPSILON = 1e-4
+LARGEST_GRADIENT = 1e30  # beyond it a splat stays as it is
 CHUNK = 512
 _F = np.float32
 
@@ -103,7 +104,7 @@ def adam_step(
     shift = np.zeros(columns, np.float32)
     b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
     b2, c2 = splat16(_F(BETA2)), splat16(_F(1.0 - BETA2))
-    epsilon, huge = splat16(_F(EPSILON)), splat16(_F(1e30))
+    epsilon, huge = splat16(_F(EPSILON)), splat16(_F(LARGEST_GRADIENT))
     while True:
         start = take_ticket(ticket) * chunk
         if start >= n:
@@ -173,7 +174,7 @@ class Model:
         return len(self.means)
 
     @property
-    def arrays(self) -> tuple[NDArray[np.float32], ...]:
+    def arrays(self) -> Arrays:
         """What the rasteriser takes."""
         return (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh)
 
@@ -217,6 +218,12 @@ def new_model(
         np.zeros(n, np.int32),
         np.zeros(n, np.float32),
     )
+
+
+def empty_model() -> Model:
+    """No splats at all."""
+    shapes = ((0, 3), (0, 4), (0, 3), (0,), (0, 1, 3))
+    return new_model(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
 _CORRECTIONS = bias_corrections()

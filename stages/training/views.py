@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.photos.load import load_image
+from stages.measure.judge import load_photograph
 from stages.scene import Camera, View
 from stages.training.loss import channel_means
 from stages.training.schedule import RESOLUTIONS
@@ -39,9 +39,8 @@ def load_views(folder: Path, views: Iterable[View], train_side: int) -> list[Tra
         levels = []
         for _, scale in RESOLUTIONS:
             camera = view.camera.fitted(max(16, round(train_side * scale)))
-            picture = load_image(folder / view.image, camera.width, camera.height)
-            pixels = np.round(picture * 255).astype(np.uint8)
-            planar = np.ascontiguousarray(pixels.transpose(2, 0, 1))
+            photograph = load_photograph(folder, view.name, view.image, camera)
+            planar = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
             levels.append(Level(camera, planar, channel_means(planar)))
         loaded.append(TrainingView(view.name, tuple(levels)))
     return loaded

@@ -13,8 +13,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from stages.raster import RasterSettings
-from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
+from stages.raster.cpu.rasteriser import CpuRasteriser
+from stages.raster.definition import RasterSettings, splat_arrays
 from stages.scene import Camera, Splats
 from tests.benchmarks.gate import check_kernels
 from tests.benchmarks.scenes import PICTURES, equal_scene, random_scene, trained_scene, view

@@ -17,8 +17,8 @@ from rich.table import Table
 
 from stages.base.stage import Report
 from stages.kernels.pool import Pool
-from stages.raster.cpu.rasteriser import gradient_columns
-from stages.scene import Camera, Splats
+from stages.raster.definition import gradient_columns
+from stages.scene import Camera, Look, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import Model, new_model
 from stages.training.schedule import Schedule
@@ -45,7 +45,7 @@ console = Console(width=150)
 class Stepper:
     """A trainer with one photograph and a model, stepped again and again."""
 
-    def __init__(self, splats: Splats, camera: Camera, pool: Pool, reference: bool = False) -> None:
+    def __init__(self, splats: Splats, camera: Camera, pool: Pool, backend: str = "cpu") -> None:
         r = np.random.default_rng(1)
         photograph = r.integers(0, 256, (3, camera.height, camera.width)).astype(np.uint8)
         photograph[:] = photograph.mean(2, keepdims=True)  # stripes: something to fit, not noise
@@ -54,9 +54,10 @@ class Stepper:
         schedule = Schedule(10_000, 1e-3, splats.sh_degree, 1, len(splats), 0)
         folder = Path(tempfile.gettempdir())
         self.trainer = Trainer(
-            schedule, [photo], [], len(splats), folder, Report(), use_reference=reference
+            schedule, [photo], [], Look(1e-5), len(splats), folder, Report(), backend=backend
         )
-        self.trainer.rasteriser.pool = pool
+        self.rasteriser = self.trainer.stepper.rasteriser
+        self.rasteriser.pool = pool
         self.model: Model = new_model(
             *(
                 np.array(a, np.float32, order="C")
@@ -69,15 +70,16 @@ class Stepper:
                 )
             )
         )
+        self.trainer.stepper.load(self.model)
         self.camera = camera
 
     def __call__(self) -> None:
-        self.trainer.step(self.model, LATE)
+        self.trainer.step(LATE)
 
     def size(self) -> tuple[int, int]:
         """(visible splats, intersections)."""
         settings = self.trainer.settings(3)
-        forward = self.trainer.rasteriser.forward(self.model.arrays, self.camera, settings)
+        forward = self.rasteriser.forward(self.model.arrays, self.camera, settings)
         return len(forward.visible), forward.n_intersections
 
 
@@ -85,7 +87,7 @@ def check_step() -> None:
     """Exit unless a step of the kernels moves all parameters as a step of the reference does."""
     camera = view(131, 75)
     scene = random_scene(800, camera, degree=2)
-    ours, wanted = (Stepper(scene, camera, Pool(2), reference) for reference in (False, True))
+    ours, wanted = (Stepper(scene, camera, Pool(2), name) for name in ("cpu", "reference"))
     ours()
     wanted()
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):

@@ -23,7 +23,7 @@ from stages.raster.cpu.projection import (
     GX,
     GY,
 )
-from stages.raster.cpu.rasteriser import Forward
+from stages.raster.definition import Forward
 from tests.benchmarks.timing import Job
 
 SOURCE = Path(__file__).with_name("yardstick.cpp")

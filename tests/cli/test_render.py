@@ -19,7 +19,7 @@ from splatcli.commands import render as command
 from stages import formats
 from stages.cameras import nerfstudio
 from stages.film.image_files import eight_bits
-from stages.raster import render
+from stages.raster.draw import render
 from stages.scene import Camera, View, look_at
 from tests import scenes
 from tests.tolerances import FILM_LEVELS

@@ -66,7 +66,10 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
 
     def pipeline(path: Path) -> SimpleNamespace:
         return SimpleNamespace(
-            run_folder=path, manifest=outputs.get, load=lambda name: outputs[name]
+            run_folder=path,
+            manifest=outputs.get,
+            load=lambda name: outputs[name],
+            recorded_settings=lambda: {"train": SimpleNamespace(backend="auto")},
         )
 
     monkeypatch.setattr(sources, "Pipeline", pipeline)

@@ -6,7 +6,8 @@ import functools
 
 import numpy as np
 
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst
 from tests.extremes.oracles import finite_differences, opacity_gradient_of_layers
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative, splats

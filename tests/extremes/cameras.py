@@ -10,7 +10,8 @@ import numpy as np
 
 from stages import train
 from stages.base.stage import Report
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from stages.scene import Camera, look_at, scene_extent
 from tests.extremes.measured import Measured, broken, difference, worst
 from tests.extremes.oracles import centre_in_picture, inside_clamp, means2d, textbook_picture

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst
 from tests.scenes import PARAMETERS, camera, cloud, gradients, join, splats, textbook_alpha
 from tests.tolerances import FLOAT32_IMAGE, FLOAT32_OUTPUT

@@ -13,7 +13,8 @@ import numpy as np
 from stages import formats
 from stages.formats import usd_read
 from stages.proof.second_readers import FileContent, read_back
-from stages.raster import RasterSettings, Rendering, render
+from stages.raster.definition import RasterSettings, Rendering
+from stages.raster.draw import render
 from stages.scene import Camera, Splats, look_at
 from tests.extremes.measured import Measured, worst
 from tests.scenes import join

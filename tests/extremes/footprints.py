@@ -7,7 +7,8 @@ import functools
 import numpy as np
 import torch
 
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from stages.raster.reference import parameters_of, project, render_tensors, rotation_matrices
 from tests.extremes import kernels
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst

@@ -8,7 +8,7 @@ from stages.raster.cpu.projection import (
     camera_row,
     footprint_values,
 )
-from stages.raster.cpu.rasteriser import splat_arrays
+from stages.raster.definition import splat_arrays
 
 
 def rotation(scene, view, settings):

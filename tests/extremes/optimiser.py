@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.kernels.pool import Pool
-from stages.raster.cpu.rasteriser import Backward, gradient_columns
+from stages.raster.definition import Backward, gradient_columns
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from tests.extremes.measured import Measured, worst
 from tests.tolerances import FIRST_STEP

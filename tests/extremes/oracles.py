@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from stages.raster import RasterSettings
+from stages.raster.definition import RasterSettings
 from stages.raster.reference import Parameters, parameters_of, render_tensors
 from stages.scene import dc_to_rgb
 from tests.scenes import PARAMETERS, textbook_alpha

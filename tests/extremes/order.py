@@ -10,8 +10,10 @@ import numpy as np
 from stages import train
 from stages.base.stage import Report
 from stages.kernels.pool import Pool
-from stages.raster import RasterSettings, render
-from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
+from stages.raster.cpu.rasteriser import CpuRasteriser
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.draw import render
+from stages.training.cpu_step import CpuStep
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative
 from tests.small_scene import small_scene
@@ -92,7 +94,8 @@ def _drawn_by_reference():
     scene, view = cloud(300, degree=1), camera(90, 70)
     v = np.random.default_rng(1).normal(size=(70, 90, 3)).astype(np.float32)
     image = render(scene, view, RasterSettings(), "reference").image
-    return [image, *gradients("reference", scene, view, v).values()]
+    slopes = gradients("reference", scene, view, v).values()
+    return [image, *map(np.ascontiguousarray, slopes)]
 
 
 def _drawn(threads):
@@ -120,6 +123,7 @@ def _trained(backend, steps, threads):
         )
         start = scene.splats.take(np.arange(0, 80, 2)).with_sh_degree(0)
         trainer = train.make_trainer(scene.reconstruction, len(start), settings, folder, Report())
-        trainer.rasteriser = CpuRasteriser(Pool(threads))
+        if backend == "cpu":
+            trainer.stepper = CpuStep(CpuRasteriser(Pool(threads)))
         model = trainer.run(start)
         return [array.copy() for array in vars(model).values()]

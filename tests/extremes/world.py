@@ -12,7 +12,8 @@ import numpy as np
 from stages import formats, seed
 from stages.base.stage import Report
 from stages.formats import usd_read
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from stages.scene import Camera, Reconstruction, Splats, View, look_at, scene_extent
 from stages.structure.levelling import upright
 from tests.extremes.measured import Measured, difference, worst

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from stages.raster import RasterSettings
-from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
+from stages.raster.backends import rasteriser_of
+from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.reference import blend_weights, parameters_of, project, render_tensors
-from tests.scenes import camera, cloud, relative, splats
+from tests.scenes import BACKENDS, camera, cloud, relative, splats
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9), sh_degree=2)
 
@@ -25,9 +25,9 @@ def photograph(seed=5):
     return np.random.default_rng(seed).uniform(0, 1, (3, 30, 40)).astype(np.float32)
 
 
-def measured(scene, picture, where, settings=SETTINGS):
+def measured(backend, scene, picture, where, settings=SETTINGS):
     """[N, 3] of `contributions`, zero for what is out of view."""
-    rasteriser = CpuRasteriser()
+    rasteriser = rasteriser_of(backend)
     forward = rasteriser.forward(splat_arrays(scene), where, settings)
     residual = np.ascontiguousarray(forward.image[:3] - picture)
     full = np.zeros((len(scene), 3))
@@ -43,25 +43,29 @@ def squared_error(scene, picture, where):
     )
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("seed", range(3))
-def test_the_change_of_the_error_is_that_of_drawing_without_the_splat(seed):
+def test_the_change_of_the_error_is_that_of_drawing_without_the_splat(backend, seed):
     scene, where, picture = faint_cloud(seed), camera(40, 30), photograph()
     now = squared_error(scene, picture, where)
     rows = np.arange(len(scene))
     wanted = np.array([squared_error(scene.take(rows != i), picture, where) - now for i in rows])
     assert (wanted < 0).any()
     assert (wanted > 0).any()
-    assert relative(measured(scene, picture, where)[:, 0], wanted) < 1e-3
+    assert relative(measured(backend, scene, picture, where)[:, 0], wanted) < 1e-3
 
 
-def test_against_its_own_picture_no_splat_is_better_gone():
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_against_its_own_picture_no_splat_is_better_gone(backend):
     scene, where = faint_cloud(1), camera(40, 30)
-    forward = CpuRasteriser().forward(splat_arrays(scene), where, SETTINGS)
-    assert (measured(scene, forward.image[:3].copy(), where)[:, 0] >= 0).all()
+    forward = rasteriser_of(backend).forward(splat_arrays(scene), where, SETTINGS)
+    change = measured(backend, scene, forward.image[:3].copy(), where)[:, 0]
+    assert (change >= 0).all()
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("opaque", [False, True])
-def test_weights_are_those_of_the_definition(opaque):
+def test_weights_are_those_of_the_definition(backend, opaque):
     scene = cloud(200, 40, 30, size_px=8.0) if opaque else faint_cloud()
     where = camera(40, 30)
     projected = project(parameters_of(scene), where, SETTINGS)
@@ -75,15 +79,18 @@ def test_weights_are_those_of_the_definition(opaque):
         weights, _, _ = blend_weights(projected, torch.arange(len(projected.depths)), pixels)
     wanted = np.zeros((len(scene), 2))
     wanted[projected.index.numpy()] = np.stack([weights.sum(1), weights.amax(1)], 1)
-    found = measured(scene, photograph(), where)[:, 1:]
+    found = measured(backend, scene, photograph(), where)[:, 1:]
     np.testing.assert_allclose(found[:, 1], wanted[:, 1], atol=5e-3)
     assert relative(found[:, 0], wanted[:, 0]) < 1e-3
 
 
-def test_a_worked_pixel():
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_worked_pixel(backend):
     """A wide splat of opacity 1/2 and colour 1 on black, the photograph black as well: at its
     centre the picture is 1/2, and taking it out takes (1/2)^2 a channel away."""
     scene = splats([[0.0, 0.0, 1.0]], scales=1000.0, opacities=0.5, rgb=(1.0, 1.0, 1.0))
     black = np.zeros((3, 1, 1), np.float32)
-    found = measured(scene, black, camera(1, 1), replace(SETTINGS, background=(0.0, 0.0, 0.0)))
+    found = measured(
+        backend, scene, black, camera(1, 1), replace(SETTINGS, background=(0.0, 0.0, 0.0))
+    )
     np.testing.assert_allclose(found, [[-0.75, 0.5, 0.5]], rtol=1e-4)

@@ -8,8 +8,8 @@ import functools
 import numpy as np
 import pytest
 
-from stages.raster import RasterSettings, render
-from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
+from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN, RasterSettings
+from stages.raster.draw import render
 from stages.scene import rgb_to_dc
 from tests.extremes.table import NO_GPU, ROWS, measured
 from tests.scenes import BACKENDS, PARAMETERS, camera, cloud, gradients, join, relative, splats

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from stages.raster.reference import Parameters, parameters_of, render_tensors
 from stages.scene import Camera, Splats
 from tests.scenes import BACKENDS, PARAMETERS, camera, cloud, join, splats

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.raster import render, renderer
+from stages.raster.draw import render, renderer
 from tests import scenes
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from stages.raster import RasterSettings, render
 from stages.raster.cpu.projection import (
     A,
     B,
@@ -12,8 +11,10 @@ from stages.raster.cpu.projection import (
     camera_row,
     footprint_values,
 )
-from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
+from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.cpu.splat_kernels import sh_basis_values as kernel_basis
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.draw import render
 from stages.raster.reference import parameters_of, project, sh_basis
 from stages.scene import Camera
 from tests.scenes import BACKENDS, camera, splats

@@ -11,7 +11,7 @@ import pytest
 from stages import formats
 from stages.formats.rows import degrees_in_use
 from stages.measure.images import psnr
-from stages.raster import render
+from stages.raster.draw import render
 from stages.scene import Splats
 from tests.readers.engines import (
     ENGINES,

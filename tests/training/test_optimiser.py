@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from stages.kernels.pool import Pool
-from stages.raster.cpu.rasteriser import Backward, gradient_columns
+from stages.raster.definition import Backward, gradient_columns
 from stages.training.optimiser import (
     EPSILON,
     LearningRates,

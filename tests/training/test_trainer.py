@@ -9,10 +9,12 @@ from stages import train
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.measure.images import psnr
-from stages.raster import RasterSettings, render
-from stages.raster.cpu.rasteriser import CpuRasteriser, splat_arrays
+from stages.measure.judge import Photograph, scores
+from stages.raster.cpu.rasteriser import CpuRasteriser
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.draw import render
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import Splats, look_at, split_held_out
+from stages.scene import Look, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
@@ -31,12 +33,22 @@ def view_of(name, picture, where):
     return TrainingView(name, tuple(level for _ in RESOLUTIONS))
 
 
-def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, reference=False):
+def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, backend="cpu"):
     # of an extent of 10, no splat of these toys is large enough to be pruned as a giant
     schedule = Schedule(
         steps=steps, extent=10.0, sh_degree=degree, n_views=len(views), n_start=len(start), seed=0
     )
-    return Trainer(schedule, views, views, cap, folder, report or Report(), use_reference=reference)
+    judges = [
+        Photograph(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
+        for view in views
+    ]
+    report = report or Report()
+    return Trainer(schedule, views, judges, Look(near=0.1), cap, folder, report, backend=backend)
+
+
+def psnr_of(trained):
+    """Of the first photograph, drawn as it is now."""
+    return scores(trained.drawn, trained.held_out)[0].psnr_db
 
 
 def disc_and_square():
@@ -109,7 +121,7 @@ def test_view_dependence_needs_more_than_a_constant_colour():
     assert worst[2] > 35
 
 
-def small_problem(tmp_path, name, report=None, steps=60, reference=False):
+def small_problem(tmp_path, name, report=None, steps=60, backend="cpu"):
     truth = cloud(80, 40, 30, degree=1)
     where = camera(40, 30)
     picture = np.clip(render(truth, where, RasterSettings()).image, 0, 1)
@@ -117,14 +129,15 @@ def small_problem(tmp_path, name, report=None, steps=60, reference=False):
     folder = tmp_path / name
     folder.mkdir(exist_ok=True)
     views = [view_of("a", picture, where)]
-    return trainer(views, start, steps, folder, report, degree=1, reference=reference), start
+    return trainer(views, start, steps, folder, report, degree=1, backend=backend), start
 
 
 def test_training_brings_the_picture_closer(tmp_path):
     t, start = small_problem(tmp_path, "a", steps=200)
-    model, _ = t._begin(start)
-    before = t.evaluate(model)[0]["psnr_db"]
-    assert t.evaluate(t.run(start))[0]["psnr_db"] > before + 5
+    t._begin(start)
+    before = psnr_of(t)
+    t.run(start)
+    assert psnr_of(t) > before + 5
 
 
 @pytest.mark.parametrize("stop_at", [1, 17, 43])
@@ -179,7 +192,7 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     where = camera(48, 36)
     seen = []
     report.onlooker = lambda draw: seen.append(draw(where))
-    trained = finished(t.run(start), 1, start)
+    trained = finished(t.run(start), 1, start, t.look)
     settings = t.settings(t.schedule.sh_degree)
     image = render(trained, where, settings, backend="reference").image
     levels = np.rint(np.clip(image, 0, 1) * 255)
@@ -211,7 +224,7 @@ def test_a_torn_checkpoint_means_a_fresh_start(tmp_path):
 
 def test_the_reference_backend_trains_to_the_same_place(tmp_path):
     fast, start = small_problem(tmp_path, "fast", steps=10)
-    slow, _ = small_problem(tmp_path, "slow", steps=10, reference=True)
+    slow, _ = small_problem(tmp_path, "slow", steps=10, backend="reference")
     a, b = fast.run(start), slow.run(start)
     assert len(a) == len(b)
     # Adam divides a gradient by its own size: where that is rounding noise, steps may differ
@@ -233,7 +246,7 @@ def test_invalid_rows_at_the_start_do_not_spread(tmp_path):
     )
     model = t.run(broken)
     assert np.isfinite(model.means[np.isfinite(model.means).all(1)]).all()
-    assert t.evaluate(model)[0]["psnr_db"] > 10
+    assert psnr_of(t) > 10
 
 
 def test_a_run_that_loses_every_splat_ends(tmp_path):
@@ -241,7 +254,7 @@ def test_a_run_that_loses_every_splat_ends(tmp_path):
     faint = np.full(len(start), -12.0, np.float32)
     model = t.run(replace(start, opacity_logits=faint))
     assert len(model) == 0
-    assert len(finished(model, 1, start)) == 0
+    assert len(finished(model, 1, start, t.look)) == 0
     assert t.history[-1]["splats"] == 0
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from PIL import Image
 
-from stages.raster import render
+from stages.raster.draw import render
 from stages.scene import Camera, Splats, View, look_at
 from tests import scenes
 

@@ -19,7 +19,8 @@ from PIL import Image
 
 from stages.measure.images import psnr
 from stages.page.shots import shots_of
-from stages.raster import RasterSettings, render
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Splats, scene_extent
 from stages.scene.framing import depth_of_interest

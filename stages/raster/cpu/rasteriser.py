@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +18,16 @@ from stages.raster.cpu.splat_kernels import (
     project_splats,
     splat_gradients,
 )
-from stages.raster.definition import RasterSettings, Rendering
-from stages.scene import Camera, Splats
+from stages.raster.definition import (
+    NO_SMOOTHING,
+    Arrays,
+    Backward,
+    RasterSettings,
+    gradient_columns,
+)
+from stages.scene import Camera
 
 CHUNK = 512  # splats a ticket; whole vectors
-NO_SMOOTHING = np.zeros(0, np.float32)
 
 
 class Buffers:
@@ -102,25 +106,6 @@ class Forward:
         return len(self.lists)
 
 
-@dataclass(frozen=True)
-class Backward:
-    """Gradients of the visible splats, in the order of their rows.
-
-    rows [V] int32. parameters [V, gradient_columns]: mean 0:3, quaternion 3:7, log-scales 7:10,
-    opacity logit 10, then SH, basis function by basis function with RGB last, then zeros.
-    means2d [V, 2]: of the mean on the picture, per pixel.
-    """
-
-    rows: NDArray[np.int32]
-    parameters: NDArray[np.float32]
-    means2d: NDArray[np.float32]
-
-
-def gradient_columns(bands: int) -> int:
-    """Columns of a gradient row with room for `bands` of SH: whole vectors."""
-    return -(-(11 + 3 * bands) // 16) * 16
-
-
 class CpuRasteriser:
     """Draws and differentiates. One instance a thread of control; it owns its buffers."""
 
@@ -130,7 +115,7 @@ class CpuRasteriser:
 
     def forward(
         self,
-        arrays: tuple[NDArray[np.float32], ...],
+        arrays: Arrays,
         camera: Camera,
         settings: RasterSettings,
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
@@ -190,7 +175,7 @@ class CpuRasteriser:
 
     def backward(
         self,
-        arrays: tuple[NDArray[np.float32], ...],
+        arrays: Arrays,
         forward: Forward,
         v_image: NDArray[np.float32],
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
@@ -260,7 +245,7 @@ class CpuRasteriser:
     def _lists(
         self,
         visible: NDArray[np.int32],
-        arrays: tuple[NDArray[np.float32], ...],
+        arrays: Arrays,
         geometry: NDArray[np.float64],
         paint: NDArray[np.float32],
         width: int,
@@ -322,38 +307,3 @@ def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:
         starts[0] = 0
         np.cumsum(counts[:-1], out=starts[1:])
     return total
-
-
-def splat_arrays(splats: Splats) -> tuple[NDArray[np.float32], ...]:
-    """The five parameter arrays, C-contiguous float32."""
-    return tuple(
-        np.ascontiguousarray(a, dtype=np.float32)
-        for a in (
-            splats.means,
-            splats.quaternions,
-            splats.log_scales,
-            splats.opacity_logits,
-            splats.sh,
-        )
-    )
-
-
-def renderer_cpu(
-    splats: Splats, settings: RasterSettings, smoothing: NDArray[np.float32] | None = None
-) -> Callable[[Camera], Rendering]:
-    """`renderer` by the kernels."""
-    widths = NO_SMOOTHING if smoothing is None else np.ascontiguousarray(smoothing, np.float32)
-    rasteriser, arrays = CpuRasteriser(), splat_arrays(splats)
-
-    def draw(camera: Camera) -> Rendering:
-        forward = rasteriser.forward(arrays, camera, settings, widths, depths=True)
-        image = forward.image
-        return Rendering(
-            np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
-            image[3].copy(),
-            image[4].copy(),
-            image[5].copy(),
-            forward.culled,
-        )
-
-    return draw

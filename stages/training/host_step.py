@@ -1,0 +1,33 @@
+"""What training steps share that keep the model in arrays of this machine's memory."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.raster.definition import NO_SMOOTHING, Rasteriser, RasterSettings
+from stages.scene import Camera
+from stages.training.optimiser import Model, empty_model
+
+
+class HostStep:
+    """See `step.TrainingStep`; `step` is left to who inherits."""
+
+    def __init__(self, rasteriser: Rasteriser) -> None:
+        self.rasteriser = rasteriser
+        self._model = empty_model()
+
+    def load(self, model: Model) -> None:
+        self._model = model
+
+    def model(self) -> Model:
+        return self._model
+
+    def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
+        widths = self.widths(smooth)
+        forward = self.rasteriser.forward(self._model.arrays, camera, settings, widths)
+        return np.ascontiguousarray(forward.image[:3].transpose(1, 2, 0))
+
+    def widths(self, smooth: bool) -> NDArray[np.float32]:
+        """[N] of the smoothing filter, or [0] for none."""
+        return self._model.smoothing if smooth else NO_SMOOTHING

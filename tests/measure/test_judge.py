@@ -1,0 +1,83 @@
+"""One judge for all stages: the same figure for the same scene, whatever its units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages.measure.judge import CAP_DB, decibels, drawing_of, load_photographs, scores
+from stages.raster.draw import settings_of
+from stages.scene import Look, Reconstruction, Splats, View, near_plane
+from tests.scenes import BACKENDS, join, splats
+from tests.small_scene import SmallScene, small_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
+    return small_scene(tmp_path_factory.mktemp("photographs"), views=5, n=120)
+
+
+def in_units(scene: SmallScene, factor: float) -> tuple[Splats, Reconstruction]:
+    """The same scene and cameras, all lengths times `factor`."""
+    views = []
+    for view in scene.reconstruction.views:
+        matrix = view.camera.world_to_camera.copy()
+        matrix[:3, 3] *= factor
+        views.append(View(view.name, view.image, replace(view.camera, world_to_camera=matrix)))
+    found = scene.splats
+    larger = replace(
+        found,
+        means=found.means * np.float32(factor),
+        log_scales=found.log_scales + np.float32(np.log(factor)),
+        look=Look(near_plane(tuple(views)), 72),
+    )
+    return larger, replace(scene.reconstruction, views=tuple(views))
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e4])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_scene_in_other_units_gets_the_same_figures(
+    scene: SmallScene, backend: str, factor: float
+) -> None:
+    figures = []
+    for units in (1.0, factor):
+        trained, reconstruction = in_units(scene, units)
+        photographs = load_photographs(reconstruction.folder, reconstruction.views, trained.look)
+        figures.append(scores(drawing_of(trained, backend), photographs))
+    for one, other in zip(*figures, strict=True):
+        assert one.psnr_db == pytest.approx(other.psnr_db, abs=0.01)
+        assert one.ssim == pytest.approx(other.ssim, abs=1e-3)
+
+
+def test_a_file_without_cameras_gets_a_near_plane_of_its_own_size(scene: SmallScene) -> None:
+    """In small units nothing is clipped, in large ones what hangs before the lens is."""
+    for factor in (1e-4, 1.0, 1e4):
+        alone = replace(in_units(scene, factor)[0], look=Look())
+        extent = float(np.ptp(alone.means, axis=0).max())
+        assert 1e-4 * extent < settings_of(alone).near < 0.02 * extent
+
+
+def test_photographs_are_judged_at_the_size_that_was_trained(scene: SmallScene) -> None:
+    views, folder = scene.reconstruction.views, scene.reconstruction.folder
+    (small, *_) = load_photographs(folder, views, Look(0.01, 36))
+    assert small.pixels.shape == (27, 36, 3)
+    (full, *_) = load_photographs(folder, views, Look(0.01))
+    with Image.open(Path(folder) / views[0].image) as picture:
+        np.testing.assert_array_equal(full.pixels, np.asarray(picture))
+
+
+def test_the_near_plane_of_the_look_decides_what_is_drawn() -> None:
+    before_the_lens = splats([[0.0, 0.0, 0.5]], rgb=(1.0, 0.0, 0.0))
+    both = join(before_the_lens, splats([[0.0, 0.0, 5.0]], rgb=(0.0, 1.0, 0.0)))
+    assert settings_of(replace(both, look=Look(near=1.0))).near == 1.0
+
+
+def test_figures_stay_finite() -> None:
+    white = np.ones((4, 4, 3), np.float32)
+    assert decibels(white, white) == CAP_DB
+    assert decibels(white * np.nan, white) == 0.0
+    assert decibels(white * 7, white) == CAP_DB  # a screen shows no more than white

@@ -1,0 +1,55 @@
+"""One list of backends: what it names runs, is chosen by name, and is held to the definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.raster import backends
+from stages.raster.backends import Backend
+from stages.raster.definition import Backward
+from stages.raster.reference_rasteriser import ReferenceRasteriser
+from tests.scenes import BACKENDS, camera, cloud, exact_gradients, gradients, relative
+from tests.tolerances import FLOAT32_GRADIENT
+
+
+class Zeros(ReferenceRasteriser):
+    """Draws, and says that nothing matters."""
+
+    def backward(self, arrays, forward, v_image, smoothing=None):
+        found = super().backward(arrays, forward, v_image)
+        none = np.zeros_like(found.parameters)
+        return Backward(found.rows, none, np.zeros_like(found.means2d))
+
+
+def worst_gradient(backend: str) -> float:
+    scene, view = cloud(40, degree=1), camera()
+    v = np.random.default_rng(2).normal(size=(48, 64, 3))
+    found, wanted = gradients(backend, scene, view, v), exact_gradients(scene, view, v)
+    return max(relative(found[name], wanted[name]) for name in wanted)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_every_backend_in_the_list_has_the_gradients_of_the_definition(name: str) -> None:
+    assert worst_gradient(name) <= FLOAT32_GRADIENT
+
+
+def test_a_backend_that_returns_zeros_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would pass a test that ran other kernels in its place."""
+    fake = Backend("zeros", f"{__name__}:Zeros", "for this test")
+    monkeypatch.setattr(backends, "BACKENDS", (*backends.BACKENDS, fake))
+    assert worst_gradient("zeros") > 0.5
+
+
+def test_a_backend_takes_part_in_training_without_a_step_of_its_own(monkeypatch) -> None:
+    from stages.training.plain_step import PlainStep
+    from stages.training.step import step_of
+
+    fake = Backend("another", "stages.raster.reference_rasteriser:ReferenceRasteriser", "a test")
+    monkeypatch.setattr(backends, "BACKENDS", (*backends.BACKENDS, fake))
+    assert isinstance(step_of("another"), PlainStep)
+
+
+def test_an_unknown_backend_is_named_with_those_that_there_are() -> None:
+    with pytest.raises(ValueError, match=r"'magic', wanted one of auto, cpu, reference"):
+        backends.rasteriser_of("magic")

@@ -1,0 +1,53 @@
+"""The step that is written from its definitions, and the kernels' step, do the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.draw import render
+from stages.scene import Splats
+from stages.training.loss import channel_means
+from stages.training.optimiser import LearningRates, Model, new_model
+from stages.training.step import step_of
+from stages.training.views import Level
+from tests.scenes import camera, cloud
+
+RATES = LearningRates(means=1e-3)
+
+
+def level_of(scene: Splats) -> Level:
+    where = camera(40, 30)
+    picture = np.clip(render(scene, where).image, 0, 1)
+    pixels = np.ascontiguousarray((picture * 255).round().astype(np.uint8).transpose(2, 0, 1))
+    return Level(where, pixels, channel_means(pixels))
+
+
+def stepped(backend: str, steps: int, degree: int = 1) -> tuple[Model, list[float]]:
+    level = level_of(cloud(80, 40, 30, degree=1))
+    start = cloud(60, 40, 30, degree=1, seed=4)
+    stepper = step_of(backend)
+    stepper.load(new_model(*(array.copy() for array in splat_arrays(start))))
+    settings = RasterSettings(near=0.1, sh_degree=degree)
+    losses = [stepper.step(level, settings, RATES, smooth=False) for _ in range(steps)]
+    return stepper.model(), losses
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_one_step_leaves_the_same_moments_counts_and_loss(degree: int) -> None:
+    kernels, losses = stepped("cpu", 1, degree)
+    plain, wanted = stepped("reference", 1, degree)
+    assert losses == pytest.approx(wanted, rel=1e-5)
+    for name in ("moment1", "moment2", "gradient_sum"):
+        found, known = getattr(kernels, name), getattr(plain, name)
+        np.testing.assert_allclose(found, known, atol=2e-4 * np.abs(known).max())
+    for name in ("gradient_count",):
+        np.testing.assert_array_equal(getattr(kernels, name), getattr(plain, name))
+
+
+def test_many_steps_end_at_the_same_loss() -> None:
+    _, losses = stepped("cpu", 20)
+    _, wanted = stepped("reference", 20)
+    np.testing.assert_allclose(losses, wanted, rtol=1e-3)
+    assert losses[-1] < losses[0]
