@@ -104,7 +104,7 @@ def _frames(length: Length, usual_s: float) -> int:
 
 
 def _from_file(path: str) -> list[Camera]:
-    from stages.cameras.camera_file import read_cameras
+    from stages.cameras.table import read_cameras
 
     if not Path(path).exists():
         raise SplatError(

@@ -1,4 +1,4 @@
-"""Camera files of other programs: which module reads one, and what all of them must pass.
+"""What a file of cameras holds, and what all of them must pass.
 
 What is read comes in our own conventions: world to camera, x right, y down, z forward. The world
 is the file's own; see each module for what it does to it.
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
-from stages.base.errors import Family, SplatError
 from stages.scene import Camera, View
 
 LARGEST_SIDE = 100_000  # pixels; no lens shows more
@@ -32,25 +31,6 @@ class CameraFile:
     views: tuple[View, ...]
     folder: Path
     distorted: int
-
-
-def read_cameras(path: Path) -> CameraFile:
-    """The cameras of a transforms.json or of a COLMAP model's folder (or of one that has it as
-    sparse/0). Raises SplatError "cameras-unknown" or "cameras-unreadable"."""
-    from stages.cameras import colmap, nerfstudio
-
-    if path.suffix.lower() == ".json":
-        return nerfstudio.read(path)
-    folder = colmap.model_folder(path)
-    if folder is not None:
-        return colmap.read(folder)
-    raise SplatError(
-        "cameras-unknown",
-        given=f"{path} is neither a .json file nor a folder with a COLMAP model.",
-        wanted="nerfstudio's transforms.json, or a folder with COLMAP's images.bin or images.txt.",
-        hint="Check the path; a run's cameras are written by `splat cameras RUN OUT`.",
-        family=Family.USAGE,
-    )
 
 
 def make_views(

@@ -71,6 +71,11 @@ def write(
         partial.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
+def recognised(path: Path) -> Path | None:
+    """The path itself, if it is a .json file."""
+    return path if path.suffix.lower() == ".json" else None
+
+
 def read(path: Path) -> CameraFile:
     """The cameras of a file; `file_path` gives their names. Raises SplatError
     "cameras-unreadable"."""

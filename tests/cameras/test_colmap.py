@@ -11,7 +11,7 @@ import pytest
 from stages.base.errors import SplatError
 from stages.cameras.colmap import (
     ColmapModel,
-    model_folder,
+    recognised,
     read,
     read_model,
     write_colmap_model,
@@ -104,7 +104,7 @@ def assert_same(found: ColmapModel, wanted: ColmapModel) -> None:
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     write_colmap_model(tmp_path / "sparse" / "0", example())
-    folder = model_folder(tmp_path)
+    folder = recognised(tmp_path)
     assert folder == tmp_path / "sparse" / "0"
     cameras, model = read_model(folder)
     assert_same(model, example())

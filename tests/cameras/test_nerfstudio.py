@@ -12,8 +12,8 @@ import pytest
 from plyfile import PlyData
 
 from stages.base.errors import SplatError
-from stages.cameras.camera_file import read_cameras
 from stages.cameras.nerfstudio import write
+from stages.cameras.table import read_cameras
 from stages.scene import Camera, View, look_at
 from tests.structure.synthetic import random_rotation
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.cameras.camera_file import read_cameras
 from stages.cameras.colmap import read_model, write_colmap_model
+from stages.cameras.table import read_cameras
 from tests.cameras.test_colmap import example
 
 
