@@ -11,9 +11,9 @@ import pytest
 from stages.base.errors import SplatError
 from stages.cameras.colmap import (
     ColmapModel,
-    recognised,
     read,
     read_model,
+    recognised,
     write_colmap_model,
 )
 from stages.scene import Camera
