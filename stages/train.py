@@ -188,7 +188,7 @@ def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
     from stages.measure.judge import scores
     from stages.training.charts import contact_sheet, training_plot
 
-    found = scores(trainer.drawn, trainer.held_out)
+    found = scores(trainer.drawn, trainer.held_out, with_flip=True)
     if found:
         values = [score.psnr_db for score in found]
         worst = min(found, key=lambda score: score.psnr_db)
@@ -197,6 +197,7 @@ def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
         report.metric("psnr_worst_photograph", worst.name)
         report.metric("psnr_spread_db", round(float(np.std(values)), 3))
         report.metric("ssim", round(float(np.mean([score.ssim for score in found])), 4))
+        report.metric("flip", round(float(np.mean([score.flip or 0.0 for score in found])), 4))
     else:
         report.warn(
             "train-nothing-held-out",

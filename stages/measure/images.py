@@ -35,3 +35,14 @@ def ssim(image: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
     score = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
     score /= (mean_a * mean_a + mean_b * mean_b + c1) * (var_a + var_b + c2)
     return float(score.mean())
+
+
+def flip(image: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
+    """Mean FLIP error (Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating
+    Images"), 0 for equal images to 1: what an eye sees that changes between the two at 67 pixels a
+    degree, as its authors' own evaluator computes it."""
+    import flip_evaluator
+
+    pair = (np.ascontiguousarray(x, np.float32) for x in (truth, image))
+    _, mean, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)
+    return float(mean)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.images import psnr, ssim
+from stages.measure.images import flip, psnr, ssim
 from stages.photos.load import load_image
 from stages.raster.draw import renderer
 from stages.scene import Camera, Look, Splats, View
@@ -38,11 +38,13 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Score:
-    """How near one drawing is to its photograph; PSNR at most 99 dB."""
+    """How near one drawing is to its photograph; PSNR at most 99 dB. Definitions in `images`.
+    flip: None where it was not asked for; it takes five times as long as the others."""
 
     name: str
     psnr_db: float
     ssim: float
+    flip: float | None = None
 
 
 def load_photographs(folder: Path, views: Iterable[View], look: Look) -> tuple[Photograph, ...]:
@@ -64,12 +66,15 @@ def decibels(image: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
     return 0.0 if np.isnan(found) else min(found, CAP_DB)
 
 
-def scores(draw: Drawing, photographs: Iterable[Photograph]) -> list[Score]:
-    """PSNR and SSIM of each photograph, of drawings clipped to what a screen can show."""
+def scores(
+    draw: Drawing, photographs: Iterable[Photograph], with_flip: bool = False
+) -> list[Score]:
+    """PSNR, SSIM and perhaps FLIP of each photograph, of drawings clipped to what a screen can show."""
     found = []
     for photograph in photographs:
         image, truth = np.clip(draw(photograph.camera), 0.0, 1.0), photograph.image
-        found.append(Score(photograph.name, decibels(image, truth), ssim(image, truth)))
+        seen = flip(image, truth) if with_flip else None
+        found.append(Score(photograph.name, decibels(image, truth), ssim(image, truth), seen))
     return found
 
 

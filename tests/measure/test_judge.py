@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.measure.images import flip
 from stages.measure.judge import CAP_DB, decibels, drawing_of, load_photographs, scores
 from stages.raster.draw import settings_of
 from stages.scene import Look, Reconstruction, Splats, View, near_plane
@@ -81,3 +82,15 @@ def test_figures_stay_finite() -> None:
     assert decibels(white, white) == CAP_DB
     assert decibels(white * np.nan, white) == 0.0
     assert decibels(white * 7, white) == CAP_DB  # a screen shows no more than white
+
+
+def test_flip_is_that_of_its_authors_worked_cases() -> None:
+    """0 for equal pictures; nearly 1 for blue against yellow, which are as far apart as the
+    measure's colours go; and one noisy pixel in a thousand hardly counts."""
+    blue = np.zeros((32, 32, 3), np.float32) + np.float32([0, 0, 1])
+    yellow = 1 - blue
+    assert flip(blue, blue) == 0.0
+    assert flip(blue, yellow) > 0.9
+    speck = blue.copy()
+    speck[16, 16] = 1.0
+    assert 0.0 < flip(speck, blue) < 0.05
