@@ -69,7 +69,7 @@ def decibels(image: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
 def scores(
     draw: Drawing, photographs: Iterable[Photograph], with_flip: bool = False
 ) -> list[Score]:
-    """PSNR, SSIM and perhaps FLIP of each photograph, of drawings clipped to what a screen can show."""
+    """PSNR, SSIM and perhaps FLIP of each, of drawings clipped to what a screen can show."""
     found = []
     for photograph in photographs:
         image, truth = np.clip(draw(photograph.camera), 0.0, 1.0), photograph.image
