@@ -52,11 +52,6 @@ def tell(done: int, total: int) -> None:
         watcher(done, total)
 
 
-def block_of(splats: Splats, rows: slice, order: NDArray[np.integer] | None = None) -> Splats:
-    """Some rows: views of them, or with an `order` copies of those that it names."""
-    return splats.take(rows if order is None else order[rows])
-
-
 def allocated(count: int, degree: int) -> Splats:
     """`count` splats for a reader to fill, float32; what they hold is not defined."""
     return Splats(

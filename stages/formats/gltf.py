@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from stages.formats.blocks import blocks
 from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
-from stages.formats.gltf_read import read
 from stages.formats.rows import (
     kept_rows,
     linear_opacities,
@@ -23,8 +22,6 @@ from stages.formats.rows import (
 )
 from stages.formats.turn import SH_SIGNS, turned
 from stages.scene import Splats, dc_to_rgb
-
-__all__ = ["fallback_colours", "read", "sh_attributes", "write"]
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:

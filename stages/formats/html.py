@@ -75,12 +75,12 @@ def read(path: Path) -> Splats:
     with reading(path), tempfile.TemporaryDirectory(prefix="splat-") as folder:
         inside = Path(folder) / "inside.ply"
         with inside.open("wb") as file:
-            for block in _unzipped(path):
+            for block in unzipped(path):
                 file.write(block)
         return ply.parse(inside)
 
 
-def _unzipped(path: Path) -> Iterator[bytes]:
+def unzipped(path: Path) -> Iterator[bytes]:
     """The .ply inside, a part at a time; each script element is a line of its own."""
     start, end = (re.escape(t.encode("ascii")) for t in (document.CHUNK_START, document.CHUNK_END))
     wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)
