@@ -105,7 +105,7 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    from stages.formats.blocks import watched
+    from stages.base.blocks import watched
 
     columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
     with Progress(*columns, console=console.err, transient=True) as bar:

@@ -21,10 +21,17 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import passing
 from stages.formats import smallest_three
-from stages.formats.blocks import allocated, passing
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
-from stages.formats.rows import checked, kept_rows, linear_opacities, logits_of, unit_quaternions
+from stages.formats.rows import (
+    allocated,
+    checked,
+    kept_rows,
+    linear_opacities,
+    logits_of,
+    unit_quaternions,
+)
 from stages.scene import SH_C0, Splats, morton
 
 CHUNK = 256

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import blocks
+from stages.base.blocks import blocks
 from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
 from stages.formats.rows import (
     kept_rows,

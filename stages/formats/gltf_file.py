@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.base.blocks import passing
 from stages.base.errors import Family, SplatError
-from stages.formats.blocks import passing
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121}

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import tell
 from stages.formats import ply
-from stages.formats.blocks import tell
 from stages.formats.rows import kept_rows
 from stages.page import document
 from stages.page.shots import shots_of

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import forget, passing
 from stages.formats import compressed_ply
-from stages.formats.blocks import allocated, forget, passing
 from stages.formats.far import recentred
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
-from stages.formats.rows import checked, kept_rows
+from stages.formats.rows import allocated, checked, kept_rows
 from stages.scene import Splats
 
 _ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3: the columns of a block are gathered from the cache

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.base.blocks import passing
 from stages.formats import codebook, smallest_three
-from stages.formats.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
 from stages.scene import Splats, morton

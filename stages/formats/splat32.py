@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.formats.blocks import allocated, passing
+from stages.base.blocks import passing
 from stages.formats.rows import (
     LOG_SCALE_MIN,
+    allocated,
     checked,
     kept_rows,
     linear_opacities,

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.base.blocks import passing
 from stages.formats import smallest_three
-from stages.formats.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
 from stages.formats.turn import FLIP, turned

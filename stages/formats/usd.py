@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.formats.blocks import passing
+from stages.base.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
 from stages.formats.turn import turned
 from stages.scene import Splats

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import blocks
+from stages.base.blocks import blocks
 from stages.scene import Splats
 
 # From a file's axes to ours; spelled out here: a wrong turn must not check itself.

@@ -20,8 +20,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.blocks import forget, passing
 from stages.formats import format_of, function
-from stages.formats.blocks import forget, passing
 from stages.proof.content import Y_DOWN, Y_UP, FileContent, logits, splats_of
 from stages.scene import Splats
 

@@ -18,7 +18,7 @@ from stages.proof.prover import Prover, cameras_for
 from stages.proof.second_readers import read_back
 from stages.scene import Splats
 from tests.formats.test_compressed_ply import angles
-from tests.formats.truth import C0, many_splats, red_splat
+from tests.formats.truth import C0, extreme_splats, many_splats, red_splat
 
 
 def content_of(path: Path) -> bytes:
@@ -132,11 +132,7 @@ def test_what_lies_beyond_reach_looks_the_same_from_the_middle(tmp_path: Path) -
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
-    splats = many_splats(4).with_sh_degree(1)
-    splats.log_scales[:] = [[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]]
-    splats.opacity_logits[:] = [100, -100, 20, -20]
-    splats.quaternions[:2] = [[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]]
-    splats.means[3] = (7e8, -3e38, 1e-40)
+    splats = extreme_splats(1)
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.spz", splats) == 0
     back = formats.read(tmp_path / "a.spz")
