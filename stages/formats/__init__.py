@@ -5,7 +5,8 @@ them back so; each format's own axes and units of measure stay inside its module
 
 A new format, in five steps:
 1. A module here with `write(path, splats, *, units)`, which writes by `base.atomic.replacing` what
-   `rows.kept_rows` leaves, and says how many it left out.
+   `rows.kept_rows` leaves, a block at a time by `base.blocks.passing`, and says how many it left
+   out.
 2. In the same module, or in one beside it if it grows, `read(path)`: its work inside
    `base.bad_files.reading`, its result through `rows.checked`.
 3. A second reader, of a library that we did not write or of raw bytes, and an anatomy: in `proof`.

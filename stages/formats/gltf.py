@@ -20,8 +20,8 @@ from stages.formats.rows import (
     linear_scales,
     unit_quaternions,
 )
-from stages.formats.turn import SH_SIGNS, turned
 from stages.scene import Splats, dc_to_rgb
+from stages.scene.turn import SH_SIGNS, turned
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:

@@ -27,8 +27,8 @@ from stages.formats.rows import (
     linear_scales,
     unit_quaternions,
 )
-from stages.formats.turn import turned
 from stages.scene import Splats
+from stages.scene.turn import turned
 
 _U16 = 65535
 # A step of the scales may be this part of a middling splat's size. Where a few huge splats would

@@ -20,10 +20,10 @@ from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import forget, passing
 from stages.formats import compressed_ply
-from stages.formats.far import recentred
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
 from stages.formats.rows import allocated, checked, kept_rows
 from stages.scene import Splats
+from stages.scene.far import recentred
 
 _ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3: the columns of a block are gathered from the cache
 _Tables = Iterator[tuple[slice, NDArray[Any]]]

@@ -25,8 +25,8 @@ from stages.base.blocks import passing
 from stages.formats import smallest_three
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
-from stages.formats.turn import FLIP, turned
 from stages.scene import Splats
+from stages.scene.turn import FLIP, turned
 
 _LEVEL = 6  # 9 takes eight times as long for 1 % less
 _LEAST_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23

@@ -21,8 +21,8 @@ from stages.base.blocks import passing
 from stages.formats import smallest_three
 from stages.formats.inflate import Inflated, check_size, unpacked
 from stages.formats.rows import allocated, checked, logits_of, unit_quaternions
-from stages.formats.turn import turned
 from stages.scene import Splats
+from stages.scene.turn import turned
 
 HEADER = struct.Struct("<4sIIBBBB")
 MAGIC = b"NGSP"

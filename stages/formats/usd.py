@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
-from stages.formats.turn import turned
 from stages.scene import Splats
+from stages.scene.turn import turned
 
 _ROOT, _PRIM = "/Scene", "/Scene/Splats"
 

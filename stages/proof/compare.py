@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import FORMATS, Format, function
-from stages.formats.turn import FLIP, turned
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.proof.second_readers import FileContent
 from stages.scene import SH_C0, Splats
+from stages.scene.turn import FLIP, turned
 
 _BLOCK = 1 << 16  # rows compared at a time: copies stay small however large the file is
 
