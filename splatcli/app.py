@@ -13,6 +13,7 @@ from splatcli.console import guarded
 from splatcli.folders import find_run_folder
 from splatcli.options import with_parameters
 from stages import STAGE_NAMES
+from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
 from stages.run.pipeline import Pipeline
 
@@ -54,6 +55,7 @@ Backend = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Events and results as lines of JSON.")]
 
+_ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
 _STAGE_HELP = {
     "ingest": "Read and check the photographs.",
     "sfm": "Find where each photograph was taken from.",
@@ -205,14 +207,11 @@ def info(
 
 def convert(
     source: Annotated[Path, typer.Argument(help="Splat file to read; its name says the format.")],
-    target: Annotated[Path, typer.Argument(help="Splat file to write; its name says the format.")],
+    target: Annotated[Path, typer.Argument(help=f"Splat file to write: {_ENDINGS}.")],
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a splat file into one of another format.
-
-    Endings: .ply .splat .glb .gltf .usda .usdc .usdz .quantised.glb .compressed.ply .spz .sog .html
-    """
+    """Make a splat file into one of another format."""
     from splatcli.commands import convert as work
 
     work.convert(source, target, quiet, as_json)

@@ -15,22 +15,21 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.formats import FORMATS, MESHES
 from stages.raster.backends import backend_of, backend_setting
 
 if TYPE_CHECKING:
     from stages.proof.prover import Prover
-    from stages.scene import ExportedAssets, QuantisedSplats, Reconstruction, Splats
+    from stages.scene import (
+        ExportedAssets,
+        ExportedFile,
+        QuantisedSplats,
+        Reconstruction,
+        Splats,
+    )
 
-FORMATS = (
-    *("ply", "splat", "glb", "gltf", "usda", "usdc", "usdz"),
-    *("quantised.glb", "compressed.ply", "spz", "sog", "html"),
-)
-# What `--format` says -> the files that it stands for. They hold triangles: no splat reader's.
-MESHES = {
-    "mesh": ("mesh.glb", "mesh.ply"),
-    "mesh.glb": ("mesh.glb",),
-    "mesh.ply": ("mesh.ply",),
-}
+_MESH = "mesh"  # to `--format`: every format of meshes
+_CHOICES = (*FORMATS, _MESH, *MESHES)
 _INDEX = "assets.json"
 
 
@@ -42,7 +41,7 @@ class ExportSettings:
         default=("ply", "splat", "glb", "usdz"),
         metadata={
             "help": "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
-            "choices": (*FORMATS, *MESHES),
+            "choices": _CHOICES,
         },
     )
     name: str = field(default="scene", metadata={"help": "Name of the files, without a suffix."})
@@ -54,12 +53,12 @@ class ExportSettings:
 
 def check(settings: ExportSettings) -> None:
     """Raises SplatError for a format that is not written, and for a name that cannot be one."""
-    unknown = [name for name in settings.formats if name not in (*FORMATS, *MESHES)]
+    unknown = [name for name in settings.formats if name not in _CHOICES]
     if unknown or not settings.formats:
         raise SplatError(
             "export-format-unknown",
             given=f"Asked to export {', '.join(unknown) or 'no format at all'}.",
-            wanted=f"One or more of {', '.join((*FORMATS, *MESHES))}.",
+            wanted=f"One or more of {', '.join(_CHOICES)}.",
             hint="Name each with --format, for example: splat export --format glb --format usdz",
             family=Family.USAGE,
         )
@@ -107,19 +106,17 @@ def run(
         report.progress(number, len(wanted), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
         formats.write(path, splats, units=reconstruction.units, views=reconstruction.views)
-        size = path.stat().st_size
-        if name == "gltf":
-            size += path.with_suffix(".bin").stat().st_size if len(splats) else 0
+        size = FORMATS[name].size_bytes(path)
         files.append(ExportedFile(name, path.name, size))
         figures[name] = {
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
-            **_proven(prover, path, name, report),
+            **_proven(prover, path, report),
         }
         report.progress(number + 1, len(wanted), f".{name}", verify_db=figures[name]["verify_db"])
-    for name, path, size in _write_meshes(splats, reconstruction, settings, folder, report):
-        files.append(ExportedFile(name, path.name, size))
-        figures[name] = {"size_bytes": size}
+    for file in _write_meshes(splats, reconstruction, settings, folder, report):
+        files.append(file)
+        figures[file.format] = {"size_bytes": file.size_bytes}
     report.metric("backend", backend_of(settings.backend).name)
     report.metric("files", len(files))
     report.metric("splats", len(splats))
@@ -135,17 +132,28 @@ def _write_meshes(
     settings: ExportSettings,
     folder: Path,
     report: Report,
-) -> list[tuple[str, Path, int]]:
-    """(format, path, bytes) of each mesh asked for; metric: mesh, see `surface.make`."""
-    wanted = dict.fromkeys(file for name in settings.formats for file in MESHES.get(name, ()))
+) -> list[ExportedFile]:
+    """Each mesh asked for, read back and compared; metric: mesh, see `surface.make`. Raises
+    SplatError "export-verify-failed"."""
+    asked = (e for name in settings.formats for e in (MESHES if name == _MESH else (name,)))
+    wanted = [MESHES[ending] for ending in dict.fromkeys(asked) if ending in MESHES]
     if not wanted:
         return []
-    from stages.surface.files import write_meshes
+    from stages.formats import function
+    from stages.scene import ExportedFile
+    from stages.surface.files import fault_of
     from stages.surface.make import make
 
     made = make(splats, reconstruction, settings.mesh_triangles, settings.backend, report)
     report.metric("mesh", made.figures)
-    return write_meshes(folder, settings.name, wanted, made.mesh, reconstruction.units)
+    files = []
+    for row in wanted:
+        path = folder / f"{settings.name}.{row.ending}"
+        function(row.writer)(path, made.mesh, reconstruction.units)
+        if fault := fault_of(path, row, made.mesh):
+            raise _failed(path, fault, "mesh")
+        files.append(ExportedFile(row.ending, path.name, row.size_bytes(path)))
+    return files
 
 
 def _clear(folder: Path) -> None:
@@ -172,34 +180,34 @@ def _say_what_is_missing(count: int, dropped: int, report: Report) -> None:
         )
 
 
-def _write_index(folder: Path, files: list[Any]) -> None:
+def _write_index(folder: Path, files: list[ExportedFile]) -> None:
     entries = [
         {"format": file.format, "path": file.path, "size_bytes": file.size_bytes} for file in files
     ]
     (folder / _INDEX).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
-def _proven(prover: Prover, path: Path, name: str, report: Report) -> dict[str, Any]:
+def _proven(prover: Prover, path: Path, report: Report) -> dict[str, Any]:
     """The file's figures. Raises SplatError "export-verify-failed"."""
-    from stages.formats import LOSSY
+    from stages.formats import format_of
 
-    proof = prover.prove(path)
+    row, proof = format_of(path), prover.prove(path)
     if proof.fault:
-        raise _failed(path, proof.fault)
+        raise _failed(path, proof.fault, "splats")
     if proof.loss_db is not None:
         report.warn(
-            f"export-{name.replace('.', '-')}-lossy",
+            f"export-{row.ending.replace('.', '-')}-lossy",
             f"{path.name} differs from the trained splats by {proof.loss_db:.1f} dB: the format "
-            f"{LOSSY[name]}. Where a viewer reads them, prefer .ply, .glb or .usdz.",
+            f"{row.loses}. Where a viewer reads them, prefer .ply, .glb or .usdz.",
         )
     return proof.figures
 
 
-def _failed(path: Path, reason: str) -> SplatError:
+def _failed(path: Path, reason: str, held: str) -> SplatError:
     return SplatError(
         "export-verify-failed",
         given=f"{path.name} came out wrong: {reason}.",
-        wanted="A file that another program reads as the same splats.",
+        wanted=f"A file that another program reads as the same {held}.",
         hint="Leave this format out with --format, and report this with the run's manifest.",
         family=Family.QUALITY,
     )
@@ -227,7 +235,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=3,
+    version=4,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,

@@ -12,10 +12,12 @@ import pytest
 from stages import export, formats
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.export import FORMATS, ExportSettings
+from stages.export import ExportSettings
+from stages.formats import FORMATS
 from stages.proof import second_readers
+from stages.proof.content import FileContent
 from stages.scene import ExportedAssets, QuantisedSplats, Splats
-from stages.surface import fuse
+from stages.surface import fuse, ply
 from tests.small_scene import SmallScene, small_scene
 
 
@@ -37,13 +39,13 @@ def exported(
 
 
 def test_every_format_draws_the_same_picture_again(scene: SmallScene, tmp_path: Path) -> None:
-    assets, report = exported(scene, tmp_path, formats=FORMATS)
+    assets, report = exported(scene, tmp_path, formats=tuple(FORMATS))
     assert [file.format for file in assets.files] == list(FORMATS)
     for file in assets.files:
         figures = report.metrics["formats"][file.format]
         assert (tmp_path / file.path).is_file()
         assert figures["verify_cameras"] == 2  # those held out of ten
-        if file.format in formats.LOSSY:
+        if FORMATS[file.format].loses:
             assert 20 < figures["verify_db"] < 99
             if file.format == "splat":
                 assert figures["bytes_per_splat"] == 32
@@ -72,7 +74,7 @@ def test_equal_inputs_give_equal_files_and_load_gives_the_list(
     for name in ("a", "b"):
         folder = tmp_path / name
         folder.mkdir()
-        assets, _ = exported(scene, folder, formats=FORMATS)
+        assets, _ = exported(scene, folder, formats=tuple(FORMATS))
         contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
         assert export.load(folder) == assets
     assert contents[0] == contents[1]
@@ -93,8 +95,10 @@ def test_a_wrong_file_does_not_pass(
 ) -> None:
     """As if the writer had made a common mistake: the check must see each of them."""
 
-    def wrong(path: Path) -> second_readers.FileContent:
-        content = second_readers._READERS[formats.format_of(path)](path)
+    right = second_readers.read_back
+
+    def wrong(path: Path) -> FileContent:
+        content = right(path)
         splats = content.splats
         if damage == "quaternion order":
             splats = replace(splats, quaternions=np.roll(splats.quaternions, 1, axis=1))
@@ -153,7 +157,7 @@ def test_a_scene_without_splats_is_exported_with_a_warning(
     scene: SmallScene, tmp_path: Path
 ) -> None:
     nothing = scene.splats.take(np.zeros(len(scene.splats), bool))
-    _, report = exported(scene, tmp_path, nothing, formats=FORMATS)
+    _, report = exported(scene, tmp_path, nothing, formats=tuple(FORMATS))
     assert [code for code, _ in report.warnings] == ["export-empty"]
 
 
@@ -208,6 +212,16 @@ def test_a_mesh_alone_of_as_many_triangles_as_asked(
     assets, report = exported(scene, tmp_path, formats=("mesh.glb",), mesh_triangles=500)
     assert [file.path for file in assets.files] == ["scene.mesh.glb"]
     assert 400 < report.metrics["mesh"]["triangles"] <= 500
+
+
+def test_a_wrong_mesh_does_not_pass(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fuse, "VOXELS", 48**3)
+    monkeypatch.setattr(ply, "write", lambda path, mesh, units: path.write_bytes(b"ply\n"))
+    with pytest.raises(SplatError, match=r"scene\.mesh\.ply came out wrong") as caught:
+        exported(scene, tmp_path, formats=("mesh.ply",))
+    assert (caught.value.code, caught.value.family) == ("export-verify-failed", Family.QUALITY)
 
 
 def test_no_splats_give_an_empty_mesh(scene: SmallScene, tmp_path: Path) -> None:

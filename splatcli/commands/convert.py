@@ -21,15 +21,12 @@ _STEPS = 3
 def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     """Read `source`, write `target`, read that again with another parser, draw it and compare.
 
-    Raises SplatError: what keeps a file from being read or written, "convert-mesh", and
-    "convert-verify-failed".
+    Raises SplatError: what keeps a file from being read or written, and "convert-verify-failed".
     """
     from stages import formats
     from stages.formats.rows import kept_rows
 
-    if target.name.lower().endswith((".mesh.glb", ".mesh.ply")):
-        raise _no_mesh(target)
-    names = formats.format_of(source), formats.format_of(target)  # before any work is done
+    rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
     with _progress(quiet, as_json) as say:
         say(f"reading {source}")
@@ -38,9 +35,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
         dropped = formats.write(target, splats)
         say(f"comparing {target}")
         found = _proven(source, target, kept_rows(splats)[0])
-    size = target.stat().st_size
-    if names[1] == "gltf" and len(splats) > dropped:
-        size += target.with_suffix(".bin").stat().st_size
+    size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
         "target": str(target),
@@ -75,20 +70,10 @@ def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     from stages.proof.prover import Prover, cameras_for
 
     cameras = cameras_for(splats, views_around(source))
-    proof = Prover.of(splats, cameras, came_as=format_of(source)).prove(target)
+    proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)
     if proof.fault:
         raise _failed(target, proof.fault)
     return proof.figures
-
-
-def _no_mesh(target: Path) -> SplatError:
-    return SplatError(
-        "convert-mesh",
-        given=f"{target} is the name of a mesh.",
-        wanted="A format of splats: a mesh is made with the cameras of a run.",
-        hint="In the run's folder: splat export --format mesh",
-        family=Family.USAGE,
-    )
 
 
 def _failed(path: Path, reason: str) -> SplatError:
@@ -120,7 +105,7 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    from stages.formats.blocks import watched
+    from stages.base.blocks import watched
 
     columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
     with Progress(*columns, console=console.err, transient=True) as bar:

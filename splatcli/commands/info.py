@@ -96,11 +96,15 @@ def _share(count: int, census: Census) -> str:
 
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:
+    from stages.formats import format_of
     from stages.proof.anatomy import anatomy_of
 
-    facts: dict[str, Any] = {"file": str(path), "size": console.size(path.stat().st_size)}
+    size = format_of(path).size_bytes(path)
+    facts: dict[str, Any] = {"file": str(path), "size": console.size(size)}
     anatomy = anatomy_of(path)
-    if anatomy is not None and count:
+    if anatomy.untold:
+        facts["bytes_per_splat_unknown"] = anatomy.untold
+    elif count:
         name = "bytes_per_splat_unpacked" if anatomy.unpacked else "bytes_per_splat"
         facts[name] = {what: round(n / count, 2) for what, n in anatomy.parts.items()}
     return facts

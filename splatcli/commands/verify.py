@@ -70,12 +70,14 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
 
 def _files(target: Path | None) -> list[Path]:
     """The file itself; of a run folder, what it exported but for meshes, which hold no splats."""
+    from stages.formats import MESHES
+
     if target is not None and not target.is_dir():
         return [target]
     from splatcli.folders import find_run_folder
 
     assets = Pipeline(find_run_folder(target)).load("export")
-    files = [file for file in assets.files if not file.format.startswith("mesh.")]
+    files = [file for file in assets.files if file.format not in MESHES]
     if not files:
         raise SplatError(
             "verify-no-splats",
@@ -95,12 +97,13 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     if against is not None and not against.is_dir():
         seen = sources.views_around(against) or sources.views_around(file)
         splats = kept_rows(formats.read(against))[0]
-        return _Original(splats, seen, str(against), formats.format_of(against))
+        return _Original(splats, seen, str(against), formats.format_of(against).ending)
     if against is not None and not runfolder.is_run_folder(against):
         raise runfolder.missing(against)
     run = Pipeline(against) if against is not None else sources.pipeline_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
-        return _Original(kept_rows(read)[0], (), _ITSELF, formats.format_of(file), itself=True)
+        came_as = formats.format_of(file).ending
+        return _Original(kept_rows(read)[0], (), _ITSELF, came_as, itself=True)
     seen = run.load("sfm").views
     splats = kept_rows(run.load("quantise").splats)[0]
     backend = sources.backend_of(run)
@@ -117,12 +120,11 @@ def _tell(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None
 def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
     from stages.formats import format_of
 
-    size = file.stat().st_size
-    if format_of(file) == "gltf" and file.with_suffix(".bin").is_file():
-        size += file.with_suffix(".bin").stat().st_size
+    row = format_of(file)
+    size = row.size_bytes(file)
     return {
         "file": str(file),
-        "format": format_of(file),
+        "format": row.ending,
         "against": original.name,
         "splats": proof.splats,
         "size_bytes": size,
@@ -182,9 +184,9 @@ def _label(name: str) -> str:
 
 
 def _why(file: Path) -> str:
-    from stages.formats import LOSSY, format_of
+    from stages.formats import format_of
 
-    why = LOSSY.get(format_of(file))
+    why = format_of(file).loses
     return f"The format {why}." if why else "The original had lost more already."
 
 

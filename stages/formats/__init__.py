@@ -1,60 +1,43 @@
-"""One module a file format: read and write, nothing else.
+"""Files of splats: one table of formats, one or two modules each, read and write, nothing else.
 
 `write` takes splats in our own conventions (y down, ln scales, logit opacity) and `read` gives
 them back so; each format's own axes and units of measure stay inside its module.
+
+A new format, in five steps:
+1. A module here with `write(path, splats, *, units)`, which writes by `base.atomic.replacing` what
+   `rows.kept_rows` leaves, a block at a time by `base.blocks.passing`, and says how many it left
+   out.
+2. In the same module, or in one beside it if it grows, `read(path)`: its work inside
+   `base.bad_files.reading`, its result through `rows.checked`.
+3. A second reader, of a library that we did not write or of raw bytes, and an anatomy: in `proof`.
+   What each takes and gives is said at `table.Format`.
+4. A row in `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the fuzzer
+   and the tests of every format know it from then on.
+5. README's table: `pytest tests/formats/test_table.py` prints the line that is missing.
 """
 
 from __future__ import annotations
 
-import importlib
 from contextlib import nullcontext
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.formats.table import FORMATS, MESHES, TABLE, Anatomy, Format, format_of, function
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View
 
-# What a file's name ends in, without the dot -> module.
-FORMATS = {
-    "ply": "ply",
-    "splat": "splat32",
-    "glb": "gltf",
-    "usdz": "usd",
-    "gltf": "gltf",
-    "quantised.glb": "gltf_quantised",
-    "usda": "usd",
-    "usdc": "usd",
-    "compressed.ply": "compressed_ply",
-    "spz": "spz",
-    "sog": "sog",
-    "html": "html",
-}
-# Those that hold less than float32, and what of: smaller, and not the same splats any more.
-LOSSY = {
-    "splat": "has 8-bit colours that do not change with the view",
-    "quantised.glb": "has rotations, sizes and opacities of 16 bits",
-    "compressed.ply": "has positions and sizes of 10 and 11 bits, and 8-bit colours",
-    "spz": "has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
-    "sog": "has 256 sizes and colours, and a palette of view-dependent colours",
-}
-
-
-def format_of(path: Path) -> str:
-    """The format that the end of the name says. Raises SplatError "format-unknown" for another."""
-    name = Path(path).name.lower()
-    endings = [known for known in FORMATS if name.endswith("." + known)]
-    if not endings:
-        raise SplatError(
-            "format-unknown",
-            given=f"{path} has the suffix {Path(path).suffix!r}.",
-            wanted=f"One of {', '.join('.' + known for known in FORMATS)}.",
-            hint="Choose a name with one of these suffixes.",
-            family=Family.USAGE,
-        )
-    return max(endings, key=len)
+__all__ = [
+    "FORMATS",
+    "MESHES",
+    "TABLE",
+    "Anatomy",
+    "Format",
+    "format_of",
+    "function",
+    "read",
+    "write",
+]
 
 
 def write(
@@ -64,27 +47,24 @@ def write(
     how many could not be drawn (values not finite, or too large) and were left out.
 
     units: "metres" or "arbitrary", noted in the formats that can carry it.
-    views: cameras in the frame of `splats.means` to look from, for the format that shows itself.
-    Raises SplatError "format-unknown", or what keeps the file from being written.
+    views: cameras in the frame of `splats.means` to look from, for the formats that show them.
+    Raises SplatError as `format_of`, or what keeps the file from being written.
     """
-    more = {"views": views} if format_of(path) == "html" else {}
-    dropped: int = _module(path).write(Path(path), splats, units=units, **more)
+    row = format_of(path)
+    more: dict[str, Any] = {"views": views} if row.wants_views else {}
+    dropped: int = function(row.writer)(Path(path), splats, units=units, **more)
     return dropped
 
 
 def read(path: Path, *, strict: bool = True) -> Splats:
     """The splats of a file, float32, y down.
 
-    strict: whether a value that is not finite makes the file unreadable. Raises SplatError
-    "format-unknown" or "splats-unreadable".
+    strict: whether a value that is not finite makes the file unreadable. Raises SplatError as
+    `format_of`, or "splats-unreadable".
     """
     from stages.formats.rows import damage_kept
 
-    module = _module(path)
+    reader = function(format_of(path).reader)
     with nullcontext() if strict else damage_kept():
-        splats: Splats = module.read(Path(path))
+        splats: Splats = reader(Path(path))
     return splats
-
-
-def _module(path: Path) -> ModuleType:
-    return importlib.import_module(f"stages.formats.{FORMATS[format_of(path)]}")

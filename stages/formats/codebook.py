@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import blocks, passing
+from stages.base.blocks import blocks, passing
 
 SIZE = 256
 _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6

@@ -21,10 +21,17 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import passing
 from stages.formats import smallest_three
-from stages.formats.blocks import allocated, passing
-from stages.formats.ply_header import Header, binary_rows, read_header
-from stages.formats.rows import checked, kept_rows, linear_opacities, logits_of, unit_quaternions
+from stages.formats.ply_header import Header, binary_rows, header_text, read_header
+from stages.formats.rows import (
+    allocated,
+    checked,
+    kept_rows,
+    linear_opacities,
+    logits_of,
+    unit_quaternions,
+)
 from stages.scene import SH_C0, Splats, morton
 
 CHUNK = 256
@@ -42,8 +49,6 @@ _RANGES = (
     ("{}_r", "{}_g", "{}_b"),
 )
 
-order = morton.order
-
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
@@ -53,26 +58,18 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """
     splats, dropped = kept_rows(splats)
     degree = int(splats.sh_degrees.max(initial=0))
-    splats, rows = splats.with_sh_degree(degree), order(splats)
+    splats, rows = splats.with_sh_degree(degree), morton.order(splats)
     packed = [_pack(splats.take(rows[part])) for part in passing(len(splats), _BLOCK)]
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header_text(splats, degree, units).encode("ascii"))
+        file.write(_header_text(splats, degree, units))
         for part in range(3):  # all chunks, then all words, then all SH
             for block in packed:
                 file.write(block[part].data)
     return dropped
 
 
-def _header_text(splats: Splats, degree: int, units: str) -> str:
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment up axis: -y (right-handed; x right, y down, z forward)",
-        f"comment units: {units}",
-    ]
-    if splats.origin.any():
-        lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in splats.origin))
-    lines.append(f"element chunk {-(-len(splats) // CHUNK)}")
+def _header_text(splats: Splats, degree: int, units: str) -> bytes:
+    lines = [f"element chunk {-(-len(splats) // CHUNK)}"]
     for names in _RANGES:
         lines += [f"property float {name.format(end)}" for end in ("min", "max") for name in names]
     lines.append(f"element vertex {len(splats)}")
@@ -81,7 +78,7 @@ def _header_text(splats: Splats, degree: int, units: str) -> str:
         lines.append(f"element sh {len(splats)}")
         rest = 3 * ((degree + 1) ** 2 - 1)
         lines += [f"property uchar f_rest_{i}" for i in range(rest)]
-    return "\n".join([*lines, "end_header", ""])
+    return header_text(units, splats.origin, lines)
 
 
 def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

@@ -12,19 +12,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import blocks
+from stages.base.blocks import blocks
 from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
-from stages.formats.gltf_read import read
 from stages.formats.rows import (
     kept_rows,
     linear_opacities,
     linear_scales,
     unit_quaternions,
 )
-from stages.formats.turn import SH_SIGNS, turned
 from stages.scene import Splats, dc_to_rgb
-
-__all__ = ["fallback_colours", "read", "sh_attributes", "write"]
+from stages.scene.turn import SH_SIGNS, turned
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:

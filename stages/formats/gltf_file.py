@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.base.blocks import passing
 from stages.base.errors import Family, SplatError
-from stages.formats.blocks import passing
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121}
@@ -108,12 +108,8 @@ def _document(
             arrays.append(array)
             offset += array.nbytes
         described.append(_primitive(names))
-    version = importlib.metadata.version("splat")
-    extras: dict[str, Any] = {"units": units}
-    if origin.any():
-        extras["splat_origin"] = [float(v) for v in origin]
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"splat {version}", "extras": extras},
+        "asset": asset(units, origin),
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0] if described else []}],
@@ -132,6 +128,16 @@ def _document(
         "buffers": [{}],
     }
     return document, arrays
+
+
+def asset(units: str, origin: NDArray[np.float64], made: str = "", **more: Any) -> dict[str, Any]:
+    """The `asset` of a document of ours. origin [3]: in the file's axes. made: what the generator
+    made, in brackets after its name. more: for the extras."""
+    generator = f"splat {importlib.metadata.version('splat')}{made and f' ({made})'}"
+    extras: dict[str, Any] = {"units": units, **more}
+    if origin.any():
+        extras["splat_origin"] = [float(v) for v in origin]
+    return {"version": "2.0", "generator": generator, "extras": extras}
 
 
 def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:

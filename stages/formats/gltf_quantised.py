@@ -18,20 +18,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import blocks
+from stages.base.blocks import blocks
 from stages.formats.gltf import fallback_colours, sh_attributes
 from stages.formats.gltf_file import EXTENSION, Attribute, write_file
-from stages.formats.gltf_read import read
 from stages.formats.rows import (
     kept_rows,
     linear_opacities,
     linear_scales,
     unit_quaternions,
 )
-from stages.formats.turn import turned
 from stages.scene import Splats
-
-__all__ = ["order", "read", "write"]
+from stages.scene.turn import turned
 
 _U16 = 65535
 # A step of the scales may be this part of a middling splat's size. Where a few huge splats would

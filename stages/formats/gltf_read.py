@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.formats.far import recentred
 from stages.formats.rows import checked, joined, logits_of, logs_of
-from stages.formats.turn import turned
 from stages.scene import Splats
+from stages.scene.far import recentred
+from stages.scene.turn import turned
 
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {5120: "i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}

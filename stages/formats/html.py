@@ -16,8 +16,8 @@ from pathlib import Path
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import tell
 from stages.formats import ply
-from stages.formats.blocks import tell
 from stages.formats.rows import kept_rows
 from stages.page import document
 from stages.page.shots import shots_of
@@ -75,12 +75,12 @@ def read(path: Path) -> Splats:
     with reading(path), tempfile.TemporaryDirectory(prefix="splat-") as folder:
         inside = Path(folder) / "inside.ply"
         with inside.open("wb") as file:
-            for block in _unzipped(path):
+            for block in unzipped(path):
                 file.write(block)
         return ply.parse(inside)
 
 
-def _unzipped(path: Path) -> Iterator[bytes]:
+def unzipped(path: Path) -> Iterator[bytes]:
     """The .ply inside, a part at a time; each script element is a line of its own."""
     start, end = (re.escape(t.encode("ascii")) for t in (document.CHUNK_START, document.CHUNK_END))
     wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)

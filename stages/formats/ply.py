@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import forget, passing
 from stages.formats import compressed_ply
-from stages.formats.blocks import allocated, forget, passing
-from stages.formats.far import recentred
-from stages.formats.ply_header import Header, binary_rows, read_header
-from stages.formats.rows import checked, kept_rows
+from stages.formats.ply_header import Header, binary_rows, header_text, read_header
+from stages.formats.rows import allocated, checked, kept_rows
 from stages.scene import Splats
+from stages.scene.far import recentred
 
 _ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3: the columns of a block are gathered from the cache
 _Tables = Iterator[tuple[slice, NDArray[Any]]]
@@ -59,23 +59,14 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 
 def blocks(splats: Splats, units: str) -> Iterator[bytes]:
     """The bytes of the file, a part at a time; every splat must be drawable."""
-    yield _header_text(splats, units).encode("ascii")
+    yield _header_text(splats, units)
     for rows in passing(len(splats), _ROWS_AT_ONCE):
         yield _table(splats, rows).tobytes()
 
 
-def _header_text(splats: Splats, units: str) -> str:
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment up axis: -y (right-handed; x right, y down, z forward)",
-        f"comment units: {units}",
-    ]
-    if splats.origin.any():
-        lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in splats.origin))
-    lines.append(f"element vertex {len(splats)}")
-    lines += [f"property float {name}" for name in property_names(splats.sh_degree)]
-    return "\n".join([*lines, "end_header", ""])
+def _header_text(splats: Splats, units: str) -> bytes:
+    properties = [f"property float {name}" for name in property_names(splats.sh_degree)]
+    return header_text(units, splats.origin, [f"element vertex {len(splats)}", *properties])
 
 
 def _table(splats: Splats, rows: slice) -> NDArray[np.float32]:

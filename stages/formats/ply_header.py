@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -23,6 +24,18 @@ TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+
+
+def header_text(
+    units: str, origin: NDArray[np.float64], elements: Sequence[str], note: str = ""
+) -> bytes:
+    """The header of a binary file of ours. elements: its lines of elements and properties."""
+    lines = ["ply", "format binary_little_endian 1.0", *([f"comment {note}"] if note else [])]
+    lines.append("comment up axis: -y (right-handed; x right, y down, z forward)")
+    lines.append(f"comment units: {units}")
+    if origin.any():
+        lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in origin))
+    return "\n".join([*lines, *elements, "end_header", ""]).encode("ascii")
 
 
 @dataclass(frozen=True)

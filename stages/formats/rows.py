@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
-from stages.formats.blocks import blocks
+from stages.base.blocks import blocks
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
 
@@ -119,6 +119,18 @@ def logs_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.flo
         with np.errstate(divide="ignore", invalid="ignore"):
             logs[rows] = np.maximum(np.log(exact), LOG_SCALE_MIN)
     return logs
+
+
+def allocated(count: int, degree: int) -> Splats:
+    """`count` splats for a reader to fill, float32; what they hold is not defined."""
+    return Splats(
+        means=np.empty((count, 3), np.float32),
+        quaternions=np.empty((count, 4), np.float32),
+        log_scales=np.empty((count, 3), np.float32),
+        opacity_logits=np.empty(count, np.float32),
+        sh=np.empty((count, (degree + 1) ** 2, 3), np.float32),
+        sh_degrees=np.zeros(count, np.uint8),
+    )
 
 
 def degrees_in_use(sh: NDArray[np.floating]) -> NDArray[np.uint8]:

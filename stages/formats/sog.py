@@ -20,20 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.base.blocks import passing
 from stages.formats import codebook, smallest_three
-from stages.formats.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
-from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE, read
+from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
 from stages.scene import Splats, morton
-
-__all__ = ["order", "read", "write"]
 
 # Beyond them scales look the same, and the codebook's entries are better spent between.
 _LOG_SCALE_LIMIT = 20.0
 _PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
 _DC_LIMIT = 1e4
-
-order = morton.order
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
@@ -44,7 +40,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """
     splats, dropped = kept_rows(splats)
     degree = int(splats.sh_degrees.max(initial=0))
-    splats, places = splats.with_sh_degree(degree), order(splats)
+    splats, places = splats.with_sh_degree(degree), morton.order(splats)
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": False}
     meta["asset"] = {"generator": "splat", "units": units}
     if splats.origin.any():

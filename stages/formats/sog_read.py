@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import passing
 from stages.formats import smallest_three
-from stages.formats.blocks import allocated, passing
-from stages.formats.rows import checked, logits_of
+from stages.formats.rows import allocated, checked, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16

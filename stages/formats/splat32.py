@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.formats.blocks import allocated, passing
+from stages.base.blocks import passing
 from stages.formats.rows import (
+    LOG_SCALE_MIN,
+    allocated,
     checked,
     kept_rows,
     linear_opacities,
@@ -32,10 +34,16 @@ RECORD = np.dtype(
 
 
 def order(splats: Splats) -> NDArray[np.intp]:
-    """[N] rows from the largest volume x opacity to the least; equals keep their order."""
+    """[N] rows from the largest volume x opacity to the least, as the file holds both: whoever
+    looks at it finds no row out of its place. Equals keep their order."""
+    logs = np.maximum(splats.log_scales, LOG_SCALE_MIN).sum(axis=1, dtype=np.float64)
     with np.errstate(divide="ignore"):
-        size = splats.log_scales.sum(axis=1, dtype=np.float64) + np.log(linear_opacities(splats))
+        size = logs + np.log(_alphas(splats), dtype=np.float64)
     return np.argsort(-size, kind="stable")
+
+
+def _alphas(splats: Splats) -> NDArray[np.uint8]:
+    return np.rint(255 * linear_opacities(splats)).astype(np.uint8)
 
 
 def encode(splats: Splats) -> NDArray[np.void]:
@@ -45,7 +53,7 @@ def encode(splats: Splats) -> NDArray[np.void]:
     records["scale"] = linear_scales(splats)
     rgb = dc_to_rgb(splats.sh[:, 0].astype(np.float64))
     records["rgba"][:, :3] = np.rint(255 * np.clip(rgb, 0, 1))
-    records["rgba"][:, 3] = np.rint(255 * linear_opacities(splats))
+    records["rgba"][:, 3] = _alphas(splats)
     records["quaternion"] = _encode_quaternions(unit_quaternions(splats.quaternions))
     return records
 

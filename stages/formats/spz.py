@@ -21,14 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.base.blocks import passing
 from stages.formats import smallest_three
-from stages.formats.blocks import block_of, passing
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
-from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE, read
-from stages.formats.turn import FLIP, turned
+from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
 from stages.scene import Splats
-
-__all__ = ["read", "write"]
+from stages.scene.turn import FLIP, turned
 
 _LEVEL = 6  # 9 takes eight times as long for 1 % less
 _LEAST_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
@@ -50,7 +48,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     header = HEADER.pack(MAGIC, 3, len(splats), degree, bits, 0, 0)
     arrays: tuple[Callable[[Splats], NDArray[Any]], ...] = (
         lambda block: _positions(block, bits),
-        lambda block: _byte(255 * linear_opacities(block)),
+        _opacities,
         lambda block: _byte(255 * (COLOUR_SCALE * block.sh[:, 0].astype(np.float64) + 0.5)),
         lambda block: _byte(16 * (_within_reach(block).log_scales + 10)),
         lambda block: _pack_rotations(turned(block.with_sh_degree(0)).quaternions),
@@ -65,7 +63,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         packed.write(header)
         for array in arrays:
             for rows in passing(len(splats)):
-                packed.write(np.ascontiguousarray(array(block_of(splats, rows))).data)
+                packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
     return dropped
 
 
@@ -105,6 +103,12 @@ def _rest(splats: Splats) -> NDArray[np.uint8]:
     levels = np.rint(128 * sh.astype(np.float64)) + 128
     levels = np.floor((levels / steps[:, None]) + 0.5) * steps[:, None]
     return _byte(levels)
+
+
+def _opacities(splats: Splats) -> NDArray[np.uint8]:
+    """[N] of 1 to 254: there are readers that take the logit of 0 and of 255, which is infinite,
+    and neither can be seen to differ from its neighbour."""
+    return np.clip(_byte(255 * linear_opacities(splats)), 1, 254)
 
 
 def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
+from stages.base.blocks import passing
 from stages.formats import smallest_three
-from stages.formats.blocks import allocated, passing
 from stages.formats.inflate import Inflated, check_size, unpacked
-from stages.formats.rows import checked, logits_of, unit_quaternions
-from stages.formats.turn import turned
+from stages.formats.rows import allocated, checked, logits_of, unit_quaternions
 from stages.scene import Splats
+from stages.scene.turn import turned
 
 HEADER = struct.Struct("<4sIIBBBB")
 MAGIC = b"NGSP"

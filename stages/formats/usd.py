@@ -1,4 +1,4 @@
-"""USD: .usda, .usdc and .usdz with the schema ParticleField3DGaussianSplat (usd-core >= 25.11).
+"""USD: .usda, .usdc and .usdz with the schema ParticleField3DGaussianSplat (usd-core >= 26.3).
 
 Linear scales and opacities, raw SH with all bands of one splat together, y up: the splats are
 turned upright. What a file leaves out silently becomes identity, unit scale, opaque or grey in
@@ -18,13 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.formats.blocks import block_of, passing
+from stages.base.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
-from stages.formats.turn import turned
-from stages.formats.usd_read import read
 from stages.scene import Splats
-
-__all__ = ["read", "write"]
+from stages.scene.turn import turned
 
 _ROOT, _PRIM = "/Scene", "/Scene/Splats"
 
@@ -89,7 +86,7 @@ def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any
     is given a block at a time."""
     array, end = kind(0), 0
     for rows in passing(len(splats)):
-        values = np.ascontiguousarray(values_of(turned(block_of(splats, rows))), np.float32)
+        values = np.ascontiguousarray(values_of(turned(splats.take(rows))), np.float32)
         if not end:
             array = kind(len(values) // (rows.stop - rows.start) * len(splats))
         array[end : end + len(values)] = kind.FromNumpy(values)
@@ -101,7 +98,7 @@ def _extent(splats: Splats) -> NDArray[np.float32]:
     """[2, 3] the box of all ellipsoids of 3 standard deviations, upright."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for rows in passing(len(splats)):
-        block = turned(block_of(splats, rows))
+        block = turned(splats.take(rows))
         reach = _reach(unit_quaternions(block.quaternions), linear_scales(block))
         low = np.minimum(low, (block.means - reach).min(axis=0))
         high = np.maximum(high, (block.means + reach).max(axis=0))

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.formats.far import recentred
 from stages.formats.rows import checked, damage_kept, joined, keeps_damage, logits_of, logs_of
-from stages.formats.turn import turned
 from stages.scene import Splats, load_splats, save_splats
+from stages.scene.far import recentred
+from stages.scene.turn import turned
 
 _TYPE = "ParticleField3DGaussianSplat"
 _REFUSED = 3  # exit status of the child when it found what is wrong

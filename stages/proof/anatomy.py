@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import zipfile
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from stages.base.bad_files import reading
-from stages.formats import format_of, spz_read
+from stages.formats import Anatomy, format_of, function, spz_read
+from stages.formats.html import unzipped
 from stages.formats.inflate import Inflated
-from stages.formats.ply_header import read_header
+from stages.formats.ply_header import Header, read_header
 from stages.formats.splat32 import RECORD
 
 _PLY = {
@@ -26,7 +27,12 @@ _PLY = {
     "packed_color": "colours, opacities",
 }
 _PLY_STARTS = {"f_dc_": "colours", "f_rest_": "SH", "scale_": "scales", "rot_": "rotations"}
-_SPLAT = {"mean": "positions", "scale": "scales", "rgba": "colours, opacities"}
+_SPLAT = {
+    "mean": "positions",
+    "scale": "scales",
+    "rgba": "colours, opacities",
+    "quaternion": "rotations",
+}
 _GLTF = {"POSITION": "positions", "COLOR_0": "fallback colours"}
 _GLTF_ENDS = {"ROTATION": "rotations", "SCALE": "scales", "OPACITY": "opacities"}
 _GLTF_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5126: 4}
@@ -35,50 +41,36 @@ _SPZ = ("positions", "opacities", "colours", "scales", "rotations", "SH")
 _SOG = {"means": "positions", "quats": "rotations", "sh0": "colours, opacities", "shN": "SH"}
 
 
-@dataclass(frozen=True)
-class Anatomy:
-    """parts: bytes by attribute, "other" for the rest of the file. unpacked: whether the parts are
-    counted before the compression that packs them all together."""
-
-    parts: dict[str, int]
-    unpacked: bool = False
-
-
-def anatomy_of(path: Path) -> Anatomy | None:
-    """Where the bytes of a file of splats are; None for formats whose parts cannot be told from
-    outside (USD, .html). Raises SplatError "splats-unreadable"."""
+def anatomy_of(path: Path) -> Anatomy:
+    """Where the bytes of a file of splats are, "other" for what belongs to no attribute. Raises
+    SplatError as `format_of`, or "splats-unreadable"."""
     path = Path(path)
-    name = format_of(path)
+    row = format_of(path)
     with reading(path):
-        if name in ("ply", "compressed.ply"):
-            parts = _ply(path)
-        elif name == "splat":
-            count = path.stat().st_size // RECORD.itemsize
-            fields: Any = RECORD.fields or {}
-            parts = {_SPLAT.get(k, "rotations"): count * v[0].itemsize for k, v in fields.items()}
-        elif name in ("glb", "gltf"):
-            parts = _gltf(path)
-        elif name == "spz":
-            parts, unpacked = _spz(path)
-            if unpacked:
-                return Anatomy(parts, True)
-        elif name == "sog":
-            parts = _sog(path)
-        else:
-            return None
-        other = _size(path, name) - sum(parts.values())
-        return Anatomy({**parts, "other": other} if other > 0 else parts)
+        found: Anatomy = function(row.anatomy)(path)
+    other = row.size_bytes(path) - sum(found.parts.values())
+    if found.untold or found.unpacked or other <= 0:
+        return found
+    return Anatomy({**found.parts, "other": other})
 
 
-def _size(path: Path, name: str) -> int:
-    size = path.stat().st_size
-    binary = path.with_suffix(".bin")
-    return size + binary.stat().st_size if name == "gltf" and binary.is_file() else size
-
-
-def _ply(path: Path) -> dict[str, int]:
+def ply(path: Path) -> Anatomy:
     with path.open("rb") as file:
-        header = read_header(file)
+        return Anatomy(_columns(read_header(file)))
+
+
+def html(path: Path) -> Anatomy:
+    """Of the .ply that is packed inside."""
+    start = next(unzipped(path))  # some megabytes: longer than any header
+    return Anatomy(_columns(read_header(io.BytesIO(start))), unpacked=True)
+
+
+def usd(path: Path) -> Anatomy:
+    untold = "USD packs values as it likes, and tells nobody how many bytes each attribute took"
+    return Anatomy({}, untold=untold)
+
+
+def _columns(header: Header) -> dict[str, int]:
     parts: Counter[str] = Counter()
     for element in header.elements if header.encoding != "ascii" else ():
         for name, kind in element.properties:
@@ -89,7 +81,13 @@ def _ply(path: Path) -> dict[str, int]:
     return dict(parts)
 
 
-def _gltf(path: Path) -> dict[str, int]:
+def splat(path: Path) -> Anatomy:
+    count = path.stat().st_size // RECORD.itemsize
+    fields: Any = RECORD.fields or {}
+    return Anatomy({_SPLAT[name]: count * kind[0].itemsize for name, kind in fields.items()})
+
+
+def gltf(path: Path) -> Anatomy:
     with path.open("rb") as file:
         text = file.read(20)
         if text[:4] == b"glTF":
@@ -107,26 +105,26 @@ def _gltf(path: Path) -> dict[str, int]:
                 what = _GLTF.get(name) or _GLTF_ENDS.get(end) or "SH"
                 what = "colours" if end == "SH_DEGREE_0_COEF_0" else what
                 parts[what] += element * accessor["count"]
-    return dict(parts)
+    return Anatomy(dict(parts))
 
 
-def _spz(path: Path) -> tuple[dict[str, int], bool]:
-    """(the parts, whether they are counted unpacked)."""
+def spz(path: Path) -> Anatomy:
     sizes = spz_read.packed_sizes(path)
     if sizes:
-        return dict(zip(_SPZ, sizes, strict=False)), False
+        return Anatomy(dict(zip(_SPZ, sizes, strict=False)))
     with path.open("rb") as file:
         head = Inflated(file, path.stat().st_size).read(spz_read.HEADER.size)
     _, version, count, degree, bits, _, _ = spz_read.HEADER.unpack(head)
     widths = spz_read.widths(version, degree, bits)
-    return {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}, True
+    parts = {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}
+    return Anatomy(parts, unpacked=True)
 
 
-def _sog(path: Path) -> dict[str, int]:
+def sog(path: Path) -> Anatomy:
     parts: Counter[str] = Counter()
     with zipfile.ZipFile(path) as package:
         for member in package.infolist():
             stem = member.filename.rpartition("/")[2].partition(".")[0].partition("_")[0]
             parts[_SOG.get(stem, stem)] += member.compress_size
     parts.pop("meta", None)
-    return dict(parts)
+    return Anatomy(dict(parts))

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import FORMATS
-from stages.formats.turn import FLIP, turned
+from stages.formats import FORMATS, Format, function
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.proof.second_readers import FileContent
 from stages.scene import SH_C0, Splats
+from stages.scene.turn import FLIP, turned
 
 _BLOCK = 1 << 16  # rows compared at a time: copies stay small however large the file is
 
@@ -55,15 +54,17 @@ class Differences:
 def differences(splats: Splats, content: FileContent, *names: str) -> Differences:
     """Compare a file with the `splats` that it should hold: as many, finite, in any order.
 
-    names: of the formats through which either went; some sort the rows, .splat keeps degree 0.
+    names: of the formats through which either went; some sort the rows or keep fewer bands.
     """
+    formats = [FORMATS[name] for name in names]
     file = content.splats
     upright = content.world_from_file[1, 1] < 0
     placed = splats
     if upright:
         placed = replace(splats, means=splats.means * FLIP.astype(splats.means.dtype))
-    rows = matched_rows(placed, file, _orders(placed, file, names))
-    degree = 0 if "splat" in names else max(splats.sh_degree, file.sh_degree)
+    rows = matched_rows(placed, file, _orders(placed, file, formats))
+    kept = [row.sh_degree for row in formats]
+    degree = min([max(splats.sh_degree, file.sh_degree), *kept])
     errors: dict[str, NDArray[np.floating]] = {}
     sums = np.zeros(3)
     for start in range(0, len(file), _BLOCK):
@@ -79,11 +80,11 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
     return _summary(errors, sums, extent_of(splats), rows)
 
 
-def _orders(truth: Splats, file: Splats, names: tuple[str, ...]) -> Iterator[Rows]:
+def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows]:
     """How a format may have sorted either side; made one by one, as the first often fits."""
-    for name in names:
-        order = getattr(importlib.import_module(f"stages.formats.{FORMATS[name]}"), "order", None)
-        if order is not None:
+    for row in formats:
+        if row.order:
+            order = function(row.order)
             yield order(truth)
             yield np.argsort(order(file))
 

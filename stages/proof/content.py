@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import blocks
+from stages.base.blocks import blocks
 from stages.scene import Splats
 
-Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
+# From a file's axes to ours; spelled out here: a wrong turn must not check itself.
+Y_DOWN, Y_UP = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)

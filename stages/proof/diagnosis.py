@@ -11,11 +11,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from stages.formats.turn import FLIP, turned
 from stages.proof.compare import Differences, rotations_apart
 from stages.proof.content import FileContent
 from stages.proof.matching import extent_of
 from stages.scene import Splats
+from stages.scene.turn import FLIP, turned
 
 _WORDS = {
     "position": "positions",

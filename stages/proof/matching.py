@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.blocks import blocks, passing
+from stages.base.blocks import blocks, passing
 from stages.scene import Splats, dc_to_rgb
 
 Rows = NDArray[np.intp]

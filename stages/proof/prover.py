@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import LOSSY, format_of
+from stages.formats import FORMATS, format_of, function
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
 from stages.measure.judge import CAP_DB, decibels
-from stages.proof import diagnosis, second_readers, usd_validators
+from stages.proof import diagnosis, second_readers
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.raster.backends import AUTO
@@ -94,24 +94,25 @@ class Prover:
         exact: whether even a format that keeps less than float32 has to give the same, because the
         original was read from the file itself.
         """
-        name = format_of(path)
+        row = format_of(path)
         try:
             content = _drawable(second_readers.read_back(path))
-            said = usd_validators.complaints(path) if name.startswith("usd") else []
+            said = function(row.validator)(path) if row.validator else []
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)
         if said:
-            return Proof(count, {}, f"the USD library's validators say: {said[0]}")
+            return Proof(count, {}, f"its validator says: {said[0]}")
         if count != len(self.splats):
             return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
-        lossy = not exact and (name in LOSSY or self.came_as in LOSSY)
-        return self._compared(content, name, lossy)
+        names = tuple(filter(None, (row.ending, self.came_as)))
+        lossy = not exact and any(FORMATS[name].loses for name in names)
+        return self._compared(content, names, lossy)
 
-    def _compared(self, content: FileContent, name: str, lossy: bool) -> Proof:
+    def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:
         by_camera = self._decibels(content)
         worst = min(by_camera, default=CAP_DB)
-        found = differences(self.splats, content, *filter(None, (name, self.came_as)))
+        found = differences(self.splats, content, *names)
         figures = {
             "verify_db": round(worst, 2),
             "verify_mean_db": round(float(np.mean(by_camera)), 2) if by_camera else worst,

@@ -9,15 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.proof.content import (
-    Y_UP,
-    FileContent,
-    logits,
-    splats_by_rows,
-)
+from stages.proof.content import logits, splats_by_rows
+from stages.scene import Splats
 
 
-def compressed_ply(path: Path) -> FileContent:
+def compressed_ply(path: Path) -> Splats:
     from plyfile import PlyData
 
     data = PlyData.read(str(path), mmap="c")
@@ -54,10 +50,10 @@ def compressed_ply(path: Path) -> FileContent:
             "sh": sh,
         }
 
-    return FileContent(splats_by_rows(data["vertex"].count, values_of), np.eye(4))
+    return splats_by_rows(data["vertex"].count, values_of)
 
 
-def spz(path: Path) -> FileContent:
+def spz(path: Path) -> Splats:
     import gzip
     import struct
 
@@ -90,7 +86,7 @@ def spz(path: Path) -> FileContent:
             "sh": sh,
         }
 
-    return FileContent(splats_by_rows(n, values_of), Y_UP)
+    return splats_by_rows(n, values_of)
 
 
 def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -107,7 +103,7 @@ def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
     return _with_largest(words >> 30, np.stack(others, axis=1))
 
 
-def sog(path: Path) -> FileContent:
+def sog(path: Path) -> Splats:
     import json
     import zipfile
 
@@ -148,7 +144,7 @@ def sog(path: Path) -> FileContent:
             "sh": sh,
         }
 
-    return FileContent(splats_by_rows(meta["count"], values_of), np.eye(4))
+    return splats_by_rows(meta["count"], values_of)
 
 
 def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:

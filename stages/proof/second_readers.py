@@ -2,9 +2,9 @@
 
 None of them shares code with its writer: plyfile, pygltflib with raw accessors, usd-core's
 attributes, a byte-wise reading of .splat, and for .html the standard library's HTML parser. They
-leave the splats in the file's own axes and say how those lie in our world, so that a check can
-move the camera instead of the splats: then a wrong turn of positions, rotations or SH shows in the
-picture.
+leave the splats in the file's own axes, and the table of formats says how those lie in our world,
+so that a check can move the camera instead of the splats: then a wrong turn of positions,
+rotations or SH shows in the picture.
 """
 
 from __future__ import annotations
@@ -20,15 +20,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import format_of
-from stages.formats.blocks import forget, passing
-from stages.proof import second_packed
-from stages.proof.content import (
-    Y_UP,
-    FileContent,
-    logits,
-    splats_of,
-)
+from stages.base.blocks import forget, passing
+from stages.formats import format_of, function
+from stages.proof.content import Y_DOWN, Y_UP, FileContent, logits, splats_of
 from stages.scene import Splats
 
 __all__ = ["FileContent", "read_back"]
@@ -41,10 +35,11 @@ def read_back(path: Path) -> FileContent:
     """What another program would find in the file. Raises whatever its parser raises: a file that
     was just written has no excuse."""
     with np.errstate(all="ignore"):  # flat splats have a logarithm of -infinity
-        return _READERS[format_of(path)](path)
+        row = format_of(path)
+        return FileContent(function(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
 
 
-def _ply(path: Path) -> FileContent:
+def ply(path: Path) -> Splats:
     from plyfile import PlyData
 
     vertex = PlyData.read(str(path), mmap="c")["vertex"]
@@ -70,7 +65,7 @@ def _ply(path: Path) -> FileContent:
             arrays["quaternions"][part, i] = rows[f"rot_{i}"]
         arrays["opacity_logits"][part] = rows["opacity"]
         forget(vertex.data)
-    return FileContent(splats_of(**arrays), np.eye(4))
+    return splats_of(**arrays)
 
 
 class _Chunks(HTMLParser):
@@ -97,7 +92,7 @@ class _Chunks(HTMLParser):
         self.wanted = False
 
 
-def _html(path: Path) -> FileContent:
+def html(path: Path) -> Splats:
     with tempfile.TemporaryDirectory(prefix="splat-") as folder:
         inside = Path(folder) / "inside.ply"
         with path.open(encoding="utf-8") as page, inside.open("wb") as target:
@@ -106,21 +101,20 @@ def _html(path: Path) -> FileContent:
                 parser.feed(piece)
             parser.close()
         assert parser.unpacker.eof, "the splats in it are cut short"
-        return _ply(inside)
+        return ply(inside)
 
 
-def _splat(path: Path) -> FileContent:
+def splat(path: Path) -> Splats:
     records = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 32)
     floats = np.ascontiguousarray(records[:, :24]).view("<f4")
     colours = records[:, 24:28].astype(np.float32) / 255
-    splats = splats_of(
+    return splats_of(
         means=floats[:, :3],
         quaternions=(records[:, 28:].astype(np.float32) - 128) / 128,
         log_scales=np.log(floats[:, 3:], dtype=np.float64),
         opacity_logits=logits(colours[:, 3]),
         sh=((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
     )
-    return FileContent(splats, np.eye(4))
 
 
 class _Bytes:
@@ -153,7 +147,7 @@ def _gltf_parts(path: Path) -> tuple[Any, _Bytes]:
     return document, _Bytes(path, 20 + int(head[3]) + 8)
 
 
-def _gltf(path: Path) -> FileContent:
+def gltf(path: Path) -> Splats:
     document, blob = _gltf_parts(path)
     scale = 1.0
     if document.nodes:
@@ -186,7 +180,7 @@ def _gltf(path: Path) -> FileContent:
                 sh=sh,
             )
         )
-    return FileContent(_concatenated(parts), Y_UP)
+    return _concatenated(parts)
 
 
 def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
@@ -206,7 +200,7 @@ def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.float
     return np.clip(values.astype(np.float64) / largest, -1, 1)
 
 
-def _usd(path: Path) -> FileContent:
+def usd(path: Path) -> Splats:
     from pxr import Gf, Sdf, Usd, Vt
 
     # In which column each of w, x, y, z arrives, found out and not assumed.
@@ -229,7 +223,7 @@ def _usd(path: Path) -> FileContent:
                 sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
             )
         )
-    return FileContent(_concatenated(parts), Y_UP)
+    return _concatenated(parts)
 
 
 def _concatenated(parts: list[Splats]) -> Splats:
@@ -241,19 +235,3 @@ def _concatenated(parts: list[Splats]) -> Splats:
         return splats_of(**empty, opacity_logits=np.zeros(0), sh=np.zeros((0, 1, 3)))
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
     return splats_of(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
-
-
-_READERS = {
-    "ply": _ply,
-    "splat": _splat,
-    "glb": _gltf,
-    "gltf": _gltf,
-    "quantised.glb": _gltf,
-    "usda": _usd,
-    "usdc": _usd,
-    "usdz": _usd,
-    "compressed.ply": second_packed.compressed_ply,
-    "spz": second_packed.spz,
-    "sog": second_packed.sog,
-    "html": _html,
-}

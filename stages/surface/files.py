@@ -1,62 +1,31 @@
-"""Meshes on disk: written, and read back by parsers that did not write them."""
+"""Mesh files, compared with the mesh that they were made of by parsers that did not write them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, SplatError
-from stages.surface import gltf, ply
+from stages.formats import Format, function
 from stages.surface.mesh import Mesh
 
 _Y_UP = np.array([1.0, -1.0, -1.0])  # spelled out here: a wrong turn must not check itself
-_WRITERS: dict[str, Callable[[Path, Mesh, str], None]] = {
-    "mesh.glb": gltf.write,
-    "mesh.ply": ply.write,
-}
 
 
-def write_meshes(
-    folder: Path, stem: str, formats: Iterable[str], mesh: Mesh, units: str
-) -> list[tuple[str, Path, int]]:
-    """`mesh` as `stem`.mesh.glb, `stem`.mesh.ply in `folder`, each read back and compared;
-    (format, path, bytes) of each.
-
-    Raises SplatError "export-verify-failed" (family QUALITY), or what keeps a file from being
-    written.
-    """
-    written = []
-    for name in formats:
-        path = folder / f"{stem}.{name}"
-        _WRITERS[name](path, mesh, units)
-        _check(path, name, mesh)
-        written.append((name, path, path.stat().st_size))
-    return written
-
-
-def _check(path: Path, name: str, mesh: Mesh) -> None:
+def fault_of(path: Path, row: Format, mesh: Mesh) -> str:
+    """What is wrong with a file that should hold `mesh`, as `row`'s second reader finds it; "" if
+    nothing is."""
     try:
-        vertices, faces = read_glb(path) if name == "mesh.glb" else read_ply(path)
+        vertices, faces = function(row.second_reader)(path)
     except Exception as error:  # whatever another parser raises: the file is wrong
-        raise _failed(path, f"another reader refused it ({error})") from error
+        return f"another reader refused it ({error})"
     if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):
-        raise _failed(path, f"it holds {len(vertices)} vertices and {len(faces)} triangles")
+        return f"it holds {len(vertices)} vertices and {len(faces)} triangles"
     if not np.array_equal(vertices, mesh.vertices) or not np.array_equal(faces, mesh.faces):
-        raise _failed(path, "its vertices or triangles are not those that were written")
-
-
-def _failed(path: Path, reason: str) -> SplatError:
-    return SplatError(
-        "export-verify-failed",
-        given=f"{path.name} came out wrong: {reason}.",
-        wanted="A file that another program reads as the same mesh.",
-        hint="Leave this format out with --format, and report this with the run's manifest.",
-        family=Family.QUALITY,
-    )
+        return "its vertices or triangles are not those that were written"
+    return ""
 
 
 def read_ply(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:

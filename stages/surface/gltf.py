@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats.gltf import linear_light
-from stages.formats.gltf_file import Attribute, accessor, write_glb
-from stages.formats.turn import FLIP
+from stages.formats.gltf_file import Attribute, accessor, asset, write_glb
+from stages.scene.turn import FLIP
 from stages.surface.mesh import NOTE, Mesh
 
 _UNSIGNED_INT = 5125
@@ -23,16 +22,8 @@ def write(path: Path, mesh: Mesh, units: str) -> None:
     """Positions stay relative to `mesh.origin`, which float32 could not hold; asset.extras says
     it in the file's axes. glTF's unit is the metre: where `units` is "arbitrary", asset.extras
     says so. Raises SplatError when the file cannot be written."""
-    version = importlib.metadata.version("splat")
-    extras: dict[str, Any] = {"units": units, "note": NOTE}
-    if mesh.origin.any():
-        extras["splat_origin"] = [float(v) for v in mesh.origin * FLIP + 0.0]
     document: dict[str, Any] = {
-        "asset": {
-            "version": "2.0",
-            "generator": f"splat {version} (collision proxy)",
-            "extras": extras,
-        },
+        "asset": asset(units, mesh.origin * FLIP + 0.0, "collision proxy", note=NOTE),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
     }

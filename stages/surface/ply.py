@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.base.atomic import replacing
+from stages.formats.ply_header import header_text
 from stages.surface.mesh import NOTE, Mesh
 
 _VERTEX = np.dtype([("place", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
@@ -22,23 +23,14 @@ def write(path: Path, mesh: Mesh, units: str) -> None:
     faces = np.zeros(len(mesh.faces), _FACE)
     faces["count"], faces["vertices"] = 3, mesh.faces
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(mesh, units).encode("ascii"))
+        file.write(_header(mesh, units))
         file.write(vertices.tobytes())
         file.write(faces.tobytes())
 
 
-def _header(mesh: Mesh, units: str) -> str:
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment {NOTE}",
-        "comment up axis: -y (right-handed; x right, y down, z forward)",
-        f"comment units: {units}",
-    ]
-    if mesh.origin.any():
-        lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in mesh.origin))
-    lines.append(f"element vertex {len(mesh.vertices)}")
+def _header(mesh: Mesh, units: str) -> bytes:
+    lines = [f"element vertex {len(mesh.vertices)}"]
     lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
     lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
-    return "\n".join([*lines, "end_header", ""])
+    return header_text(units, mesh.origin, lines, NOTE)

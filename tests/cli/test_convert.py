@@ -100,8 +100,14 @@ def test_help_names_every_ending() -> None:
         assert f".{name}" in text
 
 
-def test_a_mesh_is_made_from_a_run_and_not_converted_to(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", formats.MESHES)
+def test_a_mesh_is_made_from_a_run_and_converted_neither_to_nor_from(
+    tmp_path: Path, ending: str
+) -> None:
     formats.write(tmp_path / "a.ply", many_splats(20))
-    _, err = converted(tmp_path / "a.ply", tmp_path / "b.mesh.glb", code=2)
-    assert "splat export --format mesh" in err
-    assert not (tmp_path / "b.mesh.glb").exists()
+    (tmp_path / f"a.{ending}").write_bytes(b"a mesh")
+    for source, target in ((f"a.{ending}", "b.ply"), ("a.ply", f"b.{ending}")):
+        _, err = converted(tmp_path / source, tmp_path / target, code=2)
+        assert f"splat export --format {ending}" in err
+        assert "reading" not in err
+        assert not (tmp_path / target).exists()

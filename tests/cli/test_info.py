@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from splatcli import console
 from splatcli.app import app
 from stages import formats
 from tests.formats.truth import many_splats
@@ -26,6 +27,7 @@ BYTES = {
     "ply": {"positions": 12, "normals": 12, "colours": 12, "SH": 180, "scales": 12},
     "splat": {"positions": 12, "scales": 12, "colours, opacities": 4, "rotations": 4},
     "glb": {"positions": 12, "rotations": 16, "SH": 180, "opacities": 4},
+    "quantised.glb": {"positions": 12, "rotations": 8, "scales": 6, "opacities": 2},
     "compressed.ply": {"positions": 4, "rotations": 4, "SH": 45},
 }
 
@@ -57,6 +59,22 @@ def test_bytes_of_packed_files_are_those_on_disk_where_parts_are_packed_alone(
         "rotations": 4,
         "SH": 45,
     }
+    formats.write(tmp_path / "a.html", many_splats(300))  # a .ply, gzip and base64
+    told = info(tmp_path / "a.html")["bytes_per_splat_unpacked"]
+    assert (told["positions"], told["SH"]) == (12, 180)
+
+
+def test_a_format_whose_parts_nobody_can_tell_says_so(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.usdc", many_splats(3))
+    told = info(tmp_path / "a.usdc")
+    assert "how many bytes" in told["bytes_per_splat_unknown"]
+    assert "bytes_per_splat" not in told
+
+
+def test_the_size_of_a_gltf_counts_its_bin(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.gltf", many_splats(3000))
+    both = sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert info(tmp_path / "a.gltf")["size"] == console.size(both)
 
 
 def test_values_that_are_not_finite_are_described_and_not_refused(tmp_path: Path) -> None:

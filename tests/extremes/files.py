@@ -22,7 +22,7 @@ from tests.tolerances import ASPECT_TIMES_ANGLE, EIGHT_BIT_ANGLE, RMS_45_DB
 
 # Those that claim to hold everything, and .splat; the packed ones have bounds of their own in
 # tests/formats.
-KEPT_FORMATS = [f for f in formats.FORMATS if f == "splat" or f not in formats.LOSSY]
+KEPT_FORMATS = [f for f, row in formats.FORMATS.items() if f == "splat" or not row.loses]
 DEPTH, FOCAL_PX = 4.0, 60.0
 PIXEL = DEPTH / FOCAL_PX  # world units that a pixel covers at the depth of the splats
 EIGHT_BIT_COLOUR = ".splat holds colours of 8 bits that do not change with the view"

@@ -14,7 +14,7 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import compressed_ply
 from stages.scene import Splats, morton
-from tests.formats.truth import C0, many_splats
+from tests.formats.truth import C0, extreme_splats, many_splats
 
 
 def angles(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -121,11 +121,7 @@ def test_one_splat_far_away_spoils_one_chunk_only(tmp_path: Path) -> None:
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
-    splats = many_splats(4).with_sh_degree(1)
-    splats.log_scales[:] = [[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]]
-    splats.opacity_logits[:] = [100, -100, 20, -20]
-    splats.quaternions[:2] = [[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]]
-    splats.means[3] = (7e8, -3e38, 1e-40)
+    splats = extreme_splats(1)
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.compressed.ply", splats) == 0
     back = formats.read(tmp_path / "a.compressed.ply")

@@ -9,8 +9,8 @@ import pytest
 
 from stages import formats
 from stages.formats import usd_read
-from stages.formats.far import recentred
 from stages.formats.ply import property_names
+from stages.scene.far import recentred
 from tests.formats.test_round_trip import edited_glb, ply_bytes
 from tests.formats.truth import many_splats, red_splat
 

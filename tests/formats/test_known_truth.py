@@ -98,9 +98,8 @@ def test_splat_records_come_largest_first(tmp_path: Path) -> None:
     rows = np.frombuffer((tmp_path / "a.splat").read_bytes(), np.float32).reshape(-1, 8)
     alpha = np.frombuffer((tmp_path / "a.splat").read_bytes(), np.uint8).reshape(-1, 32)[:, 27]
     size = rows[:, 3:6].astype(float).prod(axis=1) * alpha
-    size = size[alpha > 30]  # opacities of few steps are rounded away from their order
-    assert len(size) > 100
-    assert (size[:-1] * 1.04 >= size[1:]).all()
+    assert (size[:-1] * (1 + 1e-6) >= size[1:]).all()  # float32 logarithms and their sums
+    assert size[0] > 100 * np.median(size) > 0
 
 
 def test_splat_keeps_an_unrotated_splat_exactly(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from stages.base.errors import SplatError
 from stages.formats import codebook
 from stages.scene import morton
 from tests.formats.test_compressed_ply import angles, three_splats
-from tests.formats.truth import C0, many_splats
+from tests.formats.truth import C0, extreme_splats, many_splats
 
 
 def members(path: Path) -> dict[str, bytes]:
@@ -124,11 +124,7 @@ def test_a_codebook_of_few_numbers_is_exact_and_of_many_is_close() -> None:
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
-    splats = many_splats(4).with_sh_degree(1)
-    splats.log_scales[:] = [[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]]
-    splats.opacity_logits[:] = [100, -100, 20, -20]
-    splats.quaternions[:2] = [[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]]
-    splats.means[3] = (7e8, -3e38, 1e-40)
+    splats = extreme_splats(1)
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.sog", splats) == 0
     back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.order(splats))

@@ -15,9 +15,10 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import spz
 from stages.proof.prover import Prover, cameras_for
+from stages.proof.second_readers import read_back
 from stages.scene import Splats
 from tests.formats.test_compressed_ply import angles
-from tests.formats.truth import C0, many_splats, red_splat
+from tests.formats.truth import C0, extreme_splats, many_splats, red_splat
 
 
 def content_of(path: Path) -> bytes:
@@ -94,7 +95,8 @@ def test_values_come_back_within_half_a_step(tmp_path: Path, degree: int) -> Non
     np.testing.assert_allclose(back.means, splats.means, atol=0.5 / 2**bits + 1e-6)
     wanted = np.clip(splats.log_scales, -10, 255 / 16 - 10)
     np.testing.assert_allclose(back.log_scales, wanted, atol=1 / 32 + 1e-5)
-    np.testing.assert_allclose(back.opacities, splats.opacities, atol=0.5 / 255 + 1e-6)
+    wanted = np.clip(splats.opacities, 1 / 255, 254 / 255)
+    np.testing.assert_allclose(back.opacities, wanted, atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(back.sh[:, 0], splats.sh[:, 0], atol=0.5 / 255 / 0.15 + 1e-5)
     # 9 bits over 1/sqrt 2: three errors of 1/1445, and the fourth what they make of the length
     assert angles(splats.quaternions, back.quaternions).max() < 0.3
@@ -130,17 +132,27 @@ def test_what_lies_beyond_reach_looks_the_same_from_the_middle(tmp_path: Path) -
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
-    splats = many_splats(4).with_sh_degree(1)
-    splats.log_scales[:] = [[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]]
-    splats.opacity_logits[:] = [100, -100, 20, -20]
-    splats.quaternions[:2] = [[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]]
-    splats.means[3] = (7e8, -3e38, 1e-40)
+    splats = extreme_splats(1)
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.spz", splats) == 0
     back = formats.read(tmp_path / "a.spz")
     assert len(back) == 4
-    np.testing.assert_allclose(back.opacities, [1, 0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(255 * back.opacities, [254, 1, 254, 1], atol=1e-4)
     assert angles(splats.quaternions, back.quaternions).max() < 0.3
+
+
+def test_opacities_stay_clear_of_the_bytes_whose_logit_is_infinite(tmp_path: Path) -> None:
+    splats = many_splats(5)
+    splats.opacity_logits[:] = [-100, -6.5, 0, 6.5, 100]
+    formats.write(tmp_path / "a.spz", splats)
+    assert list(content_of(tmp_path / "a.spz")[16 + 5 * 9 :][:5]) == [1, 1, 128, 254, 254]
+
+
+def test_bytes_of_other_writers_whose_logit_is_infinite_are_read_as_numbers(tmp_path: Path) -> None:
+    path = packed(many_splats(2), tmp_path, 16 + 2 * 9, b"\0\xff")
+    for back in (formats.read(path), read_back(path).splats):
+        assert np.isfinite(back.opacity_logits).all()
+        np.testing.assert_allclose(back.opacities, [0, 1], atol=1e-6)
 
 
 def packed(splats: Splats, tmp_path: Path, at: int, new: bytes, extra: bytes = b"") -> Path:

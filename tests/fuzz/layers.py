@@ -31,7 +31,7 @@ _SPZ_4 = Path(__file__).parents[1] / "formats" / "spz4" / "adobe_degree_3.spz"
 
 @functools.cache
 def files(ending: str) -> dict[str, bytes]:
-    """What our writer leaves: a.`ending`, and a.bin beside a .gltf."""
+    """What our writer leaves: a.`ending`, and what belongs to it."""
     with tempfile.TemporaryDirectory() as folder:
         formats.write(Path(folder) / f"a.{ending}", many_splats(SPLATS))
         return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
@@ -145,13 +145,25 @@ def _part(ending: str, name: str, *, text: bool) -> Layer:
     )
 
 
+def _on_disk(ending: str) -> Layer:
+    """A file of the format as it is, beside what belongs to it."""
+    name = f"a.{ending}"
+
+    def beside() -> dict[str, bytes]:
+        return {other: content for other, content in files(ending).items() if other != name}
+
+    share = 0.05 if ending in _PROCESS_EACH else 1.0
+    return Layer(name, _whole(ending), beside=beside, text=ending in _WORDS, share=share)
+
+
+_WORDS = ("gltf", "usda")
+_PROCESS_EACH = ("usda", "usdc", "usdz")
+
 LAYERS: dict[str, Layer] = {
-    "ply": Layer("a.ply", _whole("ply")),
+    **{ending: _on_disk(ending) for ending in formats.FORMATS},
+    "html": Layer("a.html", lambda: _html_parts()[1], _html_around, text=True),
     "ply, header and words": Layer("a.ply", _whole("ply"), text=True),
     "ply, ascii": Layer("a.ply", _ascii_ply, text=True),
-    "splat": Layer("a.splat", _whole("splat")),
-    "compressed.ply": Layer("a.compressed.ply", _whole("compressed.ply")),
-    "spz": Layer("a.spz", _whole("spz")),
     "spz, unpacked": Layer(
         "a.spz",
         lambda: gzip.decompress(files("spz")["a.spz"]),
@@ -159,20 +171,10 @@ LAYERS: dict[str, Layer] = {
     ),
     "spz 4": Layer("a.spz", _SPZ_4.read_bytes),
     "spz 4, unpacked": Layer("a.spz", lambda: b"".join([_spz_4()[0], *_spz_4()[1]]), _spz_4_with),
-    "sog": Layer("a.sog", _whole("sog")),
     "sog, meta.json": _part("sog", "meta.json", text=True),
     "sog, a picture": _part("sog", "means_l.webp", text=False),
-    "glb": Layer("a.glb", _whole("glb")),
     "glb, document": _glb_document("glb"),
-    "quantised.glb": Layer("a.quantised.glb", _whole("quantised.glb")),
     "quantised.glb, document": _glb_document("quantised.glb"),
-    "gltf": Layer(
-        "a.gltf", _whole("gltf"), beside=lambda: {"a.bin": files("gltf")["a.bin"]}, text=True
-    ),
-    "html": Layer("a.html", lambda: _html_parts()[1], _html_around, text=True),
     "html, unpacked": Layer("a.html", _html_inside, _html_with, text=True),
-    "usda": Layer("a.usda", _whole("usda"), text=True, share=0.05),
-    "usdc": Layer("a.usdc", _whole("usdc"), share=0.05),
-    "usdz": Layer("a.usdz", _whole("usdz"), share=0.05),
     **camera_layers.LAYERS,
 }

@@ -91,8 +91,7 @@ def _sizes(
     for name in names:
         path = folder / f"scene.{name}"
         formats.write(path, splats, views=views)
-        size = path.stat().st_size
-        size += path.with_suffix(".bin").stat().st_size if name == "gltf" else 0
+        size = formats.FORMATS[name].size_bytes(path)
         found = read_back(path)
         again = [
             render(found.splats, view.camera.moved(found.world_from_file)).image for view in views

@@ -10,18 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stages.proof.content import (
-    Y_UP,
-    FileContent,
-    logits,
-    splats_of,
-)
+from stages.formats import format_of
+from stages.proof.content import Y_DOWN, Y_UP, FileContent, logits, splats_of
 from stages.proof.second_readers import read_back
 from tests.packages import UnavailableError, installed, node
 
 HERE = Path(__file__).parent
-Y_DOWN = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ def _gsply(path: Path) -> FileContent:
             opacity_logits=data.opacities,
             sh=np.concatenate([data.sh0[:, None], rest], axis=1),
         ),
-        Y_UP if spz else Y_DOWN,
+        _axes(path),
     )
 
 
@@ -69,7 +65,7 @@ def _open3d(path: Path) -> FileContent:
             opacity_logits=values["opacity"][:, 0],
             sh=sh,
         ),
-        Y_UP if path.suffix == ".spz" else Y_DOWN,
+        _axes(path),
     )
 
 
@@ -94,7 +90,7 @@ def _tinyusdz(path: Path) -> FileContent:
             opacity_logits=logits(values("opacities")),
             sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
         ),
-        Y_UP,
+        _axes(path),
     )
 
 
@@ -104,8 +100,7 @@ def _splat_transform(path: Path) -> FileContent:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out.ply"
         node().run(command, path, out)
-        axes = Y_UP if path.suffix == ".spz" else Y_DOWN
-        return replace(read_back(out), world_from_file=axes)
+        return replace(read_back(out), world_from_file=_axes(path))
 
 
 def _adobe_spz(path: Path) -> FileContent:
@@ -127,8 +122,12 @@ def _adobe_spz(path: Path) -> FileContent:
             opacity_logits=alphas,
             sh=np.concatenate([dc, sh.reshape(count, bands, 3)], axis=1),
         ),
-        Y_UP,
+        _axes(path),
     )
+
+
+def _axes(path: Path) -> NDArray[np.float64]:
+    return Y_UP if format_of(path).y_up else Y_DOWN
 
 
 def _imported(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Work on many splats a block of rows at a time, so that what is made on the way stays small.
+"""Work on many rows a block at a time, so that what is made on the way stays small.
 
 Who wants to know how far the work is watches it: `with watched(watcher): formats.read(path)`.
 Readers and writers go over the rows more than once (values, order, one attribute after the other),
@@ -14,8 +14,6 @@ from contextvars import ContextVar
 
 import numpy as np
 from numpy.typing import NDArray
-
-from stages.scene import Splats
 
 ROWS = 1 << 16  # 16 MB of splats of degree 3
 Watcher = Callable[[int, int], None]  # (done, in all) of a pass: rows, mostly
@@ -50,23 +48,6 @@ def tell(done: int, total: int) -> None:
     watcher = _watcher.get()
     if watcher is not None:
         watcher(done, total)
-
-
-def block_of(splats: Splats, rows: slice, order: NDArray[np.integer] | None = None) -> Splats:
-    """Some rows: views of them, or with an `order` copies of those that it names."""
-    return splats.take(rows if order is None else order[rows])
-
-
-def allocated(count: int, degree: int) -> Splats:
-    """`count` splats for a reader to fill, float32; what they hold is not defined."""
-    return Splats(
-        means=np.empty((count, 3), np.float32),
-        quaternions=np.empty((count, 4), np.float32),
-        log_scales=np.empty((count, 3), np.float32),
-        opacity_logits=np.empty(count, np.float32),
-        sh=np.empty((count, (degree + 1) ** 2, 3), np.float32),
-        sh_degrees=np.zeros(count, np.uint8),
-    )
 
 
 def forget(mapped: NDArray[np.generic]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.formats.turn import turned
+from stages.scene.turn import turned
 from tests.formats.truth import colour, covariance, many_splats, red_splat
 
 F = np.diag([1.0, -1.0, -1.0])

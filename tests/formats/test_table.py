@@ -1,0 +1,111 @@
+"""The table of formats says what is true of the files, and README's table is made of it."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages import formats
+from stages.base.errors import Family, SplatError
+from stages.formats import FORMATS, MESHES, TABLE, Format, function
+from stages.proof.anatomy import anatomy_of
+from tests.formats.test_round_trip import read
+from tests.formats.truth import many_splats
+
+README = Path(__file__).parents[2] / "README.md"
+PLACES = ("writer", "reader", "second_reader", "anatomy", "order", "validator")
+
+
+def readme_lines() -> list[str]:
+    """The lines of README's table, formats that say the same of themselves on one."""
+    lines = []
+    for (opens_in, keeps, y_up), rows in itertools.groupby(
+        TABLE, lambda row: (row.opens_in, row.keeps, row.y_up)
+    ):
+        names = ", ".join(f"`{row.ending}`" for row in rows)
+        lines.append(f"| {names} | {opens_in} | {keeps}{'; y up' if y_up else ''} |")
+    return lines
+
+
+def test_readmes_table_is_made_of_the_rows() -> None:
+    lines = README.read_text(encoding="utf-8").splitlines()
+    start = lines.index("| `--format` | opens in | keeps |") + 2
+    found = list(itertools.takewhile(str.strip, lines[start:]))
+    assert found == readme_lines(), "README's table should be:\n" + "\n".join(readme_lines())
+
+
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.ending)
+def test_every_function_that_a_row_names_is_there(row: Format) -> None:
+    for place in filter(None, (getattr(row, name) for name in PLACES)):
+        assert callable(function(place)), place
+    assert bool(row.anatomy) != row.is_mesh
+
+
+@pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
+def test_a_writer_takes_views_where_its_row_says_so(row: Format) -> None:
+    assert ("views" in inspect.signature(function(row.writer)).parameters) == row.wants_views
+
+
+@pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
+def test_rows_of_a_file_lie_in_the_order_that_the_table_tells(tmp_path: Path, row: Format) -> None:
+    splats = many_splats(200)
+    path = tmp_path / f"a.{row.ending}"
+    formats.write(path, splats)
+    order = function(row.order)(splats) if row.order else np.arange(200)
+    back = read(path)
+    np.testing.assert_allclose(back.means, splats.means[order], atol=0.02)
+    assert back.sh_degree == row.sh_degree
+
+
+@pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
+def test_what_a_row_says_is_lost_is_lost_and_nothing_else(tmp_path: Path, row: Format) -> None:
+    splats = many_splats(200)
+    path = tmp_path / f"a.{row.ending}"
+    formats.write(path, splats)
+    order = function(row.order)(splats) if row.order else np.arange(200)
+    back, wanted = read(path).with_sh_degree(3), splats.take(order)
+    pairs = [(getattr(back, n), getattr(wanted, n)) for n in ("means", "sh", "opacities")]
+    same = all(np.allclose(a, b, atol=1e-6) for a, b in pairs)
+    assert same == (not row.loses)
+
+
+@pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
+def test_a_format_leaves_the_files_that_its_row_names(tmp_path: Path, row: Format) -> None:
+    path = tmp_path / f"a b.{row.ending}"
+    formats.write(path, many_splats(9))
+    assert sorted(row.files(path)) == sorted(tmp_path.iterdir())
+    assert row.size_bytes(path) == sum(file.stat().st_size for file in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
+def test_every_format_tells_its_bytes_or_why_not(tmp_path: Path, row: Format) -> None:
+    path = tmp_path / f"a.{row.ending}"
+    formats.write(path, many_splats(300))
+    found = anatomy_of(path)
+    if found.untold:
+        assert not found.parts
+    else:
+        assert {"positions", "rotations", "scales"} <= found.parts.keys()
+        assert found.parts["positions"] >= 300 * 4
+        assert found.unpacked or sum(found.parts.values()) <= row.size_bytes(path)
+
+
+@pytest.mark.parametrize("ending", MESHES)
+def test_a_mesh_is_neither_read_nor_written_as_splats(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"A.{ending}".upper()
+    for attempt in (lambda: formats.read(path), lambda: formats.write(path, many_splats(3))):
+        with pytest.raises(SplatError, match="name of a mesh") as caught:
+            attempt()
+        assert (caught.value.code, caught.value.family) == ("format-mesh", Family.USAGE)
+        assert f"splat export --format {ending}" in caught.value.hint
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_longest_ending_decides() -> None:
+    assert formats.format_of(Path("a.glb")).ending == "glb"
+    assert formats.format_of(Path("a.b.Compressed.PLY")).ending == "compressed.ply"
+    assert formats.format_of(Path("compressed.ply")).ending == "ply"
