@@ -139,7 +139,7 @@ def _write_meshes(
     wanted = [MESHES[ending] for ending in dict.fromkeys(asked) if ending in MESHES]
     if not wanted:
         return []
-    from stages.formats import function
+    from stages.base.lazy import named
     from stages.scene import ExportedFile
     from stages.surface.files import fault_of
     from stages.surface.make import make
@@ -149,7 +149,7 @@ def _write_meshes(
     files = []
     for row in wanted:
         path = folder / f"{settings.name}.{row.ending}"
-        function(row.writer)(path, made.mesh, reconstruction.units)
+        named(row.writer)(path, made.mesh, reconstruction.units)
         if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, row.size_bytes(path)))

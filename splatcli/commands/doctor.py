@@ -14,9 +14,10 @@ from pathlib import Path
 from splatcli import console
 from stages.base import threads
 from stages.base.errors import Family
+from stages.base.lazy import named
 from stages.base.libraries import versions
 from stages.base.memory import available_mib
-from stages.raster.backends import BACKENDS, Backend, loaded
+from stages.raster.backends import BACKENDS, Backend
 
 _MODULES = {
     "av": "av",
@@ -116,7 +117,7 @@ def _numba_cache() -> Check:
 def _backend(backend: Backend) -> Check:
     label = f"backend {backend.name}"
     try:
-        loaded(backend.rasteriser)
+        named(backend.rasteriser)
     except Exception as error:
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         return Check(label, f"not present ({said})", ok=False)

@@ -22,7 +22,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.formats.table import FORMATS, MESHES, TABLE, Anatomy, Format, format_of, function
+from stages.base.lazy import named
+from stages.formats.table import FORMATS, MESHES, TABLE, Anatomy, Format, format_of
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View
@@ -34,7 +35,6 @@ __all__ = [
     "Anatomy",
     "Format",
     "format_of",
-    "function",
     "read",
     "write",
 ]
@@ -52,7 +52,7 @@ def write(
     """
     row = format_of(path)
     more: dict[str, Any] = {"views": views} if row.wants_views else {}
-    dropped: int = function(row.writer)(Path(path), splats, units=units, **more)
+    dropped: int = named(row.writer)(Path(path), splats, units=units, **more)
     return dropped
 
 
@@ -64,7 +64,7 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     """
     from stages.formats.rows import damage_kept
 
-    reader = function(format_of(path).reader)
+    reader = named(format_of(path).reader)
     with nullcontext() if strict else damage_kept():
         splats: Splats = reader(Path(path))
     return splats

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from stages.base.errors import Family, SplatError
 
@@ -70,13 +67,6 @@ class Anatomy:
     parts: dict[str, int]
     unpacked: bool = False
     untold: str = ""
-
-
-def function(place: str) -> Callable[..., Any]:
-    """What "module:function" names; the module is imported now."""
-    module, _, name = place.partition(":")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return found
 
 
 _GLB = Format(

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from stages.base.bad_files import reading
-from stages.formats import Anatomy, format_of, function, spz_read
+from stages.base.lazy import named
+from stages.formats import Anatomy, format_of, spz_read
 from stages.formats.html import unzipped
 from stages.formats.inflate import Inflated
 from stages.formats.ply_header import Header, read_header
@@ -47,7 +48,7 @@ def anatomy_of(path: Path) -> Anatomy:
     path = Path(path)
     row = format_of(path)
     with reading(path):
-        found: Anatomy = function(row.anatomy)(path)
+        found: Anatomy = named(row.anatomy)(path)
     other = row.size_bytes(path) - sum(found.parts.values())
     if found.untold or found.unpacked or other <= 0:
         return found

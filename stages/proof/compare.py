@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import FORMATS, Format, function
+from stages.base.lazy import named
+from stages.formats import FORMATS, Format
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.proof.second_readers import FileContent
 from stages.scene import SH_C0, Splats
@@ -84,7 +85,7 @@ def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows
     """How a format may have sorted either side; made one by one, as the first often fits."""
     for row in formats:
         if row.order:
-            order = function(row.order)
+            order = named(row.order)
             yield order(truth)
             yield np.argsort(order(file))
 

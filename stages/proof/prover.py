@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats import FORMATS, format_of, function
+from stages.base.lazy import named
+from stages.formats import FORMATS, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
 from stages.measure.judge import CAP_DB, decibels
 from stages.proof import diagnosis, second_readers
@@ -97,7 +98,7 @@ class Prover:
         row = format_of(path)
         try:
             content = _drawable(second_readers.read_back(path))
-            said = function(row.validator)(path) if row.validator else []
+            said = named(row.validator)(path) if row.validator else []
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import forget, passing
-from stages.formats import format_of, function
+from stages.base.lazy import named
+from stages.formats import format_of
 from stages.proof.content import Y_DOWN, Y_UP, FileContent, logits, splats_of
 from stages.scene import Splats
 
@@ -36,7 +37,7 @@ def read_back(path: Path) -> FileContent:
     was just written has no excuse."""
     with np.errstate(all="ignore"):  # flat splats have a logarithm of -infinity
         row = format_of(path)
-        return FileContent(function(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
+        return FileContent(named(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
 
 
 def ply(path: Path) -> Splats:

@@ -8,9 +8,10 @@ backward. What this list names is imported when it is first used.
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from stages.base.lazy import named
 
 if TYPE_CHECKING:
     from stages.raster.definition import Rasteriser
@@ -53,14 +54,8 @@ def backend_of(name: str) -> Backend:
 
 def rasteriser_of(name: str) -> Rasteriser:
     """A rasteriser of the backend `name` or "auto". Raises ValueError for an unknown one."""
-    made: Rasteriser = loaded(backend_of(name).rasteriser)()
+    made: Rasteriser = named(backend_of(name).rasteriser)()
     return made
-
-
-def loaded(place: str) -> Any:
-    """What "module:name" names."""
-    module, _, name = place.partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 def backend_setting() -> Any:

@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.backends import backend_of, loaded, rasteriser_of
+from stages.base.lazy import named
+from stages.raster.backends import backend_of, rasteriser_of
 from stages.raster.definition import Rasteriser, RasterSettings
 from stages.scene import Camera
 from stages.training.optimiser import LearningRates, Model
@@ -38,5 +39,5 @@ class TrainingStep(Protocol):
 def step_of(backend: str) -> TrainingStep:
     """The training step of the backend `backend` or "auto". Raises ValueError."""
     chosen = backend_of(backend)
-    made: TrainingStep = loaded(chosen.step)(rasteriser_of(chosen.name))
+    made: TrainingStep = named(chosen.step)(rasteriser_of(chosen.name))
     return made
