@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from splatcli import console, sources, viewpoints
 from splatcli.progress import counting
-from stages.base import memory, threads
+from stages.base import memory
 from stages.base.errors import Family, SplatError
+from stages.kernels import cache
 
 if TYPE_CHECKING:
     from stages.raster.definition import Rendering
@@ -54,7 +55,7 @@ def render(target: Path | None, wanted: Wanted) -> None:
     else:
         cameras = _film_cameras(splats, seen, wanted, kind == "film")
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
-    if not threads.kernels_are_compiled():
+    if not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     backend = wanted.backend or sources.backend_of(pipeline or sources.pipeline_around(target))
     draw = renderer(splats, backend=backend)

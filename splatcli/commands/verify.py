@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatcli import console, sources
-from stages.base import threads
 from stages.base.errors import Family, SplatError
+from stages.kernels import cache
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 
@@ -46,7 +46,7 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
     for file in files:
         formats.format_of(file)  # before any work is done
     quiet = quiet or as_json
-    if not quiet and not threads.kernels_are_compiled():
+    if not quiet and not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     original, prover, found = None, None, []
     for number, file in enumerate(files):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from stages.kernels.simd import kernel
 
 
 def mean_neighbour_distance(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
@@ -25,7 +26,7 @@ def mean_neighbour_distance(points: NDArray[np.float64], count: int) -> NDArray[
     return result
 
 
-@numba.njit(cache=True)
+@kernel
 def _sweep(points: NDArray[np.float64], axis: int, count: int) -> NDArray[np.float64]:
     """Points sorted along `axis`: look outwards on both sides until the next candidate is farther
     along that axis alone than the `count`th best so far."""
