@@ -8,17 +8,20 @@ from typing import Annotated, Any
 
 import typer
 
-from splatcli import jobs, options, summary
+from splatcli import jobs, summary
 from splatcli.console import guarded
 from splatcli.folders import find_run_folder
-from splatcli.options import with_parameters
+from splatcli.options import number, option, with_parameters
+from splatcli.usage import Commands
 from stages import STAGE_NAMES
+from stages.base.settings import Setting
 from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
 from stages.run.pipeline import Pipeline
 
 app = typer.Typer(
     name="splat",
+    cls=Commands,
     help="Turn a folder of photographs into a 3D Gaussian splat that opens everywhere.",
     no_args_is_help=True,
     add_completion=False,
@@ -45,11 +48,15 @@ Run = Annotated[
 ]
 Backend = Annotated[
     str | None,
-    typer.Option(
-        help=f"What draws: {', '.join(CHOICES)}; by default what the run was trained with.",
-        callback=options.one_of(CHOICES),
-        show_default=False,
-        metavar="NAME",
+    option(
+        Setting(
+            "backend",
+            "--backend",
+            str,
+            choices=CHOICES,
+            help=f"What draws: {', '.join(CHOICES)}; by default what the run was trained with.",
+        ),
+        shown=False,
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
@@ -139,15 +146,15 @@ def render(
         ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(min=1, max=100_000, help="How many frames along the path.")
+        int | None, number("--frames", int, 1, 100_000, "How many frames along the path.")
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.01, max=3600, help="How long the film lasts.", show_default="by path"),
+        number("--seconds", float, 0.01, 3600, "How long the film lasts.", "by path"),
     ] = None,
-    fps: Annotated[float, typer.Option(min=1, max=240, help="Frames a second.")] = 30.0,
+    fps: Annotated[float, number("--fps", float, 1, 240, "Frames a second.")] = 30.0,
     width: Annotated[
-        int | None, typer.Option(min=1, max=16384, help="Width of the picture (pixels).")
+        int | None, number("--width", int, 1, 16384, "Width of the picture (pixels).")
     ] = None,
     depth: Annotated[
         bool,
@@ -178,7 +185,7 @@ def view(
     ] = None,
     *,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port to serve on; 0 for any that is free.")
+        int, number("--port", int, 0, 65535, "Port to serve on; 0 for any that is free.")
     ] = 0,
     open_browser: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the browser, or only print the address.")

@@ -9,17 +9,12 @@ from typing import Any
 
 import typer
 
-from splatcli import (
-    live_view as watching,
-)
-from splatcli import (
-    options,
-    progress,
-    summary,
-)
+from splatcli import console, options, progress, summary
+from splatcli import live_view as watching
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
+from stages.base.settings import Setting, settings_of
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 
@@ -36,15 +31,16 @@ PROCESS_OPTIONS = (
 )
 
 
-def preset_parameter() -> Parameter:
-    """`--preset`, with the names that training defines."""
-    option = typer.Option(
+def preset_parameter(shown: str) -> Parameter:
+    """`--preset`, with the names that training defines. shown: the default."""
+    setting = Setting(
+        "preset",
         "--preset",
+        str,
+        choices=tuple(presets()),
         help="How much training: preview (minutes), standard, or best (the full recipe).",
-        show_default=DEFAULT_PRESET,
-        metavar="NAME",
     )
-    return options.keyword("preset", options.choice("preset", presets()) | None, option)
+    return options.keyword("preset", str | None, options.option(setting, shown))
 
 
 def view_parameter() -> Parameter:
@@ -65,16 +61,35 @@ def process_parameters() -> list[Parameter]:
     """The few options of `process`; one that several stages share is given to all of them."""
     found: dict[str, Parameter] = {}
     for name in STAGE_NAMES:
-        for parameter in options.parameters(load_stage(name).settings_type, PROCESS_OPTIONS):
+        kind = load_stage(name).settings_type
+        for parameter in options.parameters(kind, PROCESS_OPTIONS, _shown):
             found.setdefault(parameter.name, parameter)
     chosen = (found[name] for name in PROCESS_OPTIONS if name in found)
-    return [preset_parameter(), *chosen, view_parameter()]
+    shown = f"{DEFAULT_PRESET}; as before where a run goes on"
+    return [preset_parameter(shown), *chosen, view_parameter()]
 
 
 def stage_parameters(name: str) -> list[Parameter]:
     """All settings of one stage; training has presets too, and can be watched."""
-    own = options.parameters(load_stage(name).settings_type)
-    return [preset_parameter(), *own, view_parameter()] if name == "train" else own
+    kind = load_stage(name).settings_type
+    if name == "ingest":
+        return options.parameters(kind)
+    if name != "train":
+        return options.parameters(kind, shown=_kept)
+    own = options.parameters(kind, shown=_kept)
+    return [preset_parameter(f"as before, else {DEFAULT_PRESET}"), *own, view_parameter()]
+
+
+def _shown(setting: Setting) -> str | bool:
+    """The default for the help: that of the preset, where presets differ in it."""
+    values = {getattr(preset, setting.name, setting.default) for preset in presets().values()}
+    return options.shown_default(setting) if len(values) == 1 else "by preset"
+
+
+def _kept(setting: Setting) -> str | bool:
+    """As `_shown`, where what the run was asked before comes first."""
+    shown = _shown(setting)
+    return f"as before, else {shown}" if shown else "as before"
 
 
 def settings_for(
@@ -85,6 +100,20 @@ def settings_for(
     if preset is not None and "train" in chosen:
         chosen["train"] = presets()[preset]
     return {name: options.changed(settings, typed) for name, settings in chosen.items()}
+
+
+def training_in_words(settings: Any, typed: Mapping[str, Any], preset: str | None) -> str:
+    """What training is asked of a run that goes on, and which of it was not asked just now."""
+    origins: dict[str, list[str]] = {}
+    before = f"preset {preset}" if preset else "as this run was asked before"
+    for setting in settings_of(type(settings)):
+        name = setting.name
+        if name in typed or _shown(setting) == "by preset":
+            origin = "as typed" if name in typed else before
+            words = f"{console.label(name)} {console.figure(name, getattr(settings, name))}"
+            origins.setdefault(origin, []).append(words)
+    told = "; ".join(f"{', '.join(words)} ({origin})" for origin, words in origins.items())
+    return f"Training: {told}."
 
 
 def defaults() -> dict[str, Any]:
@@ -141,7 +170,10 @@ def run_all(
     base = defaults() if photos is not None else pipeline.recorded_settings()
     typed = options.given_only(given)
     view = typed.pop("view", False)
-    settings = settings_for(base, typed, typed.pop("preset", None))
+    preset = typed.pop("preset", None)
+    settings = settings_for(base, typed, preset)
+    if photos is None and not (quiet or as_json):
+        console.note(training_in_words(settings["train"], typed, preset))
     run(pipeline, settings, quiet=quiet, as_json=as_json, view=view)
 
 
@@ -156,17 +188,17 @@ def run_stage(
 
     The stages after training are cheap: those that are missing in between run too.
     """
-    if not runfolder.is_run_folder(pipeline.run_folder):
-        base = defaults()
-    else:
-        base = pipeline.recorded_settings()
+    known = runfolder.is_run_folder(pipeline.run_folder)
+    base = pipeline.recorded_settings() if known else defaults()
     typed = options.given_only(given)
     preset, view = typed.pop("preset", None), typed.pop("view", False)
     if "formats" in typed:
         typed["formats"] = _with_exported(pipeline, typed["formats"])
     settings = settings_for({name: base[name]}, typed, preset)
-    if not runfolder.is_run_folder(pipeline.run_folder):
+    if not known:
         settings = {**base, **settings}
+    if name == "train" and not (quiet or as_json):
+        console.note(training_in_words(settings["train"], typed, preset))
     may_run = _may_run(name)
     run(pipeline, settings, until=name, may_run=may_run, quiet=quiet, as_json=as_json, view=view)
 

@@ -1,70 +1,72 @@
 """Command-line options, made from the stages' settings.
 
-A field's type, help and bounds are stated once, in its stage. An option that is not given is None
-here, so that a stage's command changes only what was typed.
+A setting's type, help and bounds are stated once, in its stage, which also says what is wrong with
+a value. An option that is not given is None here, so that a stage's command changes only what was
+typed.
 """
 
 from __future__ import annotations
 
-import enum
 import inspect
-import sys
-import types
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import MISSING, Field, fields, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any
 
 import typer
 
-from stages.base.errors import Family, SplatError
+from stages.base.settings import Setting, check_settings, settings_of
 
-_METAVARS = {int: "N", float: "X", bool: None, str: "TEXT", Path: "PATH"}
-
-
-def parameters(settings_type: type, names: Iterable[str] | None = None) -> list[inspect.Parameter]:
-    """One keyword parameter a settings field (those in `names`), as typer reads them."""
-    hints = get_type_hints(settings_type)
-    wanted = {field.name: field for field in fields(settings_type)}
-    chosen = wanted if names is None else {n: wanted[n] for n in names if n in wanted}
-    return [_parameter(field, hints[name]) for name, field in chosen.items()]
+_METAVARS = {int: "N", float: "X", bool: None, Path: "PATH"}
 
 
-def flag_of(field: Field[Any], hint: Any) -> str:
-    """ "--max-side"; a repeatable option is named in the singular: formats -> --format."""
-    name = field.metadata.get("option") or field.name
-    if _is_many(hint) and name.endswith("s") and "option" not in field.metadata:
-        name = name[:-1]
-    return "--" + str(name).replace("_", "-")
+def parameters(
+    settings_type: type,
+    names: Iterable[str] | None = None,
+    shown: Callable[[Setting], str | bool] | None = None,
+) -> list[inspect.Parameter]:
+    """One keyword parameter a settings field (those in `names`), as typer reads them.
+
+    shown: the default to show in the help; by default the field's own.
+    """
+    every = {setting.name: setting for setting in settings_of(settings_type)}
+    chosen = every.values() if names is None else [every[name] for name in names if name in every]
+    return [_parameter(setting, (shown or shown_default)(setting)) for setting in chosen]
 
 
-def _parameter(field: Field[Any], hint: Any) -> inspect.Parameter:
-    kind = _element_type(field, hint)
-    flag = flag_of(field, hint)
-    bounds: dict[str, Any] = {}
-    if kind in (int, float):
-        bounds = {"min": field.metadata.get("min", 0), "max": field.metadata.get("max")}
-    if kind is bool:
-        flag = f"{flag}/--no-{flag[2:]}"
-    option = typer.Option(
-        flag,
-        help=_help(field, kind),
-        show_default=_shown_default(field),
-        metavar=_METAVARS.get(kind, "NAME"),
-        **bounds,
+def _parameter(setting: Setting, shown: str | bool) -> inspect.Parameter:
+    if setting.kind is bool:
+        flags, accepted = f"{setting.flag}/--no-{setting.flag[2:]}", bool | None
+        return keyword(
+            setting.name, accepted, typer.Option(flags, help=setting.help, show_default=shown)
+        )
+    one = list[setting.kind] if setting.many else setting.kind  # type: ignore[name-defined]
+    return keyword(setting.name, one | None, option(setting, shown))
+
+
+def option(setting: Setting, shown: str | bool = True) -> Any:
+    """A typer option that takes what the setting allows, and says so itself when it does not."""
+    return typer.Option(
+        setting.flag,
+        parser=setting.parse,
+        help=_help(setting),
+        show_default=shown,
+        metavar=_METAVARS.get(setting.kind, "NAME" if setting.choices else "TEXT"),
     )
-    accepted = Union[list[kind], None] if _is_many(hint) else Union[kind, None]  # type: ignore[valid-type]  # noqa: UP007
-    return keyword(field.name, accepted, option)
 
 
-def _help(field: Field[Any], kind: Any) -> str:
-    """The field's help, with the choices if it does not name them itself."""
-    text = str(field.metadata.get("help", ""))
-    members: Iterable[enum.Enum] = kind if isinstance(kind, enum.EnumMeta) else ()
-    words = [str(member.value) for member in members]
-    if all(word in text for word in words):
-        return text
-    return f"{text.rstrip('.')}: {', '.join(words)}."
+def number(
+    flag: str, kind: type, low: float, high: float, help: str, shown: str | bool = True
+) -> Any:
+    """A typer option for a number that is no stage's setting."""
+    return option(Setting(flag[2:], flag, kind, low=low, high=high, help=help), shown)
+
+
+def _help(setting: Setting) -> str:
+    """The setting's help, with the choices if it does not name them itself."""
+    if all(word in setting.help for word in setting.choices):
+        return setting.help
+    return f"{setting.help.rstrip('.')}: {', '.join(setting.choices)}."
 
 
 def keyword(name: str, accepted: Any, option: Any, default: Any = None) -> inspect.Parameter:
@@ -77,45 +79,10 @@ def keyword(name: str, accepted: Any, option: Any, default: Any = None) -> inspe
     )
 
 
-def choice(name: str, values: Iterable[str]) -> type[enum.Enum]:
-    """A type that accepts only these words."""
-    return enum.Enum(name, {value: value for value in values})  # type: ignore[return-value]
-
-
-def one_of(words: Collection[str]) -> Callable[[str | None], str | None]:
-    """A check, as typer calls it, that an option is one of `words` or was not given."""
-
-    def checked(value: str | None) -> str | None:
-        if value is not None and value not in words:
-            raise typer.BadParameter(f"{value!r} is not one of {', '.join(words)}.")
-        return value
-
-    return checked
-
-
-def _is_many(hint: Any) -> bool:
-    return get_origin(hint) in (tuple, list)
-
-
-def _element_type(field: Field[Any], hint: Any) -> Any:
-    """The type of one value: int, float, bool, str, Path, or an enumeration of choices."""
-    if get_origin(hint) in (Union, types.UnionType):
-        hint = next(arg for arg in get_args(hint) if arg is not type(None))
-    if _is_many(hint):
-        hint = get_args(hint)[0]
-    choices = field.metadata.get("choices")
-    if choices is None and get_origin(hint) is Literal:
-        choices = get_args(hint)
-    if choices is not None:
-        return choice(field.name, map(str, choices))
-    return hint if hint in (int, float, bool, str, Path) else str
-
-
-def _shown_default(field: Field[Any]) -> str | bool:
-    value = field.default
-    if value is MISSING and field.default_factory is not MISSING:
-        value = field.default_factory()
-    if value is None or value is MISSING or value == "":
+def shown_default(setting: Setting) -> str | bool:
+    """A setting's default for the help; False for none."""
+    value = setting.default
+    if value is None or value == "":
         return False
     if isinstance(value, (tuple, list)):
         return " ".join(map(str, value))
@@ -123,40 +90,17 @@ def _shown_default(field: Field[Any]) -> str | bool:
 
 
 def given_only(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What was typed: None and empty lists left out, choices as words, lists as tuples."""
-    typed = {}
-    for name, value in given.items():
-        if value is None or value == []:
-            continue
-        typed[name] = tuple(map(_word, value)) if isinstance(value, list) else _word(value)
-    return typed
-
-
-def _word(value: Any) -> Any:
-    return value.value if isinstance(value, enum.Enum) else value
+    """What was typed: None and empty lists left out, lists as tuples."""
+    typed = {name: value for name, value in given.items() if value is not None and value != []}
+    return {n: tuple(value) if isinstance(value, list) else value for n, value in typed.items()}
 
 
 def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
-    """`settings` with the typed fields that it has, checked.
-
-    A stage's file may have `check(settings)`, which raises SplatError: better now than after the
-    stages before it have run. Raises SplatError (option-value, or what `check` raises).
-    """
+    """`settings` with the typed fields that it has, checked. Raises SplatError (option-value)."""
     names = {field.name for field in fields(settings)}
-    check = getattr(sys.modules[type(settings).__module__], "check", None)
-    try:
-        new = replace(settings, **{k: v for k, v in typed.items() if k in names})
-        if check is not None:
-            check(new)
-        return new
-    except (ValueError, TypeError) as error:
-        raise SplatError(
-            "option-value",
-            given=f"An option has a value that cannot be used: {error}.",
-            wanted="A value that the setting allows.",
-            hint="Add --help to the command to see what each option takes.",
-            family=Family.USAGE,
-        ) from error
+    new = replace(settings, **{name: value for name, value in typed.items() if name in names})
+    check_settings(new)
+    return new
 
 
 def with_parameters(

@@ -7,7 +7,6 @@ compared with the splats that it was made from. A file that came out wrong stops
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,6 +30,8 @@ if TYPE_CHECKING:
 _MESH = "mesh"  # to `--format`: every format of meshes
 _CHOICES = (*FORMATS, _MESH, *MESHES)
 _INDEX = "assets.json"
+# Every system must take the name, USD's packages too: brackets separate names inside them.
+_NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 
 
 @dataclass(frozen=True)
@@ -44,34 +45,24 @@ class ExportSettings:
             "choices": _CHOICES,
         },
     )
-    name: str = field(default="scene", metadata={"help": "Name of the files, without a suffix."})
+    name: str = field(
+        default="scene",
+        metadata={
+            "help": "Name of the files, without a suffix.",
+            "pattern": _NAME,
+            "wanted": "A name that every system takes: letters, digits, spaces, - and _; no "
+            "folder, no suffix.",
+        },
+    )
     backend: str = backend_setting()
     mesh_triangles: int = field(
-        default=50_000, metadata={"help": "Triangles of the mesh, at most about.", "min": 100}
+        default=50_000,
+        metadata={
+            "help": "Triangles of the mesh, at most about.",
+            "min": 100,
+            "max": 100_000_000,
+        },
     )
-
-
-def check(settings: ExportSettings) -> None:
-    """Raises SplatError for a format that is not written, and for a name that cannot be one."""
-    unknown = [name for name in settings.formats if name not in _CHOICES]
-    if unknown or not settings.formats:
-        raise SplatError(
-            "export-format-unknown",
-            given=f"Asked to export {', '.join(unknown) or 'no format at all'}.",
-            wanted=f"One or more of {', '.join(_CHOICES)}.",
-            hint="Name each with --format, for example: splat export --format glb --format usdz",
-            family=Family.USAGE,
-        )
-    # Every system must take the name, USD's packages too: brackets separate names inside them.
-    good = re.fullmatch(r"[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}", settings.name)
-    if not good or settings.name != settings.name.strip(" .") or settings.name == "assets":
-        raise SplatError(
-            "export-name",
-            given=f"The name {settings.name!r} cannot be a file's name on every system.",
-            wanted="Letters, digits, spaces, - and _; no folder, no suffix.",
-            hint="Choose another --name.",
-            family=Family.USAGE,
-        )
 
 
 def run(
@@ -90,7 +81,6 @@ def run(
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
-    check(settings)
     quantised: QuantisedSplats = inputs["quantise"]
     reconstruction: Reconstruction = inputs["sfm"]
     _clear(folder)

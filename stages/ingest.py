@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base import threads
-from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from stages.scene import Capture, Photo
 
 FEWEST_PHOTOGRAPHS = 3
-_SMALLEST_MAX_SIDE_PX = 64
 _PIXELS_AT_ONCE = 250_000_000  # over all threads; about 4 bytes each while they are decoded
 
 
@@ -35,7 +34,9 @@ class IngestSettings:
         default=1600,
         metadata={
             "help": "Longer side of the photographs used for structure from motion and, at most, "
-            "for training (px)."
+            "for training (px).",
+            "min": 64,
+            "max": 32_768,
         },
     )
 
@@ -63,8 +64,6 @@ def run(
     from stages.photos import advice, capture_file, find
     from stages.scene import Capture
 
-    if settings.max_side < _SMALLEST_MAX_SIDE_PX:
-        raise _bad_max_side(settings.max_side)
     root = Path(inputs["photos"])
     found = find.find(root)
     folder.mkdir(parents=True, exist_ok=True)
@@ -170,16 +169,6 @@ def _report_capture(photos: tuple[Photo, ...], measures: list[Measures], report:
     medians = np.median([[p.sharpness, p.log2_luminance] for p in photos], axis=0)
     report.metric("median_sharpness", round(float(medians[0]), 3))
     report.metric("median_log2_luminance", round(float(medians[1]), 3))
-
-
-def _bad_max_side(given: int) -> SplatError:
-    return SplatError(
-        "ingest-bad-max-side",
-        given=f"--max-side {given}.",
-        wanted=f"At least {_SMALLEST_MAX_SIDE_PX} pixels; 1600 is a good choice.",
-        hint="Leave it out to use the default.",
-        family=Family.USAGE,
-    )
 
 
 def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatError:

@@ -20,9 +20,16 @@ BACK_OFFS = 5
 
 @dataclass(frozen=True)
 class PruneSettings:
-    rounds: int = field(default=2, metadata={"help": "Rounds of pruning, 0 for none."})
+    rounds: int = field(
+        default=2, metadata={"help": "Rounds of pruning, 0 for none.", "min": 0, "max": 100}
+    )
     max_loss_db: float = field(
-        default=0.05, metadata={"help": "Held-out PSNR that pruning may cost in all (dB)."}
+        default=0.05,
+        metadata={
+            "help": "Held-out PSNR that pruning may cost in all (dB).",
+            "min": 0,
+            "max": 100,
+        },
     )
     backend: str = backend_setting()
 

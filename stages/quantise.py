@@ -32,18 +32,13 @@ class QuantiseSettings:
 
     max_loss_db: float = field(
         default=0.02,
-        metadata={"help": "Held-out PSNR that smaller files may cost (dB)."},
+        metadata={"help": "Held-out PSNR that smaller files may cost (dB).", "min": 0, "max": 100},
     )
     max_views: int = field(
-        default=12, metadata={"help": "Photographs to measure on, at most.", "min": 1}
+        default=12,
+        metadata={"help": "Photographs to measure on, at most.", "min": 1, "max": 100_000},
     )
     backend: str = backend_setting()
-
-
-def check(settings: QuantiseSettings) -> None:
-    """Raises ValueError for settings that cannot be used."""
-    if not settings.max_loss_db >= 0:
-        raise ValueError("max_loss_db must be 0 or more")
 
 
 def run(
@@ -59,7 +54,6 @@ def run(
     from stages.formats.rows import kept_rows
     from stages.scene import QuantisedSplats, save_splats
 
-    check(settings)
     splats: Splats = inputs["prune"]
     judge = _Judge.on(inputs["sfm"], splats.look, settings, report)
     raw_db = judge.psnr(splats)

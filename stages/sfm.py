@@ -38,16 +38,27 @@ class SfmSettings:
     """Settings of structure from motion."""
 
     seed: int = field(
-        default=0, metadata={"help": "Seed of every random choice; same seed, same result."}
+        default=0,
+        metadata={
+            "help": "Seed of every random choice; same seed, same result.",
+            "min": 0,
+            "max": 2**31 - 1,
+        },
     )
     max_features: int = field(
-        default=8192, metadata={"help": "Features to look for in each photograph (about)."}
+        default=8192,
+        metadata={
+            "help": "Features to look for in each photograph (about).",
+            "min": 100,
+            "max": 1_000_000,
+        },
     )
     matching: str = field(
         default="auto",
         metadata={
             "help": "Which photographs to compare: exhaustive (every pair), sequential (neighbours "
-            "in order of name) or auto (exhaustive up to 300 photographs)."
+            "in order of name) or auto (exhaustive up to 300 photographs).",
+            "choices": ("auto", "exhaustive", "sequential"),
         },
     )
     allow_partial: bool = field(
@@ -56,7 +67,12 @@ class SfmSettings:
     )
     max_minutes: float = field(
         default=120.0,
-        metadata={"help": "Give up after this time (minutes).", "affects_output": False},
+        metadata={
+            "help": "Give up after this time (minutes).",
+            "min": 0.1,
+            "max": 100_000,
+            "affects_output": False,
+        },
     )
 
 
@@ -72,7 +88,7 @@ def run(
     from stages.structure import attempts, finish, ladder, reconstruction_files
 
     capture: Capture = inputs["ingest"]
-    _check(capture, settings)
+    _check(capture)
     if (folder / _FINISHED).exists():
         return _again(folder, report)
     work = folder / _WORK
@@ -109,24 +125,7 @@ def load(folder: Path) -> Reconstruction:
     return load_reconstruction(folder)
 
 
-def _check(capture: Capture, settings: SfmSettings) -> None:
-    if settings.matching not in ("auto", "exhaustive", "sequential"):
-        raise SplatError(
-            "sfm-unknown-matching",
-            given=f"--matching {settings.matching}.",
-            wanted="One of auto, exhaustive, sequential.",
-            hint="Leave it out to let the number of photographs decide.",
-            family=Family.USAGE,
-        )
-    if settings.max_features < 100 or not settings.max_minutes > 0 or settings.seed < 0:
-        raise SplatError(
-            "sfm-bad-setting",
-            given=f"max_features {settings.max_features}, max_minutes {settings.max_minutes:g}, "
-            f"seed {settings.seed}.",
-            wanted="At least 100 features, some time, and a seed that is not negative.",
-            hint="Leave these options out to use their defaults.",
-            family=Family.USAGE,
-        )
+def _check(capture: Capture) -> None:
     if len(capture.photos) < _FEWEST_PHOTOGRAPHS:
         raise SplatError(
             "sfm-too-few-photographs",

@@ -20,16 +20,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    steps: int = field(default=7000, metadata={"help": "Steps of training, one photograph each."})
+    steps: int = field(
+        default=7000,
+        metadata={"help": "Steps of training, one photograph each.", "min": 1, "max": 1_000_000},
+    )
     train_side: int = field(
-        default=800, metadata={"help": "Longer side of the photographs in training (pixels)."}
+        default=800,
+        metadata={
+            "help": "Longer side of the photographs in training (pixels).",
+            "min": 16,
+            "max": 8192,
+        },
     )
     sh_degree: int = field(
         default=2,
-        metadata={"help": "Degree of view-dependent colour, 0 (none) to 3."},
+        metadata={"help": "Degree of view-dependent colour, 0 (none) to 3.", "min": 0, "max": 3},
     )
     max_splats: int = field(
-        default=0, metadata={"help": "Splats at most; 0 takes what free memory allows."}
+        default=0,
+        metadata={
+            "help": "Splats at most; 0 takes what free memory allows.",
+            "min": 0,
+            "max": 100_000_000,
+        },
     )
     smooth: bool = field(
         default=False,
@@ -38,7 +51,9 @@ class TrainSettings:
             "needles and dust."
         },
     )
-    seed: int = field(default=0, metadata={"help": "Seed of all random numbers."})
+    seed: int = field(
+        default=0, metadata={"help": "Seed of all random numbers.", "min": 0, "max": 2**31 - 1}
+    )
     backend: str = backend_setting()
 
 
@@ -56,7 +71,6 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     from stages.training.checkpoint import remove_checkpoint
 
     started = time.monotonic()
-    check(settings)
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
@@ -83,26 +97,6 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
         )
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return splats
-
-
-def check(settings: TrainSettings) -> None:
-    """Raises SplatError for values that no training can have."""
-    limits = {
-        "steps": (1, 1_000_000),
-        "train_side": (16, 8192),
-        "sh_degree": (0, 3),
-        "max_splats": (0, 100_000_000),
-    }
-    for name, (low, high) in limits.items():
-        value = getattr(settings, name)
-        if not low <= value <= high:
-            raise SplatError(
-                "train-setting-out-of-range",
-                given=f"--{name.replace('_', '-')} {value}.",
-                wanted=f"A number from {low:,} to {high:,}.",
-                hint="Leave the option out to get the preset's value.",
-                family=Family.USAGE,
-            )
 
 
 def make_trainer(

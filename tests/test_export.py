@@ -11,6 +11,7 @@ import pytest
 
 from stages import export, formats
 from stages.base.errors import Family, SplatError
+from stages.base.settings import check_settings
 from stages.base.stage import Report
 from stages.export import ExportSettings
 from stages.formats import FORMATS
@@ -162,21 +163,33 @@ def test_a_scene_without_splats_is_exported_with_a_warning(
 
 
 @pytest.mark.parametrize("chosen", [("obj",), ("ply", "ksplat"), (), ("PLY",)])
-def test_an_unknown_format_is_refused_before_anything_is_written(
-    scene: SmallScene, tmp_path: Path, chosen: tuple[str, ...]
-) -> None:
-    with pytest.raises(SplatError) as caught:
-        exported(scene, tmp_path, formats=chosen)
-    assert caught.value.code == "export-format-unknown"
-    assert list(tmp_path.iterdir()) == []
+def test_a_format_that_is_not_written_is_refused(chosen: tuple[str, ...]) -> None:
+    with pytest.raises(SplatError, match="--format") as caught:
+        check_settings(ExportSettings(formats=chosen))
+    assert "quantised.glb" in caught.value.wanted
 
 
 @pytest.mark.parametrize(
-    "name", ["", "../up", "a/b", "a\\b", "con:", " a", "a.", "x" * 200, "a[b]"]
+    "name",
+    [
+        "",
+        "../up",
+        "a/b",
+        "a\\b",
+        "con:",
+        " a",
+        "a ",
+        ".a",
+        "a.",
+        "x" * 101,
+        "a[b]",
+        "assets",
+        "a\n",
+    ],
 )
 def test_a_name_that_is_no_file_name_is_refused(name: str) -> None:
     with pytest.raises(SplatError) as caught:
-        export.check(ExportSettings(name=name))
+        check_settings(ExportSettings(name=name))
     assert caught.value.family == Family.USAGE
 
 

@@ -332,11 +332,6 @@ def test_fewer_than_three_usable_photographs_are_an_error(tmp_path: Path, usable
     assert "broken.png" in error.given
 
 
-def test_a_senseless_size_is_an_error(photos: Path) -> None:
-    with pytest.raises(SplatError, match="max-side"):
-        ingested(photos, max_side=0)
-
-
 def test_a_full_disk_is_an_error_and_leaves_no_half_picture(
     photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

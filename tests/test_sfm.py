@@ -198,23 +198,6 @@ def test_two_scenes_are_told_apart_and_one_may_be_taken(
     assert "sfm-separate-groups" in codes
 
 
-@pytest.mark.parametrize(
-    ("settings", "code"),
-    [
-        ({"matching": "telepathy"}, "sfm-unknown-matching"),
-        ({"max_features": 5}, "sfm-bad-setting"),
-        ({"max_minutes": 0.0}, "sfm-bad-setting"),
-        ({"max_minutes": float("nan")}, "sfm-bad-setting"),
-        ({"seed": -1}, "sfm-bad-setting"),
-    ],
-)
-def test_senseless_settings_are_usage_errors(
-    tmp_path: Path, settings: dict[str, object], code: str
-) -> None:
-    error = failure(bad_captures.sample(4), tmp_path, **settings)
-    assert (error.code, error.family) == (code, Family.USAGE)
-
-
 def test_two_photographs_are_too_few(tmp_path: Path) -> None:
     assert failure(bad_captures.sample(2), tmp_path).code == "sfm-too-few-photographs"
 

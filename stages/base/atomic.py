@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from stages.base.disk import is_full
 from stages.base.errors import Family, SplatError
 
 
@@ -53,7 +53,10 @@ def make_folder(folder: Path) -> None:
 
 def _refused(path: Path, error: OSError) -> SplatError:
     reason = error.strerror or str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT) or (error.errno is None and _is_full(path)):
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or (
+        # NumPy and the USD library do not say why a write failed: look.
+        error.errno is None and is_full(path.parent)
+    ):
         return SplatError(
             "disk-full",
             given=f"{path} could not be written: {reason}.",
@@ -68,11 +71,3 @@ def _refused(path: Path, error: OSError) -> SplatError:
         hint="Check the folder's permissions, or choose another one.",
         family=Family.RESOURCES,
     )
-
-
-def _is_full(path: Path) -> bool:
-    """NumPy and the USD library do not say why a write failed: look."""
-    try:
-        return shutil.disk_usage(path.parent).free < 1 << 20
-    except OSError:
-        return False

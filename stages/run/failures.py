@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import errno
-import shutil
 from pathlib import Path
 
+from stages.base.disk import is_full
 from stages.base.errors import Family, SplatError
 
 _DISK = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
-_FULL_BELOW_BYTES = 4 * 1024 * 1024  # libraries that report a full disk as something else
 _USER = (Family.USAGE, Family.INPUT, Family.RUN_FOLDER)
 _MEMORY_WORDS = ("can't allocate memory", "out of memory", "not enough memory")
 
@@ -24,7 +23,8 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
     chain = _chain(error)
     if any(isinstance(link, OSError) and link.errno in _DISK for link in chain):
         return disk_full(doing, folder)
-    full = isinstance(error, Exception) and _free_bytes(folder) < _FULL_BELOW_BYTES
+    # Libraries report a full disk as something else.
+    full = isinstance(error, Exception) and is_full(folder)
     for link in chain:
         if isinstance(link, SplatError):
             # What ended in a process of its own cannot say why: a full disk explains it.
@@ -74,12 +74,3 @@ def out_of_memory(doing: str, error: BaseException) -> SplatError:
         hint="Close other programs, or ask for less: --max-splats, --train-side, --max-side.",
         family=Family.RESOURCES,
     )
-
-
-def _free_bytes(folder: Path) -> int:
-    for place in (folder, *folder.parents):
-        try:
-            return shutil.disk_usage(place).free
-        except OSError:
-            continue
-    return _FULL_BELOW_BYTES

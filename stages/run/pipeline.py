@@ -10,6 +10,7 @@ from typing import Any
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.interrupt import stop_on_signals
+from stages.base.settings import check_settings
 from stages.base.stage import Stage
 from stages.run import runfolder
 from stages.run.attempt import Listener, attempt
@@ -95,6 +96,8 @@ class Pipeline:
         Returns the manifests in order. Raises SplatError; Interrupted when a signal stopped it,
         with everything finished kept and the stage's own checkpoint in its working folder.
         """
+        for given in (settings or {}).values():
+            check_settings(given)  # before a folder is made
         listener = listener or Listener()
         stop = Event()
         first = self.layout.workspace(self.layout.stages[0]).final
@@ -108,6 +111,8 @@ class Pipeline:
                 run_file = runfolder.recorded_for(self.run_folder, self.photos, first)
                 run_file = run_file.updated(settings or {})
                 wanted = run_file.settings_of(self.layout.stages)
+                for recorded in wanted.values():
+                    check_settings(recorded)
                 planner = Planner(self.layout, run_file.photographs)
                 self._check_allowed(planner.photos, wanted, until, may_run)
                 run_file.write(self.run_folder)

@@ -183,22 +183,48 @@ def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["process", "photos", "--steps", "-4"], "--steps"),
-        (["process", "photos", "--steps", "many"], "--steps"),
-        (["process", "photos", "--preset", "fastest"], "preview"),
-        (["process", "photos", "--backend", "cuda"], "--backend"),
-        (["process", "photos", "--format", "obj"], "--format"),
-        (["process", "photos", "--stepz", "4"], "--stepz"),
+        (["process", "photos", "--steps", "-4"], "--steps -4 cannot be used"),
+        (["process", "photos", "--steps", "many"], "A whole number from 1 to 1,000,000."),
+        (["process", "photos", "--preset", "fast"], "One of preview, standard, best."),
+        (["process", "photos", "--backend", "cuda"], "One of auto, cpu, reference."),
+        (["process", "photos", "--format", "obj"], "--format obj cannot be used"),
+        (["process", "photos", "--stepz", "4"], "Did you mean --steps"),
+        (["process", "photos", "--steps"], "--steps needs a value"),
+        (["process", "photos", "--train-side", "nan"], "--train-side nan cannot be used"),
+        (["export", "--name", "a/b"], "--name a/b cannot be used"),
         (["proces", "photos"], "process"),
-        (["render", "--width", "0"], "--width"),
+        (["convert", "a.ply"], "splat convert needs a target"),
+        (["render", "--width", "0"], "A whole number from 1 to 16,384."),
+        (["view", "--port", "x"], "--port x cannot be used"),
     ],
 )
-def test_wrong_words_are_named_and_exit_2(splat, words: list[str], said: str) -> None:
+def test_wrong_words_are_named_in_our_words_and_exit_2(splat, words: list[str], said: str) -> None:
     result = splat(*words)
     assert result.exit_code == 2, result.output
     assert said in result.stderr
-    assert "Traceback" not in result.output
+    for label in ("Error: ", "Wanted: ", "Next: "):
+        assert label in result.stderr
+    for foreign in ("Traceback", "Value error", "Input should", "Invalid value", "Usage:"):
+        assert foreign not in result.output
     assert not Path("run").exists()
+
+
+def test_wrong_words_are_json_where_json_is_asked_for(splat) -> None:
+    for words in (["--steps", "0"], ["--stepz", "0"]):
+        (event,) = events(splat("process", "photos", "--json", *words))
+        assert (event["event"], event["family"]) == ("error", 2)
+
+
+def test_training_that_goes_on_says_which_settings_it_keeps(splat) -> None:
+    fresh = splat("process", "photos", "--preset", "preview")
+    assert "Training:" not in fresh.stderr
+    again = splat("train", "--steps", "7000")
+    assert (
+        "Training: steps 7,000 (as typed); train side 480, SH degree 1, max splats 60,000 "
+        "(as this run was asked before)." in again.stderr
+    )
+    other = splat("process", "--preset", "standard").stderr
+    assert "steps 7,000, train side 800, SH degree 2, max splats 250,000 (preset stan" in other
 
 
 def test_every_splat_error_shows_given_wanted_next_and_code(splat, pretend) -> None:

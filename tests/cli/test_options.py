@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import pytest
 import typer
@@ -15,15 +14,11 @@ from stages.base.errors import SplatError
 
 @dataclass(frozen=True)
 class Settings:
-    long_side: int = field(default=1600, metadata={"help": "Long side (px)."})
+    long_side: int = field(default=1600, metadata={"help": "Long side (px).", "min": 0})
     rate: float | None = field(default=None, metadata={"help": "Rate (1/s).", "max": 2})
-    kind: Literal["a", "b"] = field(default="a", metadata={"help": "Kind."})
+    kind: str = field(default="a", metadata={"help": "Kind.", "choices": ("a", "b")})
     names: tuple[str, ...] = field(default=(), metadata={"help": "A name."})
     loud: bool = field(default=False, metadata={"help": "Shout."})
-
-    def __post_init__(self) -> None:
-        if self.long_side == 13:
-            raise ValueError("13 is unlucky")
 
 
 def parse(*words: str) -> dict:
@@ -34,8 +29,7 @@ def parse(*words: str) -> dict:
         seen.update(options.given_only(given))
 
     app.command()(options.with_parameters(command, options.parameters(Settings)))
-    result = CliRunner().invoke(app, list(words))
-    assert result.exit_code == 0, result.output
+    CliRunner().invoke(app, list(words), catch_exceptions=False)
     return seen
 
 
@@ -47,15 +41,10 @@ def test_only_what_was_typed_is_given() -> None:
     assert parse("--rate", "1.5") == {"rate": 1.5}
 
 
-def test_values_out_of_bounds_are_refused() -> None:
-    for words in (["--rate", "3"], ["--rate", "-1"], ["--long-side", "-1"], ["--kind", "c"]):
-        with pytest.raises(AssertionError):
-            parse(*words)
-
-
-def test_settings_that_refuse_a_value_are_a_usage_error() -> None:
-    with pytest.raises(SplatError, match="unlucky") as caught:
-        options.changed(Settings(), {"long_side": 13})
+@pytest.mark.parametrize("words", ["--rate 3", "--long-side -1", "--long-side x", "--kind c"])
+def test_value_that_a_setting_cannot_have_is_named_with_its_option(words: str) -> None:
+    with pytest.raises(SplatError, match=f"{words} cannot be used") as caught:
+        parse(*words.split())
     assert caught.value.family == 2
 
 

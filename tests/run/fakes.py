@@ -18,7 +18,7 @@ class CopySettings:
 
 @dataclass(frozen=True)
 class CountSettings:
-    iterations: int = field(default=7000, metadata={"help": "steps"})
+    iterations: int = field(default=7000, metadata={"help": "steps", "min": 1})
     seed: int = field(default=0, metadata={"help": "random seed"})
 
 

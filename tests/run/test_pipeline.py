@@ -19,6 +19,7 @@ from stages.base.errors import Family, Interrupted, SplatError
 from stages.run.lock import locked
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Listener, Pipeline
+from stages.run.runfile import RunFile
 from tests.run.fakes import CopySettings, CountSettings, fake_stages, photographs
 
 
@@ -215,6 +216,28 @@ def test_foreign_folder_is_refused_and_untouched(photos: Path, run_folder: Path)
         Pipeline(run_folder, photos, fake_stages()).run()
     assert caught.value.code == "run-folder-foreign"
     assert [p.name for p in run_folder.iterdir()] == ["thesis.txt"]
+
+
+def test_settings_out_of_bounds_are_refused_before_anything_is_made(
+    photos: Path, run_folder: Path
+) -> None:
+    with pytest.raises(SplatError, match="--iterations 0") as caught:
+        Pipeline(run_folder, photos, fake_stages()).run({"count": CountSettings(iterations=0)})
+    assert caught.value.code == "option-value"
+    assert not run_folder.exists()
+
+
+def test_recorded_settings_out_of_bounds_are_refused_before_any_stage_runs(
+    finished: Pipeline, run_folder: Path, photos: Path
+) -> None:
+    recorded = RunFile.read(run_folder)
+    assert recorded is not None
+    recorded.updated({"count": CountSettings(iterations=0)}).write(run_folder)
+    (photos / "a.jpg").write_text("longer")
+    heard = Heard()
+    with pytest.raises(SplatError, match="--iterations 0"):
+        finished.run(listener=heard)
+    assert heard.events == []
 
 
 def test_run_folder_among_the_photographs_is_refused(photos: Path) -> None:

@@ -1,0 +1,128 @@
+"""What settings may be: stated once, in each field's metadata, and checked from there.
+
+"help": with the unit. "min", "max": of numbers, both allowed. "choices": the words allowed; of a
+list's items, of which there must then be one at least. "pattern": of a text, a regular expression
+for all of it, with "wanted", the sentence that says what it asks for. "option": the option's name
+where it is not the field's. "affects_output": False where another value gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import types
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from stages.base.errors import Family, SplatError
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One value that a person may choose, and what it may be.
+
+    flag: "--max-side". kind: type of the value, or of a list's items (`many`). optional: whether it
+    may be None. default: None if there is none. low, high: of numbers, None where there is no end.
+    """
+
+    name: str
+    flag: str
+    kind: type
+    default: Any = None
+    many: bool = False
+    optional: bool = False
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    pattern: str = ""
+    wanted: str = ""
+    help: str = ""
+
+    def check(self, value: Any) -> None:
+        """Raises SplatError "option-value" for a value that the setting cannot have."""
+        if value is None and self.optional:
+            return
+        items = value if self.many and isinstance(value, (tuple, list)) else (value,)
+        for item in items:
+            if not self._allows(item):
+                raise self._refused(item)
+        if self.choices and not items:
+            raise self._refused("with nothing")
+
+    def parse(self, text: str) -> Any:
+        """One value from what was typed. Raises SplatError "option-value"."""
+        try:
+            value = self.kind(text)
+        except ValueError:
+            raise self._refused(text) from None
+        if not self._allows(value):
+            raise self._refused(text)
+        return value
+
+    def _allows(self, value: Any) -> bool:
+        if self.kind in (int, float):
+            kinds = (int, float) if self.kind is float else (int,)
+            if not isinstance(value, kinds) or isinstance(value, bool) or not math.isfinite(value):
+                return False
+            return (self.low is None or value >= self.low) and (
+                self.high is None or value <= self.high
+            )
+        if not isinstance(value, self.kind) or (self.choices and value not in self.choices):
+            return False
+        return not self.pattern or re.fullmatch(self.pattern, str(value)) is not None
+
+    def _refused(self, value: Any) -> SplatError:
+        return SplatError(
+            "option-value",
+            given=f"{self.flag} {value if str(value) else chr(34) * 2} cannot be used.",
+            wanted=self.wanted or self._wanted(),
+            hint="Leave it out to get the usual value.",
+            family=Family.USAGE,
+        )
+
+    def _wanted(self) -> str:
+        if self.choices:
+            return f"One of {', '.join(self.choices)}."
+        if self.kind not in (int, float):
+            return "Yes or no." if self.kind is bool else "A text."
+        what = "A whole number" if self.kind is int else "A number"
+        if self.low is not None and self.high is not None:
+            return f"{what} from {self.low:,} to {self.high:,}."
+        return f"{what} of at least {self.low:,}." if self.low is not None else f"{what}."
+
+
+def settings_of(settings_type: type) -> list[Setting]:
+    """Every field of a settings dataclass, in order."""
+    hints = get_type_hints(settings_type)
+    found = []
+    for field in fields(settings_type):
+        hint, optional = hints[field.name], False
+        if get_origin(hint) in (Union, types.UnionType):
+            hint = next(arg for arg in get_args(hint) if arg is not type(None))
+            optional = True
+        many = get_origin(hint) in (tuple, list)
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        option = field.name.removesuffix("s") if many else field.name
+        found.append(
+            Setting(
+                name=field.name,
+                flag="--" + field.metadata.get("option", option).replace("_", "-"),
+                kind=get_args(hint)[0] if many else hint,
+                default=None if default is MISSING else default,
+                many=many,
+                optional=optional,
+                low=field.metadata.get("min"),
+                high=field.metadata.get("max"),
+                choices=tuple(field.metadata.get("choices", ())),
+                pattern=field.metadata.get("pattern", ""),
+                wanted=field.metadata.get("wanted", ""),
+                help=field.metadata.get("help", ""),
+            )
+        )
+    return found
+
+
+def check_settings(settings: Any) -> None:
+    """Check every field of a settings dataclass. Raises SplatError "option-value"."""
+    for setting in settings_of(type(settings)):
+        setting.check(getattr(settings, setting.name))
