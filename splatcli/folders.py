@@ -11,7 +11,8 @@ DEFAULT = Path("run")
 
 
 def find_run_folder(named: Path | None = None) -> Path:
-    """The named run folder; else the current folder, `run/`, or the only one in it.
+    """The named run folder; else the current folder, `run/`, or the only one in it; those in
+    which nothing ever succeeded count only if there is no other.
 
     Raises SplatError: run-folder-missing, run-folder-unclear.
     """
@@ -23,7 +24,8 @@ def find_run_folder(named: Path | None = None) -> Path:
     for folder in (here, DEFAULT):
         if runfolder.is_run_folder(folder):
             return folder
-    found = sorted(path for path in here.iterdir() if runfolder.is_run_folder(path))
+    every = sorted(path for path in here.iterdir() if runfolder.is_run_folder(path))
+    found = [path for path in every if runfolder.has_finished_work(path)] or every
     if len(found) == 1:
         return found[0]
     if found:

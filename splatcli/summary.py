@@ -150,6 +150,8 @@ def _state(step: Step, busy: int | None) -> str:
         return "running"
     if not step.will_run:
         return "finished"
+    if step.failed:
+        return "failed"
     if step.manifest is not None:
         return "runs again"
     return "interrupted" if step.interrupted else "to do"

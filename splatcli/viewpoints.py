@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from splatcli import console
 from stages.base.errors import Family, SplatError
+from stages.base.words import counted
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -117,8 +118,8 @@ def _from_file(path: str) -> list[Camera]:
     found = read_cameras(Path(path))
     if found.distorted:
         console.note(
-            f"Warning: the lenses of {found.distorted} cameras in {path} distort; their pictures "
-            "are drawn as pinhole cameras see them.",
+            f"Warning: in {path} are {counted(found.distorted, 'camera')} whose lens distorts; "
+            "the pictures are drawn as pinhole cameras see them.",
             "yellow",
         )
     return [view.camera for view in found.views]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.base.words import counted
 from stages.formats import FORMATS, MESHES
 from stages.raster.backends import backend_of, backend_setting
 
@@ -161,8 +162,8 @@ def _say_what_is_missing(count: int, dropped: int, report: Report) -> None:
     if dropped:
         report.warn(
             "export-splats-dropped",
-            f"{dropped} splats hold values that no viewer can draw and were left out; "
-            "if they are many, train again with another seed.",
+            f"Left out, because of values that no viewer can draw: {counted(dropped, 'splat')}. "
+            "If they are many, train again with another seed.",
         )
     if not count:
         report.warn(

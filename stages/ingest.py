@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base import threads
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report, Stage
+from stages.base.words import counted
 
 if TYPE_CHECKING:
     from stages.photos.decode import PixelBudget
@@ -172,7 +173,7 @@ def _report_capture(photos: tuple[Photo, ...], measures: list[Measures], report:
 
 
 def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatError:
-    given = f"{root} holds {usable} usable photograph{'' if usable == 1 else 's'}."
+    given = f"{root} holds {counted(usable, 'usable photograph')}."
     if reasons:
         few = "; ".join(f"{name}: {why}" for name, why in reasons[:3])
         more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base import threads
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.base.words import counted
 
 if TYPE_CHECKING:
     from stages.scene import Capture, Reconstruction
@@ -129,7 +130,7 @@ def _check(capture: Capture) -> None:
     if len(capture.photos) < _FEWEST_PHOTOGRAPHS:
         raise SplatError(
             "sfm-too-few-photographs",
-            given=f"There are {len(capture.photos)} usable photographs.",
+            given=f"The capture holds {counted(len(capture.photos), 'usable photograph')}.",
             wanted=f"At least {_FEWEST_PHOTOGRAPHS}; 20 to 50 do an object or a room well.",
             hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
             family=Family.INPUT,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.base.words import counted
 from stages.raster.backends import backend_of, backend_setting
 
 if TYPE_CHECKING:
@@ -127,8 +128,8 @@ def make_trainer(
     if smaller:
         report.warn(
             "train-photographs-smaller",
-            f"{len(smaller)} photographs are smaller than --train-side {settings.train_side}; "
-            "they are used at their own size. --max-side sets how large ingest keeps them.",
+            f"Used at their own size, smaller than --train-side {settings.train_side}: "
+            f"{counted(len(smaller), 'photograph')}. --max-side sets how large ingest keeps them.",
         )
     cap = settings.max_splats or splat_cap(available_mib())
     return Trainer(

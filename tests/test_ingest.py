@@ -313,7 +313,7 @@ def test_bad_folders_each_get_their_own_message(tmp_path: Path) -> None:
     (photos / "a.txt").write_text("a")
     text_only = error_of(photos)
     assert (text_only.code, text_only.family) == ("ingest-no-photographs", Family.INPUT)
-    assert "1 other files" in text_only.given
+    assert "(1 other file)" in text_only.given
     (photos / "clip.mp4").write_bytes(b"a")
     assert "ffmpeg" in error_of(photos).hint
     single = save(tmp_path / "one.jpg", textured(1))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from stages.base.words import counted
 from stages.photos.find import RAW_ADVICE, VIDEO_ADVICE, Findings
 from stages.scene import Photo
 
@@ -85,7 +86,8 @@ def about_capture(
     if len(photos) < FEWEST_WITHOUT_WARNING:
         warn(
             "ingest-few-photographs",
-            f"There are {len(photos)} usable photographs. 20 to 50 do an object or a room well: "
+            f"The capture holds {counted(len(photos), 'usable photograph')}. 20 to 50 do an "
+            "object or a room well: "
             "take more, in small steps around the scene, with 60-80 % overlap.",
         )
     blurred = _about_sharpness(photos, warn)
@@ -96,8 +98,9 @@ def about_capture(
         extra = sum(len(group) - 1 for group in duplicates)
         warn(
             "ingest-near-duplicates",
-            f"{extra} of {len(photos)} photographs show nearly the same as another: {groups}. "
-            "They add no depth: take a step sideways between photographs.",
+            f"{extra} of {len(photos)} photographs {'shows' if extra == 1 else 'show'} nearly the "
+            f"same as another: {groups}. "
+            "That adds no depth: take a step sideways between photographs.",
         )
     return blurred
 

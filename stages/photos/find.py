@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from stages.base.errors import Family, SplatError
+from stages.base.words import counted
 
 LOSSY = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".heic", ".heif", ".hif", ".avif"})
 LOSSLESS = frozenset({".png", ".tif", ".tiff", ".bmp"})
@@ -191,17 +192,20 @@ RAW_ADVICE = "Export raw files as JPEG or TIFF first, all with the same white ba
 
 def _no_photographs(folder: Path, found: Findings) -> SplatError:
     wanted = "JPEG, PNG, TIFF, WebP or HEIC photographs, at least 3; 20 to 50 do an object well."
-    unread = {"videos": found.videos, "raw files": found.raws, "pictures": found.other_pictures}
-    total = sum(map(len, unread.values())) + found.others
-    if total == 0:
+    counts = {
+        "video": len(found.videos),
+        "raw file": len(found.raws),
+        "picture": len(found.other_pictures),
+        "other file": found.others,
+    }
+    if not any(counts.values()):
         return SplatError(
             "ingest-empty-folder",
             given=f"{folder} is empty.",
             wanted=wanted,
             hint="Copy the photographs into it, or name another folder.",
         )
-    kinds = [f"{len(names)} {kind}" for kind, names in unread.items() if names]
-    kinds += [f"{found.others} other files"] if found.others else []
+    kinds = [counted(count, kind) for kind, count in counts.items() if count]
     hint = "Name the folder that holds the photographs."
     if found.videos:
         hint = VIDEO_ADVICE

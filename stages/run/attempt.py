@@ -80,7 +80,12 @@ def attempt(
         raise
     except Exception as error:
         explained = as_splat_error(error, stage.name, space.run_folder)
-        if explained is None or explained is error:
+        if explained is None:
+            said = str(error).splitlines()[0] if str(error) else "no more is known"
+            space.note_failure("bug", f"{type(error).__name__}: {said}.")
+            raise
+        space.note_failure(explained.code, explained.given)
+        if explained is error:
             raise
         raise explained from error
     finally:

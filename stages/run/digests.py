@@ -8,10 +8,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+UNREADABLE = "unreadable"
+
 
 @dataclass(frozen=True)
 class FileRecord:
-    """One file as it was seen. sha256: hexadecimal. size: bytes. mtime_ns: nanoseconds."""
+    """One file as it was seen. sha256: hexadecimal, or `UNREADABLE`. size: bytes. mtime_ns:
+    nanoseconds."""
 
     sha256: str
     size: int
@@ -32,28 +35,40 @@ def record_files(
     known: Mapping[str, FileRecord] | None = None,
     *,
     leave_out: frozenset[str] = frozenset(),
-    hidden: bool = True,
+    users: bool = False,
 ) -> FileRecords:
     """Every file under `folder` (or `folder` itself if it is a file), by posix name, sorted.
 
     known: earlier records; a file whose size and modification time are unchanged keeps its digest
         unread, which makes a second look at a large folder cheap. An edited file has another time.
-    leave_out: names to skip. hidden: whether names with a leading dot count; desktop programs drop
-        such files into folders of photographs.
+    leave_out: names to skip. users: whether the files are the user's own: then names with a leading
+        dot do not count, since desktop programs drop such files among photographs, and a file that
+        may not be read is recorded as that.
     Raises OSError.
     """
     known = known or {}
+    record = _record_if_readable if users else _record
     if folder.is_file():
-        return {folder.name: _record(folder, known.get(folder.name))}
+        return {folder.name: record(folder, known.get(folder.name))}
     found: FileRecords = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
-        if not hidden and any(part.startswith(".") for part in relative.parts):
+        if users and any(part.startswith(".") for part in relative.parts):
             continue
         name = relative.as_posix()
         if name not in leave_out and path.is_file():
-            found[name] = _record(path, known.get(name))
+            found[name] = record(path, known.get(name))
     return found
+
+
+def _record_if_readable(path: Path, known: FileRecord | None) -> FileRecord:
+    if known is not None and known.sha256 == UNREADABLE:
+        known = None  # a change of permissions is no change of time
+    try:
+        return _record(path, known)
+    except PermissionError:
+        stat = path.stat()
+        return FileRecord(UNREADABLE, stat.st_size, stat.st_mtime_ns)
 
 
 def _record(path: Path, known: FileRecord | None) -> FileRecord:

@@ -21,7 +21,8 @@ _NAMED_AT_MOST = 3
 @dataclass(frozen=True)
 class Step:
     """One line of a plan. reason: why it runs, in words; "" if it does not. interrupted: work on
-    it was begun and left. manifest: of the finished run, if there is one."""
+    it was begun and left. failed: and left because it failed. manifest: of the finished run, if
+    there is one."""
 
     stage: Stage
     number: int
@@ -29,6 +30,7 @@ class Step:
     reason: str
     manifest: Manifest | None = None
     interrupted: bool = False
+    failed: bool = False
 
 
 class Planner:
@@ -71,9 +73,10 @@ class Planner:
             for name in stage.reads
             if name in self._pending
         ]
+        failure = space.failure()
         if manifest is None:
             first = "was interrupted" if interrupted else "has not run yet"
-            return Step(stage, number, True, first, None, interrupted)
+            return Step(stage, number, True, failure or first, None, interrupted, bool(failure))
         reasons = why_again(
             self._request_if_known(stage, settings, manifest, bool(waiting)),
             manifest,
@@ -81,7 +84,11 @@ class Planner:
         )
         broken = damage(space.final, manifest.outputs)[:_NAMED_AT_MOST]
         reasons += waiting + [f"its output {words}" for words in broken]
-        return Step(stage, number, bool(reasons), ", ".join(reasons), manifest, interrupted)
+        runs = bool(reasons)
+        if runs and failure:
+            reasons.append(f"failed at the last attempt: {failure}")
+        why = ", ".join(reasons)
+        return Step(stage, number, runs, why, manifest, interrupted, runs and bool(failure))
 
     def request(self, stage: Stage, settings: Any) -> Request:
         """What `stage` is asked to do. Raises SplatError (photographs-missing), OSError."""
@@ -91,7 +98,7 @@ class Planner:
         if self._photo_records is None:
             done = Manifest.read(self.layout.workspace(stage).final)
             known = done.input_files.get(PHOTOS) if done else None
-            self._photo_records = record_files(self.existing_photos(), known, hidden=False)
+            self._photo_records = record_files(self.existing_photos(), known, users=True)
         inputs = {PHOTOS: combined_digest(self._photo_records)}
         return request_for(stage, settings, inputs, {PHOTOS: self._photo_records})
 

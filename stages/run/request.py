@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from stages.base.stage import Stage
+from stages.base.words import counted
 from stages.run.digests import FileRecords, differences
 from stages.run.manifest import Manifest, plain, write_json
 
@@ -98,7 +99,8 @@ def _input_changes(name: str, request: Request, done: Manifest) -> list[str]:
     now, then = request.input_files[name], done.input_files.get(name, {})
     changes = [f"photograph {words}" for words in differences(then, now)]
     if len(changes) > 3:
-        return [*changes[:3], f"{len(changes) - 3} more photographs changed"]
+        rest = len(changes) - 3
+        return [*changes[:3], f"{counted(rest, 'more photograph')} changed"]
     return changes or [f"{name} changed"]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from stages.base.errors import Family, SplatError
 from stages.run.digests import combined_digest, record_files
 from stages.run.lock import LOCK, locked
-from stages.run.manifest import Manifest
+from stages.run.manifest import MANIFEST, Manifest
 from stages.run.planning import PHOTOS
 from stages.run.runfile import RUN_FILE, RunFile
 
@@ -17,6 +17,11 @@ from stages.run.runfile import RUN_FILE, RunFile
 def is_run_folder(folder: Path) -> bool:
     """Whether splat made this folder."""
     return (folder / RUN_FILE).is_file()
+
+
+def has_finished_work(folder: Path) -> bool:
+    """Whether any stage ever came to its end in this run folder."""
+    return any(folder.glob(f"[1-9]-*/{MANIFEST}"))
 
 
 @contextmanager
@@ -59,7 +64,7 @@ def _same(photos: Path, first_stage_folder: Path) -> bool:
     done = Manifest.read(first_stage_folder)
     if done is None:
         return False
-    return combined_digest(record_files(photos, hidden=False)) == done.inputs.get(PHOTOS)
+    return combined_digest(record_files(photos, users=True)) == done.inputs.get(PHOTOS)
 
 
 def _check_photos(folder: Path, photos: Path) -> None:

@@ -1,22 +1,26 @@
 """The folders of one stage in a run folder, and how work becomes finished by rename.
 
-`4-train` is finished work. `.4-train.partial` is where work goes on; it is kept when it is
-interrupted. `.4-train.old` is the finished work that is being replaced, for the moment between two
-renames. A crash at any point leaves either the old or the new work whole.
+`4-train` is finished work. `.4-train.partial` is where work goes on; it is kept when work is
+interrupted, and with the reason in it when work fails. `.4-train.old` is the finished work that is
+being replaced, for the moment between two renames. A crash at any point leaves either the old or
+the new work whole.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.stage import Stage
-from stages.run.manifest import MANIFEST, Manifest
+from stages.run.manifest import MANIFEST, Manifest, write_json
 from stages.run.request import REQUEST, Request
 
 USAGE = "usage.json"
-_FILES = (MANIFEST, REQUEST, USAGE)
+_FAILURE = "failure.json"
+_FILES = (MANIFEST, REQUEST, USAGE, _FAILURE)
 BOOKKEEPING = frozenset([*_FILES, *(name + ".tmp" for name in _FILES)])
 
 
@@ -39,9 +43,23 @@ class Workspace:
     def old(self) -> Path:
         return self.run_folder / f".{self.label}.old"
 
+    def note_failure(self, code: str, given: str) -> None:
+        """Leave in the working folder why it was left; as far as the disk still allows."""
+        with suppress(OSError):
+            write_json(self.partial / _FAILURE, {"code": code, "given": given})
+
+    def failure(self) -> str:
+        """Why the last attempt failed, with its code; "" if it did not."""
+        try:
+            data = json.loads((self.partial / _FAILURE).read_text(encoding="utf-8"))
+            return f"{data['given']} ({data['code']})"
+        except (OSError, ValueError, LookupError, TypeError):
+            return ""
+
     def begin(self, request: Request, settings_type: type) -> bool:
         """Make the working folder ready; True if it holds work on the same request. OSError."""
         if self.partial.exists():
+            (self.partial / _FAILURE).unlink(missing_ok=True)
             if request.matches(self.partial, settings_type):
                 for half in self.partial.rglob(".partial-*"):  # of `replacing`, killed half-way
                     half.unlink()

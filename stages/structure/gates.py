@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from statistics import median
 
+from stages.base.words import counted
+
 CALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC = 2, 4, 5, 6  # COLMAP's TwoViewGeometry
 
 
@@ -234,7 +236,8 @@ def _check_support(figures: Figures, limits: Limits) -> list[Failure]:
         failures.append(
             Failure(
                 "sfm-too-few-points",
-                f"Only {figures.points} points were found in {figures.registered} photographs.",
+                f"Only {counted(figures.points, 'point')} could be found in "
+                f"{counted(figures.registered, 'photograph')}.",
                 f"At least {limits.points_per_view} a photograph are wanted.",
                 texture,
             )
@@ -303,7 +306,8 @@ def _no_parallax(what: str) -> Failure:
 
 def _separate(largest: int, others: list[int], single: int, photographs: int) -> Failure:
     parts = [str(largest), *map(str, others[:5])]
-    alone = f", and {single} photographs match no other" if single else ""
+    match = "matches" if single == 1 else "match"
+    alone = f", and {counted(single, 'photograph')} {match} no other" if single else ""
     return Failure(
         "sfm-separate-groups",
         f"The {photographs} photographs fall into unconnected groups of {', '.join(parts)}{alone}.",
@@ -318,7 +322,7 @@ def _no_model(figures: Figures) -> Failure:
         "sfm-no-model",
         f"No arrangement of the {figures.photographs} photographs could be found"
         + (
-            f" ({figures.registered} placed, {figures.points} points)."
+            f" ({figures.registered} placed, {counted(figures.points, 'point')})."
             if figures.registered
             else "."
         ),

@@ -174,6 +174,20 @@ def test_run_folder_is_found_from_inside_beside_and_alone(splat, tmp_path, monke
     assert splat("status").exit_code == 0
 
 
+def test_run_folder_in_which_nothing_succeeded_is_not_offered(splat, pretend) -> None:
+    def refuse(inputs, settings, folder, report) -> None:
+        raise SplatError("ingest-x", given="Two cats.", wanted="A dog.", hint="Bark.")
+
+    pretend["ingest"] = refuse
+    splat("process", "photos", "--out", "empty")
+    assert splat("status").exit_code == 0  # the only one: it has something to tell
+    assert states(splat, "empty")["ingest"] == "failed"
+    assert "Two cats. (ingest-x)" in " ".join(splat("status", "empty").stdout.split())
+    del pretend["ingest"]
+    splat("process", "photos", "--out", "good")
+    assert states(splat)["ingest"] == "finished"
+
+
 def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
     result = splat("train")
     assert result.exit_code == 5

@@ -240,6 +240,29 @@ def test_recorded_settings_out_of_bounds_are_refused_before_any_stage_runs(
     assert heard.events == []
 
 
+def test_photograph_that_may_not_be_read_does_not_stop_the_run(
+    photos: Path, run_folder: Path, monkeypatch
+) -> None:
+    """Tests may run as a user whom permissions do not bind."""
+    opened = Path.open
+
+    def refusing(self: Path, *args, **kwargs):
+        if self.name == "b.jpg":
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+        return opened(self, *args, **kwargs)
+
+    def copy(inputs, settings, folder, report) -> None:
+        (folder / "text").mkdir()
+        (folder / "text" / "all.txt").write_text("one")
+
+    pipeline = Pipeline(run_folder, photos, fake_stages(copy=copy))
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", refusing)
+        pipeline.run()
+        assert ran(pipeline) == []
+    assert reasons(pipeline)["copy"] == "photograph b.jpg changed"  # it may be read again
+
+
 def test_run_folder_among_the_photographs_is_refused(photos: Path) -> None:
     with pytest.raises(SplatError) as caught:
         Pipeline(photos / "run", photos, fake_stages()).run()
@@ -312,10 +335,19 @@ def test_lock_of_a_killed_process_does_not_count(finished: Pipeline, run_folder:
     assert ran(finished) == []
 
 
-def test_unwritable_place_is_refused(photos: Path) -> None:
-    for place in (Path("/proc/run"), photos / "a.jpg" / "run"):
-        with pytest.raises(SplatError):
-            Pipeline(place, photos.parent / "photos", fake_stages()).run()
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc here")
+def test_place_where_no_folder_can_be_is_not_called_a_full_disk(photos: Path) -> None:
+    with pytest.raises(SplatError, match="/proc/run") as caught:
+        Pipeline(Path("/proc/run"), photos, fake_stages()).run()
+    assert caught.value.code == "run-folder-unusable"
+
+
+def test_run_folder_below_a_file_is_refused(photos: Path) -> None:
+    below = photos.parent / "file"
+    below.write_text("")
+    with pytest.raises(SplatError) as caught:
+        Pipeline(below / "run", photos, fake_stages()).run()
+    assert caught.value.code == "run-folder-unusable"
 
 
 def test_folder_without_write_permission_is_refused(
@@ -412,6 +444,39 @@ def test_interrupted_stage_goes_on_from_its_checkpoint(photos: Path, run_folder:
     pipeline.run(listener=heard)
     assert heard.events == [("skipped", "copy"), ("resumed", "count"), ("started", "sign")]
     assert pipeline.load("count") == "10 from 6"
+
+
+def test_failed_stage_is_told_with_its_reason_until_it_runs_again(
+    photos: Path, run_folder: Path
+) -> None:
+    refusal = SplatError("count-x", given="Two cats.", wanted="A dog.", hint="Bark.")
+    with pytest.raises(SplatError):
+        Pipeline(run_folder, photos, fake_stages(count=failing(refusal))).run()
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    step = pipeline.status()[1]
+    assert (step.failed, step.reason) == (True, "Two cats. (count-x)")
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    step = pipeline.status()[1]
+    assert (step.failed, step.interrupted, step.reason) == (False, True, "was interrupted")
+    pipeline.run()
+    assert not pipeline.status()[1].will_run
+    assert "failure.json" not in {p.name for p in (run_folder / "2-count").iterdir()}
+
+
+def test_reason_of_a_crash_and_of_a_stage_that_ran_again_is_kept_too(
+    finished: Pipeline, run_folder: Path
+) -> None:
+    broken = Pipeline(run_folder, stages=fake_stages(count=failing(ValueError("no cats"))))
+    with pytest.raises(ValueError, match="no cats"):
+        broken.run({"count": CountSettings(iterations=1)})
+    step = broken.status()[1]
+    assert step.failed
+    assert step.reason == (
+        "iterations 7000 -> 1, failed at the last attempt: ValueError: no cats. (bug)"
+    )
+    finished.run({"count": CountSettings()})  # as it was finished before
+    assert not finished.status()[1].failed
 
 
 def test_what_a_stage_offers_to_draw_reaches_the_listener(photos: Path, run_folder: Path) -> None:

@@ -151,7 +151,7 @@ def test_unconnected_groups_are_named_by_size() -> None:
     (failure,) = check_pairs(pairs, 9)
     assert failure.code == "sfm-separate-groups"
     assert "6, 2" in failure.given
-    assert "1 photographs match no other" in failure.given
+    assert "1 photograph matches no other" in failure.given
 
 
 def test_no_pairs_at_all() -> None:
