@@ -69,6 +69,7 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     """Train; write splats.bin, history.csv, a plot and a contact sheet of held-out photographs."""
     from stages.raster.smoothing import smoothed
     from stages.scene.storage import save_splats
+    from stages.training.cap import forget_cap
     from stages.training.checkpoint import remove_checkpoint
 
     started = time.monotonic()
@@ -76,7 +77,6 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     start: Splats = inputs["seed"]
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
     report.metric("backend", backend_of(settings.backend).name)
-    report.metric("splat_cap", trainer.cap)
     report.metric("train_photographs", len(trainer.train))
     report.metric("held_out_photographs", len(trainer.held_out))
     model = trainer.run(start)
@@ -88,6 +88,7 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     write_quality(trainer, folder, report)
     save_splats(folder, splats)
     remove_checkpoint(folder)
+    forget_cap(folder)
     report.metric("steps", settings.steps)
     report.metric("splats", len(splats))
     if len(splats) >= 0.98 * trainer.cap:
@@ -108,10 +109,9 @@ def make_trainer(
     report: Report,
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
-    from stages.base.memory import available_mib
     from stages.measure.judge import load_photographs
     from stages.scene import Look, near_plane, scene_extent, split_held_out
-    from stages.training.densify import splat_cap
+    from stages.training.cap import cap_for
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
     from stages.training.views import load_views
@@ -131,20 +131,23 @@ def make_trainer(
             f"Used at their own size, smaller than --train-side {settings.train_side}: "
             f"{counted(len(smaller), 'photograph')}. --max-side sets how large ingest keeps them.",
         )
-    cap = settings.max_splats or splat_cap(available_mib())
+    cap = cap_for(folder, settings.max_splats)
+    report.metric("splat_cap", cap.splats)
+    report.metric("splat_cap_from", cap.origin)
+    report.metric("splat_cap_free_mib", cap.free_mib)
     return Trainer(
         schedule=Schedule(
             steps=settings.steps,
             extent=scene_extent(reconstruction.views),
             sh_degree=settings.sh_degree,
             n_views=len(train),
-            n_start=min(n_start, cap),
+            n_start=min(n_start, cap.splats),
             seed=settings.seed,
         ),
         train=train,
         held_out=held_out,
         look=look,
-        cap=cap,
+        cap=cap.splats,
         folder=folder,
         report=report,
         smooth=settings.smooth,

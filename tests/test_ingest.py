@@ -74,6 +74,24 @@ def test_a_folder_that_cannot_be_written_to_is_fine(photos: Path) -> None:
     assert len(capture.photos) == 3
 
 
+def test_a_photograph_that_may_not_be_read_is_left_out_and_named(
+    photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(next(photos.glob("*.jpg")), photos / "locked.jpg")
+    read = Path.read_bytes
+
+    def refusing(self: Path) -> bytes:
+        if self.name == "locked.jpg":
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+        return read(self)
+
+    monkeypatch.setattr(Path, "read_bytes", refusing)
+    capture, warnings, _ = ingested(photos)
+    assert len(capture.photos) == 3
+    assert "locked.jpg is left out" in warnings["ingest-left-out"]
+    assert "Permission denied" in warnings["ingest-left-out"]
+
+
 def test_load_returns_what_run_returned(photos: Path) -> None:
     capture, _, _ = ingested(photos)
     assert ingest.load(capture.folder) == capture

@@ -16,6 +16,7 @@ from stages.raster.draw import render
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import Look, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
+from stages.training import cap
 from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -286,3 +287,57 @@ def test_under_the_smoothing_filter_no_trained_splat_is_finer_than_its_photograp
     widths = smoothing_widths(found.means, [v.camera.fitted(72) for v in kept], near=0.01)
     assert (np.exp(found.log_scales).min(1) >= 0.999 * widths).all()
     assert report.metrics["psnr_db"] > 20
+
+
+class KilledError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("how", ["killed before its first checkpoint", "stopped at a checkpoint"])
+def test_a_run_goes_on_under_its_first_cap_whatever_memory_is_free_by_then(
+    tmp_path, monkeypatch, how
+):
+    scene = small_scene(tmp_path)
+    inputs = {"sfm": scene.reconstruction, "seed": scene.splats.with_sh_degree(0)}
+    settings = TrainSettings(steps=30, train_side=48, sh_degree=0, max_splats=0)
+    monkeypatch.setattr(cap, "splat_cap", int)
+
+    def trained(name, free_mib, stopping=False):
+        monkeypatch.setattr(cap, "available_mib", lambda: free_mib)
+        folder, report = tmp_path / name, Report()
+        folder.mkdir(exist_ok=True)
+
+        def stop(label, done, total, numbers):
+            if stopping and label == "training" and done == 12:
+                report.stop_requested.set()
+                if "killed" in how:
+                    raise KilledError
+
+        report.listener = stop
+        train.run(inputs, settings, folder, report)
+        return (folder / "splats.bin").read_bytes(), report.metrics
+
+    few, figures = trained("few", 100.0)
+    many, _ = trained("many", 400.0)
+    assert few != many
+    assert (figures["splat_cap"], figures["splat_cap_from"]) == (100, "free memory")
+    assert figures["splat_cap_free_mib"] == 100
+    with pytest.raises((KilledError, Interrupted)):
+        trained("broken", 100.0, stopping=True)
+    assert (tmp_path / "broken" / "checkpoint.bin").exists() == ("stopped" in how)
+    again, _ = trained("broken", 400.0)
+    assert again == few
+    assert not (tmp_path / "broken" / "cap.json").exists()
+
+
+def test_a_cap_that_was_asked_for_is_told_as_that(tmp_path):
+    assert cap.cap_for(tmp_path, 500) == cap.Cap(500, "--max-splats")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_note_of_the_cap_is_written_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
+    for text in ("", "[]", '{"splats": "many", "origin": "?"}', '{"splats": 0, "origin": "?"}'):
+        (tmp_path / cap.FILE_NAME).write_text(text)
+        assert cap.cap_for(tmp_path, 0).free_mib == 4096
+        assert cap.cap_for(tmp_path, 0) == cap._read(tmp_path / cap.FILE_NAME)

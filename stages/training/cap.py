@@ -1,0 +1,51 @@
+"""How many splats a run may have: decided at its first start, and kept by its later ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from stages.base.atomic import replacing
+from stages.base.memory import available_mib
+from stages.training.densify import splat_cap
+
+FILE_NAME = "cap.json"
+
+
+@dataclass(frozen=True)
+class Cap:
+    """splats: at most. origin: "--max-splats" or "free memory". free_mib: what was free then, if
+    that decided; None where the system did not say."""
+
+    splats: int
+    origin: str
+    free_mib: float | None = None
+
+
+def cap_for(folder: Path, max_splats: int) -> Cap:
+    """`max_splats`, or for 0 what free memory allows: as it was when work in `folder` began, since
+    a run that goes on with another cap would end in other bytes."""
+    if max_splats:
+        return Cap(max_splats, "--max-splats")
+    kept = _read(folder / FILE_NAME)
+    if kept is not None:
+        return kept
+    free_mib = available_mib()
+    cap = Cap(splat_cap(free_mib), "free memory", free_mib and round(free_mib))
+    with replacing(folder / FILE_NAME) as path:
+        path.write_text(json.dumps(asdict(cap)) + "\n", encoding="utf-8")
+    return cap
+
+
+def forget_cap(folder: Path) -> None:
+    """Of a finished run, whose manifest says what it was."""
+    (folder / FILE_NAME).unlink(missing_ok=True)
+
+
+def _read(path: Path) -> Cap | None:
+    try:
+        cap = Cap(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None
+    return cap if isinstance(cap.splats, int) and cap.splats > 0 else None
