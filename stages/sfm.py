@@ -307,5 +307,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=2, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=3, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from stages.base.errors import Family, SplatError
 from stages.base.words import counted
+from stages.scene.capture import PHOTOS_FOLDER
 
 LOSSY = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".heic", ".heif", ".hif", ".avif"})
 LOSSLESS = frozenset({".png", ".tif", ".tiff", ".bmp"})
@@ -112,7 +113,7 @@ def picture_names(names: Iterable[str]) -> dict[str, str]:
             candidate = path.with_name(f"{path.stem}-{number}{path.suffix}")
             number += 1
         taken.add(_folded(candidate))
-        given[name] = f"photos/{candidate}"
+        given[name] = f"{PHOTOS_FOLDER}{candidate}"
     return given
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stages.scene.camera import Camera
 
 HELD_OUT_EVERY = 8
+PHOTOS_FOLDER = "photos/"  # of a capture: where its normalised pictures are
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,12 @@ class Photo:
     sharpness: float
     log2_luminance: float
     exposure_ev: float | None
+
+    @property
+    def picture(self) -> str:
+        """What every later picture of this photograph is called too, with its suffix: decided once,
+        by ingest, so that no two photographs share one ("day 1/IMG_01.jpg")."""
+        return self.image.removeprefix(PHOTOS_FOLDER)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import posixpath
 import shutil
 from pathlib import Path
 
@@ -21,7 +20,10 @@ from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_p
 COLMAP = "colmap"
 IMAGES = f"{COLMAP}/images"
 SPARSE = f"{COLMAP}/sparse/0"
-JPEG_QUALITY = 97
+_JPEG = (
+    *(cv2.IMWRITE_JPEG_QUALITY, 97),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+)
 
 
 def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -> Reconstruction:
@@ -38,7 +40,7 @@ def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -
         pinhole_for(size, params)
         for size, params in zip(model.camera_sizes, model.camera_params, strict=True)
     ]
-    pictures = picture_names([photo.name for photo in ordered])
+    pictures = [photo.picture for photo in ordered]
     _write_pictures(model, pinholes, ordered, pictures, capture.folder, folder, report)
     cameras = [
         _camera(pinholes[model.view_cameras[i]], model.world_to_camera[i])
@@ -58,21 +60,6 @@ def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -
         tracks=model.tracks,
         levelled=levelled,
     )
-
-
-def picture_names(names: list[str]) -> list[str]:
-    """A .jpg path for each photograph: its own name where that is a JPEG's, else with ".jpg"
-    added; distinct also where upper and lower case are the same."""
-    taken: set[str] = set()
-    pictures = []
-    for name in names:
-        clean = posixpath.normpath("/" + name).lstrip("/")
-        picture = clean if clean.lower().endswith((".jpg", ".jpeg")) else clean + ".jpg"
-        while picture.casefold() in taken:
-            picture = picture.rsplit(".", 1)[0] + "_.jpg"
-        taken.add(picture.casefold())
-        pictures.append(picture)
-    return pictures
 
 
 def _camera(pinhole: Pinhole, world_to_camera: np.ndarray) -> Camera:
@@ -134,13 +121,11 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _write(path: Path, image: np.ndarray) -> None:
-    options = [
-        cv2.IMWRITE_JPEG_QUALITY,
-        JPEG_QUALITY,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-    ]
-    encoded = cv2.imencode(".jpg", image, options)[1]
+    """As the suffix says: what came without loss goes on without."""
+    if path.suffix.lower() == ".png":
+        encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1]
+    else:
+        encoded = cv2.imencode(".jpg", image, _JPEG)[1]
     with replacing(path) as partial:
         encoded.tofile(partial)
 
