@@ -66,7 +66,8 @@ PRESETS: dict[str, TrainSettings] = {
 
 
 def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report: Report) -> Splats:
-    """Train; write splats.bin, history.csv, a plot and a contact sheet of held-out photographs."""
+    """Train; write splats.bin, history.csv, a plot, and held-out photographs as a contact sheet
+    with a legend."""
     from stages.raster.smoothing import smoothed
     from stages.scene.storage import save_splats
     from stages.training.cap import forget_cap

@@ -6,7 +6,6 @@ import importlib
 import os
 import platform
 import shutil
-import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,26 +14,11 @@ from splatcli import console
 from stages.base import threads
 from stages.base.errors import Family
 from stages.base.lazy import named
-from stages.base.libraries import versions
+from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
+from stages.base.words import counted
 from stages.raster.backends import BACKENDS, Backend
 
-_MODULES = {
-    "av": "av",
-    "fast-simplification": "fast_simplification",
-    "numba": "numba",
-    "numpy": "numpy",
-    "opencv-contrib-python-headless": "cv2",
-    "pillow": "PIL",
-    "pillow-heif": "pillow_heif",
-    "plyfile": "plyfile",
-    "pycolmap": "pycolmap",
-    "pygltflib": "pygltflib",
-    "scikit-image": "skimage",
-    "scipy": "scipy",
-    "torch": "torch",
-    "usd-core": "pxr",
-}
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
 
@@ -66,24 +50,30 @@ def checks() -> Iterator[Check]:
     """Every check, in the order shown."""
     yield Check("splat", versions().get("splat", "not installed as a package"))
     yield Check("python", f"{platform.python_version()} on {platform.platform()}")
-    yield from map(_library, _MODULES)
+    yield from map(_library, needed())
     yield Check("threads", f"{threads.count()} of {os.cpu_count()} cores (SPLAT_THREADS sets it)")
     yield Check("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "not set"))
     yield _memory()
     yield _disk()
-    yield _numba_cache()
+    yield _kernel_cache()
     for backend in BACKENDS:
         yield _backend(backend)
 
 
 def _library(distribution: str) -> Check:
-    found = versions().get(distribution)
+    modules, advice = modules_of(distribution), "Install splat again: pip install ."
+    if not modules:
+        return Check(distribution, "not installed", ok=False, advice=advice)
     try:
-        importlib.import_module(_MODULES[distribution])
+        for module in modules:
+            importlib.import_module(module)
     except Exception as error:  # a broken library may raise anything while it loads
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return Check(distribution, said, ok=False, advice="Install splat again: pip install .")
-    return Check(distribution, found or "present")
+        return Check(distribution, _said(error), ok=False, advice=advice)
+    return Check(distribution, versions().get(distribution, "present"))
+
+
+def _said(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _memory() -> Check:
@@ -101,17 +91,18 @@ def _disk() -> Check:
     return Check("free disk here", console.size(free), advice=advice)
 
 
-def _numba_cache() -> Check:
-    import stages.raster
-
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(named) if named else Path(next(iter(stages.raster.__path__)))
+def _kernel_cache() -> Check:
     try:
-        with tempfile.NamedTemporaryFile(dir=folder):
-            return Check("kernel cache", f"{folder} is writable")
-    except OSError as error:
-        where = f"{folder}: {error.strerror}"
-        return Check("kernel cache", where, advice="Kernels are kept in your home folder instead.")
+        from stages.kernels import cache
+
+        own, others = cache.folder(), cache.others()
+        value = f"{own}, {console.size(cache.size_bytes(own))}"
+        if others:
+            value += f"; {counted(len(others), 'other version')} beside it, "
+            value += console.size(sum(map(cache.size_bytes, others)))
+        return Check("kernel cache", value)
+    except Exception as error:  # no place to write to, or no Numba
+        return Check("kernel cache", _said(error), ok=False)
 
 
 def _backend(backend: Backend) -> Check:
@@ -119,6 +110,5 @@ def _backend(backend: Backend) -> Check:
     try:
         named(backend.rasteriser)
     except Exception as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return Check(label, f"not present ({said})", ok=False)
+        return Check(label, f"not present ({_said(error)})", ok=False)
     return Check(label, "present")

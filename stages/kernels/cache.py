@@ -34,6 +34,19 @@ def are_compiled() -> bool:
     return any(folder().rglob("*.nbi"))
 
 
+def others() -> list[Path]:
+    """Folders of other versions and machines beside this process's, the one used last first."""
+    found = [path for path in folder().parent.glob("kernels-*") if path != folder()]
+    with suppress(OSError):  # what another process removes meanwhile
+        found.sort(key=_last_use, reverse=True)
+    return found
+
+
+def size_bytes(kernels: Path) -> int:
+    """Of everything in a folder of kernels."""
+    return sum(path.stat().st_size for path in kernels.rglob("*") if path.is_file())
+
+
 def prepare() -> None:
     """Make the folder, tell Numba of it, and remove old ones; nothing if the user named a folder.
 
@@ -52,7 +65,9 @@ def prepare() -> None:
             root = Path(tempfile.mkdtemp(prefix="splat-"))
         _hold(root / name)
     os.environ[_VARIABLE] = str(root / name)
-    _remove_old(root, name)
+    for path in others()[KEPT - 1 :]:
+        with suppress(OSError):
+            _remove(path)
 
 
 def _digest() -> str:
@@ -93,16 +108,6 @@ def _hold(path: Path) -> None:
         if (path / _IN_USE).exists():
             break
     _held.append(file)
-
-
-def _remove_old(root: Path, own: str) -> None:
-    """Remove all but the `KEPT` folders used last, this process's among them."""
-    others = [path for path in root.glob("kernels-*") if path.name != own]
-    with suppress(OSError):  # what another process removes meanwhile
-        others.sort(key=_last_use, reverse=True)
-    for path in others[KEPT - 1 :]:
-        with suppress(OSError):
-            _remove(path)
 
 
 def _last_use(path: Path) -> float:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.atomic import replacing
+
 SHEET_COLUMN = 480  # pixels, at most
 ERROR_GAIN = 4.0
 
@@ -15,17 +17,20 @@ ERROR_GAIN = 4.0
 def contact_sheet(
     path: Path, rows: list[tuple[str, float, NDArray[np.float32], NDArray[np.float32]]]
 ) -> None:
-    """A PNG with a row for each (name, PSNR in dB, render, photograph): photograph, render,
-    absolute error x 4."""
+    """A PNG with a numbered row for each (name, PSNR in dB, render, photograph): photograph,
+    render, absolute error x 4; and a .txt beside it that says which number is which photograph,
+    since the picture's font knows only ASCII."""
     import cv2
 
-    strips = []
-    for name, decibel, image, truth in rows:
+    strips, legend = [], []
+    for number, (name, decibel, image, truth) in enumerate(rows, 1):
+        legend.append(f"{number}  {name}  {decibel:.2f} dB\n")
         error = np.clip(np.abs(image - truth) * ERROR_GAIN, 0, 1)
         tiles = [_fitted(tile) for tile in (truth, image, error)]
         strip = np.hstack(tiles)
         title = np.full((26, strip.shape[1], 3), 24, np.uint8)
-        text = f"{_ascii(name)}   photograph | render {decibel:.2f} dB | error x{ERROR_GAIN:.0f}"
+        shown = f"{number}  {name if name.isascii() else f'(see {path.stem}.txt)'}"
+        text = f"{shown}   photograph | render {decibel:.2f} dB | error x{ERROR_GAIN:.0f}"
         cv2.putText(title, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (220,) * 3, 1, cv2.LINE_AA)
         strips.append(np.vstack([title, strip]))
     if not strips:
@@ -33,6 +38,8 @@ def contact_sheet(
     width = max(strip.shape[1] for strip in strips)
     padded = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0))) for s in strips]
     _write_png(path, np.vstack(padded))
+    with replacing(path.with_suffix(".txt")) as temporary:
+        temporary.write_text("".join(legend), encoding="utf-8")
 
 
 def training_plot(path: Path, history: list[dict[str, Any]]) -> None:
@@ -63,11 +70,6 @@ def training_plot(path: Path, history: list[dict[str, Any]]) -> None:
     _write_png(path, canvas)
 
 
-def _ascii(name: str) -> str:
-    """OpenCV's font knows no other letters."""
-    return name.encode("ascii", "replace").decode()
-
-
 def _fitted(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     import cv2
 
@@ -79,8 +81,6 @@ def _fitted(image: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
     from PIL import Image
-
-    from stages.base.atomic import replacing
 
     with replacing(path) as temporary:
         Image.fromarray(image).save(temporary, format="PNG")

@@ -1,0 +1,33 @@
+"""Pictures for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stages.training import charts
+
+
+@pytest.mark.parametrize("name", ["Кухня 1.jpg", "台所.jpg", "Küche.jpg"])
+def test_contact_sheet_never_shows_a_name_that_its_font_cannot_draw(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[str] = []
+    monkeypatch.setattr(cv2, "putText", lambda image, text, *more: drawn.append(text))
+    grey = np.full((30, 40, 3), 0.5, np.float32)
+    charts.contact_sheet(
+        tmp_path / "held_out.png", [("a.jpg", 21.5, grey, grey), (name, 20.25, grey, grey)]
+    )
+    assert drawn[0].startswith("1  a.jpg  ")
+    assert drawn[1].startswith("2  (see held_out.txt)  ")
+    assert "?" not in drawn[1]
+    legend = (tmp_path / "held_out.txt").read_text(encoding="utf-8")
+    assert legend == f"1  a.jpg  21.50 dB\n2  {name}  20.25 dB\n"
+
+
+def test_contact_sheet_of_nothing_is_none(tmp_path: Path) -> None:
+    charts.contact_sheet(tmp_path / "held_out.png", [])
+    assert not list(tmp_path.iterdir())
