@@ -120,6 +120,15 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "
     out.print(drawn, soft_wrap=False)
 
 
+def columns(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table that is never broken to fit the screen: what is copied from it stays whole."""
+    every = [tuple(headings), *map(tuple, rows)]
+    widths = [max(map(len, column)) for column in zip(*every, strict=True)]
+    for number, row in enumerate(every):
+        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        out.print(Text(line.rstrip(), style="" if number else "bold"))
+
+
 def note(text: str, style: str = "") -> None:
     """One line for the reader, on standard error."""
     err.print(Text(text, style=style))

@@ -47,7 +47,7 @@ def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -
     console.table(("stage", "time", "peak memory", "result"), rows)
     if assets:
         console.out.print()
-        console.table(
+        console.columns(
             ("asset", "size", "read back and drawn again, PSNR"),
             [(path, console.size(count), quality) for path, count, quality in assets],
         )

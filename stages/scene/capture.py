@@ -68,7 +68,8 @@ class Reconstruction:
     points [P, 3] float64, colours [P, 3] uint8, errors_px [P] mean reprojection error, tracks [P]
     number of photographs that see the point.
     origin [3]: what to add to be back in the coordinates that `units` speaks of (float64).
-    units: "metres" or "arbitrary". levelled: whether up = -Y was found from the cameras.
+    units: "arbitrary": nothing yet finds out how large a scene is.
+    levelled: whether up = -Y was found from the cameras.
     """
 
     folder: Path

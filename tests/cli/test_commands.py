@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from splatcli import console
 from stages.base.errors import Interrupted, SplatError
 from stages.run.lock import locked
 
@@ -40,6 +41,13 @@ def test_process_makes_everything_and_says_where(splat) -> None:
     assert "peak memory" in result.stdout
     assert "held out PSNR 27.12 dB" in " ".join(result.stdout.split())
     assert "Do it yourself" in result.stderr
+
+
+def test_asset_paths_are_not_broken_on_a_narrow_terminal(splat, monkeypatch) -> None:
+    monkeypatch.setattr(console.out, "width", 40)
+    long = "a folder with a name that is longer than any terminal is wide/run"
+    result = splat("process", "photos", "--out", long)
+    assert str(Path(long) / "7-export" / "out.ply") in result.stdout
 
 
 def test_process_twice_does_nothing(splat) -> None:

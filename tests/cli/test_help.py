@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from splatcli.app import app
 from stages import STAGE_NAMES
+from tests import sample
 
 ROOT = Path(__file__).parent.parent.parent
 COMMANDS = (
@@ -40,6 +41,31 @@ def test_help_imports_nothing_heavy() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stderr.strip() == "[]"
+
+
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["process", "--help"]])
+def test_help_writes_nothing(words: list[str], tmp_path: Path) -> None:
+    env = {n: value for n, value in sample.environment().items() if n != "NUMBA_CACHE_DIR"}
+    places = {name: str(tmp_path) for name in ("HOME", "XDG_CACHE_HOME", "TMPDIR", "LOCALAPPDATA")}
+    done = subprocess.run(
+        sample.command(*words),
+        cwd=tmp_path,
+        env=env | places,
+        stdout=subprocess.DEVNULL,
+        timeout=60,
+        check=True,
+    )
+    assert done.returncode == 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_of_train_says_what_a_run_that_goes_on_keeps() -> None:
+    text = " ".join(help_of("train").split())
+    assert "as before, else standard" in text
+    assert "as before, else by preset" in text
+    assert "0 takes what free memory allows. [default: (by preset)]" in " ".join(
+        help_of("process").split()
+    )
 
 
 @pytest.mark.skipif(not hasattr(os, "wait4"), reason="no account of a child's processor time")

@@ -35,6 +35,7 @@ def test_a_photograph_has_one_name_in_every_folder(tmp_path: Path) -> None:
     capture, folder = captured(tmp_path / "ingest"), tmp_path / "sfm"
     model = replace(orbit_model(4, 60), names=tuple(p.image for p in capture.photos))
     found = finish(model, capture, folder, Report())
+    assert found.units == "arbitrary"
     of_ingest = {photo.name: photo.image.removeprefix("photos/") for photo in capture.photos}
     assert of_ingest["photo.heic"] == "photo-2.jpg"
     assert of_ingest["r_0.png"] == "r_0.png"
