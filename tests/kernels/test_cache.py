@@ -93,3 +93,13 @@ def test_only_this_room_imports_numba() -> None:
         if pattern.search(path.read_text("utf-8"))
     }
     assert rooms == {"kernels"}
+
+
+def test_a_change_in_any_room_with_kernels_makes_another_folder() -> None:
+    stages = ROOT / "stages"
+    with_kernels = {
+        path.relative_to(stages).parts[0]
+        for path in stages.rglob("*.py")
+        if "@kernel" in path.read_text("utf-8")
+    }
+    assert with_kernels <= set(cache._ROOMS)
