@@ -71,7 +71,7 @@ def active_counts(bands: int) -> int:
 
 COLUMN_COUNTS = _column_counts()
 # [STEP_COUNTS x 64] 1 where a column goes by that count, else 0
-_GROUPS = (COLUMN_COUNTS == np.arange(STEP_COUNTS)[:, None]).astype(np.float32).ravel()
+_GROUPS = (np.arange(STEP_COUNTS)[:, None] == COLUMN_COUNTS).astype(np.float32).ravel()
 GROUP_SIZE = len(COLUMN_COUNTS)
 
 
