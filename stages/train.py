@@ -242,5 +242,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="train", version=3, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=4, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )
