@@ -118,5 +118,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=2, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=3, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

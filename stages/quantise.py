@@ -188,7 +188,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=2,
+    version=3,
     reads=("sfm", "prune"),
     settings_type=QuantiseSettings,
     run=run,

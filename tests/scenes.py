@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from stages.raster import backends
-from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
+from stages.raster.definition import (
+    LOG_SCALE,
+    MEAN,
+    NO_SMOOTHING,
+    OPACITY,
+    ROTATION,
+    SH,
+    RasterSettings,
+    splat_arrays,
+    used_columns,
+)
 from stages.scene import Camera, Splats, logit, rgb_to_dc
 
 BACKENDS = tuple(backend.name for backend in backends.BACKENDS)
@@ -88,12 +98,12 @@ def gradients(backend, scene, view, v_image, settings=None, smoothing=None):
     full[found.rows] = found.parameters
     bands = (min(settings.sh_degree, scene.sh_degree) + 1) ** 2
     sh = np.zeros(scene.sh.shape)
-    sh[:, :bands] = full[:, 11 : 11 + 3 * bands].reshape(len(scene), bands, 3)
+    sh[:, :bands] = full[:, SH : used_columns(bands)].reshape(len(scene), bands, 3)
     return {
-        "means": full[:, 0:3],
-        "quaternions": full[:, 3:7],
-        "log_scales": full[:, 7:10],
-        "opacity_logits": full[:, 10],
+        "means": full[:, MEAN:ROTATION],
+        "quaternions": full[:, ROTATION:LOG_SCALE],
+        "log_scales": full[:, LOG_SCALE:OPACITY],
+        "opacity_logits": full[:, OPACITY],
         "sh": sh,
     }
 

@@ -203,6 +203,17 @@ def vfma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @intrinsic
+def vfnma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+    """c - a * b, rounded once."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        negated = builder.fneg(args[0])
+        return call_llvm(builder, "llvm.fma.v16f32", _VECTOR, [negated, args[1], args[2]])
+
+    return f32x16(a, b, c), codegen
+
+
+@intrinsic
 def vselect(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
     """a where the mask is set, else b."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,20 +13,41 @@ from stages.scene import Camera, Splats
 
 ALPHA_MIN = 1.0 / 255.0  # below it a splat is not drawn in a pixel: it could not change 8 bits
 ALPHA_MAX = 0.99  # as every viewer caps it
-TRANSMITTANCE_MIN = 1e-4  # a pixel is finished once less light than this passes
+# A pixel is finished once less light than this passes: the most that can leak. Two splats at the
+# cap leave 1e-4, halves 2^-13 or 2^-14; this is near none of them, so that rounding does not decide
+# whether the next splat is drawn.
+TRANSMITTANCE_MIN = 8.6e-5
 LOG_SCALE_MAX = 44.0  # exp(2 x 44) is the last square of a scale that float32 holds
+SCALE_MAX = math.exp(LOG_SCALE_MAX)  # also of a smoothing filter's width
+COLOUR_MAX = 1e20  # a colour is clamped there, as at 0: its gradients then fit into float32
 QUATERNION_MIN = 1e-20  # largest component; below it a rotation is lost to rounding
+
+# A row of gradients: where each parameter's begin. SH come basis function by basis function, RGB
+# last, DC first; whole vectors of 16 columns, zero beyond the last band.
+MEAN, ROTATION, LOG_SCALE, OPACITY, SH, SH_REST = 0, 3, 7, 10, 11, 14
+
+
+def used_columns(bands: int) -> int:
+    """Columns of a gradient row that hold something, with `bands` (basis functions) of SH."""
+    return SH + 3 * bands
+
+
+def gradient_columns(bands: int) -> int:
+    """Columns of a gradient row with room for `bands` of SH: whole vectors."""
+    return -(-used_columns(bands) // 16) * 16
 
 
 @dataclass(frozen=True)
 class RasterSettings:
     """How to draw.
 
-    near: a splat is drawn if the z of its centre is larger; world units.
+    near: a splat is drawn if the z of its centre is larger; world units, at least 0.
     dilation_px2: added to both variances of a splat's footprint, as all viewers do; pixels^2.
     antialias: make up in opacity for what the dilation adds in area.
     background: RGB behind everything.
     sh_degree: bands above it are ignored.
+
+    Raises ValueError for a near plane behind the camera or none at all.
     """
 
     near: float = 0.01
@@ -33,6 +55,10 @@ class RasterSettings:
     antialias: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = 3
+
+    def __post_init__(self) -> None:
+        if not self.near >= 0:
+            raise ValueError(f"near {self.near}, wanted 0 or more")
 
 
 @dataclass(frozen=True)
@@ -76,8 +102,7 @@ class Forward(Protocol):
 class Backward:
     """Gradients of the visible splats, in the order of their rows.
 
-    rows [V] int32. parameters [V, gradient_columns]: mean 0:3, quaternion 3:7, log-scales 7:10,
-    opacity logit 10, then SH, basis function by basis function with RGB last, then zeros.
+    rows [V] int32. parameters [V, gradient_columns]: layout above.
     means2d [V, 2]: of the mean on the picture, per pixel.
     """
 
@@ -86,23 +111,9 @@ class Backward:
     means2d: NDArray[np.float32]
 
 
-def gradient_columns(bands: int) -> int:
-    """Columns of a gradient row with room for `bands` of SH: whole vectors."""
-    return -(-(11 + 3 * bands) // 16) * 16
-
-
 def splat_arrays(splats: Splats) -> Arrays:
     """The five parameter arrays, C-contiguous float32."""
-    return tuple(
-        np.ascontiguousarray(a, dtype=np.float32)
-        for a in (
-            splats.means,
-            splats.quaternions,
-            splats.log_scales,
-            splats.opacity_logits,
-            splats.sh,
-        )
-    )
+    return tuple(np.ascontiguousarray(a, dtype=np.float32) for a in splats.arrays)
 
 
 class Rasteriser(Protocol):

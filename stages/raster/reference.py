@@ -6,7 +6,7 @@ A splat with mean m, rotation R(q), scales s and opacity o is seen through the l
 approximation of the projection (Zwicker et al. 2001): with V = J W R diag(s), its footprint is a
 Gaussian of covariance V V^T + e I, e the dilation. Along a pixel's ray splats are blended from
 near to far: alpha = min(0.99, o exp(-d)), left out where it is below 1/255, and a pixel is finished
-once less than 1e-4 of the light behind passes, after the splat that did it has been blended.
+once less than 8.6e-5 of the light behind passes, after the splat that did it has been blended.
 
 Order: by depth (z in the camera) rounded to float32; equal depths by the splat's own values (mean,
 opacity, scales, rotation, SH), so that the order of rows in a file never shows.
@@ -25,8 +25,10 @@ from torch import Tensor
 from stages.raster.definition import (
     ALPHA_MAX,
     ALPHA_MIN,
+    COLOUR_MAX,
     LOG_SCALE_MAX,
     QUATERNION_MIN,
+    SCALE_MAX,
     TRANSMITTANCE_MIN,
     RasterSettings,
 )
@@ -55,21 +57,17 @@ class Parameters:
 
 def parameters_of(splats: Splats, dtype: torch.dtype = torch.float64) -> Parameters:
     """Leaf tensors of `splats`, ready for autograd."""
-    arrays = (
-        splats.means,
-        splats.quaternions,
-        splats.log_scales,
-        splats.opacity_logits,
-        splats.sh,
-    )
-    return Parameters(*(torch.tensor(a, dtype=dtype, requires_grad=True) for a in arrays))
+    return Parameters(*(torch.tensor(a, dtype=dtype, requires_grad=True) for a in splats.arrays))
 
 
-def drawable(p: Parameters) -> Tensor:
-    """[N] bool: finite values, scales whose squares float32 can hold, a rotation that exists."""
+def drawable(p: Parameters, smoothing: Tensor | None = None) -> Tensor:
+    """[N] bool: finite values, scales and smoothing widths whose squares float32 can hold, a
+    rotation that exists."""
     finite = torch.stack([t.flatten(1).isfinite().all(1) for t in map(_two_d, p.tensors())]).all(0)
     bounded = (p.log_scales <= LOG_SCALE_MAX).all(1)
     rotates = p.quaternions.abs().amax(1) >= QUATERNION_MIN
+    if smoothing is not None:
+        bounded &= (smoothing >= 0) & (smoothing <= SCALE_MAX)
     return finite & bounded & rotates
 
 
@@ -103,12 +101,12 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colours(p: Parameters, camera_centre: Tensor, degree: int) -> Tensor:
-    """[N, 3] colour of each splat seen from `camera_centre`."""
+    """[N, 3] colour of each splat seen from `camera_centre`, 0 to COLOUR_MAX."""
     offset = p.means - camera_centre
     directions = offset / offset.norm(dim=1, keepdim=True)
     degree = min(degree, int(p.sh.shape[1] ** 0.5) - 1)
     basis = sh_basis(directions, degree)
-    return (0.5 + (basis[:, :, None] * p.sh[:, : basis.shape[1]]).sum(1)).clamp_min(0.0)
+    return (0.5 + (basis[:, :, None] * p.sh[:, : basis.shape[1]]).sum(1)).clamp(0.0, COLOUR_MAX)
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def project(
     world_to_camera = torch.tensor(camera.world_to_camera, **like)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     z = (p.means.detach() @ rotation.T + translation)[:, 2]
-    index = (drawable(p) & (z > settings.near)).nonzero()[:, 0]
+    index = (drawable(p, smoothing) & (z > settings.near)).nonzero()[:, 0]
     p = p.rows(index)
     scales, kept = p.log_scales.exp(), torch.ones_like(z[index])
     if smoothing is not None:

@@ -64,7 +64,7 @@ class ReferenceRasteriser:
         with torch.no_grad():
             projected = project(p, camera, settings, _widths(smoothing))
             image, *planes = render_projected(p, projected, camera, settings)
-            culled = int((~drawable(p)).sum())
+            culled = int((~drawable(p, _widths(smoothing))).sum())
         every = [*image.unbind(-1), *(planes if depths else planes[:1])]
         picture = torch.stack(every).numpy().astype(np.float32)
         visible = np.sort(projected.index[_touching(projected, camera)].numpy()).astype(np.int32)

@@ -29,13 +29,9 @@ def smoothing_widths(
     are given in). A splat that no camera sees gets the widest of all; 0 without any camera."""
     finest = np.full(len(means), np.inf)
     for camera in cameras:
-        at = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        z = at[:, 2]
-        with np.errstate(all="ignore"):
-            x = camera.fx * at[:, 0] / z + camera.cx
-            y = camera.fy * at[:, 1] / z + camera.cy
-        seen = (z > near) & (np.abs(x - camera.width / 2) < (0.5 + RIM) * camera.width)
-        seen &= np.abs(y - camera.height / 2) < (0.5 + RIM) * camera.height
+        pixels, z = camera.project(means)
+        size = np.array([camera.width, camera.height])
+        seen = (z > near) & (np.abs(pixels - size / 2) < (0.5 + RIM) * size).all(1)
         interval = np.where(seen, z / max(camera.fx, camera.fy), np.inf)
         finest = np.minimum(finest, interval)
     known = np.isfinite(finest)

@@ -36,6 +36,20 @@ class Camera:
         """[3] unit viewing direction in the world."""
         return self.world_to_camera[2, :3].copy()
 
+    def project(
+        self, points: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(pixels [N, 2], z [N]) of points [N, 3] of the world, in float64. Pixels mean nothing
+        where z is not above 0; at z = 0 they are infinite or not numbers."""
+        at = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        with np.errstate(all="ignore"):
+            pixels = at[:, :2] / at[:, 2:] * (self.fx, self.fy) + (self.cx, self.cy)
+        return pixels, at[:, 2]
+
+    def shows(self, pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """[N] whether pixels [N, 2] lie in the picture, its right and lower rim excluded."""
+        return np.asarray(((pixels >= 0) & (pixels < (self.width, self.height))).all(1))
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid (both axes scaled separately)."""
         sx, sy = width / self.width, height / self.height

@@ -39,11 +39,9 @@ def around(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
 def depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
     """The median z of what lies in the picture; of all in front if nothing does."""
     points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
-    x, y, z = (points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+    pixels, z = camera.project(points)
     ahead = z > 0.01
-    with np.errstate(all="ignore"):
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    inside = ahead & (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+    inside = ahead & camera.shows(pixels)
     for chosen in (inside, ahead):
         if chosen.any():
             return float(np.median(z[chosen]))

@@ -1,4 +1,4 @@
-"""An order of splats in which neighbours in space are mostly neighbours in the file."""
+"""An order of splats in which neighbours in space are mostly neighbours in file and memory."""
 
 from __future__ import annotations
 
@@ -11,14 +11,20 @@ _BITS = 21  # three times 21 fit into 64
 
 
 def order(splats: Splats) -> NDArray[np.intp]:
-    """[N] rows along a Morton curve (interleaved bits of x, y, z); equals keep their order.
+    """[N] rows of `splats` in the order of their means; see `order_of`."""
+    return order_of(splats.means)
+
+
+def order_of(means: NDArray[np.floating]) -> NDArray[np.intp]:
+    """[N] rows of means [N, 3] along a Morton curve (interleaved bits of x, y, z); equals keep
+    their order.
 
     Of the ranks of the coordinates, not of their values: one splat far away would otherwise leave
-    all others in one cell.
+    all others in one cell. What is not a number comes last of its axis.
     """
-    code = np.zeros(len(splats), np.uint64)
+    code = np.zeros(len(means), np.uint64)
     for axis in range(3):
-        code |= _spread(_ranks(splats.means[:, axis])) << np.uint64(2 - axis)
+        code |= _spread(_ranks(means[:, axis])) << np.uint64(2 - axis)
     return np.argsort(code, kind="stable")
 
 

@@ -59,6 +59,11 @@ class Splats:
         return len(self.means)
 
     @property
+    def arrays(self) -> tuple[NDArray[np.floating], ...]:
+        """The five that describe each splat, in the fields' order: what a rasteriser takes."""
+        return (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh)
+
+    @property
     def sh_degree(self) -> int:
         """The degree that `sh` has room for."""
         return {1: 0, 4: 1, 9: 2, 16: 3}[self.sh.shape[1]]

@@ -90,11 +90,9 @@ def _seen(
     camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(pixels [K, 2], depths [K]) of the points that land in the picture."""
-    at = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    at = at[at[:, 2] > 1e-6]
-    pixels = at[:, :2] / at[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
-    return pixels[inside], at[inside, 2]
+    pixels, z = camera.project(points)
+    inside = (z > 1e-6) & camera.shows(pixels)
+    return pixels[inside], z[inside]
 
 
 def _thinned(

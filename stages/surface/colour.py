@@ -23,16 +23,9 @@ def coloured(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
     sums, votes = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
     for found in maps:
         camera = found.camera
-        pose = camera.world_to_camera
-        x, y, z = (mesh.vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]).T
-        before = z > 0
-        scale = 1 / np.where(before, z, 1)
-        column = np.floor(camera.fx * x * scale + camera.cx)
-        row = np.floor(camera.fy * y * scale + camera.cy)
-        inside = (
-            before & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        )
-        rows, columns = row[inside].astype(int), column[inside].astype(int)
+        pixels, z = camera.project(mesh.vertices.astype(np.float64))
+        inside = (z > 0) & camera.shows(pixels)
+        columns, rows = pixels[inside].astype(int).T
         agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
         seen = np.flatnonzero(inside)[agrees]
         rows, columns = rows[agrees], columns[agrees]

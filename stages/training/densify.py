@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.raster.definition import OPACITY
 from stages.scene import logit
 from stages.scene.rotations import matrices_of
-from stages.training.optimiser import Model
+from stages.training.optimiser import OPACITY_STEPS, Model
 
 SPLIT_FACTOR = 1.6  # children of a split are that much smaller
 LARGE = 0.01  # of the scene's extent: above it a splat is split, below it cloned
@@ -69,22 +70,6 @@ def densify(
     return grown, Growth(int((~large).sum()), int(large.sum()), pruned, refused)
 
 
-def neighbours_together(means: NDArray[np.floating]) -> NDArray[np.int64]:
-    """[N] an order of rows in which neighbours in space are near each other (Morton's): a tile's
-    splats then share cache lines and pages, which makes a step about a tenth faster."""
-    known = means[np.isfinite(means).all(1)].astype(np.float64)
-    if len(known) == 0:
-        return np.arange(len(means))
-    low, high = np.percentile(known, (1, 99), axis=0)
-    share = np.nan_to_num((means - low) / np.maximum(high - low, 1e-30))
-    cells = np.clip(share * 1023, 0, 1023).astype(np.int64)
-    code = np.zeros(len(means), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
-
-
 def _worth_keeping(model: Model, extent: float, prune_giants: bool) -> NDArray[np.bool_]:
     keep = model.opacity_logits >= logit(OPACITY_MIN)
     for array in model.arrays:
@@ -106,7 +91,9 @@ def _children(parents: Model, rng: np.random.Generator) -> Model:
 
 
 def reset_opacities(model: Model) -> None:
-    """Make everything nearly transparent, so that only what the photographs need comes back."""
+    """Make everything nearly transparent, so that only what the photographs need comes back; its
+    optimisation begins anew."""
     np.minimum(model.opacity_logits, np.float32(logit(OPACITY_RESET)), out=model.opacity_logits)
-    model.moment1[:, 10] = 0.0
-    model.moment2[:, 10] = 0.0
+    model.moment1[:, OPACITY] = 0.0
+    model.moment2[:, OPACITY] = 0.0
+    model.steps[:, OPACITY_STEPS] = 0

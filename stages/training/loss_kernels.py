@@ -1,14 +1,17 @@
 """0.8 L1 + 0.2 (1 - SSIM) and its gradient, in one pass over the rows of a picture.
 
 SSIM as Wang et al. 2004 (Gaussian window 11x11, sigma 1.5, K1 = 0.01, K2 = 0.03, data range 1),
-per channel, averaged over pixels and channels. The target's mean is subtracted from both pictures
-first: variances as E[x^2] - E[x]^2 then lose nothing in float32, however bright the pictures.
-Beyond the rim both pictures are taken to have that mean.
+per channel, averaged over pixels and channels. Beyond the rim both pictures are taken to have the
+target's mean, which is subtracted from them first.
+
+Everything is computed from the image x and the difference d = x - y, and squares are taken of
+offsets from the window's middle (along a row from its middle pixel, across rows of their means from
+the middle row's). E[x^2] - E[x]^2 would not do in float32: a picture half light, half dark has 0.2
+of square and 1e-4 of variance; pictures that are nearly alike differ by less than their roundings.
 
 A band of rows streams through two rings of 11 filtered rows each, so that the working set stays in
-the cache and no map of the size of the picture is ever made. SSIM needs four filtered maps: x, y,
-x^2 + y^2 and x y. Rows of flat arrays are named by where they begin, never sliced: a slice counts
-references, and threads would fight over the counter.
+the cache and no map of the size of the picture is ever made. Rows of flat arrays are named by where
+they begin, never sliced: a slice counts references, and threads would fight over the counter.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from stages.kernels.simd import (
     take_ticket,
     vabs,
     vfma,
+    vfnma,
     vgt,
     vload,
     vload_levels,
@@ -41,7 +45,9 @@ _GAUSS = [math.exp(-((k - RADIUS) ** 2) / (2 * 1.5**2)) for k in range(TAPS)]
 WINDOW = np.array([g / sum(_GAUSS) for g in _GAUSS], np.float32)
 
 
-MAPS, SLOPES = 4, 3  # filtered maps; derivatives: by mean, by variance, by covariance
+# Filtered maps: mean of x, mean of d, variances of x and y added, variance of d.
+MAPS = 4
+SLOPES = 3  # derivatives, as the gradient takes them together: F0 + x F1 - d F2
 
 
 @kernel
@@ -51,29 +57,72 @@ def band_count(height):
 
 
 @kernel
-def _load_row(picture, scale, channel, y, mean, row, at):
-    """Row y, times `scale`, less the mean into row[at + PAD :]; zero beyond the rim."""
-    height, width = picture.shape[1], picture.shape[2]
+def _load_row(image, target, scale, channel, y, mean, xs, ds, at):
+    """Row y of the image, less the mean, into xs[at + PAD :]; the image less `scale` x the target
+    into ds. Zero beyond the rim."""
+    height, width = target.shape[1], target.shape[2]
     whole = width // 16 * 16
     start, level = (channel * height + y) * width, splat16(mean)
     if y < 0 or y >= height:
-        for x in range(width):
-            row[at + PAD + x] = _F(0.0)
+        for x in range(at + PAD, at + PAD + width):
+            xs[x], ds[x] = _F(0.0), _F(0.0)
         return
     for x in range(0, whole, 16):
-        value = vload_levels(picture, start + x) * splat16(scale)
-        vstore(row, at + PAD + x, value - level)
+        value = vload_levels(image, start + x)
+        vstore(xs, at + PAD + x, value - level)
+        vstore(ds, at + PAD + x, value - vload_levels(target, start + x) * splat16(scale))
     for x in range(whole, width):
-        row[at + PAD + x] = _F(picture[channel, y, x]) * scale - mean
+        value = image[channel, y, x]
+        xs[at + PAD + x] = value - mean
+        ds[at + PAD + x] = value - _F(target[channel, y, x]) * scale
 
 
 @kernel
-def _multiply_rows(xs, x_at, ys, y_at, padded, products):
-    """x^2 + y^2 and x y of a row into products[: 2 padded]."""
-    for at in range(0, padded, 16):
-        x, y = vload(xs, x_at + at), vload(ys, y_at + at)
-        vstore(products, at, vfma(x, x, y * y))
-        vstore(products, padded + at, x * y)
+def _filter_pictures(xs, ds, at, padded, out, out_at):
+    """The four maps of one padded row, over each pixel's horizontal window."""
+    zero = splat16(_F(0.0))
+    for x in range(PAD, padded - PAD, 16):
+        middle = at + x
+        x_0, d_0 = vload(xs, middle), vload(ds, middle)
+        m_x, m_d, both, other = zero, zero, zero, zero
+        for k in range(1, RADIUS + 1):
+            weight = splat16(WINDOW[RADIUS + k])
+            x_a, x_b = vload(xs, middle - k) - x_0, vload(xs, middle + k) - x_0
+            d_a, d_b = vload(ds, middle - k) - d_0, vload(ds, middle + k) - d_0
+            y_a, y_b = x_a - d_a, x_b - d_b
+            m_x, m_d = vfma(weight, x_a + x_b, m_x), vfma(weight, d_a + d_b, m_d)
+            square = vfma(x_a, x_a, vfma(x_b, x_b, vfma(y_a, y_a, y_b * y_b)))
+            both = vfma(weight, square, both)
+            other = vfma(weight, vfma(d_a, d_a, d_b * d_b), other)
+        m_y = m_x - m_d
+        vstore(out, out_at + x, x_0 + m_x)
+        vstore(out, out_at + padded + x, d_0 + m_d)
+        vstore(out, out_at + 2 * padded + x, vfnma(m_x, m_x, vfnma(m_y, m_y, both)))
+        vstore(out, out_at + 3 * padded + x, vfnma(m_d, m_d, other))
+
+
+@kernel
+def _window(ring, starts, padded, at):
+    """The four maps at offset `at`, over the whole window, from 11 rows of `_filter_pictures`:
+    variances within rows and between the rows' means."""
+    middle = starts[RADIUS] + at
+    x_0, d_0 = vload(ring, middle), vload(ring, padded + middle)
+    weight = splat16(WINDOW[RADIUS])
+    both = weight * vload(ring, 2 * padded + middle)
+    other = weight * vload(ring, 3 * padded + middle)
+    m_x, m_d = splat16(_F(0.0)), splat16(_F(0.0))
+    for k in range(TAPS):
+        if k != RADIUS:
+            row, weight = starts[k] + at, splat16(WINDOW[k])
+            x, d = vload(ring, row) - x_0, vload(ring, padded + row) - d_0
+            y = x - d
+            m_x, m_d = vfma(weight, x, m_x), vfma(weight, d, m_d)
+            square = vfma(x, x, vfma(y, y, vload(ring, 2 * padded + row)))
+            both = vfma(weight, square, both)
+            other = vfma(weight, vfma(d, d, vload(ring, 3 * padded + row)), other)
+    m_y = m_x - m_d
+    both = vfnma(m_x, m_x, vfnma(m_y, m_y, both))
+    return x_0 + m_x, d_0 + m_d, both, vfnma(m_d, m_d, other)
 
 
 @kernel
@@ -106,30 +155,29 @@ def _ring_starts(newest, row_size, starts):
 
 @kernel
 def _similarity_row(ring, starts, padded, mean, width, out):
-    """SSIM of one row; its derivatives by mean, variance and covariance into out[: 3 padded].
+    """SSIM of one row, c d / (a b); its derivatives into out[: 3 padded]. Returns the row's sum.
 
-    Returns the row's sum. Derivatives are those of the filtered maps of x, x^2 and xy.
+    With V, C the derivatives by the variance of x and by the covariance, a gradient adds up
+    2 V (x - mean) + C (y - mean) over windows. V is nearly -C / 2 where pictures are alike, so it
+    is written as (2 V + C) (x - mean) - C (d - mean), and 2 V + C by the variance of d.
     """
-    two, mean_v = splat16(_F(2.0)), splat16(mean)
+    one, two, mean_v = splat16(_F(1.0)), splat16(_F(2.0)), splat16(mean)
     c1, c2 = splat16(C1), splat16(C2)
     total = 0.0
     for at in range(PAD, PAD + width, 16):
-        m_x, m_y = _column_sum(ring, at, starts), _column_sum(ring, padded + at, starts)
-        squares = _column_sum(ring, 2 * padded + at, starts)
-        cov = _column_sum(ring, 3 * padded + at, starts) - m_x * m_y
-        full_x, full_y = m_x + mean_v, m_y + mean_v
-        a = full_x * full_x + full_y * full_y + c1
-        b = (squares - m_x * m_x - m_y * m_y) + c2
-        c = two * full_x * full_y + c1
-        d = two * cov + c2
-        inverse = splat16(_F(1.0)) / (a * b)
+        m_x, m_d, both, other = _window(ring, starts, padded, at)
+        full_x = m_x + mean_v
+        c = vfma(two * full_x, full_x - m_d, c1)
+        a = vfma(m_d, m_d, c)
+        b = both + c2
+        d = b - other
+        inverse = one / (a * b)
         score = c * d * inverse
-        by_variance = splat16(_F(0.0)) - score * a * inverse
         by_cov = two * c * inverse
-        by_mean = two * (full_y * d - full_x * score * b) * inverse
-        by_mean = by_mean - two * m_x * by_variance - m_y * by_cov
-        vstore(out, at, by_mean)
-        vstore(out, padded + at, by_variance)
+        by_both = by_cov * other * a * inverse  # 1 / b is a / (a b)
+        by_mean = two * d * inverse * m_d * (full_x * m_d * b * inverse - one)
+        vstore(out, at, by_mean - m_x * by_both + m_d * by_cov)
+        vstore(out, padded + at, by_both)
         vstore(out, 2 * padded + at, by_cov)
         if at + 16 <= PAD + width:
             total += vsum(score)
@@ -144,21 +192,20 @@ def _similarity_row(ring, starts, padded, mean, width, out):
 
 
 @kernel
-def _gradient_row(ring, starts, padded, xs, ys, own, weight, scratch, v_image, channel, y):
-    """Row y of v_image; returns the row's sum of |x - y|. own: where the row begins in xs, ys."""
+def _gradient_row(ring, starts, padded, xs, ds, own, weight, scratch, v_image, channel, y):
+    """Row y of v_image; returns the row's sum of |x - y|. own: where the row begins in xs, ds."""
     height, width = v_image.shape[1], v_image.shape[2]
-    zero, two = splat16(_F(0.0)), splat16(_F(2.0))
+    zero = splat16(_F(0.0))
     absolute, similar = splat16(_F((1.0 - weight) / 3.0)), splat16(_F(-weight / 3.0))
     total = zero
     to = (channel * height + y) * width
     for x in range(0, width, 16):
         at = PAD + x
-        x_v, y_v = vload(xs, own + at), vload(ys, own + at)
-        by_mean = _column_sum(ring, at, starts)
-        by_variance = _column_sum(ring, padded + at, starts)
-        by_cov = _column_sum(ring, 2 * padded + at, starts)
-        gradient = similar * (by_mean + two * x_v * by_variance + y_v * by_cov)
-        difference = x_v - y_v
+        difference = vload(ds, own + at)
+        alone = _column_sum(ring, at, starts)
+        by_x = vload(xs, own + at) * _column_sum(ring, padded + at, starts)
+        by_d = difference * _column_sum(ring, 2 * padded + at, starts)
+        gradient = similar * (alone + by_x - by_d)
         sign = vselect(
             vgt(difference, zero),
             absolute,
@@ -168,24 +215,18 @@ def _gradient_row(ring, starts, padded, xs, ys, own, weight, scratch, v_image, c
         if x + 16 <= width:
             vstore(v_image, to + x, gradient + sign)
         else:
-            vstore(scratch, 0, gradient + sign)
+            spare = SLOPES * padded  # the rims of what stands before it stay zero
+            vstore(scratch, spare, gradient + sign)
             for k in range(width - x):
-                v_image[channel, y, x + k] = scratch[k]
+                v_image[channel, y, x + k] = scratch[spare + k]
     return vsum(total)
 
 
 @kernel
-def _filter_picture_row(
-    image, target, scale, channel, y, mean, padded, xs, ys, own, scratch, ring, to
-):
-    """Row y of both pictures into xs, ys and its four filtered maps into the ring."""
-    _load_row(image, _F(1.0), channel, y, mean, xs, own)
-    _load_row(target, scale, channel, y, mean, ys, own)
-    _multiply_rows(xs, own, ys, own, padded, scratch)
-    _filter_row(xs, own, padded, ring, to)
-    _filter_row(ys, own, padded, ring, to + padded)
-    _filter_row(scratch, 0, padded, ring, to + 2 * padded)
-    _filter_row(scratch, padded, padded, ring, to + 3 * padded)
+def _filter_picture_row(image, target, scale, channel, y, mean, padded, xs, ds, own, ring, to):
+    """Row y of both pictures into xs, ds and its four filtered maps into the ring."""
+    _load_row(image, target, scale, channel, y, mean, xs, ds, own)
+    _filter_pictures(xs, ds, own, padded, ring, to)
 
 
 @kernel
@@ -200,7 +241,7 @@ def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
     bands = band_count(height)
     band = (height + bands - 1) // bands
     padded = 2 * PAD + (width + 15) // 16 * 16
-    xs, ys = np.zeros(TAPS * padded, np.float32), np.zeros(TAPS * padded, np.float32)
+    xs, ds = np.zeros(TAPS * padded, np.float32), np.zeros(TAPS * padded, np.float32)
     maps = np.zeros(TAPS * MAPS * padded, np.float32)
     slopes = np.zeros(TAPS * SLOPES * padded, np.float32)
     scratch = np.zeros(4 * padded, np.float32)
@@ -217,7 +258,7 @@ def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
             slot = y % TAPS
             own, to = slot * padded, slot * MAPS * padded
             _filter_picture_row(
-                image, target, scale, channel, y, mean, padded, xs, ys, own, scratch, maps, to
+                image, target, scale, channel, y, mean, padded, xs, ds, own, maps, to
             )
             middle = y - RADIUS
             if middle < top - RADIUS:
@@ -238,6 +279,6 @@ def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
                 _ring_starts(middle, SLOPES * padded, starts)
                 own = out % TAPS * padded
                 l1 += _gradient_row(
-                    slopes, starts, padded, xs, ys, own, weight, scratch, v_image, channel, out
+                    slopes, starts, padded, xs, ds, own, weight, scratch, v_image, channel, out
                 )
         sums[number, 0], sums[number, 1] = l1, ssim

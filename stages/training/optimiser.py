@@ -1,7 +1,9 @@
 """Adam (Kingma and Ba 2015), sparse: on the splats that a step has seen; or dense, on all.
 
-A splat out of view keeps its moments and its own count of steps, and its bias correction follows
-that count: the first step of a splat first seen late is lr, not 3 lr.
+A splat out of view keeps its moments and its own counts of steps, and its bias correction follows
+those counts: the first step of a splat first seen late is lr, not 3 lr. There is a count for each
+group of columns that begins by itself: opacity begins anew at a reset, a band of SH when it is
+switched on.
 """
 
 from __future__ import annotations
@@ -26,15 +28,51 @@ from stages.kernels.simd import (
     vsqrt,
     vstore,
 )
-from stages.raster.definition import Arrays, Backward, gradient_columns
+from stages.raster.definition import (
+    LOG_SCALE,
+    MEAN,
+    OPACITY,
+    ROTATION,
+    SH,
+    SH_REST,
+    Arrays,
+    Backward,
+    gradient_columns,
+    used_columns,
+)
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
 # loss: 1e-15, as often used, turns rounding noise into whole steps.
 EPSILON = 1e-4
-LARGEST_GRADIENT = 1e30  # beyond it a splat stays as it is
+# A gradient beyond it is an accident: its step is left out. No honest one comes near, its square is
+# far from float32's end, and one of 1e15 taken in would leave the splat standing for 70,000 steps.
+LARGEST_GRADIENT = 1e12
+# Columns of `Model.steps`: of all that is there from the start, of the opacity, of the bands of SH.
+BASIC_STEPS, OPACITY_STEPS, BAND_STEPS = 0, 1, 2
+STEP_COUNTS = BAND_STEPS + 3
 CHUNK = 512
 _F = np.float32
+
+
+def _column_counts() -> NDArray[np.int64]:
+    """[64] by which count each column of a gradient row goes."""
+    counts = np.full(gradient_columns(16), BASIC_STEPS)
+    counts[OPACITY] = OPACITY_STEPS
+    for degree in (1, 2, 3):
+        counts[used_columns(degree**2) :] = BAND_STEPS + degree - 1
+    return counts
+
+
+def active_counts(bands: int) -> int:
+    """How many of the counts, from the first, have a part in a step with `bands` of SH."""
+    return BAND_STEPS + math.isqrt(bands) - 1
+
+
+COLUMN_COUNTS = _column_counts()
+# [STEP_COUNTS x 64] 1 where a column goes by that count, else 0
+_GROUPS = (np.arange(STEP_COUNTS)[:, None] == COLUMN_COUNTS).astype(np.float32).ravel()
+GROUP_SIZE = len(COLUMN_COUNTS)
 
 
 @dataclass(frozen=True)
@@ -62,10 +100,31 @@ class LearningRates:
     def row(self, bands: int) -> NDArray[np.float32]:
         """One rate for each column of a gradient row with `bands` of SH."""
         rates = np.zeros(gradient_columns(bands), np.float32)
-        rates[0:3], rates[3:7], rates[7:10] = self.means, self.quaternions, self.log_scales
-        rates[10], rates[11:14] = self.opacity_logits, self.sh_dc
-        rates[14 : 11 + 3 * bands] = self.sh_rest
+        rates[MEAN:ROTATION], rates[ROTATION:LOG_SCALE] = self.means, self.quaternions
+        rates[LOG_SCALE:OPACITY], rates[OPACITY] = self.log_scales, self.opacity_logits
+        rates[SH:SH_REST], rates[SH_REST : used_columns(bands)] = self.sh_dc, self.sh_rest
         return rates
+
+
+@kernel
+def _count(steps, i, counts, corrections, scales):
+    """One step more in the first `counts` counts of row i; their bias corrections into `scales`."""
+    last = len(corrections) - 1
+    for group in range(counts):
+        steps[i, group] += 1
+        t = min(np.int64(steps[i, group]), last)
+        scales[group, 0], scales[group, 1] = corrections[t, 0], corrections[t, 1]
+
+
+@kernel
+def _scales_of(scales, counts, k):
+    """Bias corrections of columns k to k + 16, of both moments."""
+    scale1, scale2 = splat16(_F(0.0)), splat16(_F(0.0))
+    for group in range(counts):
+        share = vload(_GROUPS, group * GROUP_SIZE + k)
+        scale1 = vfma(share, splat16(scales[group, 0]), scale1)
+        scale2 = vfma(share, splat16(scales[group, 1]), scale2)
+    return scale1, scale2
 
 
 @kernel
@@ -83,6 +142,7 @@ def adam_step(
     moment1,
     moment2,
     steps,
+    counts,
     corrections,
     rates,
     ndc_x,
@@ -92,16 +152,17 @@ def adam_step(
 ):
     """Move the visible splats; add up the size of their mean's gradient on the picture.
 
-    gradients, means2d: see `cpu.Backward`. corrections [T, 2]: 1 / (1 - beta^t) of both betas.
-    rates [columns of gradients]. ndc_x, ndc_y: factors that take a gradient per pixel to the units
-    of the densification threshold. sh [N, 3 bands]: a 2-D view. A splat with a gradient that is
-    not finite stays as it is.
+    gradients, means2d: see `cpu.Backward`. steps [N, STEP_COUNTS], of which the first `counts` have
+    a part in this step. corrections [T, 2]: 1 / (1 - beta^t) of both betas. rates [columns of
+    gradients]. ndc_x, ndc_y: factors that take a gradient per pixel to the units
+    of the densification threshold. sh [N, 3 bands]: a 2-D view. A splat with a gradient beyond
+    LARGEST_GRADIENT, or with one that is not finite, stays as it is.
     """
     n = len(visible)
     columns = gradients.shape[1]
     stride = moment1.shape[1]
-    last = len(corrections) - 1
     shift = np.zeros(columns, np.float32)
+    scales = np.empty((STEP_COUNTS, 2), np.float32)
     b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
     b2, c2 = splat16(_F(BETA2)), splat16(_F(1.0 - BETA2))
     epsilon, huge = splat16(_F(EPSILON)), splat16(_F(LARGEST_GRADIENT))
@@ -117,9 +178,7 @@ def adam_step(
                 bad |= vany(vnot(vge(huge, vabs(g))))
             if bad:
                 continue
-            steps[i] += 1
-            t = min(np.int64(steps[i]), last)
-            scale1, scale2 = splat16(corrections[t, 0]), splat16(corrections[t, 1])
+            _count(steps, i, counts, corrections, scales)
             for k in range(0, columns, 16):
                 g = vload(gradients, rank * columns + k)
                 at = np.int64(i) * stride + k
@@ -127,16 +186,17 @@ def adam_step(
                 v = vfma(b2, vload(moment2, at), c2 * g * g)
                 vstore(moment1, at, m)
                 vstore(moment2, at, v)
+                scale1, scale2 = _scales_of(scales, counts, k)
                 step = vload(rates, k) * m * scale1 / (vsqrt(v * scale2) + epsilon)
                 vstore(shift, k, step)
             for k in range(3):
-                means[i, k] -= shift[k]
-                log_scales[i, k] -= shift[7 + k]
+                means[i, k] -= shift[MEAN + k]
+                log_scales[i, k] -= shift[LOG_SCALE + k]
             for k in range(4):
-                quaternions[i, k] -= shift[3 + k]
-            opacity_logits[i] -= shift[10]
-            for k in range(min(columns - 11, sh.shape[1])):
-                sh[i, k] -= shift[11 + k]
+                quaternions[i, k] -= shift[ROTATION + k]
+            opacity_logits[i] -= shift[OPACITY]
+            for k in range(min(columns - SH, sh.shape[1])):
+                sh[i, k] -= shift[SH + k]
             gx, gy = means2d[rank, 0] * ndc_x, means2d[rank, 1] * ndc_y
             gradient_sum[i] += math.sqrt(gx * gx + gy * gy)
             gradient_count[i] += 1
@@ -152,10 +212,10 @@ def bias_corrections() -> NDArray[np.float32]:
 class Model:
     """The splats in training and all that their optimisation remembers.
 
-    Parameters as in `Splats`, float32. moment1, moment2: columns as the
-    gradient's (`cpu.Backward`), for all bands. steps [N] int32: how often each was moved.
-    gradient_sum, gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D
-    smoothing filter, 0 for none.
+    Parameters as in `Splats`, float32. moment1, moment2: columns as the gradient's, for all bands.
+    steps [N, STEP_COUNTS] int32: how often each was moved, by groups of columns. gradient_sum,
+    gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D smoothing
+    filter, 0 for none.
     """
 
     means: NDArray[np.float32]
@@ -213,7 +273,7 @@ def new_model(
         sh,
         np.zeros((n, columns), np.float32),
         np.zeros((n, columns), np.float32),
-        np.zeros(n, np.int32),
+        np.zeros((n, STEP_COUNTS), np.int32),
         np.zeros(n, np.float32),
         np.zeros(n, np.int32),
         np.zeros(n, np.float32),
@@ -267,6 +327,7 @@ def apply_gradients(
         model.moment1,
         model.moment2,
         model.steps,
+        active_counts(bands),
         _CORRECTIONS,
         rates.row(bands),
         np.float32(0.5 * width / pixels),

@@ -8,13 +8,30 @@ from __future__ import annotations
 import numpy as np
 import torch
 import torch.nn.functional as functional
-from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.raster.definition import Backward, RasterSettings
+from stages.raster.definition import (
+    LOG_SCALE,
+    MEAN,
+    OPACITY,
+    ROTATION,
+    SH,
+    Backward,
+    RasterSettings,
+    used_columns,
+)
 from stages.training.host_step import HostStep
 from stages.training.loss import SSIM_WEIGHT
-from stages.training.optimiser import BETA1, BETA2, EPSILON, LARGEST_GRADIENT, LearningRates, Model
+from stages.training.optimiser import (
+    BETA1,
+    BETA2,
+    COLUMN_COUNTS,
+    EPSILON,
+    LARGEST_GRADIENT,
+    LearningRates,
+    Model,
+    active_counts,
+)
 from stages.training.views import Level
 
 _RADIUS, _SIGMA = 5, 1.5  # of SSIM's window
@@ -37,7 +54,7 @@ class PlainStep(HostStep):
         v_image = image.grad.numpy().astype(np.float32)
         backward = self.rasteriser.backward(model.arrays, forward, v_image, widths)
         bands = (settings.sh_degree + 1) ** 2
-        adam(model, backward, rates.row(bands), camera.width, camera.height)
+        adam(model, backward, bands, rates, camera.width, camera.height)
         return float(value.detach())
 
 
@@ -68,24 +85,23 @@ def _ssim(x: Tensor, y: Tensor, mean: Tensor) -> Tensor:
 
 
 def adam(
-    model: Model, backward: Backward, rates: NDArray[np.float32], width: int, height: int
+    model: Model, backward: Backward, bands: int, rates: LearningRates, width: int, height: int
 ) -> None:
     """One sparse step of Adam, as `optimiser.apply_gradients` does it."""
     whole = (np.abs(backward.parameters) <= LARGEST_GRADIENT).all(1)
     rows, g = backward.rows[whole], backward.parameters[whole].astype(np.float64)
     columns = g.shape[1]
-    model.steps[rows] += 1
-    t = model.steps[rows].astype(np.float64)[:, None]
+    model.steps[rows, : active_counts(bands)] += 1
+    t = np.maximum(model.steps[rows], 1).astype(np.float64)[:, COLUMN_COUNTS[:columns]]
     m = BETA1 * model.moment1[rows, :columns] + (1 - BETA1) * g
     v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g
     model.moment1[rows, :columns], model.moment2[rows, :columns] = m, v
-    shift = rates * (m / (1 - BETA1**t)) / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
-    model.means[rows] -= shift[:, 0:3]
-    model.quaternions[rows] -= shift[:, 3:7]
-    model.log_scales[rows] -= shift[:, 7:10]
-    model.opacity_logits[rows] -= shift[:, 10]
-    bands = min((columns - 11) // 3, model.sh.shape[1])
-    model.sh[rows, :bands] -= shift[:, 11 : 11 + 3 * bands].reshape(len(rows), bands, 3)
+    shift = rates.row(bands) * (m / (1 - BETA1**t)) / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
+    model.means[rows] -= shift[:, MEAN:ROTATION]
+    model.quaternions[rows] -= shift[:, ROTATION:LOG_SCALE]
+    model.log_scales[rows] -= shift[:, LOG_SCALE:OPACITY]
+    model.opacity_logits[rows] -= shift[:, OPACITY]
+    model.sh[rows, :bands] -= shift[:, SH : used_columns(bands)].reshape(len(rows), bands, 3)
     pull = backward.means2d[whole].astype(np.float64) * (0.5 * width, 0.5 * height)
     model.gradient_sum[rows] += np.hypot(*pull.T) / (width * height)
     model.gradient_count[rows] += 1

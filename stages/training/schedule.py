@@ -67,10 +67,12 @@ class Schedule:
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
     def resets_after(self, step: int) -> bool:
-        """Whether to reset opacities once `step` is done."""
+        """Whether to reset opacities once `step` is done: only while growth goes on for as long
+        again, for what stays faint is pruned by growth."""
         if self.steps < MIN_STEPS_FOR_RESET:
             return False
-        return (step + 1) % self._scaled(3000) == 0 and step + 1 <= self.steps // 2
+        done, interval = step + 1, self._scaled(3000)
+        return done % interval == 0 and done + interval <= GROWTH_ENDS * self.steps
 
     def prunes_giants(self, step: int) -> bool:
         return step >= self._scaled(3000)

@@ -18,9 +18,9 @@ from stages.measure.judge import Photograph, scores
 from stages.raster.backends import AUTO
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import Camera, Look, Splats
+from stages.scene import Camera, Look, Splats, morton
 from stages.training.checkpoint import load_checkpoint, save_checkpoint
-from stages.training.densify import densify, neighbours_together, reset_opacities
+from stages.training.densify import densify, reset_opacities
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.schedule import THRESHOLD, Schedule
 from stages.training.step import step_of
@@ -96,19 +96,8 @@ class Trainer:
         start = start.with_sh_degree(self.schedule.sh_degree)
         if len(start) > self.cap:
             start = start.take(np.linspace(0, len(start) - 1, self.cap).round().astype(np.int64))
-        start = start.take(neighbours_together(start.means))
-        return new_model(
-            *(
-                np.array(a, np.float32, order="C")
-                for a in (
-                    start.means,
-                    start.quaternions,
-                    start.log_scales,
-                    start.opacity_logits,
-                    start.sh,
-                )
-            )
-        )
+        start = start.take(morton.order(start))
+        return new_model(*(np.array(a, np.float32, order="C") for a in start.arrays))
 
     def settings(self, degree: int) -> RasterSettings:
         return RasterSettings(near=self.look.near, sh_degree=degree)
@@ -144,7 +133,7 @@ class Trainer:
             self.schedule.prunes_giants(step),
             self.schedule.rng(step),
         )
-        model = model.take(neighbours_together(model.means))
+        model = model.take(morton.order_of(model.means))
         if self.smooth:
             model.smoothing[:] = self.widths(model.means)
         self.stepper.load(model)

@@ -17,7 +17,7 @@ typedef float f16 __attribute__((vector_size(64), aligned(4)));
 typedef int32_t i16 __attribute__((vector_size(64), aligned(4)));
 
 constexpr int TILE = 16, PIXELS = 256;
-constexpr float ALPHA_MIN = 1.0f / 255.0f, ALPHA_MAX = 0.99f, T_MIN = 1e-4f;
+constexpr float ALPHA_MIN = 1.0f / 255.0f, ALPHA_MAX = 0.99f, T_MIN = 8.6e-5f;
 
 inline f16 load(const float *p) { f16 v; std::memcpy(&v, p, 64); return v; }
 inline void store(float *p, f16 v) { std::memcpy(p, &v, 64); }

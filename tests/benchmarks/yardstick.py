@@ -40,14 +40,14 @@ def row_spans(width, starts, members, geometry, spans):
         for entry in range(starts[tile], starts[tile + 1]):
             row = members[entry]
             wide = geometry[row, GVX] >= geometry[row, GVY]
-            reach = np.log(2.0) * (geometry[row, GL] + np.log2(255.0)) * 1.0001
+            reach = (geometry[row, GL] + np.log2(255.0)) * 1.0001
             first, last = 1, 0
             for j in range(TILE):
                 for i in range(TILE):
                     dx, dy = left + i - geometry[row, GX], top + j - geometry[row, GY]
                     u, t = (dx, dy) if wide else (dy, dx)
                     t -= geometry[row, GK] * u
-                    if geometry[row, GA] * u * u + geometry[row, GB] * t * t <= reach:
+                    if (geometry[row, GA] * u) ** 2 + (geometry[row, GB] * t) ** 2 <= reach:
                         first, last = (j if last < first else first), j
             spans[entry] = first + 16 * last
 
@@ -65,7 +65,9 @@ class Yardstick:
     def blend(self, pool: Pool, forward: Forward, image: NDArray[np.float32]) -> Job:
         """A job that draws the lists of `forward` into image [4, H, W], with the pool's threads."""
         geometry = forward.geometry.copy()
-        geometry[:, GL] = np.exp2(geometry[:, GL])  # the opacity itself, as the kernel wants it
+        # the opacity itself and the exponent to base e, as the kernel wants them
+        geometry[:, GL] = np.exp2(geometry[:, GL])
+        geometry[:, (GA, GB)] = geometry[:, (GA, GB)] ** 2 * np.log(2.0)
         lists = forward.lists
         spans = np.empty(len(lists), np.uint8)
         row_spans(forward.width, lists.starts, lists.members, forward.geometry, spans)

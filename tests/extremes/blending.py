@@ -8,10 +8,11 @@ import numpy as np
 
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
+from stages.scene import SH_C0
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst
 from tests.extremes.oracles import finite_differences, opacity_gradient_of_layers
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative, splats
-from tests.tolerances import BLEED, CAP_GRADIENT, FLOAT32_SHIFT, MANY_LAYERS
+from tests.tolerances import BLEED, CAP_GRADIENT, FLOAT32_IMAGE, FLOAT32_SHIFT, MANY_LAYERS
 
 FLAT = np.ones((48, 64, 3), np.float32)
 
@@ -22,6 +23,30 @@ def opaque_black(backend):
     image = render(scene, camera(), white, backend).image
     # black as stored in float32 DC is 2e-8
     return [Measured(11, "white that shows", difference(image, 0), BLEED + FLOAT32_SHIFT)]
+
+
+def saturated(backend):
+    """Splats at the cap, one behind the other: two leave exactly 1e-4 of the light."""
+    n, view = 10_000, camera(1, 1)
+    z = np.linspace(1, 2, n)
+    scene = splats(
+        np.stack([0 * z, 0 * z, z], 1), scales=50, opacities=0.99999, rgb=np.full((n, 3), 2.0)
+    )
+    white = RasterSettings(background=(1.0, 1.0, 1.0))
+    found = gradients(backend, scene, view, np.ones((1, 1, 3), np.float32), white)["sh"][:, 0, 0]
+    light = np.array([1.0, 0.01, 1e-4])
+    passed = 0.01 ** len(light)  # three are drawn
+    image = render(scene, view, white, backend).image
+    return [
+        Measured(30, "image", difference(image, 2 - passed), FLOAT32_IMAGE),
+        Measured(
+            30,
+            "gradients by colour of the first three, each relative",
+            worst(relative(found[i : i + 1], 0.99 * light[i : i + 1] * SH_C0) for i in range(3)),
+            MANY_LAYERS,
+        ),
+        Measured(30, "gradients behind them that are not 0", int(np.count_nonzero(found[3:])), 0),
+    ]
 
 
 BACKGROUND = (1.0, 0.5, 0.0)

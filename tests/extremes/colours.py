@@ -11,6 +11,8 @@ from tests.extremes.oracles import inside_clamp, textbook_picture
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, join, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 
+LARGEST = float(np.finfo(np.float32).max)
+
 
 def bright_and_broken(backend):
     values_broken, pictures = 0, []
@@ -28,6 +30,30 @@ def bright_and_broken(backend):
         Measured(26, "1e3, 1e10: image, relative", worst(pictures), FLOAT32_IMAGE),
         *_against_reference(backend),
         *_not_numbers(backend),
+    ]
+
+
+def brightest(backend):
+    """Coefficients at float32's end, in a colour that is cut off and in one that just is not."""
+    beyond, values_broken, slopes = 0, 0, []
+    for value in (LARGEST, -LARGEST, 1e19):
+        for degree in (0, 2):
+            scene = cloud(100, degree=degree)
+            rows = np.arange(0, 100, 10)
+            scene.sh[rows, rows // 10 % scene.sh.shape[1], rows % 3] = value
+            drawn = render(scene, camera(), RasterSettings(), backend)
+            values_broken += broken(drawn.image, drawn.depth, drawn.median_depth) + drawn.culled
+            found, wanted = (gradients(b, scene, camera(), _v()) for b in (backend, "reference"))
+            beyond += sum(int((~(abs(found[n]) < LARGEST)).sum()) for n in PARAMETERS)
+            slopes += [relative(found[name], wanted[name]) for name in PARAMETERS]
+    return [
+        Measured(32, "values not finite, or culled", values_broken, 0),
+        Measured(32, "gradients beyond float32", beyond, 0),
+        *(
+            [Measured(32, "gradients to the reference, relative", worst(slopes), FLOAT32_GRADIENT)]
+            if backend != "reference"
+            else []
+        ),
     ]
 
 

@@ -36,6 +36,25 @@ def scales_out_of_range(backend):
     ]
 
 
+def widths_out_of_range(backend):
+    """Smoothing filters of a width that is none."""
+    good, view, settings = cloud(50), camera(), RasterSettings()
+    at_ease = np.full(50, 0.01, np.float32)
+    alone = render(good, view, settings, backend, at_ease).image
+    bad = np.float32([np.nan, np.inf, -np.inf, -0.01, np.exp(45.0)])
+    both = join(cloud(len(bad), seed=9), good)
+    widths = np.concatenate([bad, at_ease])
+    drawn = render(both, view, settings, backend, widths)
+    found = gradients(backend, both, view, FLAT, settings, widths)
+    left = sum(int(np.count_nonzero(found[name][: len(bad)])) for name in PARAMETERS)
+    return [
+        Measured(35, "image of the others", difference(drawn.image, alone), 0),
+        Measured(35, "miscounted", abs(drawn.culled - len(bad)), 0),
+        Measured(35, "gradients not finite", broken_gradients(found), 0),
+        Measured(35, "gradients of the culled that are not 0", left, 0),
+    ]
+
+
 def near_plane(backend):
     """Drawn where z > near, z and near compared in float64; see `RasterSettings.near`."""
     wrong, values_broken = 0, 0

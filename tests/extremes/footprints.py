@@ -1,4 +1,4 @@
-"""Rows 1-4 and 6-8: footprints of extreme shape, and their way back to the parameters."""
+"""Rows 1-4, 6-8 and 31: footprints of extreme shape, and their way back to the parameters."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from stages.raster.reference import parameters_of, project, render_tensors, rota
 from tests.extremes import kernels
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst
 from tests.extremes.oracles import finite_differences
+from tests.extremes.sixty_digits import exact_gradients
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative, splats, textbook_alpha
 from tests.tolerances import (
     CLAMP_GRADIENT,
     COMPENSATION,
+    FLOAT32_GRADIENT,
     FLOAT32_IMAGE,
     NEEDLE_1E3,
     NEEDLE_1E4,
@@ -103,6 +105,50 @@ def huge(backend):
         Measured(4, "image", worst(pictures), FLOAT32_IMAGE),
         Measured(4, "gradients not finite", gradients_broken, 0),
     ]
+
+
+def far_and_wide(backend):
+    """A footprint as wide as its centre is far from the picture."""
+    view, found, values_broken = camera(16, 12), [], 0
+    v = np.random.default_rng(1).uniform(0.2, 1.0, (12, 16, 3)).astype(np.float32)
+    for size_px in (1e3, 1e5, 1e7, 1e9, 1e12, 1e16, 1e19, 2e20):
+        scene = _beside(size_px)
+        measured, wanted = gradients(backend, scene, view, v), exact_gradients(scene, view, v)
+        values_broken += broken_gradients(measured)
+        values_broken += broken(render(scene, view, RasterSettings(), backend).image)
+        others = worst(relative(measured[n], wanted[n]) for n in wanted if n != "means")
+        mean = relative(measured["means"], wanted["means"])
+        beyond = backend == "reference" and size_px > 1e12
+        found.append(
+            Measured(
+                31,
+                f"gradient by the mean, {size_px:g} px, relative",
+                mean,
+                FLOAT32_GRADIENT,
+                NEARLY_CANCELS if beyond else "",
+            )
+        )
+        found.append(
+            Measured(31, f"other gradients, {size_px:g} px, relative", others, FLOAT32_GRADIENT)
+        )
+    return [*found, Measured(31, "values and gradients not finite", values_broken, 0)]
+
+
+NEARLY_CANCELS = (
+    "moved away, such a splat shrinks and comes nearer to the picture; autograd in float64 has no "
+    "digits for the little that is left of the two"
+)
+
+
+def _beside(size_px, z=3.0):
+    size = size_px * z / 60.0
+    return splats(
+        (0.9 * size, -0.6 * size, z),
+        scales=size * np.array([1.0, 0.7, 1.2]),
+        opacities=0.8,
+        rgb=(1, 1, 1),
+        quaternions=(0.8, 0.1, -0.3, 0.2),
+    )
 
 
 def quaternions_of_any_norm(backend):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from stages.raster.definition import RasterSettings
+from stages.raster.definition import TRANSMITTANCE_MIN, RasterSettings
 from stages.raster.reference import Parameters, parameters_of, render_tensors
 from stages.scene import dc_to_rgb
 from tests.scenes import PARAMETERS, textbook_alpha
@@ -21,7 +21,7 @@ def textbook_picture(scene, view, background=(0.0, 0.0, 0.0)):
     light = np.ones((view.height, view.width), L)
     rgb = dc_to_rgb(scene.sh[:, 0].astype(L))
     for row in np.argsort(z, kind="stable"):
-        alpha = np.where(light >= 1e-4, textbook_alpha(scene, view, row), 0)
+        alpha = np.where(light >= TRANSMITTANCE_MIN, textbook_alpha(scene, view, row), 0)
         image += (alpha * light)[..., None] * rgb[row]
         light = light * (1 - alpha)
     return (image + light[..., None] * np.array(background, L)).astype(np.float64)
@@ -101,7 +101,7 @@ def opacity_gradient_of_layers(scene, view, v, background):
     what lies behind is summed from the back, in extended precision."""
     alpha = np.array([textbook_alpha(scene, view, i)[0, 0] for i in range(len(scene))], L)
     before = np.concatenate([[L(1)], np.cumprod(1 - alpha)[:-1]])
-    alpha[before < 1e-4] = 0
+    alpha[before < TRANSMITTANCE_MIN] = 0
     light = np.cumprod(1 - alpha)
     shade = dc_to_rgb(scene.sh[:, 0].astype(L)) @ np.asarray(v, L)
     parts = alpha * before * shade

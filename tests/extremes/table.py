@@ -58,6 +58,12 @@ ROWS = (
     Row(27, "odd_cameras", "170 degrees; off-centre; coincident", cameras.odd_cameras),
     Row(28, "first_seen_late", "splat first seen at step 1000", optimiser.first_seen_late, ONE),
     Row(29, "every_format", "rows 1 to 8 through every file, 45 dB", files.every_format),
+    Row(30, "saturated", "10,000 splats at the cap of alpha", blending.saturated),
+    Row(31, "far_and_wide", "footprints of 1e3 to 2e20 px, off-centre", footprints.far_and_wide),
+    Row(32, "brightest", "SH coefficients 3.4e38, 1e19", colours.brightest),
+    Row(33, "out_of_range", "one gradient of 1e13 to NaN", optimiser.out_of_range, ONE),
+    Row(34, "switched_on_late", "a band, a reset at step 1000", optimiser.switched_on_late, ONE),
+    Row(35, "widths_out_of_range", "smoothing NaN, inf, < 0", culling.widths_out_of_range),
 )
 
 HEAD = """# Extremes
@@ -84,8 +90,8 @@ def listing() -> str:
     notes: list[str] = []
     lines = [
         HEAD,
-        "| row | input | measured | bound | reference | cpu | result |",
-        "|--:|---|---|--:|--:|--:|---|",
+        f"| row | input | measured | bound | {' | '.join(BACKENDS)} | result |",
+        f"|--:|---|---|--:|{'--:|' * len(BACKENDS)}---|",
     ]
     for row in ROWS:
         name = row.input

@@ -134,6 +134,12 @@ def test_hostile_values_corrupt_nothing_else(slot, kind):
             assert relative(b.image, a.image) <= FLOAT32_IMAGE, (component, value)
 
 
+@pytest.mark.parametrize("near", [-0.1, -1e-30, np.nan])
+def test_a_near_plane_behind_the_camera_is_refused(near):
+    with pytest.raises(ValueError, match="wanted 0 or more"):
+        RasterSettings(near=near)
+
+
 def test_colours_are_never_squashed():
     """Colour is 0.5 + SH, clamped below only: no sigmoid anywhere."""
     scene = splats((0, 0, 2), scales=5.0, opacities=0.5, rgb=(3.0, -1.0, 0.25))

@@ -42,7 +42,7 @@ def test_one_step_leaves_the_same_moments_counts_and_loss(degree: int) -> None:
     for name in ("moment1", "moment2", "gradient_sum"):
         found, known = getattr(kernels, name), getattr(plain, name)
         np.testing.assert_allclose(found, known, atol=2e-4 * np.abs(known).max())
-    for name in ("gradient_count",):
+    for name in ("gradient_count", "steps"):
         np.testing.assert_array_equal(getattr(kernels, name), getattr(plain, name))
 
 

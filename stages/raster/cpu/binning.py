@@ -40,6 +40,7 @@ CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
 # many they are, and the slot of its first gradient.
 ROW, FOUND, COUNT, SLOT = range(4)
 _LN2 = math.log(2.0)
+_HALF_LOG2E = 0.5 / _LN2
 _FAINTEST = math.log2(ALPHA_MIN)
 _FAR = 1e9
 BATCH = 32  # splats whose spans are found together
@@ -195,9 +196,10 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
     x, y = geometry[row, GX], geometry[row, GY]
     a, c = geometry[row, GVX], geometry[row, GVY]
     major = max(a, c)
-    b, det = geometry[row, GK] * major, 0.5 * major / geometry[row, GB]
+    b, thin = geometry[row, GK] * major, geometry[row, GB]
     per_c = 1.0 / c
-    slope, rest = b * per_c, det * per_c
+    # det / c, det from B^2 = log2(e) / 2 x major / det
+    slope, rest = b * per_c, _HALF_LOG2E * major / (thin * thin) * per_c
     right_end = b * math.sqrt(reach2 / a)
     first_row = BLOCK * dload(_EIGHT, 0) + top
     low, high = dmax(first_row, y0), dmin(first_row + (BLOCK - 1), y1)

@@ -3,7 +3,7 @@
 A tile is 16x16 pixels in blocks of 4x4; a block is one vector. A splat is drawn in those blocks
 only that its ellipse touches. Per (splat, tile) the exponent is rewritten in float64 around the
 tile's first pixel, so that everything that runs in float32 is small:
-    log2 alpha = log2 opacity - (A u^2 + B t^2) / ln 2,
+    log2 alpha = log2 opacity - (A u)^2 - (B t)^2,
 u the pixel's offset along the axis of the larger variance, t across. `alpha_of` is the one
 function for both directions: alpha must be the same to the last bit, since the way back divides by
 1 - alpha.
@@ -25,6 +25,7 @@ from stages.kernels.simd import (
     vany,
     vexp2,
     vfma,
+    vfnma,
     vge,
     vgt,
     vload,
@@ -45,6 +46,7 @@ from stages.raster.cpu.projection import (
     GVY,
     GX,
     GY,
+    sums_origin,
 )
 from stages.raster.cpu.tile import (
     BLOCKS,
@@ -59,8 +61,11 @@ from stages.raster.definition import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 # Planes of a tile's work, forward and backward.
 RED, GREEN, BLUE, ALPHA, DEPTH, MEDIAN, LIGHT, LAST = (k * PIXELS for k in range(8))
 V_RED, V_GREEN, V_BLUE, PASSING, BEHIND = (k * PIXELS for k in range(5))
+# What the way back leaves of a splat, sums over a tile's pixels: of v u, v t, v u^2, v t^2, v u t
+# and v, with v the gradient that reaches a pixel's exponent; of the gradients by three colours.
+S_U, S_T, S_UU, S_TT, S_UT, S_1, S_RED = range(7)
+SUMS = S_RED + 3
 AHEAD = 6  # entries: how early a splat's record is asked for
-_LOG2E = 1.4426950408889634
 _F = np.float32
 _ALPHA_MIN, _ALPHA_MAX, _T_MIN = _F(ALPHA_MIN), _F(ALPHA_MAX), _F(TRANSMITTANCE_MIN)
 _FAINTEST = _F(-115.0)  # log2 of alpha: below it `vexp2` would leave its range
@@ -82,9 +87,8 @@ _LANES, _STEPS = _offsets()
 def tile_frame(geometry, row, tile_x, tile_y):
     """The record of a row around the tile's first pixel centre.
 
-    Returns (major, A', B', K, log2 opacity, U, T): major, 0 where the major axis is x, 16 where it
-    is y; A', B': of the exponent to base 2, negative; U, T: vectors of the first block's offsets
-    along the major axis and across it.
+    Returns (major, A, B, -K, log2 opacity, U, T): major, 0 where the major axis is x, 16 where it
+    is y; U, T: vectors of the first block's offsets along the major axis and across it.
     """
     dx = tile_x * TILE + 0.5 - geometry[row, GX]
     dy = tile_y * TILE + 0.5 - geometry[row, GY]
@@ -93,13 +97,11 @@ def tile_frame(geometry, row, tile_x, tile_y):
     major = 0 if wide else 16
     u = dx if wide else dy
     t = dy - k * dx if wide else dx - k * dy
-    along, across = vload(_LANES, major), vload(_LANES, 16 - major)
-    us = splat16(_F(u)) + along
-    ts = splat16(_F(t)) + across - splat16(_F(k)) * along
+    us, ts = _first_block(u, t, k, major)
     return (
         major,
-        splat16(_F(geometry[row, GA] * -_LOG2E)),
-        splat16(_F(geometry[row, GB] * -_LOG2E)),
+        splat16(_F(geometry[row, GA])),
+        splat16(_F(geometry[row, GB])),
         splat16(_F(-k)),
         splat16(_F(geometry[row, GL])),
         us,
@@ -108,14 +110,32 @@ def tile_frame(geometry, row, tile_x, tile_y):
 
 
 @kernel
+def _first_block(u, t, k, major):
+    """Offsets of a tile's first block, from those of its first pixel."""
+    along, across = vload(_LANES, major), vload(_LANES, 16 - major)
+    return splat16(_F(u)) + along, splat16(_F(t)) + across - splat16(_F(k)) * along
+
+
+@kernel
+def _sums_frame(geometry, row, tile_x, tile_y, width, height):
+    """As U and T of `tile_frame`, from where the sums begin."""
+    o, p, q = sums_origin(geometry, row, width, height)
+    x, y, k = tile_x * TILE + 0.5, tile_y * TILE + 0.5, geometry[row, GK]
+    wide = geometry[row, GVX] >= geometry[row, GVY]
+    major, minor = (x, y) if wide else (y, x)
+    return _first_block(major - o, minor - q - k * (major - p), k, 0 if wide else 16)
+
+
+@kernel
 def alpha_of(frame, block):
-    """(alpha before the cap, u, t) of the 16 pixels of a block."""
+    """Of the 16 pixels of a block: alpha before the cap, and what takes offsets of the first block
+    to those of this one, along and across."""
     major, a, b, slope, level, us, ts = frame
     along = splat16(_STEPS[major + block])
-    u = us + along
-    t = vfma(slope, along, ts + splat16(_STEPS[16 - major + block]))
-    level = vfma(b * t, t, vfma(a * u, u, level))
-    return vexp2(vmax(level, splat16(_FAINTEST))), u, t
+    across = vfma(slope, along, splat16(_STEPS[16 - major + block]))
+    u, t = a * (us + along), b * (ts + across)
+    level = vfnma(t, t, vfnma(u, u, level))
+    return vexp2(vmax(level, splat16(_FAINTEST))), along, across
 
 
 @kernel
@@ -256,7 +276,7 @@ def blend_gradient_tiles(
     v_image,
     gradients,
 ):
-    """gradients [intersections, 9] at each entry's slot, from v_image [3, H, W]."""
+    """gradients [intersections, SUMS] at each entry's slot, from v_image [3, H, W]."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(5 * PIXELS, np.float32)
@@ -272,16 +292,17 @@ def blend_gradient_tiles(
         for entry in range(end - 1, start - 1, -1):
             number = _F(entry - start + 1)
             if number > furthest:
-                for k in range(9):
+                for k in range(SUMS):
                     gradients[slots[entry], k] = 0.0
                 continue
             ahead = members[max(entry - AHEAD, start)]
             prefetch(geometry, ahead * GEOMETRY_ROW)
             prefetch(paint, ahead * 4)
-            prefetch(gradients, slots[max(entry - AHEAD, start)] * 9)
+            prefetch(gradients, slots[max(entry - AHEAD, start)] * SUMS)
             alive = bits16(vge(vload(block_last, 0), splat16(number)))
             entry_gradient(
                 tile_frame(geometry, members[entry], tile_x, tile_y),
+                _sums_frame(geometry, members[entry], tile_x, tile_y, width, height),
                 number,
                 np.int64(masks[entry]) & alive,
                 paint,
@@ -295,12 +316,11 @@ def blend_gradient_tiles(
 
 
 @kernel
-def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradients, slot):
-    """Gradient of one splat in one tile into gradients[slot, :9].
-
-    With v the gradient that reaches the exponent of a pixel, u and t its offsets along and across
-    the splat's major axis, the sums over pixels of: v u, v t, v u^2, v t^2, v u t, v, and of the
-    gradients of red, green and blue.
+def entry_gradient(
+    frame, from_origin, number, blocks, paint, row, work, last, last_at, gradients, slot
+):
+    """Gradient of one splat in one tile into gradients[slot]: see SUMS, u and t from the origin of
+    `sums_origin`.
 
     work: the incoming gradient, the light that passes behind the splat, and what lies behind
     weighted by the incoming gradient (a suffix sum). The last two move in front of it.
@@ -309,11 +329,12 @@ def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradi
     zero, one = splat16(_F(0.0)), splat16(_F(1.0))
     v_u, v_t, v_uu, v_tt, v_ut, v_1 = zero, zero, zero, zero, zero, zero
     s_r, s_g, s_b = zero, zero, zero
+    us, ts = from_origin
     while blocks:
         block = lowest_bit(blocks)
         blocks &= blocks - 1
         at = 16 * block
-        raw, u, t = alpha_of(frame, block)
+        raw, along, across = alpha_of(frame, block)
         drawn = vand(vge(raw, splat16(_ALPHA_MIN)), vge(vload(last, last_at + at), splat16(number)))
         alpha = vselect(drawn, vmin(raw, splat16(_ALPHA_MAX)), zero)
         inverse = one / (one - alpha)
@@ -329,6 +350,7 @@ def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradi
         vstore(work, BEHIND + at, vfma(weight, shade, after))
         v = alpha * (after * inverse - before * shade)
         v = vselect(vgt(splat16(_ALPHA_MAX), raw), v, zero)  # the cap passes nothing on
+        u, t = us + along, ts + across
         by_u, by_t = v * u, v * t
         v_1 = v_1 + v
         v_u = v_u + by_u
@@ -336,5 +358,5 @@ def entry_gradient(frame, number, blocks, paint, row, work, last, last_at, gradi
         v_uu = vfma(by_u, u, v_uu)
         v_tt = vfma(by_t, t, v_tt)
         v_ut = vfma(by_u, t, v_ut)
-    store_sums8(gradients, slot * 9, v_u, v_t, v_uu, v_tt, v_ut, v_1, s_r, s_g)
-    gradients[slot, 8] = vsum(s_b)
+    store_sums8(gradients, slot * SUMS, v_u, v_t, v_uu, v_tt, v_ut, v_1, s_r, s_g)
+    gradients[slot, S_RED + 2] = vsum(s_b)

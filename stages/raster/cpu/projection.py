@@ -33,25 +33,36 @@ from stages.kernels.simd64 import (
 )
 from stages.raster.definition import (
     ALPHA_MIN,
+    LOG_SCALE,
     LOG_SCALE_MAX,
+    MEAN,
+    OPACITY,
     QUATERNION_MIN,
+    ROTATION,
+    SCALE_MAX,
+    SH,
     RasterSettings,
 )
 from stages.scene import Camera
 
-# Camera row: rotation 0:9, translation 9:12, fx fy cx cy 12:16, clamp limits 16:20 (low x, high x,
-# low y, high y), near 20, dilation 21, antialias 22, centre 23:26, width 26, height 27.
-CAMERA_ROW = 28
+# Camera row: rotation (row by row) and translation from the world to the camera, then what the
+# names say, and where the camera stands in the world.
+R, T = 0, 9
+FX, FY, CX, CY = 12, 13, 14, 15
+LOW_X, HIGH_X, LOW_Y, HIGH_Y = 16, 17, 18, 19  # of the slopes x/z and y/z, beyond which J is frozen
+NEAR, DILATION, ANTIALIAS = 20, 21, 22
+STAND = 23  # 23:26
+WIDTH, HEIGHT = 26, 27
 
 # Work of eight splats (float64[WORK_ROW x 8], one a thread): entry k of all lanes lies at 8 k.
 # Filled by `footprint`, read by `footprint_gradient`.
-AT = 0  # 0:3 position in the camera
+X, Y, Z = 0, 1, 2  # position in the camera
 V0, V1 = 3, 6  # rows of V = J W R diag(s)
 AXES = 9  # 9:18 W R
 SCALES = 18  # 18:21
 CROSS = 21  # 21:24 V0 x V1
 A, B, C, DET, MINORS = 24, 25, 26, 27, 28
-OPACITY, COMPENSATION = 29, 30
+FULL_OPACITY, COMPENSATION = 29, 30
 NORM, QUATERNION = 31, 32  # 32:36 unit
 SLOPE = 36  # 36:38 clamped x/z, y/z
 INSIDE = 38  # 38:40 1 where the slope is inside its limits, else 0
@@ -59,12 +70,16 @@ SMOOTHING = 40  # opacity factor of the 3D smoothing filter
 RATIOS = 41  # 41:44 scale before that filter over scale after it
 WORK_ROW = 44
 
-# Geometry record of a splat, float64[8]: mean in pixels, the three numbers of the exponent
-# A u^2 + B (v - K u)^2 (u along the axis of the larger variance), log2 of the opacity, variances.
+# Geometry record of a splat, float64[8]: mean in pixels; the three numbers of the exponent to base
+# 2, (A u)^2 + (B (v - K u))^2, u along the axis of the larger variance (float32 could not hold the
+# A^2 of a footprint of 1e19 pixels); log2 of the opacity; variances.
 GEOMETRY_ROW = 8
 GX, GY, GA, GB, GK, GL, GVX, GVY = range(8)
+# What `footprint_gradient` gives, entries of 8 lanes: as a row of gradients up to the SH.
+GRADIENTS = SH
 
 _LOG2E = 1.0 / math.log(2.0)
+_SQRT_LOG2E = math.sqrt(_LOG2E)
 _FAINTEST = math.log(ALPHA_MIN)
 
 
@@ -102,7 +117,7 @@ def put(w, k, value):
 
 
 @kernel
-def drawable(rows, means, quaternions, log_scales, opacity_logits):
+def drawable(rows, means, quaternions, log_scales, opacity_logits, smoothing):
     """Mask: all values but the colours are finite and in the range that can be drawn."""
     zero = spread8(0.0)
     good = dge(LOG_SCALE_MAX, gather8(log_scales, rows, 3, 0))
@@ -117,6 +132,9 @@ def drawable(rows, means, quaternions, log_scales, opacity_logits):
         q = gather8(quaternions, rows, 4, k)
         nothing = nothing + 0.0 * q
         largest = dmax(largest, dmax(q, -q))
+    if len(smoothing) > 0:
+        width = gather8(smoothing, rows, 1, 0)
+        good = dand(good, dand(dge(width, 0.0), dge(SCALE_MAX, width)))
     return dand(dand(good, deq(nothing, zero)), dge(largest, QUATERNION_MIN))
 
 
@@ -127,24 +145,24 @@ def footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothi
     smoothing [N], or [0] for none: see `raster.smoothing`.
     """
     mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
-    x = cam[0] * mx + cam[1] * my + cam[2] * mz + cam[9]
-    y = cam[3] * mx + cam[4] * my + cam[5] * mz + cam[10]
-    z = cam[6] * mx + cam[7] * my + cam[8] * mz + cam[11]
-    put(w, 0, x)
-    put(w, 1, y)
-    put(w, 2, z)
+    x = cam[R] * mx + cam[R + 1] * my + cam[R + 2] * mz + cam[T]
+    y = cam[R + 3] * mx + cam[R + 4] * my + cam[R + 5] * mz + cam[T + 1]
+    z = cam[R + 6] * mx + cam[R + 7] * my + cam[R + 8] * mz + cam[T + 2]
+    put(w, X, x)
+    put(w, Y, y)
+    put(w, Z, z)
     _axes(rows, cam, quaternions, w)
     slope_x, slope_y = x / z, y / z
-    u = dmin(dmax(slope_x, cam[16]), cam[17])
-    v = dmin(dmax(slope_y, cam[18]), cam[19])
+    u = dmin(dmax(slope_x, cam[LOW_X]), cam[HIGH_X])
+    v = dmin(dmax(slope_y, cam[LOW_Y]), cam[HIGH_Y])
     put(w, SLOPE, u)
     put(w, SLOPE + 1, v)
     put(w, INSIDE, dselect(deq(u, slope_x), 1.0, 0.0))
     put(w, INSIDE + 1, dselect(deq(v, slope_y), 1.0, 0.0))
     _scales(rows, log_scales, smoothing, w)
     _covariance(cam, u, v, z, w)
-    put(w, OPACITY, 1.0 / (1.0 + dexp(-gather8(opacity_logits, rows, 1, 0))))
-    return dgt(z, cam[20])
+    put(w, FULL_OPACITY, 1.0 / (1.0 + dexp(-gather8(opacity_logits, rows, 1, 0))))
+    return dgt(z, cam[NEAR])
 
 
 @kernel
@@ -169,8 +187,8 @@ def _scales(rows, log_scales, smoothing, w):
 @kernel
 def _covariance(cam, u, v, z, w):
     """V = J W R diag(s), cov2d = V V^T + e I, its determinant by Cauchy-Binet."""
-    j00, j02 = cam[12] / z, -cam[12] * u / z
-    j11, j12 = cam[13] / z, -cam[13] * v / z
+    j00, j02 = cam[FX] / z, -cam[FX] * u / z
+    j11, j12 = cam[FY] / z, -cam[FY] * v / z
     a, b, c = spread8(0.0), spread8(0.0), spread8(0.0)
     for k in range(3):
         s = at(w, SCALES + k)
@@ -185,14 +203,14 @@ def _covariance(cam, u, v, z, w):
         minor = at(w, V0 + n) * at(w, V1 + m) - at(w, V0 + m) * at(w, V1 + n)
         put(w, CROSS + k, minor)
         minors = minors + minor * minor
-    e = cam[21]
+    e = cam[DILATION]
     det = minors + e * (a + c) + e * e
     put(w, A, a + e)
     put(w, B, b)
     put(w, C, c + e)
     put(w, MINORS, minors)
     put(w, DET, det)
-    if cam[22] != 0.0:
+    if cam[ANTIALIAS] != 0.0:
         put(w, COMPENSATION, dsqrt(dmax(minors, 1e-60) / det))
     else:
         put(w, COMPENSATION, spread8(1.0))
@@ -222,7 +240,7 @@ def _axes(rows, cam, quaternions, w):
     r21 = 2.0 * (q2 * q3 + q0 * q1)
     r22 = 1.0 - 2.0 * (q1 * q1 + q2 * q2)
     for row in range(3):
-        c0, c1, c2 = cam[3 * row], cam[3 * row + 1], cam[3 * row + 2]
+        c0, c1, c2 = cam[R + 3 * row], cam[R + 3 * row + 1], cam[R + 3 * row + 2]
         put(w, AXES + 3 * row, c0 * r00 + c1 * r10 + c2 * r20)
         put(w, AXES + 3 * row + 1, c0 * r01 + c1 * r11 + c2 * r21)
         put(w, AXES + 3 * row + 2, c0 * r02 + c1 * r12 + c2 * r22)
@@ -231,27 +249,27 @@ def _axes(rows, cam, quaternions, w):
 @kernel
 def used_opacity(w):
     """Opacity as it is drawn: with what antialiasing and smoothing make of it."""
-    return at(w, OPACITY) * at(w, COMPENSATION) * at(w, SMOOTHING)
+    return at(w, FULL_OPACITY) * at(w, COMPENSATION) * at(w, SMOOTHING)
 
 
 @kernel
 def geometry_records(cam, w, rows, geometry):
     """geometry[rows] from their work; the mask of those that touch a pixel of the picture."""
     opacity = used_opacity(w)
-    a, b, c, det, z = at(w, A), at(w, B), at(w, C), at(w, DET), at(w, 2)
+    a, b, c, det, z = at(w, A), at(w, B), at(w, C), at(w, DET), at(w, Z)
     drawn = dand(dge(opacity, ALPHA_MIN), dand(dgt(1e300, det), dgt(det, 0.0)))
-    x = cam[12] * at(w, 0) / z + cam[14]
-    y = cam[13] * at(w, 1) / z + cam[15]
+    x = cam[FX] * at(w, X) / z + cam[CX]
+    y = cam[FY] * at(w, Y) / z + cam[CY]
     level = dlog(dmax(opacity, ALPHA_MIN))
     reach2 = 2.0 * (level - _FAINTEST)
     half_x, half_y = dsqrt(reach2 * a), dsqrt(reach2 * c)
-    drawn = dand(drawn, dand(dge(x + half_x, 0.5), dge(cam[26] - 0.5, x - half_x)))
-    drawn = dand(drawn, dand(dge(y + half_y, 0.5), dge(cam[27] - 0.5, y - half_y)))
+    drawn = dand(drawn, dand(dge(x + half_x, 0.5), dge(cam[WIDTH] - 0.5, x - half_x)))
+    drawn = dand(drawn, dand(dge(y + half_y, 0.5), dge(cam[HEIGHT] - 0.5, y - half_y)))
     major = dmax(a, c)
     scatter8(geometry, rows, GEOMETRY_ROW, GX, x)
     scatter8(geometry, rows, GEOMETRY_ROW, GY, y)
-    scatter8(geometry, rows, GEOMETRY_ROW, GA, 0.5 / major)
-    scatter8(geometry, rows, GEOMETRY_ROW, GB, 0.5 * major / det)
+    scatter8(geometry, rows, GEOMETRY_ROW, GA, dsqrt(0.5 / major) * _SQRT_LOG2E)
+    scatter8(geometry, rows, GEOMETRY_ROW, GB, dsqrt(0.5 * major / det) * _SQRT_LOG2E)
     scatter8(geometry, rows, GEOMETRY_ROW, GK, b / major)
     scatter8(geometry, rows, GEOMETRY_ROW, GL, level * _LOG2E)
     scatter8(geometry, rows, GEOMETRY_ROW, GVX, a)
@@ -260,12 +278,41 @@ def geometry_records(cam, w, rows, geometry):
 
 
 @kernel
-def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_opacity, smoothed, out):
+def sums_origin(geometry, row, width, height):
+    """(o, p, q): where the offsets u' and t' of the way back begin, pixels.
+
+    u' = major - o, t' = (minor - q) - K (major - p), major and minor a pixel's coordinates along
+    the axis of the larger variance and along the other. They begin at a mean in the picture; beside
+    a mean out of it where they are least in the picture, so that neither is larger than that. Sums
+    from a mean 1e5 pixels away would keep few digits of where the pixels are, and all that a step
+    of the mean along its ray changes is in those.
+    """
+    x, y = geometry[row, GX], geometry[row, GY]
+    wide = geometry[row, GVX] >= geometry[row, GVY]
+    major, minor = (x, y) if wide else (y, x)
+    if 0.0 <= x <= width and 0.0 <= y <= height:
+        return major, major, minor
+    across, down = np.float64(width), np.float64(height)
+    if not wide:
+        across, down = down, across
+    k = geometry[row, GK]
+    far, near = (across, 0.0) if k > 0.0 else (0.0, across)
+    o = min(max(major, 0.0), across)
+    if -minor - k * (far - major) > 0.0:  # the whole picture lies on one side of the axis
+        return o, far, 0.0
+    if down - minor - k * (near - major) < 0.0:  # or on the other
+        return o, near, down
+    return o, major, minor
+
+
+@kernel
+def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_near, g_opacity, smoothed, out):
     """Chain rule from the footprints of eight splats to their parameters.
 
-    Gradients of mean x, mean y (px), A, B, K of the exponent and of the opacity drawn.
+    Gradients of mean x, mean y (px), of A, B, K of the exponent A u^2 + B (v - K u)^2, of the
+    logarithm of 1 / z through that exponent, and of the opacity drawn.
     smoothed: whether a smoothing filter was used.
-    out (work of 11 entries): gradients of mean (3), quaternion (4), log-scales (3), opacity logit.
+    out (work of GRADIENTS entries): gradients of mean, quaternion, log-scales, opacity logit.
     """
     a, b, c, det = at(w, A), at(w, B), at(w, C), at(w, DET)
     major = dmax(a, c)
@@ -275,21 +322,25 @@ def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_opacity, smoothed, out
     wide = dge(a, c)
     g_var_x, g_var_y = dselect(wide, g_major, 0.0), dselect(wide, 0.0, g_major)
     g_minors = spread8(0.0)
-    opacity, drawn = at(w, OPACITY), used_opacity(w)
-    if cam[22] != 0.0:
+    opacity, drawn = at(w, FULL_OPACITY), used_opacity(w)
+    e = cam[DILATION]
+    if cam[ANTIALIAS] != 0.0:
         g_compensation = g_opacity * opacity * at(w, SMOOTHING)
         compensation, minors = at(w, COMPENSATION), at(w, MINORS)
         g_det = g_det - 0.5 * g_compensation * compensation / det
-        g_minors = dselect(dgt(minors, 1e-60), 0.5 * g_compensation / (compensation * det), 0.0)
-    put(out, 10, g_opacity * drawn * (1.0 - opacity))
+        thick = dgt(minors, 1e-60)
+        g_minors = dselect(thick, 0.5 * g_compensation / (compensation * det), 0.0)
+        # of ln(compensation) by ln(1 / z), whose 4th power the minors grow with
+        growth = dselect(thick, e * (a + c), e * (a + c) - 2.0 * det)
+        g_near = g_near + g_compensation * compensation * growth / det
+    put(out, OPACITY, g_opacity * drawn * (1.0 - opacity))
     g_minors = g_minors + g_det
-    e2 = 2.0 * cam[21] * g_det
-    z = at(w, 2)
-    fx, fy = cam[12], cam[13]
+    e2 = 2.0 * e * g_det
+    z = at(w, Z)
+    fx, fy = cam[FX], cam[FY]
     u, v = at(w, SLOPE), at(w, SLOPE + 1)
     j00, j02, j11, j12 = fx / z, -fx * u / z, fy / z, -fy * v / z
-    zero = spread8(0.0)
-    g00, g02, g11, g12 = zero, zero, zero, zero
+    g02, g12 = spread8(0.0), spread8(0.0)
     for k in range(3):
         n, m = (k + 1) % 3, (k + 2) % 3
         v0, v1 = at(w, V0 + k), at(w, V1 + k)
@@ -302,63 +353,60 @@ def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_opacity, smoothed, out
         if smoothed:
             kept = at(w, RATIOS + k) * at(w, RATIOS + k)
             g_log_scale = g_log_scale * kept + g_opacity * drawn * (1.0 - kept)
-        put(out, 7 + k, g_log_scale)
+        put(out, LOG_SCALE + k, g_log_scale)
         t0, t1 = g_v0 * at(w, SCALES + k), g_v1 * at(w, SCALES + k)
-        x_axis, y_axis, z_axis = at(w, AXES + k), at(w, AXES + 3 + k), at(w, AXES + 6 + k)
-        g00, g02 = g00 + t0 * x_axis, g02 + t0 * z_axis
-        g11, g12 = g11 + t1 * y_axis, g12 + t1 * z_axis
+        z_axis = at(w, AXES + 6 + k)
+        g02, g12 = g02 + t0 * z_axis, g12 + t1 * z_axis
         # from here on these entries hold the gradient of W R
         put(w, AXES + k, j00 * t0)
         put(w, AXES + 3 + k, j11 * t1)
         put(w, AXES + 6 + k, j02 * t0 + j12 * t1)
     _quaternion_gradient(cam, w, out)
-    _mean_gradient(cam, w, g_x, g_y, g00, g02, g11, g12, out)
+    _mean_gradient(cam, w, g_x, g_y, g02, g12, g_near, out)
 
 
 @kernel
-def _mean_gradient(cam, w, g_px, g_py, g00, g02, g11, g12, out):
-    """out[0:3] from the gradients of the mean on the picture and of the Jacobian."""
-    fx, fy = cam[12], cam[13]
-    x, y, z, u, v = at(w, 0), at(w, 1), at(w, 2), at(w, SLOPE), at(w, SLOPE + 1)
-    g_x, g_y = g_px * fx / z, g_py * fy / z
-    g_z = -(g_px * fx * x + g_py * fy * y) / (z * z)
-    g_z = g_z + (g02 * fx * u - g00 * fx + g12 * fy * v - g11 * fy) / (z * z)
+def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_near, out):
+    """out[MEAN] from the gradients of the mean on the picture, of the Jacobian's last column, and
+    of the logarithm of 1 / z with slopes held still."""
+    fx, fy = cam[FX], cam[FY]
+    z, u, v = at(w, Z), at(w, SLOPE), at(w, SLOPE + 1)
     # a slope inside its limits moves with the mean; a clamped one does not
     g_u = dselect(dgt(at(w, INSIDE), 0.5), -g02 * fx / z, 0.0)
     g_v = dselect(dgt(at(w, INSIDE + 1), 0.5), -g12 * fy / z, 0.0)
-    g_x, g_y = g_x + g_u / z, g_y + g_v / z
-    g_z = g_z - (g_u * u + g_v * v) / z
+    g_x, g_y = (g_px * fx + g_u) / z, (g_py * fy + g_v) / z
+    g_z = -(g_near + g_u * u + g_v * v) / z
     for k in range(3):
-        put(out, k, cam[k] * g_x + cam[3 + k] * g_y + cam[6 + k] * g_z)
+        put(out, MEAN + k, cam[R + k] * g_x + cam[R + 3 + k] * g_y + cam[R + 6 + k] * g_z)
 
 
 @kernel
 def _quaternion_gradient(cam, w, out):
-    """out[3:7] from the gradient of W R that stands in the work's AXES."""
+    """out[ROTATION] from the gradient of W R that stands in the work's AXES."""
     q0, q1 = at(w, QUATERNION), at(w, QUATERNION + 1)
     q2, q3 = at(w, QUATERNION + 2), at(w, QUATERNION + 3)
     g0, g1, g2 = at(w, AXES), at(w, AXES + 3), at(w, AXES + 6)
-    r00 = cam[0] * g0 + cam[3] * g1 + cam[6] * g2
-    r10 = cam[1] * g0 + cam[4] * g1 + cam[7] * g2
-    r20 = cam[2] * g0 + cam[5] * g1 + cam[8] * g2
+    r00 = cam[R] * g0 + cam[R + 3] * g1 + cam[R + 6] * g2
+    r10 = cam[R + 1] * g0 + cam[R + 4] * g1 + cam[R + 7] * g2
+    r20 = cam[R + 2] * g0 + cam[R + 5] * g1 + cam[R + 8] * g2
     g0, g1, g2 = at(w, AXES + 1), at(w, AXES + 4), at(w, AXES + 7)
-    r01 = cam[0] * g0 + cam[3] * g1 + cam[6] * g2
-    r11 = cam[1] * g0 + cam[4] * g1 + cam[7] * g2
-    r21 = cam[2] * g0 + cam[5] * g1 + cam[8] * g2
+    r01 = cam[R] * g0 + cam[R + 3] * g1 + cam[R + 6] * g2
+    r11 = cam[R + 1] * g0 + cam[R + 4] * g1 + cam[R + 7] * g2
+    r21 = cam[R + 2] * g0 + cam[R + 5] * g1 + cam[R + 8] * g2
     g0, g1, g2 = at(w, AXES + 2), at(w, AXES + 5), at(w, AXES + 8)
-    r02 = cam[0] * g0 + cam[3] * g1 + cam[6] * g2
-    r12 = cam[1] * g0 + cam[4] * g1 + cam[7] * g2
-    r22 = cam[2] * g0 + cam[5] * g1 + cam[8] * g2
+    r02 = cam[R] * g0 + cam[R + 3] * g1 + cam[R + 6] * g2
+    r12 = cam[R + 1] * g0 + cam[R + 4] * g1 + cam[R + 7] * g2
+    r22 = cam[R + 2] * g0 + cam[R + 5] * g1 + cam[R + 8] * g2
     n0 = 2.0 * (q1 * (r21 - r12) + q2 * (r02 - r20) + q3 * (r10 - r01))
     n1 = 2.0 * (q2 * (r01 + r10) + q3 * (r02 + r20) + q0 * (r21 - r12)) - 4.0 * q1 * (r11 + r22)
     n2 = 2.0 * (q1 * (r01 + r10) + q3 * (r12 + r21) + q0 * (r02 - r20)) - 4.0 * q2 * (r00 + r22)
     n3 = 2.0 * (q1 * (r02 + r20) + q2 * (r12 + r21) + q0 * (r10 - r01)) - 4.0 * q3 * (r00 + r11)
     along = n0 * q0 + n1 * q1 + n2 * q2 + n3 * q3
     norm = at(w, NORM)
-    put(out, 3, (n0 - along * q0) / norm)
-    put(out, 4, (n1 - along * q1) / norm)
-    put(out, 5, (n2 - along * q2) / norm)
-    put(out, 6, (n3 - along * q3) / norm)
+    put(out, ROTATION, (n0 - along * q0) / norm)
+    put(out, ROTATION + 1, (n1 - along * q1) / norm)
+    put(out, ROTATION + 2, (n2 - along * q2) / norm)
+    put(out, ROTATION + 3, (n3 - along * q3) / norm)
 
 
 @kernel

@@ -13,7 +13,6 @@ from stages.raster.cpu import binning, blend, contributions
 from stages.raster.cpu.projection import GEOMETRY_ROW, camera_row
 from stages.raster.cpu.splat_kernels import (
     CULLED,
-    SUMS,
     VISIBLE,
     project_splats,
     splat_gradients,
@@ -183,7 +182,7 @@ class CpuRasteriser:
         """Gradients of the visible splats, from v_image [3, H, W]."""
         n = len(forward.visible)
         get = self.buffers.get
-        (raw,) = self.buffers.carve(((forward.n_intersections, SUMS), np.float32))
+        (raw,) = self.buffers.carve(((forward.n_intersections, blend.SUMS), np.float32))
         self._over_tiles(blend.blend_gradient_tiles, forward, v_image, raw)
         out = get("out", (n, gradient_columns((forward.degree + 1) ** 2)), np.float32)
         means2d = get("means2d", (n, 2), np.float32)

@@ -15,6 +15,7 @@ from stages.kernels.simd import (
 from stages.kernels.simd64 import (
     LANES,
     bits8,
+    dand,
     dgt,
     dload,
     dmax,
@@ -27,26 +28,44 @@ from stages.kernels.simd64 import (
     spread8,
 )
 from stages.raster.cpu.binning import COUNT, SLOT
+from stages.raster.cpu.blend import S_1, S_RED, S_T, S_TT, S_U, S_UT, S_UU, SUMS
 from stages.raster.cpu.projection import (
+    CX,
+    CY,
+    DILATION,
     GA,
     GB,
     GEOMETRY_ROW,
     GK,
+    GRADIENTS,
+    GVX,
+    GVY,
+    GX,
+    GY,
+    HEIGHT,
+    STAND,
+    WIDTH,
     WORK_ROW,
     A,
     C,
+    R,
+    T,
     at,
     drawable,
     footprint,
     footprint_gradient,
     geometry_records,
+    put,
+    sums_origin,
     used_opacity,
 )
 from stages.raster.cpu.sh_kernels import sh_basis, sh_direction_gradient
+from stages.raster.definition import COLOUR_MAX, MEAN, SH
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
-BRIGHTEST = 3.4e38  # an infinite colour would turn "none of it" into NaN
-SUMS = 9  # of a splat's gradients in a tile; see `blend.entry_gradient`
+LARGEST = 3.4e38  # what float32 holds: no gradient is handed on as infinite
+_BRIGHTEST = float(np.float32(COLOUR_MAX))  # as it is kept in the paint
+_LN2 = math.log(2.0)
 
 
 @kernel
@@ -108,7 +127,7 @@ def project_splats(
         n_seen = 0
         for start in range(first, last, LANES):
             _name_rows(rows, start, last)
-            good = bits8(drawable(rows, means, quaternions, log_scales, opacity_logits))
+            good = bits8(drawable(rows, means, quaternions, log_scales, opacity_logits, smoothing))
             in_front = bits8(
                 footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
             )
@@ -133,9 +152,9 @@ def project_splats(
 @kernel
 def _direction(rows, cam, means):
     """(unit x, y, z, distance) from the camera to eight rows."""
-    x = gather8(means, rows, 3, 0) - cam[23]
-    y = gather8(means, rows, 3, 1) - cam[24]
-    z = gather8(means, rows, 3, 2) - cam[25]
+    x = gather8(means, rows, 3, 0) - cam[STAND]
+    y = gather8(means, rows, 3, 1) - cam[STAND + 1]
+    z = gather8(means, rows, 3, 2) - cam[STAND + 2]
     distance = dsqrt(x * x + y * y + z * z)
     return x / distance, y / distance, z / distance, distance
 
@@ -151,14 +170,15 @@ def _shade(rows, cam, degree, means, sh, basis, paint):
             value = value + dload(basis, LANES * band) * gather8(
                 sh, rows, stride, 3 * band + channel
             )
-        scatter8(paint, rows, 4, channel, dmin(dmax(value, 0.0), BRIGHTEST))
+        scatter8(paint, rows, 4, channel, dmin(dmax(value, 0.0), COLOUR_MAX))
     mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
-    scatter8(paint, rows, 4, 3, cam[6] * mx + cam[7] * my + cam[8] * mz + cam[11])
+    depth = cam[R + 6] * mx + cam[R + 7] * my + cam[R + 8] * mz + cam[T + 2]
+    scatter8(paint, rows, 4, 3, depth)
 
 
 @kernel
 def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out):
-    """SH gradients into out[places, 11:]; the direction's are added to the means' in `work`."""
+    """SH gradients into out[places, SH:]; the direction's are added to the means' in `work`."""
     bands = (degree + 1) * (degree + 1)
     x, y, z, distance = _direction(rows, cam, means)
     sh_basis(degree, x, y, z, basis)
@@ -166,31 +186,32 @@ def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, w
     for band in range(bands):
         dstore(weights, LANES * band, spread8(0.0))
     for channel in range(3):
-        # a colour clamped at 0 passes nothing on
-        painted = dgt(gather8(paint, rows, 4, channel), 0.0)
-        g = dselect(painted, dload(sums, LANES * (6 + channel)), 0.0)
+        # a colour that is clamped passes nothing on
+        colour = gather8(paint, rows, 4, channel)
+        painted = dand(dgt(colour, 0.0), dgt(_BRIGHTEST, colour))
+        g = dselect(painted, dload(sums, LANES * (S_RED + channel)), 0.0)
         for band in range(bands):
-            scatter8(out, places, columns, 11 + 3 * band + channel, g * dload(basis, LANES * band))
+            scatter8(out, places, columns, SH + 3 * band + channel, g * dload(basis, LANES * band))
             if degree > 0:
                 added = g * gather8(sh, rows, stride, 3 * band + channel)
                 dstore(weights, LANES * band, dload(weights, LANES * band) + added)
     if degree > 0:
         gx, gy, gz = sh_direction_gradient(degree, x, y, z, weights)
         along = gx * x + gy * y + gz * z
-        dstore(work, 0, dload(work, 0) + (gx - along * x) / distance)
-        dstore(work, LANES, dload(work, LANES) + (gy - along * y) / distance)
-        dstore(work, 2 * LANES, dload(work, 2 * LANES) + (gz - along * z) / distance)
+        put(work, MEAN, at(work, MEAN) + (gx - along * x) / distance)
+        put(work, MEAN + 1, at(work, MEAN + 1) + (gy - along * y) / distance)
+        put(work, MEAN + 2, at(work, MEAN + 2) + (gz - along * z) / distance)
 
 
 @kernel
 def _sum_slots(raw, slot, end, lane, sums):
-    """Add up the entries slot..end of raw [intersections, 9], in order, into a lane of `sums`."""
+    """Add up entries slot..end of raw [intersections, SUMS], in order, into a lane of `sums`."""
     first, rest = spread8(0.0), 0.0
     for s in range(slot, end):
         first = first + dload(raw, s * SUMS)
-        rest += raw[s, 8]
+        rest += raw[s, LANES]
     dstore(sums, lane * 16, first)
-    sums[lane * 16 + 8] = rest
+    sums[lane * 16 + LANES] = rest
 
 
 @kernel
@@ -222,7 +243,8 @@ def splat_gradients(
     w = np.empty(WORK_ROW * LANES, np.float64)
     by_lane = np.zeros(16 * LANES, np.float64)
     sums = np.empty(SUMS * LANES, np.float64)
-    work = np.empty(11 * LANES, np.float64)
+    work = np.empty(GRADIENTS * LANES, np.float64)
+    shifts = np.empty(4 * LANES, np.float64)
     basis = np.empty(16 * LANES, np.float64)
     weights = np.empty(16 * LANES, np.float64)
     rows, places = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
@@ -244,30 +266,62 @@ def splat_gradients(
                 dstore(sums, LANES * k, gather8(by_lane, lanes, 16, k))
             footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
             _exponent_gradient(
-                rows, cam, geometry, w, sums, len(smoothing) > 0, places, means2d, work
+                rows, cam, geometry, w, sums, shifts, len(smoothing) > 0, places, means2d, work
             )
             _colour_gradient(
                 rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out
             )
-            for k in range(11):
-                scatter8(out, places, columns, k, dload(work, LANES * k))
+            for k in range(GRADIENTS):
+                value = dmin(dmax(dload(work, LANES * k), -LARGEST), LARGEST)
+                scatter8(out, places, columns, k, value)
 
 
 @kernel
-def _exponent_gradient(rows, cam, geometry, w, sums, smoothed, places, means2d, work):
+def _shifts(rows, cam, geometry, shifts):
+    """Where the sums of eight rows begin (see `sums_origin`), along and across: less the mean (0:2)
+    and less the principal point (2:4), each 8 lanes of `shifts`."""
+    for lane in range(LANES):
+        row = rows[lane]
+        o, p, q = sums_origin(geometry, row, cam[WIDTH], cam[HEIGHT])
+        x, y, cx, cy, k = geometry[row, GX], geometry[row, GY], cam[CX], cam[CY], geometry[row, GK]
+        if geometry[row, GVX] < geometry[row, GVY]:
+            x, y, cx, cy = y, x, cy, cx
+        shifts[lane] = o - x
+        shifts[LANES + lane] = q - y - k * (p - x)
+        shifts[2 * LANES + lane] = o - cx
+        shifts[3 * LANES + lane] = q - cy - k * (p - cx)
+
+
+@kernel
+def _exponent_gradient(rows, cam, geometry, w, sums, shifts, smoothed, places, means2d, work):
     """From the sums over pixels that `blend.entry_gradient` describes to means2d and to the
-    parameters' gradients in `work`."""
-    a = gather8(geometry, rows, GEOMETRY_ROW, GA)
-    b, k = gather8(geometry, rows, GEOMETRY_ROW, GB), gather8(geometry, rows, GEOMETRY_ROW, GK)
-    s_u, s_t = dload(sums, 0), dload(sums, LANES)
-    s_uu, s_tt = dload(sums, 2 * LANES), dload(sums, 3 * LANES)
-    s_ut, s_1 = dload(sums, 4 * LANES), dload(sums, 5 * LANES)
+    parameters' gradients in `work`.
+
+    With q the exponent's gradient by a pixel's offset, p a pixel and c the principal point, the
+    exponent falls with the logarithm of 1 / z as q (p - c) - e q^2: what becomes of moving the mean
+    and what becomes of scaling the footprint, each as large as the mean is far, is never formed.
+    """
+    root_a = gather8(geometry, rows, GEOMETRY_ROW, GA)
+    root_b, k = gather8(geometry, rows, GEOMETRY_ROW, GB), gather8(geometry, rows, GEOMETRY_ROW, GK)
+    a, b = _LN2 * root_a * root_a, _LN2 * root_b * root_b
+    _shifts(rows, cam, geometry, shifts)
+    du, dt = dload(shifts, 0), dload(shifts, LANES)
+    near_u, near_t, s_1 = at(sums, S_U), at(sums, S_T), at(sums, S_1)
+    s_u, s_t = near_u + du * s_1, near_t + dt * s_1
+    by_u, by_t = at(sums, S_UU) + du * near_u, at(sums, S_TT) + dt * near_t
+    s_uu, s_tt = by_u + du * s_u, by_t + dt * s_t
+    s_ut = at(sums, S_UT) + du * near_t + dt * s_u
     along = 2.0 * (b * k * s_t - a * s_u)
     across = -2.0 * b * s_t
     tall = dgt(at(w, C), at(w, A))  # whether the major axis is y
     g_x, g_y = dselect(tall, across, along), dselect(tall, along, across)
+    q_p = a * (by_u + dload(shifts, 2 * LANES) * s_u) + b * (by_t + dload(shifts, 3 * LANES) * s_t)
+    q_q = a * a * s_uu - 2.0 * a * b * k * s_ut + b * b * (1.0 + k * k) * s_tt
+    g_near = 4.0 * cam[DILATION] * q_q - 2.0 * q_p
     g_opacity = -s_1 / used_opacity(w)
-    footprint_gradient(cam, w, g_x, g_y, s_uu, s_tt, -2.0 * b * s_ut, g_opacity, smoothed, work)
+    footprint_gradient(
+        cam, w, g_x, g_y, s_uu, s_tt, -2.0 * b * s_ut, g_near, g_opacity, smoothed, work
+    )
     scatter8(means2d, places, 2, 0, g_x)
     scatter8(means2d, places, 2, 1, g_y)
 
