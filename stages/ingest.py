@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +63,7 @@ def run(
     Raises SplatError for a folder without at least 3 usable photographs, and Interrupted.
     """
     from stages.photos import advice, capture_file, find
+    from stages.photos.quality import near_duplicates
     from stages.scene import Capture
 
     root = Path(inputs["photos"])
@@ -82,7 +83,9 @@ def run(
         [n for n, t in zip(names, taken, strict=True) if t.bad_profile],
         report.warn,
     )
-    _report_capture(photos, [t.measures for t in taken if t.measures is not None], report)
+    duplicates = near_duplicates([t.measures.thumbnail for t in taken if t.measures is not None])
+    photos = _with_twins(photos, duplicates)
+    _report_capture(photos, duplicates, report)
     report.metric("left_out", len(reasons))
     report.metric("files_ignored", found.others)
     capture = Capture(folder, photos)
@@ -152,13 +155,19 @@ def _take(source: Source, max_side: int, folder: Path, budget: PixelBudget) -> _
     return _Taken(photo, measures, "", decoded.alpha, decoded.hdr, decoded.bad_profile)
 
 
-def _report_capture(photos: tuple[Photo, ...], measures: list[Measures], report: Report) -> None:
+def _with_twins(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
+    """The photographs, each of a group of near-duplicates knowing the group's first."""
+    first = {index: photos[group[0]].name for group in groups for index in group}
+    return tuple(replace(photo, twin=first.get(i, "")) for i, photo in enumerate(photos))
+
+
+def _report_capture(
+    photos: tuple[Photo, ...], duplicates: list[tuple[int, ...]], report: Report
+) -> None:
     import numpy as np
 
     from stages.photos import advice
-    from stages.photos.quality import near_duplicates
 
-    duplicates = near_duplicates([measure.thumbnail for measure in measures])
     blurred = advice.about_capture(photos, duplicates, report.warn)
     known = [photo.exposure_ev for photo in photos if photo.exposure_ev is not None]
     report.metric("photographs", len(photos))
@@ -186,4 +195,4 @@ def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatEr
     )
 
 
-STAGE = Stage(name="ingest", version=1, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=2, reads=(), settings_type=IngestSettings, run=run, load=load)

@@ -26,7 +26,7 @@ class PruneSettings:
     max_loss_db: float = field(
         default=0.05,
         metadata={
-            "help": "Held-out PSNR that pruning may cost in all (dB).",
+            "help": "PSNR of the training photographs that pruning may cost in all (dB).",
             "min": 0,
             "max": 100,
         },
@@ -48,11 +48,11 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     photographs = load_photographs(reconstruction.folder, kept, splats.look)
     judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
     before = mean_psnr_db(splats, judges, settings.backend)
+    floor = mean_psnr_db(splats, photographs, settings.backend) - settings.max_loss_db
     start, counts = len(splats), {"floaters": 0, "unneeded": 0}
     for number in range(settings.rounds):
         report.progress(number, settings.rounds, "pruning", splats=len(splats))
-        floor = before - settings.max_loss_db
-        splats, found = _one_round(splats, photographs, judges, settings.backend, floor)
+        splats, found = _one_round(splats, photographs, settings.backend, floor)
         for name, count in found.items():
             counts[name] += count
         if not sum(found.values()):
@@ -82,11 +82,10 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
 def _one_round(
     splats: Splats,
     photographs: Sequence[Photograph],
-    judges: Sequence[Photograph],
     backend: str,
     floor_db: float,
 ) -> tuple[Splats, dict[str, int]]:
-    """Remove what a round may, most harmful first; less of it while the judges lose too much."""
+    """Remove what a round may, most harmful first; less of it while they lose too much."""
     import numpy as np
 
     from stages.measure.judge import mean_psnr_db
@@ -103,7 +102,7 @@ def _one_round(
         keep = np.ones(len(splats), bool)
         keep[chosen] = False
         fewer = splats.take(keep)
-        if mean_psnr_db(fewer, judges, backend) >= floor_db:
+        if mean_psnr_db(fewer, photographs, backend) >= floor_db:
             n_floating = int(floating[chosen].sum())
             return fewer, {"floaters": n_floating, "unneeded": len(chosen) - n_floating}
         chosen = chosen[: len(chosen) // 2]

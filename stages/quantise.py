@@ -1,8 +1,8 @@
 """Splats + photographs -> QuantisedSplats: what to keep at which precision, by measurement.
 
 View-dependent colour takes up to three quarters of a file. It is cut, for all splats and then for
-each, as far as the held-out photographs do not show it; and what the 8-bit .splat costs is
-measured, so that nobody has to guess.
+each, as far as training photographs do not show it; held-out ones only judge what came of it. And
+what the 8-bit .splat costs is measured, so that nobody has to guess.
 """
 
 from __future__ import annotations
@@ -32,11 +32,15 @@ class QuantiseSettings:
 
     max_loss_db: float = field(
         default=0.02,
-        metadata={"help": "Held-out PSNR that smaller files may cost (dB).", "min": 0, "max": 100},
+        metadata={
+            "help": "PSNR of training photographs that smaller files may cost (dB).",
+            "min": 0,
+            "max": 100,
+        },
     )
     max_views: int = field(
         default=12,
-        metadata={"help": "Photographs to measure on, at most.", "min": 1, "max": 100_000},
+        metadata={"help": "Training photographs to decide by, at most.", "min": 1, "max": 100_000},
     )
     backend: str = backend_setting()
 
@@ -44,10 +48,10 @@ class QuantiseSettings:
 def run(
     inputs: Mapping[str, Any], settings: QuantiseSettings, folder: Path, report: Report
 ) -> QuantisedSplats:
-    """Decide on the splats of inputs["prune"], measured on the views of inputs["sfm"].
+    """Decide on the splats of inputs["prune"] by training views of inputs["sfm"].
 
     Metrics: psnr_raw_db, psnr_kept_db, psnr_splat32_db (means over the held-out views, or over
-    training views where none are held out), sh_degree, splats_by_sh_degree, raw_mib, kept_mib.
+    those that decided where none are held out), sh_degree, splats_by_sh_degree, raw_mib, kept_mib.
     Raises SplatError if a photograph cannot be read.
     """
     from stages.formats import splat32
@@ -55,20 +59,24 @@ def run(
     from stages.scene import QuantisedSplats, save_splats
 
     splats: Splats = inputs["prune"]
-    judge = _Judge.on(inputs["sfm"], splats.look, settings, report)
-    raw_db = judge.psnr(splats)
+    decider, judge = _measures(inputs["sfm"], splats.look, settings, report)
+    raw_db = decider.psnr(splats)
     by_degree = {splats.sh_degree: raw_db}
-    degree, kept = splats.sh_degree, splats
+    kept = splats
     for lower in range(splats.sh_degree):
         candidate = splats.with_sh_degree(lower)
-        by_degree[lower] = judge.psnr(candidate)
+        by_degree[lower] = decider.psnr(candidate)
         if raw_db - by_degree[lower] < settings.max_loss_db:
-            degree, kept = lower, candidate
+            kept = candidate
             break
-    kept, kept_db, threshold = _cut_each(kept, by_degree[degree], raw_db, settings, judge)
+    kept, threshold = _cut_each(kept, raw_db, settings, decider)
     drawn, _ = kept_rows(kept)
     in_32_bytes = splat32.decode(splat32.encode(drawn))
-    splat32_db = judge.psnr(replace(in_32_bytes, look=splats.look))
+    judged = {
+        "psnr_raw_db": judge.psnr(splats),
+        "psnr_kept_db": judge.psnr(kept),
+        "psnr_splat32_db": judge.psnr(replace(in_32_bytes, look=splats.look)),
+    }
 
     counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
     decisions: dict[str, object] = {
@@ -77,11 +85,9 @@ def run(
         "max_loss_db": settings.max_loss_db,
         "colour_loss_of_255": threshold,
         "measured_on": judge.what,
-        "views": len(judge.photographs),
+        "views": len(decider.photographs),
         "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
-        "psnr_raw_db": raw_db,
-        "psnr_kept_db": kept_db,
-        "psnr_splat32_db": splat32_db,
+        **judged,
     }
     for name in ("psnr_raw_db", "psnr_kept_db", "psnr_splat32_db", "sh_degree"):
         report.metric(name, decisions[name])
@@ -97,24 +103,23 @@ def run(
 
 
 def _cut_each(
-    kept: Splats, kept_db: float, raw_db: float, settings: QuantiseSettings, judge: _Judge
-) -> tuple[Splats, float, float]:
-    """(splats with each one's negligible bands cut, their PSNR, the threshold that passed)."""
+    kept: Splats, raw_db: float, settings: QuantiseSettings, decider: _Measure
+) -> tuple[Splats, float]:
+    """(splats with each one's negligible bands cut, the threshold that passed)."""
     import numpy as np
 
     from stages.measure.sh import cut, degrees_at
 
     if kept.sh_degree == 0:
-        return kept, kept_db, 0.0
+        return kept, 0.0
     for steps in _THRESHOLDS_OF_255:
         degrees = degrees_at(kept, steps / 255)
         if np.array_equal(degrees, kept.sh_degrees):
             continue
         candidate = cut(kept, degrees)
-        candidate_db = judge.psnr(candidate)
-        if raw_db - candidate_db < settings.max_loss_db:
-            return candidate, candidate_db, steps
-    return kept, kept_db, 0.0
+        if raw_db - decider.psnr(candidate) < settings.max_loss_db:
+            return candidate, steps
+    return kept, 0.0
 
 
 def _bytes(splats: Splats) -> int:
@@ -123,44 +128,47 @@ def _bytes(splats: Splats) -> int:
     return 4 * len(splats) * (11 + 3 * splats.sh.shape[1])
 
 
+def _measures(
+    reconstruction: Reconstruction, look: Look, settings: QuantiseSettings, report: Report
+) -> tuple[_Measure, _Measure]:
+    """(what decides, what judges): training photographs, and those held out if there are any."""
+    from stages.measure.judge import load_photographs
+    from stages.scene import split_held_out
+
+    training, held = split_held_out(reconstruction.views)
+    if not training:
+        raise SplatError(
+            "quantise-no-views",
+            given="The reconstruction has no photographs.",
+            wanted="At least one, to measure on.",
+            hint="Run `splat sfm` again.",
+            family=Family.RUN_FOLDER,
+        )
+    # Spread over the capture: views next to each other say the same.
+    count = min(settings.max_views, len(training))
+    lent = tuple(training[i * len(training) // count] for i in range(count))
+    decider, judge = (
+        _Measure(load_photographs(reconstruction.folder, views, look), what, settings, report)
+        for views, what in ((lent, "training"), (held or lent, "held out" if held else "training"))
+    )
+    return decider, judge
+
+
 @dataclass
-class _Judge:
+class _Measure:
     """Measures splats on photographs that are loaded once."""
 
     photographs: Sequence[Photograph]
     what: str
-    backend: str
+    settings: QuantiseSettings
     report: Report
     done: int = 0
-
-    @classmethod
-    def on(
-        cls, reconstruction: Reconstruction, look: Look, settings: QuantiseSettings, report: Report
-    ) -> _Judge:
-        from stages.measure.judge import load_photographs
-        from stages.scene import split_held_out
-
-        training, held = split_held_out(reconstruction.views)
-        chosen = held or training
-        if not chosen:
-            raise SplatError(
-                "quantise-no-views",
-                given="The reconstruction has no photographs.",
-                wanted="At least one, to measure on.",
-                hint="Run `splat sfm` again.",
-                family=Family.RUN_FOLDER,
-            )
-        # Spread over the capture: views next to each other say the same.
-        count = min(settings.max_views, len(chosen))
-        chosen = tuple(chosen[i * len(chosen) // count] for i in range(count))
-        photographs = load_photographs(reconstruction.folder, chosen, look)
-        return cls(photographs, "held out" if held else "training", settings.backend, report)
 
     def psnr(self, splats: Splats) -> float:
         """Mean PSNR over the photographs (dB)."""
         from stages.measure.judge import mean_psnr_db
 
-        mean = round(mean_psnr_db(splats, self.photographs, self.backend), 4)
+        mean = round(mean_psnr_db(splats, self.photographs, self.settings.backend), 4)
         self.done += 1
         # At most: raw, three lower degrees, each threshold, .splat.
         total = 5 + len(_THRESHOLDS_OF_255)

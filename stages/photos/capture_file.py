@@ -13,7 +13,7 @@ from stages.base.errors import Family, SplatError
 from stages.scene import Capture, Photo
 
 FILE = "capture.json"
-_SCHEMA = 1
+_SCHEMA = 2
 _TYPES: dict[str, tuple[type, ...]] = {
     "name": (str,),
     "image": (str,),
@@ -24,6 +24,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "sharpness": (float, int),
     "log2_luminance": (float, int),
     "exposure_ev": (float, int, type(None)),
+    "twin": (str,),
 }
 
 

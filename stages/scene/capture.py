@@ -24,6 +24,7 @@ class Photo:
     focal_px: focal length from EXIF in pixels of the normalised picture, or None.
     camera: a key that is equal for photographs of the same camera, lens setting and size.
     sharpness: the higher the sharper; comparable within one capture.
+    twin: the first photograph of those that show nearly the same as this one; "" if none does.
     log2_luminance: log2 of the median linear luminance. exposure_ev: EV at ISO 100 from EXIF.
     """
 
@@ -36,6 +37,7 @@ class Photo:
     sharpness: float
     log2_luminance: float
     exposure_ev: float | None
+    twin: str = ""
 
     @property
     def picture(self) -> str:
@@ -54,11 +56,13 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """A registered photograph, undistorted. image: relative to the reconstruction's folder."""
+    """A registered photograph, undistorted. image: relative to the reconstruction's folder. twin:
+    as in `Photo`."""
 
     name: str
     image: str
     camera: Camera
+    twin: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,16 +88,21 @@ class Reconstruction:
 
 
 def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """(training, held out): every eighth by name is held out, starting with the first.
+    """(training, held out): of every eight by name the first is held out, to judge and for nothing
+    else.
 
-    Fewer than 4 views are too few to spare one: then nothing is held out.
+    A photograph that has a twin would be judged by how well its twin was learnt: the first of the
+    eight that has none takes its place. Fewer than 4 views are too few to spare one: then nothing
+    is held out.
     """
     ordered = tuple(sorted(views, key=lambda view: view.name))
     if len(ordered) < 4:
         return ordered, ()
-    held = ordered[::HELD_OUT_EVERY]
-    kept = tuple(view for i, view in enumerate(ordered) if i % HELD_OUT_EVERY)
-    return kept, held
+    eights = (ordered[i : i + HELD_OUT_EVERY] for i in range(0, len(ordered), HELD_OUT_EVERY))
+    alone = ([view for view in eight if not view.twin] for eight in eights)
+    held = tuple(eight[0] for eight in alone if eight)
+    names = {view.name for view in held}
+    return tuple(view for view in ordered if view.name not in names), held
 
 
 def scene_extent(views: tuple[View, ...]) -> float:

@@ -51,7 +51,7 @@ def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -
     return Reconstruction(
         folder=folder,
         views=tuple(
-            View(name=photo.name, image=f"{IMAGES}/{picture}", camera=camera)
+            View(photo.name, f"{IMAGES}/{picture}", camera, photo.twin)
             for photo, picture, camera in zip(ordered, pictures, cameras, strict=True)
         ),
         points=model.points,

@@ -77,6 +77,7 @@ def _view_to_dict(view: View) -> dict[str, Any]:
     return {
         "name": view.name,
         "image": view.image,
+        "twin": view.twin,
         "width": camera.width,
         "height": camera.height,
         "fx": float(camera.fx),
@@ -93,4 +94,4 @@ def _view_from_dict(data: dict[str, Any]) -> View:
     camera = Camera(
         width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
     )
-    return View(name=str(data["name"]), image=str(data["image"]), camera=camera)
+    return View(str(data["name"]), str(data["image"]), camera, str(data["twin"]))
