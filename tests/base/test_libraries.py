@@ -19,6 +19,9 @@ def declared() -> list[str]:
 
 
 def test_every_dependency_and_no_extra_is_in_the_manifests_libraries() -> None:
+    assert set(libraries.needed()) == set(declared()), (
+        "The metadata differ from pyproject.toml: is splat installed as it stands?"
+    )
     assert set(libraries.versions()) == {"python", "splat", *declared()}
     assert libraries.versions()["zstandard"][0].isdigit()
 
