@@ -14,7 +14,7 @@ from numpy.lib import format as npy
 from stages.training.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP1"
+MAGIC = b"SPLATCP2"
 
 
 def save_checkpoint(folder: Path, model: Model, step: int, history: list[dict[str, Any]]) -> None:

@@ -17,6 +17,7 @@ from stages.raster.smoothing import smoothing_widths
 from stages.scene import Look, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training import cap
+from stages.training.checkpoint import MAGIC
 from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -218,7 +219,7 @@ def test_quality_is_judged_before_an_opacity_reset(tmp_path, monkeypatch):
 
 def test_a_torn_checkpoint_means_a_fresh_start(tmp_path):
     t, start = small_problem(tmp_path, "torn")
-    (t.folder / "checkpoint.bin").write_bytes(b"SPLATCP1" + b"\x00" * 5)
+    (t.folder / "checkpoint.bin").write_bytes(MAGIC + b"\x00" * 5)
     wanted, start2 = small_problem(tmp_path, "whole")
     assert t.run(start).means.tobytes() == wanted.run(start2).means.tobytes()
 
