@@ -1,0 +1,187 @@
+"""How good the presets are, and whether a change made them better: `python -m
+tests.benchmarks.quality --out FOLDER [CAPTURE ...]`.
+
+For the sample and for every folder of photographs that is named: cameras and seeds once, then
+training, pruning and quantising for each preset and seed. What comes out is judged at one size,
+over the same photographs, which decided nothing: the held-out ones, and for the sample further ones
+that its renderer draws. Finished cells are kept in FOLDER, so a stopped bench goes on.
+
+`--keep FILE` stores the figures, `--against FILE` compares with stored ones: paired
+over photographs and seeds, "better", "worse" or "not told apart".
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from stages import STAGE_NAMES, load_stage
+from stages.base.stage import Report
+from stages.measure.bootstrap import paired_difference
+from stages.measure.judge import Photograph, drawing_of, load_photographs, scores
+from stages.run.pipeline import Pipeline
+from stages.scene import Look, Reconstruction, Splats, near_plane, split_held_out
+from stages.train import PRESETS
+from tests.benchmarks.sample_judges import judges_in, render_judges
+from tests.sample import PHOTOS
+
+SAMPLE = "sample"
+console = Console(width=150)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One capture, preset and seed. scores: of each judge."""
+
+    capture: str
+    preset: str
+    seed: int
+    splats: int
+    cpu_seconds: float
+    wall_seconds: float
+    scores: list[dict[str, Any]]
+
+
+class Capture:
+    """Photographs, their cameras and seeds, and who judges."""
+
+    def __init__(self, name: str, photos: Path, out: Path, side: int) -> None:
+        self.name, self.folder = name, out / name
+        pipeline = Pipeline(self.folder / "run", photos)
+        pipeline.run(until="seed")
+        self.reconstruction: Reconstruction = pipeline.load("sfm")
+        self.seeds: Splats = pipeline.load("seed")
+        self.judges = self._judges(out, side)
+
+    def _judges(self, out: Path, side: int) -> tuple[Photograph, ...]:
+        look = Look(near_plane(self.reconstruction.views), side)
+        _, held = split_held_out(self.reconstruction.views)
+        found = load_photographs(self.reconstruction.folder, held, look)
+        if self.name != SAMPLE:
+            return found
+        render_judges(out / "judges")
+        return (*load_photographs(out / "judges", judges_in(self.reconstruction), look), *found)
+
+
+def measured(capture: Capture, preset: str, seed: int, side: int) -> Cell:
+    """Train, prune and quantise, and judge what came out; kept on disk."""
+    folder = capture.folder / f"{preset}-{seed}"
+    kept = folder / "cell.json"
+    if kept.is_file():
+        return Cell(**json.loads(kept.read_text(encoding="utf-8")))
+    console.print(f"{capture.name}, {preset}, seed {seed}")
+    started, cpu = time.monotonic(), _cpu_seconds()
+    outputs: dict[str, Any] = {"sfm": capture.reconstruction, "seed": capture.seeds}
+    for name in STAGE_NAMES[3:6]:
+        stage = load_stage(name)
+        settings = stage.settings_type()
+        if name == "train":
+            settings = replace(PRESETS[preset], seed=seed)
+        place = folder / name
+        place.mkdir(parents=True, exist_ok=True)
+        outputs[name] = stage.run(outputs, settings, place, Report())
+    splats = outputs["quantise"].splats
+    wall, cpu = time.monotonic() - started, _cpu_seconds() - cpu
+    judged = replace(splats, look=replace(splats.look, side=side))
+    found = scores(drawing_of(judged, "auto"), capture.judges, with_flip=True)
+    cell = Cell(
+        capture.name, preset, seed, len(splats), cpu, wall, [asdict(score) for score in found]
+    )
+    kept.write_text(json.dumps(asdict(cell), indent=1), encoding="utf-8")
+    return cell
+
+
+def _cpu_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def table_of(cells: list[Cell], side: int) -> Table:
+    """One line for each capture and preset: means over seeds and judges, the spread over seeds."""
+    columns = ("capture", "preset", "seeds", "splats", "CPU s", "wall s", "PSNR dB", "over seeds")
+    more = ("worst judge", "SSIM", "FLIP")
+    table = Table(*columns, *more, title=f"Judged at {side} px")
+    for (capture, preset), group in grouped(cells).items():
+        by_seed = np.array([[row["psnr_db"] for row in cell.scores] for cell in group])
+        names = [row["name"] for row in group[0].scores]
+        worst = int(by_seed.mean(0).argmin())
+        table.add_row(
+            capture,
+            preset,
+            str(len(group)),
+            f"{np.mean([cell.splats for cell in group]):,.0f}",
+            f"{np.mean([cell.cpu_seconds for cell in group]):.0f}",
+            f"{np.mean([cell.wall_seconds for cell in group]):.0f}",
+            f"{by_seed.mean():.2f}",
+            f"{by_seed.mean(1).std():.2f}",
+            f"{by_seed.mean(0)[worst]:.2f} ({names[worst]})",
+            f"{np.mean([row['ssim'] for cell in group for row in cell.scores]):.3f}",
+            f"{np.mean([row['flip'] for cell in group for row in cell.scores]):.3f}",
+        )
+    return table
+
+
+def grouped(cells: list[Cell]) -> dict[tuple[str, str], list[Cell]]:
+    """By capture and preset, in order of seeds."""
+    found: dict[tuple[str, str], list[Cell]] = {}
+    for cell in sorted(cells, key=lambda cell: cell.seed):
+        found.setdefault((cell.capture, cell.preset), []).append(cell)
+    return found
+
+
+def compare(now: list[Cell], before: list[Cell]) -> None:
+    """A line for each capture and preset that both have, over the seeds that both have."""
+    earlier = grouped(before)
+    for key, group in grouped(now).items():
+        seeds = {cell.seed: cell for cell in earlier.get(key, [])}
+        pairs = [(cell, seeds[cell.seed]) for cell in group if cell.seed in seeds]
+        if not pairs or any(_names(a) != _names(b) for a, b in pairs):
+            continue
+        gains = [[_psnr(a, name) - _psnr(b, name) for a, b in pairs] for name in _names(group[0])]
+        found = paired_difference(np.array(gains))
+        interval = f"{found.low:+.2f} to {found.high:+.2f}"
+        console.print(f"{' '.join(key)}: {found.verdict}, {found.mean:+.2f} dB ({interval})")
+
+
+def _names(cell: Cell) -> list[str]:
+    return [row["name"] for row in cell.scores]
+
+
+def _psnr(cell: Cell, name: str) -> float:
+    return next(float(row["psnr_db"]) for row in cell.scores if row["name"] == name)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("captures", nargs="*", type=Path, help="folders of photographs")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--presets", nargs="+", default=["preview"], choices=list(PRESETS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--side", type=int, default=480, help="at which all are judged, pixels")
+    parser.add_argument("--keep", metavar="FILE", type=Path)
+    parser.add_argument("--against", metavar="FILE", type=Path)
+    given = parser.parse_args()
+    captures = {SAMPLE: PHOTOS, **{path.resolve().name: path for path in given.captures}}
+    cells = []
+    for name, photos in captures.items():
+        capture = Capture(name, photos, given.out, given.side)
+        for preset in given.presets:
+            cells += [measured(capture, preset, seed, given.side) for seed in range(given.seeds)]
+            console.print(table_of(cells, given.side))
+    if given.keep:
+        given.keep.write_text(json.dumps([asdict(c) for c in cells], indent=1), encoding="utf-8")
+    if given.against:
+        compare(cells, [Cell(**c) for c in json.loads(given.against.read_text(encoding="utf-8"))])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""Further photographs of the sample, at places that no photograph of it was taken from.
+
+Three held-out photographs decide nothing; the sample's own renderer makes as many as one likes:
+between the places of the capture, closer, and higher. The truth's cameras are carried over to a
+reconstruction by the similarity that fits the photographs' own places best.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sample_captures import make
+from sample_captures.render import Lens, Light, photograph
+from stages.scene import Camera, Reconstruction, View
+
+TRUTH = Path(make.__file__).parent / "still_life" / "truth.json"
+PINHOLE = Lens(width=640, height=480, focal_px=600.0, k=0.0)
+# Place along the capture's arc, y and distance from the axis (metres): between its two rings; then
+# closer; then higher.
+PLACES = (
+    *((2.5, -0.60, 1.36), (5.5, -0.40, 1.38), (8.5, -0.80, 1.30), (11.5, -0.60, 1.36)),
+    *((14.5, -0.38, 1.40), (17.5, -0.84, 1.30), (20.5, -0.60, 1.36)),
+    *((5.0, -0.55, 1.02), (12.0, -0.50, 1.00), (18.0, -0.60, 1.02)),
+    *((7.0, -1.12, 1.08), (15.0, -1.12, 1.08)),
+)
+_SHAKE_M = 0.04  # of the point looked at
+
+
+def poses() -> list[NDArray[np.float64]]:
+    """[4, 4] world_to_camera of each judge, in the truth's world."""
+    rng = np.random.default_rng(99)
+    found = []
+    for place, y, distance in PLACES:
+        share = place / (make.PHOTOGRAPHS - 1) - 0.5
+        angle = np.radians(-90 + make.ARC_DEGREES * share)
+        eye = np.array([distance * np.cos(angle), y, distance * np.sin(angle)])
+        found.append(make.look_at(eye, np.array(make.TARGET) + rng.normal(0, _SHAKE_M, 3)))
+    return found
+
+
+def render_judges(folder: Path) -> None:
+    """Draw those that are not in `folder` yet, some seconds each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, pose in enumerate(poses()):
+        path = folder / f"judge_{number:02d}.png"
+        if not path.exists():
+            Image.fromarray(photograph(list(make.scene()), Light(), PINHOLE, pose)).save(path)
+
+
+def judges_in(reconstruction: Reconstruction) -> tuple[View, ...]:
+    """The judges as views of this reconstruction's world."""
+    truth = {
+        photo["name"]: np.array(photo["world_to_camera"])
+        for photo in json.loads(TRUTH.read_text(encoding="utf-8"))["photos"]
+    }
+    theirs = np.array([_centre(truth[view.name]) for view in reconstruction.views])
+    ours = np.array([view.camera.centre for view in reconstruction.views])
+    scale, rotation, offset = similarity(theirs, ours)
+    views = []
+    for number, pose in enumerate(poses()):
+        moved = np.eye(4)
+        moved[:3, :3] = pose[:3, :3] @ rotation.T
+        moved[:3, 3] = -moved[:3, :3] @ (scale * rotation @ _centre(pose) + offset)
+        width, height, focal = PINHOLE.width, PINHOLE.height, PINHOLE.focal_px
+        camera = Camera(width, height, focal, focal, width / 2, height / 2, moved)
+        views.append(View(f"judge_{number:02d}", f"judge_{number:02d}.png", camera))
+    return tuple(views)
+
+
+def _centre(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(-world_to_camera[:3, :3].T @ world_to_camera[:3, 3])
+
+
+def similarity(
+    a: NDArray[np.float64], b: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """(scale, rotation [3, 3], offset [3]) that take points a [N, 3] nearest to b (Umeyama 1991)."""
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    u, sizes, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(signs) @ vt
+    scale = float((sizes * signs).sum() / np.square(a - mean_a).sum(1).mean())
+    return scale, rotation, mean_b - scale * rotation @ mean_a
