@@ -79,7 +79,7 @@ def _centre(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def similarity(
     a: NDArray[np.float64], b: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """(scale, rotation [3, 3], offset [3]) that take points a [N, 3] nearest to b (Umeyama 1991)."""
+    """(scale, rotation [3, 3], offset [3]) that take points a [N, 3] nearest b (Umeyama 1991)."""
     mean_a, mean_b = a.mean(0), b.mean(0)
     u, sizes, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
