@@ -25,7 +25,7 @@ SEED = int(os.environ.get("SPLAT_TEST_SEED", "4"))
 # The cap is what memory allows, and memory is never twice the same.
 WORDS = process_words("--format", "ply", "--json", photos="photos", max_splats=0)
 PHOTOS = 10  # of the sample capture, enough to be placed
-MIB, OTHER_MIB = 400.0, (200.0, 2000.0)
+MIB, OTHER_MIB = 40.0, (60.0, 400.0)  # of which the first stops growth early
 # Training writes checkpoints by the clock, more seldom than this small run lasts.
 IMPATIENT = """
 import sys
