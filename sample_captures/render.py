@@ -138,7 +138,7 @@ def lookup(texture: Array, u: Array, v: Array) -> Array:
     values = cv2.remap(
         texture, grids[0], grids[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    return values.reshape(-1, 3)[: len(columns)].T
+    return np.asarray(values.reshape(-1, 3)[: len(columns)].T, np.float32)
 
 
 def occluded(

@@ -194,7 +194,7 @@ def wood(rng: np.random.Generator, height: int, width: int, tone: float = 1.0) -
 
 def table_top(rng: np.random.Generator, size: int) -> Image:
     """Wood with a round printed mat of mosaic rings in the middle."""
-    image = wood(rng, size, size)
+    image: NDArray[np.floating] = wood(rng, size, size)
     axis = (np.arange(size, dtype=np.float32) + 0.5) / size * 2 - 1
     radius = np.hypot(axis[None, :], axis[:, None])
     rings = [

@@ -125,7 +125,8 @@ def _cut_each(
 def _bytes(splats: Splats) -> int:
     """As float32 with the same bands for all, which is what most formats hold (and 11 numbers
     besides); each splat's own degree only helps formats that compress zeros away."""
-    return 4 * len(splats) * (11 + 3 * splats.sh.shape[1])
+    found: int = 4 * len(splats) * (11 + 3 * splats.sh.shape[1])
+    return found
 
 
 def _measures(

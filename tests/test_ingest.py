@@ -19,7 +19,6 @@ from stages import ingest
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.stage import Report
 from stages.ingest import IngestSettings
-from stages.photos import write
 from stages.photos.load import load_image
 from stages.run.digests import record_files
 from stages.scene import Capture
@@ -358,7 +357,7 @@ def test_a_full_disk_is_an_error_and_leaves_no_half_picture(
             file.write(data[:10])
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(write.Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(SplatError) as caught:
         ingested(photos)
     assert (caught.value.code, caught.value.family) == ("disk-full", Family.RESOURCES)

@@ -6,26 +6,39 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.sample import environment, events, process_words, splat
+from tests import processes, sample
+from tests.sample import events, process_words
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 KILLS = int(os.environ.get("SPLAT_TEST_KILLS", "4"))
-# The cap on splats is not named: it comes from free memory, and must stay what it was at first.
-WORDS = process_words("--format", "ply", "--json", "--max-splats", "0")
+SEED = int(os.environ.get("SPLAT_TEST_SEED", "4"))
+# The cap is what memory allows, and memory is never twice the same.
+WORDS = process_words("--format", "ply", "--json", photos="photos", max_splats=0)
+PHOTOS = 10  # of the sample capture, enough to be placed
+MIB, OTHER_MIB = 40.0, (60.0, 400.0)  # of which the first stops growth early
 # Training writes checkpoints by the clock, more seldom than this small run lasts.
-IMPATIENT = (
-    "import stages.training.trainer as trainer; trainer.CHECKPOINT_SECONDS = 0.7; "
-    "from splatcli.app import main; main()"
-)
+IMPATIENT = """
+import sys
+import stages.base.memory as memory
+import stages.training.trainer as trainer
+
+free_mib = float(sys.argv.pop(1))
+memory.available_mib = lambda: free_mib
+trainer.CHECKPOINT_SECONDS = 0.7
+from splatcli.app import main
+
+main()
+"""
 
 
 def outputs(run: Path) -> dict[str, str]:
@@ -48,21 +61,27 @@ def stages_by_seconds(run: Path) -> dict[str, float]:
     return {path.parent.name: json.loads(path.read_text())["seconds"] for path in manifests}
 
 
-def start(folder: Path) -> subprocess.Popen[bytes]:
-    with (folder / "log").open("ab") as log:
-        return subprocess.Popen(
-            [sys.executable, "-c", IMPATIENT, *WORDS],
-            cwd=folder,
-            env=environment(),
-            stdout=log,
-            stderr=log,
+def command(folder: Path, draw: random.Random) -> list[str]:
+    """The run, with other memory than before from where training has begun."""
+    begun = any((folder / "run").glob("*4-train*"))
+    free_mib = draw.uniform(*OTHER_MIB) if begun else MIB
+    return processes.python(IMPATIENT, str(free_mib), *WORDS)
+
+
+def complete(folder: Path, draw: random.Random) -> list[dict[str, Any]]:
+    """What the run told on its way to the end."""
+    return events(
+        subprocess.run(
+            command(folder, draw), cwd=folder, capture_output=True, text=True, timeout=600
         )
+    )
 
 
-def stop_in(sign: str, after_s: float, folder: Path, how: int) -> int | None:
+def stop_in(sign: str, after_s: float, folder: Path, how: int, draw: random.Random) -> int | None:
     """Start the run and send a signal some time after the file or folder `sign` appeared in the
     run folder. Returns its exit status; 0 if it ended before that."""
-    process = start(folder)
+    with (folder / "log").open("ab") as log:
+        process = subprocess.Popen(command(folder, draw), cwd=folder, stdout=log, stderr=log)
     try:
         while not (folder / "run" / sign).exists():
             if process.poll() is not None:
@@ -80,42 +99,46 @@ def stop_in(sign: str, after_s: float, folder: Path, how: int) -> int | None:
 
 
 def test_killed_run_ends_in_the_same_bytes(tmp_path: Path) -> None:
+    print(f"SPLAT_TEST_SEED={SEED} SPLAT_TEST_KILLS={KILLS}")  # shown if it fails
+    draw = random.Random(SEED)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    whole.mkdir()
-    broken.mkdir()
-    events(splat(*WORDS, folder=whole))
+    for folder in (whole, broken):
+        (folder / "photos").mkdir(parents=True)
+        for photo in sorted(sample.PHOTOS.iterdir())[:PHOTOS]:
+            shutil.copy(photo, folder / "photos")
+    complete(whole, draw)
     seconds = stages_by_seconds(whole / "run")
 
-    draw = random.Random(KILLS)
     names = list(seconds)  # long stages are hit more often, short ones not never
     chosen = draw.choices(names, [seconds[n] + 1.0 for n in names], k=KILLS)
     before: dict[str, int] = {}
     for stage in sorted(chosen):
         moment = draw.uniform(0.0, seconds[stage])
-        status = stop_in(f".{stage}.partial", moment, broken, signal.SIGKILL)
+        status = stop_in(f".{stage}.partial", moment, broken, signal.SIGKILL, draw)
         assert status in (-signal.SIGKILL, 0), (broken / "log").read_text()[-3000:]
         now = finished(broken / "run")
         assert before.items() <= now.items(), "what was finished stays finished"
         before = now
-    events(splat(*WORDS, folder=broken))
+    complete(broken, draw)
 
     assert outputs(broken / "run") == outputs(whole / "run")
     assert any(name.endswith(".ply") for name in outputs(whole / "run"))
     left = [path.name for path in (broken / "run").iterdir() if path.name.startswith(".")]
     assert left == [".lock"]
 
-    after_ctrl_c_training_goes_on(whole)
+    after_ctrl_c_training_goes_on(whole, draw)
 
 
-def after_ctrl_c_training_goes_on(folder: Path) -> None:
+def after_ctrl_c_training_goes_on(folder: Path, draw: random.Random) -> None:
     """On a run that is finished up to `seed`: Ctrl-C in training, then the same bytes again."""
     run = folder / "run"
     wanted = outputs(run)
     for name in ("4-train", "5-prune", "6-quantise", "7-export"):
         (run / name).rename(folder / f"was {name}")
-    assert stop_in(".4-train.partial/checkpoint.bin", 0.0, folder, signal.SIGINT) == 130
+    sign = ".4-train.partial/checkpoint.bin"
+    assert stop_in(sign, 0.0, folder, signal.SIGINT, draw) == 130
     assert '"go_on"' in (folder / "log").read_text().splitlines()[-1]
-    done = events(splat(*WORDS, folder=folder))
+    done = complete(folder, draw)
     assert [e["resumed"] for e in done if e["event"] == "started"] == [True, False, False, False]
     resumed = next(e for e in done if e["event"] == "finished" and e["stage"] == "train")
     assert resumed["metrics"]["resumed_from_step"] > 0

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.sample import PHOTOS, environment
+from tests import processes
+from tests.sample import PHOTOS
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 _RUN_AND_LOOK = """
 import json, sys
@@ -32,9 +32,8 @@ _TINY = ("--train-side", "48", "--steps", "6", "--max-splats", "400", "--preset"
 def test_the_whole_sample_runs_on_the_reference_without_one_cpu_kernel(tmp_path: Path) -> None:
     words = ["process", str(PHOTOS), "--out", "run", *_TINY, "--backend", "reference"]
     done = subprocess.run(
-        [sys.executable, "-c", _RUN_AND_LOOK, *words, "--format", "ply", "--json"],
+        processes.python(_RUN_AND_LOOK, *words, "--format", "ply", "--json"),
         cwd=tmp_path,
-        env=environment(),
         capture_output=True,
         text=True,
         timeout=600,

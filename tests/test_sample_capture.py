@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from PIL import Image
 
 from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
-from stages import ingest, sfm
-from stages.base.stage import Report
+from stages import sfm
+from stages.run.manifest import plain
 from stages.scene import Reconstruction
 
 CAPTURE = Path(__file__).parents[1] / "sample_captures" / "still_life"
@@ -85,14 +86,12 @@ def similarity(source: NDArray, target: NDArray) -> tuple[float, NDArray, NDArra
     return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
 
 
-@pytest.fixture(scope="module")
-def reconstruction(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
-    folder = tmp_path_factory.mktemp("still life")
-    capture = ingest.run(
-        {"photos": CAPTURE / "images"}, ingest.IngestSettings(), folder / "1", Report()
-    )
-    (folder / "2").mkdir()
-    return sfm.run({"ingest": capture}, sfm.SfmSettings(), folder / "2", Report())
+@pytest.fixture
+def reconstruction(sample_run: Path) -> Reconstruction:
+    """Of the whole capture, with the settings that everyone has."""
+    settings = json.loads((sample_run / "run" / "2-sfm" / "manifest.json").read_text())["settings"]
+    assert settings == plain(asdict(sfm.SfmSettings()))
+    return sfm.load(sample_run / "run" / "2-sfm")
 
 
 @pytest.mark.slow
@@ -126,11 +125,11 @@ def test_structure_from_motion_finds_the_true_lens_and_up(
         ratio = view.camera.fx * 640 / view.camera.width / truth["camera"]["f"]
         assert 0.9 < ratio < 1.1
         assert view.camera.fx == pytest.approx(view.camera.fy, rel=0.02)
-    if reconstruction.levelled:
-        true_up = {p["name"]: np.array(p["world_to_camera"])[:3, 1] for p in truth["photos"]}
-        for view in reconstruction.views:
-            found_down = view.camera.world_to_camera[:3, 1]
-            assert np.degrees(np.arccos(found_down @ true_up[view.name])) < 5
+    assert reconstruction.levelled
+    true_down = {p["name"]: np.array(p["world_to_camera"])[:3, 1] for p in truth["photos"]}
+    for view in reconstruction.views:
+        found_down = view.camera.world_to_camera[:3, 1]
+        assert np.degrees(np.arccos(found_down @ true_down[view.name])) < 1.5
 
 
 @pytest.mark.slow

@@ -97,7 +97,7 @@ def test_outlying_points_are_left_out_and_counted(
 ) -> None:
     splats, report = run(with_points(grid(), [point], **changes), tmp_path)
     assert len(splats) == 64
-    assert np.isfinite(splats.means).all()
+    assert np.abs(splats.means).max() < 10
     assert report.metrics["left_out_by_reason"][reason] == 1
 
 

@@ -19,7 +19,10 @@ _NOTHING = (0, 0, 0)
 
 def eight_bits(image: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[H, W, 3] uint8 of a rendering's colours; what is no number is black."""
-    return np.rint(np.clip(np.nan_to_num(image), 0.0, 1.0) * 255.0).astype(np.uint8)
+    found: NDArray[np.uint8] = np.rint(np.clip(np.nan_to_num(image), 0.0, 1.0) * 255.0).astype(
+        np.uint8
+    )
+    return found
 
 
 def save_picture(path: Path, pixels: NDArray[np.uint8]) -> None:

@@ -113,7 +113,10 @@ def _lengths(a: NDArray[np.float64], b: NDArray[np.float64], reach: float) -> ND
     distance `reach`, its axis turns; world units."""
     cosines = np.abs(np.sum(a[..., 3:] * b[..., 3:], axis=-1))
     turns = 2 * np.arccos(np.clip(cosines, 0.0, 1.0))
-    return np.hypot(np.linalg.norm(a[..., :3] - b[..., :3], axis=-1), reach * turns)
+    found: NDArray[np.float64] = np.hypot(
+        np.linalg.norm(a[..., :3] - b[..., :3], axis=-1), reach * turns
+    )
+    return found
 
 
 def _spline(keys: NDArray[np.float64], spans: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -240,4 +240,5 @@ def _rest_values(rows: NDArray[Any]) -> NDArray[np.float32]:
     levels[[0, 255]] = (0.0, 1.0)
     values = ((levels - 0.5) * 2 * SH_LIMIT).astype(np.float32)
     steps = np.stack([rows[name] for name in rows.dtype.names or ()], axis=1)
-    return values[steps].reshape(len(rows), 3, -1).transpose(0, 2, 1)
+    found: NDArray[np.float32] = values[steps].reshape(len(rows), 3, -1).transpose(0, 2, 1)
+    return found

@@ -65,7 +65,7 @@ def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
     """(the JSON, the binary chunk of a .glb)."""
     content = _mapped(path)
     chunk: memoryview | None = None
-    if content[:4] == b"glTF":
+    if bytes(content[:4]) == b"glTF":
         if len(content) < 20:
             raise BadFileError("it is cut short")
         _, version, total, size, kind = struct.unpack_from("<4sIII4s", content)
@@ -309,7 +309,8 @@ def _list(holder: dict[str, Any], key: str) -> list[Any]:
 def _item(items: list[Any], index: Any, what: str) -> dict[str, Any]:
     if type(index) is not int or not 0 <= index < len(items) or not isinstance(items[index], dict):
         raise BadFileError(f"it names {what} {str(index)[:40]}, which it does not hold")
-    return items[index]
+    found: dict[str, Any] = items[index]
+    return found
 
 
 def _whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:

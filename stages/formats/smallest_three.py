@@ -29,10 +29,12 @@ def join(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[
     quaternions[rows[:, None], _columns(largest)] = exact
     quaternions[rows, largest] = np.sqrt(np.maximum(0.0, 1.0 - np.square(exact).sum(axis=1)))
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return (quaternions / norms).astype(np.float32)
+    found: NDArray[np.float32] = (quaternions / norms).astype(np.float32)
+    return found
 
 
 def _columns(largest: NDArray[np.integer]) -> NDArray[np.intp]:
     """[N, 3] the columns beside the largest, rising."""
     table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], np.intp)
-    return table[largest]
+    found: NDArray[np.intp] = table[largest]
+    return found

@@ -112,7 +112,8 @@ def _opacities(splats: Splats) -> NDArray[np.uint8]:
 
 
 def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    found: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return found
 
 
 def _pack_rotations(quaternions: NDArray[np.floating]) -> NDArray[np.uint32]:

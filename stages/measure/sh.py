@@ -30,7 +30,8 @@ def degrees_at(splats: Splats, threshold: float) -> NDArray[np.uint8]:
     """[N] the lowest degree at which each splat loses no more than `threshold` (see `tail_rms`);
     never above its own. Values that are not finite keep their degree."""
     needed = (~(tail_rms(splats) <= threshold)).sum(axis=1)
-    return np.minimum(needed, splats.sh_degrees).astype(np.uint8)
+    found: NDArray[np.uint8] = np.minimum(needed, splats.sh_degrees).astype(np.uint8)
+    return found
 
 
 def cut(splats: Splats, degrees: NDArray[np.uint8]) -> Splats:

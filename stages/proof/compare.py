@@ -107,7 +107,10 @@ def _block(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
 
 def _apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """[N] largest difference in each row of [N, K]."""
-    return np.abs(a.astype(np.float64) - b.astype(np.float64)).max(axis=1, initial=0.0)
+    found: NDArray[np.float64] = np.abs(a.astype(np.float64) - b.astype(np.float64)).max(
+        axis=1, initial=0.0
+    )
+    return found
 
 
 def rotations_apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:

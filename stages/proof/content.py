@@ -27,7 +27,8 @@ class FileContent:
 
 def logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
     inside = np.clip(p, 1e-30, 1 - 1e-9, dtype=np.float64)
-    return np.log(inside / (1 - inside))
+    found: NDArray[np.float64] = np.log(inside / (1 - inside))
+    return found
 
 
 def splats_of(**arrays: NDArray[np.floating]) -> Splats:

@@ -79,7 +79,10 @@ def _values(splats: Splats) -> NDArray[np.float32]:
 def _unlike(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:
     """[N] where more than one of opacity, colour and sizes differ too much."""
     far = np.abs(a - b) > 1
-    return far[:, 0].astype(int) + far[:, 1:4].any(axis=1) + far[:, 4:].any(axis=1) > 1
+    found: NDArray[np.bool_] = (
+        far[:, 0].astype(int) + far[:, 1:4].any(axis=1) + far[:, 4:].any(axis=1) > 1
+    )
+    return found
 
 
 def _pair_anew(

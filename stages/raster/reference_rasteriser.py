@@ -83,7 +83,9 @@ class ReferenceRasteriser:
         projected.means2d.retain_grad()
         image, _, _, _ = render_projected(p, projected, forward.camera, forward.settings)
         if image.requires_grad:
-            image.backward(torch.tensor(v_image.transpose(1, 2, 0), dtype=torch.float64))
+            torch.autograd.backward(
+                image, torch.tensor(v_image.transpose(1, 2, 0), dtype=torch.float64)
+            )
         rows = forward.visible
         place = np.empty(len(arrays[0]), np.int64)
         place[projected.index.numpy()] = np.arange(len(projected.index))

@@ -36,7 +36,8 @@ def smoothing_widths(
         finest = np.minimum(finest, interval)
     known = np.isfinite(finest)
     finest[~known] = finest[known].max() if known.any() else 0.0
-    return (np.sqrt(VARIANCE) * finest).astype(np.float32)
+    found: NDArray[np.float32] = (np.sqrt(VARIANCE) * finest).astype(np.float32)
+    return found
 
 
 def smoothed(splats: Splats, widths: NDArray[np.float32]) -> Splats:

@@ -72,7 +72,8 @@ class Splats:
     def opacities(self) -> NDArray[np.floating]:
         """[N] in [0, 1]."""
         with np.errstate(over="ignore"):
-            return 1.0 / (1.0 + np.exp(-self.opacity_logits))
+            found: NDArray[np.floating] = 1.0 / (1.0 + np.exp(-self.opacity_logits))
+            return found
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Splats:
         """The rows named by an index, a mask or a slice."""
@@ -126,7 +127,8 @@ def rgb_to_dc(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def dc_to_rgb(dc: NDArray[np.floating]) -> NDArray[np.floating]:
     """View-independent colour of DC coefficients, not clamped above."""
-    return np.maximum(0.0, 0.5 + SH_C0 * dc)
+    found: NDArray[np.floating] = np.maximum(0.0, 0.5 + SH_C0 * dc)
+    return found
 
 
 def logit(p: NDArray[np.floating] | float) -> NDArray[np.floating]:

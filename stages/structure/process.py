@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ from stages.structure.job import Job
 _POLL_SECONDS = 0.1
 _TICK_SECONDS = 0.5
 _TAIL_LINES = 15
+_PROGRESS = re.compile(r"I\d{8} ")  # a line of glog at the level of information
 _DISK_FULL = ("no space left on device", "database or disk is full", "disk quota exceeded")
 
 
@@ -99,7 +101,9 @@ def _tail(log: Path) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     # COLMAP follows what went wrong by the addresses of its stack, which tell a user nothing.
     lines = [line for line in lines if not line.lstrip().startswith(("@ ", "PC: @", "***"))]
-    return "\n".join(lines[-_TAIL_LINES:])
+    # Other threads and processes go on saying how far they are.
+    telling = [line for line in lines if not _PROGRESS.match(line)]
+    return "\n".join((telling or lines)[-_TAIL_LINES:])
 
 
 def _disk_full(folder: Path) -> SplatError:

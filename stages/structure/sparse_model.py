@@ -53,7 +53,10 @@ class SparseModel:
     def centres(self) -> NDArray[np.float64]:
         """[V, 3] camera positions."""
         rotations = self.world_to_camera[:, :3, :3]
-        return -np.einsum("vij,vi->vj", rotations, self.world_to_camera[:, :3, 3])
+        found: NDArray[np.float64] = -np.einsum(
+            "vij,vi->vj", rotations, self.world_to_camera[:, :3, 3]
+        )
+        return found
 
     @property
     def tracks(self) -> NDArray[np.int32]:
@@ -203,7 +206,8 @@ def rotation_disagreements(model: SparseModel) -> NDArray[np.float64]:
     rotations = model.world_to_camera[:, :3, :3]
     relative = rotations[second] @ np.swapaxes(rotations[first], 1, 2)
     cosine = (np.einsum("qij,qij->q", relative, model.pair_rotations) - 1.0) / 2.0
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    found: NDArray[np.float64] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return found
 
 
 def baseline_over_depth(model: SparseModel) -> float:

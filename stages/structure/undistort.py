@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,8 @@ class Pinhole:
 
 def distort(uv: NDArray[np.float64], k: float) -> NDArray[np.float64]:
     """[N, 2] distorted from undistorted image-plane coordinates: u (1 + k |u|^2)."""
-    return uv * (1.0 + k * np.sum(uv**2, axis=-1, keepdims=True))
+    found: NDArray[np.float64] = uv * (1.0 + k * np.sum(uv**2, axis=-1, keepdims=True))
+    return found
 
 
 def undistort(uv: NDArray[np.float64], k: float) -> NDArray[np.float64]:
@@ -69,7 +72,9 @@ def _inner_rectangle(
     x = np.linspace(0.0, width, 257)
     y = np.linspace(0.0, height, 257)
 
-    def edge(xs: NDArray[np.float64] | float, ys: NDArray[np.float64] | float, axis: int):
+    def edge(
+        xs: NDArray[np.float64] | float, ys: NDArray[np.float64] | float, axis: int
+    ) -> NDArray[np.float64]:
         xy = np.stack(np.broadcast_arrays(xs, ys), axis=-1)
         return focal * undistort((xy - (cx, cy)) / focal, k)[:, axis]
 
@@ -81,7 +86,7 @@ def _inner_rectangle(
     )
 
 
-def _extreme(choose, values: NDArray[np.float64], otherwise: float) -> float:
+def _extreme(choose: Callable[..., Any], values: NDArray[np.float64], otherwise: float) -> float:
     return float(choose(values)) if np.isfinite(values).any() else otherwise
 
 

@@ -44,7 +44,8 @@ def unproject(camera: Camera, depth: NDArray[np.floating]) -> NDArray[np.float64
     """[H, W, 3] in the camera's axes, of every pixel's centre."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     x, y = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None]
+    found: NDArray[np.float64] = np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None]
+    return found
 
 
 def chosen(cameras: list[Camera]) -> list[Camera]:

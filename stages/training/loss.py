@@ -27,7 +27,8 @@ class Loss:
 def channel_means(target: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float32]:
     """[3] mean of each channel of a picture [3, H, W], in 0..1."""
     means = target.reshape(3, -1).mean(1, dtype=np.float64)
-    return (means * _scale(target)).astype(np.float32)
+    found: NDArray[np.float32] = (means * _scale(target)).astype(np.float32)
+    return found
 
 
 def _scale(target: NDArray[np.float32] | NDArray[np.uint8]) -> np.float32:

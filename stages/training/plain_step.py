@@ -49,7 +49,7 @@ class PlainStep(HostStep):
         image = torch.tensor(forward.image[:3], dtype=torch.float64, requires_grad=True)
         target = torch.tensor(level.pixels, dtype=torch.float64) / 255
         value = photograph_loss(image, target)
-        (camera.width * camera.height * value).backward()
+        torch.autograd.backward(camera.width * camera.height * value)
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
         backward = self.rasteriser.backward(model.arrays, forward, v_image, widths)

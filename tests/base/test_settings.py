@@ -42,6 +42,8 @@ def test_every_setting_has_help_and_a_default_that_it_allows(key: str) -> None:
 @pytest.mark.parametrize("key", NUMBERS)
 def test_every_number_of_every_stage_has_two_ends_and_both_may_be_used(key: str) -> None:
     name, setting = NUMBERS[key]
+    assert setting.low is not None
+    assert setting.high is not None
     for end in (setting.low, setting.high):
         check_settings(with_value(name, setting, setting.kind(end)))
     for beyond in (setting.low - 1, setting.high + 1, float("nan"), float("inf"), "7", True):

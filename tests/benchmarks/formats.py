@@ -23,6 +23,7 @@ from stages.base.memory import PeakMemory, resident_mib
 from stages.proof.compare import differences
 from stages.proof.second_readers import read_back
 from stages.scene import Splats, load_splats, save_splats
+from tests import processes
 from tests.benchmarks.scenes import random_scene, view
 from tests.benchmarks.timing import machine
 
@@ -73,9 +74,8 @@ def read_alone(target: Path) -> dict[str, float]:
 
 
 def in_a_process(*words: str) -> dict[str, float]:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.formats", *words], capture_output=True, text=True
-    )
+    command = processes.module("tests.benchmarks.formats", *words)
+    done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         sys.exit(done.stderr)
     return dict(json.loads(done.stdout))

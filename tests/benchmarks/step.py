@@ -10,6 +10,7 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -56,7 +57,8 @@ class Stepper:
         self.trainer = Trainer(
             schedule, [photo], [], Look(1e-5), len(splats), folder, Report(), backend=backend
         )
-        self.rasteriser = self.trainer.stepper.rasteriser
+        step: Any = self.trainer.stepper
+        self.rasteriser = step.rasteriser
         self.rasteriser.pool = pool
         self.model: Model = new_model(
             *(
@@ -210,7 +212,7 @@ def against_reference(n: int, camera: Camera) -> None:
     scene = random_scene(n, camera)
     jobs = {
         "kernels": Stepper(scene, camera, Pool()),
-        "reference": Stepper(scene, camera, Pool(), reference=True),
+        "reference": Stepper(scene, camera, Pool(), backend="reference"),
     }
     taken = interleaved(dict(jobs), 3)
     console.print(

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
-import sys
 
 import pytest
 
-from tests.sample import ROOT
+from tests import processes
+from tests.benchmarks.yardstick import COMPILER
 
 pytestmark = pytest.mark.slow
 
 
 def run(*words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", *words], cwd=ROOT, env=os.environ, capture_output=True, text=True
-    )
+    done = subprocess.run(processes.module(*words), capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -29,7 +25,7 @@ def test_the_step_benchmark_passes_its_gate_and_prints_every_kernel():
         assert kernel in printed
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ to build the yardstick with")
+@pytest.mark.skipif(COMPILER is None, reason="SPLAT_CXX names no C++ compiler for the yardstick")
 def test_the_raster_benchmark_draws_what_its_yardstick_draws():
     assert "1,000 at 1920x1080" in run("tests.benchmarks.raster", "--largest", "1000")
 

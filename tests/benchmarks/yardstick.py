@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +26,10 @@ from stages.raster.cpu.projection import (
     GX,
     GY,
 )
-from stages.raster.definition import Forward
+from stages.raster.cpu.rasteriser import Forward
 from tests.benchmarks.timing import Job
 
+COMPILER = os.environ.get("SPLAT_CXX")
 SOURCE = Path(__file__).with_name("yardstick.cpp")
 FLAGS = ("-O3", "-march=native", "-shared", "-fPIC", "-pthread")
 
@@ -53,12 +57,15 @@ def row_spans(width, starts, members, geometry, spans):
 
 
 class Yardstick:
-    """Raises FileNotFoundError where there is no g++."""
+    """Exits where SPLAT_CXX names no C++ compiler: one that happens to be there would make the
+    figures depend on what else is installed."""
 
     def __init__(self) -> None:
+        if COMPILER is None:
+            sys.exit("SPLAT_CXX must name a C++ compiler (g++, say) to build the yardstick with")
         self._folder = tempfile.TemporaryDirectory()
         library = Path(self._folder.name) / "yardstick.so"
-        subprocess.run(["g++", *FLAGS, "-o", str(library), str(SOURCE)], check=True)
+        subprocess.run([COMPILER, *FLAGS, "-o", str(library), str(SOURCE)], check=True)
         self._blend = ctypes.CDLL(str(library)).blend
         self._blend.restype = None
 
@@ -71,7 +78,7 @@ class Yardstick:
         lists = forward.lists
         spans = np.empty(len(lists), np.uint8)
         row_spans(forward.width, lists.starts, lists.members, forward.geometry, spans)
-        arrays = [
+        arrays: list[NDArray[Any]] = [
             *(lists.starts.copy(), lists.members.copy(), spans, geometry),
             *(forward.paint.copy(), forward.background, image),
         ]

@@ -10,7 +10,7 @@ import pytest
 
 from stages.cameras.colmap import read_model, write_colmap_model
 from stages.cameras.table import read_cameras
-from tests.cameras.test_colmap import example
+from tests.cameras.models import example
 
 
 def poses(path: Path) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from splatcli.app import app
 from stages import formats
-from tests.cli.test_help import help_of
+from tests.cli.help_text import help_of
 from tests.formats.truth import many_splats
 
 QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]  # USD is a process each

@@ -10,11 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from splatcli.app import app
 from stages import STAGE_NAMES
-from tests import sample
+from tests import processes
+from tests.cli.help_text import help_of
 
 ROOT = Path(__file__).parent.parent.parent
 COMMANDS = (
@@ -22,10 +21,6 @@ COMMANDS = (
     *("cameras", "doctor"),
 )
 HEAVY = ("torch", "numba", "cv2", "pycolmap", "numpy", "PIL", "pxr")
-
-
-def help_of(*words: str) -> str:
-    return CliRunner(env={"COLUMNS": "200", "TERM": "dumb"}).invoke(app, [*words, "--help"]).output
 
 
 def test_help_imports_nothing_heavy() -> None:
@@ -45,10 +40,10 @@ def test_help_imports_nothing_heavy() -> None:
 
 @pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["process", "--help"]])
 def test_help_writes_nothing(words: list[str], tmp_path: Path) -> None:
-    env = {n: value for n, value in sample.environment().items() if n != "NUMBA_CACHE_DIR"}
+    env = {n: value for n, value in os.environ.items() if n != "NUMBA_CACHE_DIR"}
     places = {name: str(tmp_path) for name in ("HOME", "XDG_CACHE_HOME", "TMPDIR", "LOCALAPPDATA")}
     done = subprocess.run(
-        sample.command(*words),
+        processes.splat(*words),
         cwd=tmp_path,
         env=env | places,
         stdout=subprocess.DEVNULL,

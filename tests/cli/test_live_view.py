@@ -79,7 +79,7 @@ def test_training_is_served_from_its_start_to_the_end_of_the_run(watcher, said) 
 def test_a_run_that_ends_early_says_so_and_waits_for_nobody_who_does_not_look(
     watcher, said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_view.time, "sleep", lambda s: pytest.fail("waited"))
+    monkeypatch.setattr(time, "sleep", lambda s: pytest.fail("waited"))
     watcher.started(TRAIN, 4, "has not run yet", False)
     watcher.progressed(TRAIN, "training", 1, 2, {})
     watcher.drawable(TRAIN, lambda camera: pytest.fail("drawn"))

@@ -3,7 +3,6 @@ their own arrays."""
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from stages import formats
+from tests import processes
 from tests.formats.truth import many_splats
-from tests.sample import ROOT
 
 pytestmark = [
     pytest.mark.slow,
@@ -37,11 +36,7 @@ print(peak * (1 if sys.platform == "darwin" else 1024))
 def peak_bytes(source: Path, target: Path) -> int:
     """The most memory that one of the processes of a conversion held."""
     done = subprocess.run(
-        [sys.executable, "-c", _CONVERT, str(source), str(target)],
-        cwd=ROOT,
-        env=os.environ,
-        capture_output=True,
-        text=True,
+        processes.python(_CONVERT, str(source), str(target)), capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     return int(done.stdout.split()[-1])

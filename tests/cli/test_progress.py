@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from splatcli import console, progress
 
-STAGE = SimpleNamespace(name="train")
+STAGE: Any = SimpleNamespace(name="train")
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     now = SimpleNamespace(s=100.0)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now.s)
+    monkeypatch.setattr(time, "monotonic", lambda: now.s)
     return now
 
 

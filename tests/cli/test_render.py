@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -15,13 +13,14 @@ import pytest
 from PIL import Image
 
 from splatcli import viewpoints
-from splatcli.commands import render as command
 from stages import formats
+from stages.base import memory
 from stages.cameras import nerfstudio
 from stages.film.image_files import eight_bits
 from stages.raster.draw import render
 from stages.scene import Camera, View, look_at
-from tests import scenes
+from tests import processes, scenes
+from tests.processes import line_of, running
 from tests.tolerances import FILM_LEVELS
 
 CLOUD = scenes.cloud(60)
@@ -58,7 +57,7 @@ def last_event(result) -> dict:
 
 def frames_of(path: Path) -> list[np.ndarray]:
     video = cv2.VideoCapture(str(path))
-    frames = []
+    frames: list[np.ndarray] = []
     while True:
         there, frame = video.read()
         if not there:
@@ -182,7 +181,7 @@ def test_what_cannot_be_drawn_is_said(splat, scene: Path, words, code: int, said
 
 
 def test_a_picture_larger_than_memory_is_refused_at_once(splat, scene: Path, monkeypatch) -> None:
-    monkeypatch.setattr(command.memory, "available_mib", lambda: 100.0)
+    monkeypatch.setattr(memory, "available_mib", lambda: 100.0)
     result = splat("render", str(scene), "--out", "a.png", "--width", "4000")
     assert result.exit_code == 6
     assert "smaller --width" in result.stderr
@@ -207,12 +206,10 @@ def test_cameras_of_other_shapes_are_shown_whole_in_a_film() -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
 def test_ctrl_c_leaves_no_half_film(scene: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "splatcli", "render", str(scene), "--json"]
-    command += ["--out", str(tmp_path / "a.mp4"), "--frames", "3000", "--width", "64"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
-        assert running.stdout is not None
-        assert "progress" in running.stdout.readline()
-        running.send_signal(signal.SIGINT)
-        running.stdout.read()
-        assert running.wait(timeout=30) == 130
+    words = ("--out", str(tmp_path / "a.mp4"), "--frames", "3000", "--width", "64")
+    with running(processes.splat("render", str(scene), "--json", *words)) as rendering:
+        assert "progress" in line_of(rendering)
+        rendering.send_signal(signal.SIGINT)
+        rendering.communicate(timeout=30)
+        assert rendering.returncode == 130
     assert os.listdir(tmp_path) == ["a.ply"]

@@ -37,7 +37,7 @@ def events(*words: object, code: int = 0) -> list[dict[str, Any]]:
 
 
 def mirrored(splats: Splats) -> Splats:
-    return replace(splats, means=splats.means * np.float32([-1, 1, 1]))
+    return replace(splats, means=splats.means * np.array([-1, 1, 1], np.float32))
 
 
 @pytest.fixture(scope="module")

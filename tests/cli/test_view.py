@@ -6,50 +6,66 @@ import os
 import re
 import signal
 import socket
-import subprocess
 import sys
 import urllib.request
+import webbrowser
 from pathlib import Path
 
 import pytest
 
 from splatcli.commands import view as command
 from stages import formats
+from tests import processes
 from tests.formats.truth import many_splats
+from tests.processes import line_of, python, running
 
-COMMAND = (sys.executable, "-m", "splatcli", "view")
+DEAF = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+os.execv(sys.executable, [sys.executable, "-m", "splatcli", *sys.argv[1:]])
+"""
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
 @pytest.mark.parametrize(
     ("suffix", "stop"),
-    [("splat", signal.SIGINT), ("glb", signal.SIGTERM), ("html", signal.SIGINT)],
+    [("splat", signal.SIGINT), ("glb", signal.SIGTERM), ("html", signal.SIGHUP)],
 )
 def test_a_file_is_served_until_ctrl_c(tmp_path: Path, suffix: str, stop: signal.Signals) -> None:
     path = tmp_path / f"thing.{suffix}"
     formats.write(path, many_splats(7))
     environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(
-        [*COMMAND, str(path), "--no-open"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    ) as running:
-        assert running.stdout is not None
-        assert running.stderr is not None
-        address = running.stdout.readline().strip()
+    errors = tmp_path.parent / f"{tmp_path.name}.err"
+    command = processes.splat("view", str(path), "--no-open")
+    with errors.open("w") as told, running(command, stderr=told, env=environment) as it:
+        address = line_of(it).strip()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", address)
         page = urllib.request.urlopen(address, timeout=20).read().decode()
         content = urllib.request.urlopen(address + "scene.ply", timeout=20).read()
-        running.send_signal(stop)
-        assert running.wait(timeout=20) == 0
-        said = running.stderr.read()
+        it.send_signal(stop)
+        assert it.wait(timeout=20) == 0
+    said = errors.read_text()
     assert f"<title>thing.{suffix}</title>" in page
     assert '"count": 7' in page
     assert b"element vertex 7\n" in content
     assert "Traceback" not in said
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_a_server_in_the_background_is_deaf_to_ctrl_c_and_ends_when_it_is_told_to(
+    tmp_path: Path,
+) -> None:
+    """A shell starts what it puts into the background with Ctrl-C ignored: that is for others."""
+    formats.write(tmp_path / "a.ply", many_splats(7))
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    command = python(DEAF, "view", str(tmp_path / "a.ply"), "--no-open")
+    with running(command, env=environment) as it:
+        address = line_of(it).strip()
+        it.send_signal(signal.SIGINT)
+        assert urllib.request.urlopen(address, timeout=20).status == 200
+        it.send_signal(signal.SIGTERM)
+        assert it.wait(timeout=20) == 0
 
 
 def test_what_is_missing_is_said(splat, tmp_path: Path) -> None:
@@ -59,7 +75,7 @@ def test_what_is_missing_is_said(splat, tmp_path: Path) -> None:
 
 
 def test_nothing_to_see_is_said(splat, tmp_path: Path) -> None:
-    formats.write(tmp_path / "none.ply", many_splats(4).take([]))
+    formats.write(tmp_path / "none.ply", many_splats(4).take(slice(0)))
     result = splat("view", "none.ply", "--no-open")
     assert result.exit_code == 3
     assert "none.ply holds no splat" in result.stderr
@@ -94,7 +110,12 @@ def test_only_what_trains_can_be_watched(splat) -> None:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="others always have a screen")
 def test_no_browser_is_tried_without_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(command.webbrowser, "open", lambda a: opened.append(a) is None)
+
+    def note(address: str) -> bool:
+        opened.append(address)
+        return True
+
+    monkeypatch.setattr(webbrowser, "open", note)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
     assert not command.open_page("http://127.0.0.1:1/")

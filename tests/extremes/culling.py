@@ -41,7 +41,7 @@ def widths_out_of_range(backend):
     good, view, settings = cloud(50), camera(), RasterSettings()
     at_ease = np.full(50, 0.01, np.float32)
     alone = render(good, view, settings, backend, at_ease).image
-    bad = np.float32([np.nan, np.inf, -np.inf, -0.01, np.exp(45.0)])
+    bad = np.array([np.nan, np.inf, -np.inf, -0.01, np.exp(45.0)], np.float32)
     both = join(cloud(len(bad), seed=9), good)
     widths = np.concatenate([bad, at_ease])
     drawn = render(both, view, settings, backend, widths)

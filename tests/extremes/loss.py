@@ -10,7 +10,7 @@ from stages.training.loss import image_loss
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import relative
 from tests.tolerances import SSIM
-from tests.training.test_loss import reference
+from tests.training.float64_loss import reference
 
 
 def ssim(backend):

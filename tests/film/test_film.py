@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,6 +52,7 @@ def test_a_film_says_what_players_ask(tmp_path: Path) -> None:
 
     path = made(tmp_path / "a.mp4", fps=30000 / 1001)
     with av.open(str(path)) as container:
+        stream: Any
         (stream,) = container.streams
         context = stream.codec_context
         assert (context.name, stream.pix_fmt) == ("h264", "yuv420p")
@@ -126,6 +128,7 @@ def test_depth_is_read_back_exactly(tmp_path: Path) -> None:
     depth = np.random.default_rng(1).normal(5, 2, (7, 9)).astype(np.float32)
     save_depth(tmp_path / "a.tiff", depth)
     read = cv2.imread(str(tmp_path / "a.tiff"), cv2.IMREAD_UNCHANGED)
+    assert read is not None
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read, depth)
 
@@ -133,8 +136,9 @@ def test_depth_is_read_back_exactly(tmp_path: Path) -> None:
 def test_pictures_are_read_back_exactly(tmp_path: Path) -> None:
     image = np.array([[[0.0, 0.5, 1.0], [2.0, -1.0, np.nan]]])
     save_picture(tmp_path / "a.png", eight_bits(image))
-    read = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
-    assert read.tolist() == [[[0, 128, 255], [255, 0, 0]]]
+    read = cv2.imread(str(tmp_path / "a.png"))
+    assert read is not None
+    assert read[..., ::-1].tolist() == [[[0, 128, 255], [255, 0, 0]]]
 
 
 def test_depth_is_lighter_where_nearer_and_black_where_nothing_is() -> None:

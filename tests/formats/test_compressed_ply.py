@@ -8,32 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import compressed_ply
-from stages.scene import Splats, morton
+from stages.scene import morton
+from tests.formats.files import angles, three_splats
 from tests.formats.truth import C0, extreme_splats, many_splats
-
-
-def angles(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[N] degrees between rotations."""
-    a, b = (q / np.linalg.norm(q.astype(np.float64), axis=1, keepdims=True) for q in (a, b))
-    return np.degrees(2 * np.arccos(np.minimum(1, np.abs((a * b).sum(axis=1)))))
-
-
-def three_splats() -> Splats:
-    splats = many_splats(3).with_sh_degree(1)
-    splats.means[:] = [[0, 0, 0], [0.25, 1.5, 1], [1, 2, 4]]  # in the order of the curve
-    splats.log_scales[:] = [[-4, -4, -4], [-3, -2, -1], [0, 0, 0]]
-    splats.quaternions[:] = [[2, 0, 0, 0], [0.5, 0.1, -0.7, 0.5], [1, 1, 1, -3]]
-    splats.opacity_logits[:] = [0, math.log(3), -math.log(3)]
-    splats.sh[:] = 0
-    splats.sh[:, 0] = (np.array([[0, 0, 0], [0.5, 0.25, 1], [1, 1, 1]]) - 0.5) / C0
-    splats.sh[1, 1:] = [[-5, 0.1, 0.2], [0.3, 0.4, 0.5], [0.6, 0.7, 5]]  # 4 is the limit
-    splats.sh_degrees[:] = 1
-    return splats
 
 
 def test_words_are_those_of_the_layout(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from stages import formats
 from stages.formats import usd_read
 from stages.formats.ply import property_names
 from stages.scene.far import recentred
-from tests.formats.test_round_trip import edited_glb, ply_bytes
+from tests.formats.files import edited_glb, ply_bytes
 from tests.formats.truth import many_splats, red_splat
 
 UTM = np.array([431_234.567, 5_412_345.678, 312.25])

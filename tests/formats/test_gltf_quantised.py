@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.formats import gltf_quantised
 from stages.proof.second_readers import read_back
-from tests.formats.test_known_truth import glb_parts
+from tests.formats.files import glb_parts
 from tests.formats.truth import MEAN, QUATERNION, many_splats, red_splat
 
 PREFIX = "KHR_gaussian_splatting:"

@@ -15,7 +15,7 @@ import pytest
 
 from stages import formats
 from stages.base.errors import Family, SplatError
-from tests.formats.test_round_trip import edited_glb, ply_bytes
+from tests.formats.files import edited_glb, ply_bytes
 from tests.formats.truth import many_splats, red_splat
 
 

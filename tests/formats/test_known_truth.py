@@ -6,7 +6,6 @@ reader would make the same mistake. Here every number is compared with the forma
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.proof.second_readers import read_back
+from tests.formats.files import glb_parts
 from tests.formats.truth import (
     C0,
     MEAN,
@@ -108,20 +108,6 @@ def test_splat_keeps_an_unrotated_splat_exactly(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.splat", splats)
     quaternion = read_back(tmp_path / "a.splat").splats.quaternions[0]
     np.testing.assert_array_equal(np.abs(quaternion), [1, 0, 0, 0])
-
-
-def glb_parts(path: Path) -> tuple[dict[str, Any], bytes]:
-    content = path.read_bytes()
-    magic, version, total = struct.unpack_from("<4sII", content)
-    assert (magic, version, total) == (b"glTF", 2, len(content))
-    size, kind = struct.unpack_from("<I4s", content, 12)
-    assert kind == b"JSON"
-    assert size % 4 == 0
-    document = json.loads(content[20 : 20 + size])
-    length, kind = struct.unpack_from("<I4s", content, 20 + size)
-    assert kind == b"BIN\0"
-    assert length == document["buffers"][0]["byteLength"] == len(content) - 28 - size
-    return document, content[28 + size :]
 
 
 def accessor(document: dict[str, Any], binary: bytes, index: int) -> NDArray[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,12 @@ import numpy as np
 import pytest
 
 from stages import formats
-from stages.formats import splat32, usd_read
+from stages.formats import splat32
 from stages.formats.ply import property_names
-from stages.scene import Splats
+from tests.formats.files import edited_glb, ply_bytes, read
 from tests.formats.truth import extreme_splats, many_splats, red_splat
 
 EXACT = [name for name, row in formats.FORMATS.items() if not row.loses]
-
-
-def read(path: Path) -> Splats:
-    """As `formats.read`, without the process that it starts for USD: another test has that."""
-    return usd_read.parse(path) if path.suffix.startswith(".usd") else formats.read(path)
 
 
 def unit(quaternions: np.ndarray) -> np.ndarray:
@@ -131,32 +125,6 @@ def test_no_splats_are_a_valid_file(tmp_path: Path, suffix: str) -> None:
     assert len(read(tmp_path / f"a.{suffix}")) == 0
 
 
-def ply_bytes(splats: Splats, names: list[str], encoding: str, kind: str) -> bytes:
-    """A .ply as other programs write it: columns in any order, of any type."""
-    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
-    known = {
-        **{c: splats.means[:, i] for i, c in enumerate("xyz")},
-        **{f"f_dc_{i}": splats.sh[:, 0, i] for i in range(3)},
-        **{f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])},
-        **{f"scale_{i}": splats.log_scales[:, i] for i in range(3)},
-        **{f"rot_{i}": splats.quaternions[:, i] for i in range(4)},
-        "opacity": splats.opacity_logits,
-    }
-    table = np.stack([known.get(name, np.full(len(splats), 7.0)) for name in names], axis=1)
-    head = ["ply", f"format {encoding} 1.0", "comment made elsewhere", "element extra 2"]
-    head += ["property uchar a", "property short b", f"element vertex {len(splats)}"]
-    head += [f"property {kind} {name}" for name in names]
-    head += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
-    text = "\n".join(head).encode()
-    if encoding == "ascii":
-        rows = "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in table)
-        return text + b"1 2\n3 4\n" + rows.encode() + b"3 0 1 2\n"
-    order = ">" if "big" in encoding else "<"
-    return (
-        text + b"\1\2\3" * 2 + table.astype(order + {"float": "f4", "double": "f8"}[kind]).tobytes()
-    )
-
-
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("kind", ["float", "double"])
 def test_a_ply_of_any_order_encoding_and_type_reads_the_same(
@@ -188,21 +156,6 @@ def test_opaque_and_flat_splats_of_other_programs_are_read(tmp_path: Path) -> No
     back = read(tmp_path / "a.ply")
     np.testing.assert_allclose(back.opacities[:2], [1, 0], atol=1e-6)
     assert np.isfinite(back.log_scales).all()
-
-
-def edited_glb(
-    path: Path, edit: Callable[[dict[str, Any]], None], binary: bytes | None = None
-) -> None:
-    """Rewrite a .glb with its JSON changed."""
-    content = path.read_bytes()
-    size = struct.unpack_from("<I", content, 12)[0]
-    document = json.loads(content[20 : 20 + size])
-    edit(document)
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    body = content[28 + size :] if binary is None else binary
-    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(body), len(text), b"JSON")
-    path.write_bytes(head + text + struct.pack("<I4s", len(body), b"BIN\0") + body)
 
 
 def test_a_gltf_node_may_move_and_scale_its_splats(tmp_path: Path) -> None:

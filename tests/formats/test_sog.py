@@ -18,7 +18,7 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import codebook
 from stages.scene import morton
-from tests.formats.test_compressed_ply import angles, three_splats
+from tests.formats.files import angles, three_splats
 from tests.formats.truth import C0, extreme_splats, many_splats
 
 

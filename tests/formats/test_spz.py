@@ -13,11 +13,11 @@ import pytest
 
 from stages import formats
 from stages.base.errors import SplatError
-from stages.formats import spz
+from stages.formats import spz_read
 from stages.proof.prover import Prover, cameras_for
 from stages.proof.second_readers import read_back
 from stages.scene import Splats
-from tests.formats.test_compressed_ply import angles
+from tests.formats.files import angles
 from tests.formats.truth import C0, extreme_splats, many_splats, red_splat
 
 
@@ -192,7 +192,7 @@ def test_what_follows_the_splats_is_passed_over_but_not_without_end(tmp_path: Pa
 
 
 def test_a_gzip_bomb_is_refused_before_it_unpacks(tmp_path: Path) -> None:
-    header = spz.HEADER.pack(b"NGSP", 3, 20_000_000, 3, 12, 0, 0)
+    header = spz_read.HEADER.pack(b"NGSP", 3, 20_000_000, 3, 12, 0, 0)
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(header + bytes(100 << 20), 1))
     with pytest.raises(SplatError, match="declares"):

@@ -14,7 +14,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.lazy import named
 from stages.formats import FORMATS, MESHES, TABLE, Format
 from stages.proof.anatomy import anatomy_of
-from tests.formats.test_round_trip import read
+from tests.formats.files import read
 from tests.formats.truth import many_splats
 
 README = Path(__file__).parents[2] / "README.md"

@@ -90,8 +90,8 @@ def many_splats(n: int = 300, seed: int = 1) -> Splats:
 def extreme_splats(degree: int) -> Splats:
     """Four that can be drawn, with values at the ends of what a float32 or a viewer can hold."""
     splats = many_splats(4).with_sh_degree(degree)
-    splats.log_scales[:] = [[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]]
+    splats.log_scales[:] = np.array([[40, -8, -8], [-200, 0, 0], [9, -0.3, -0.3], [-9, -9, -9]])
     splats.opacity_logits[:] = [100, -100, 20, -20]
-    splats.quaternions[:2] = [[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]]
+    splats.quaternions[:2] = np.array([[1e-19, 0, 0, 1e-19], [1e20, 0, 1e20, 0]])
     splats.means[3] = (7e8, -3e38, 1e-40)
     return splats

@@ -30,8 +30,8 @@ def main() -> None:
         figures = f"{tally.tried} | {tally.read} | {tally.refused} | {tally.slowest_s:.2f} s"
         print(f"| {name} | {figures} | {max(0.0, tally.peak_mib):.0f} MiB |", flush=True)
     print(f"\n{tried} inputs, {len(beaten)} readers beaten")
-    for failure in beaten:
-        console.print(failure, markup=False)
+    for words in beaten:
+        console.print(words, markup=False)
     raise SystemExit(bool(beaten))
 
 

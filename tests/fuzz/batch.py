@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
+from tests import processes
 from tests.fuzz.child import Tally
 from tests.fuzz.layers import LAYERS
 
-ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 60.0  # to start, and ...
 SECONDS_EACH = 1.0  # ... for each input, on a busy machine
 SECONDS_EACH_PROCESS = 12.0
@@ -28,13 +27,12 @@ def fuzz(name: str, inputs: int) -> Tally:
     count = max(10, round(inputs * layer.share))
     each = SECONDS_EACH if layer.share == 1 else SECONDS_EACH_PROCESS
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "tests.fuzz.child", name, str(count), folder]
+        command = processes.module("tests.fuzz.child", name, str(count), folder)
         try:
             child = subprocess.run(
                 command,
                 capture_output=True,
                 text=True,
-                cwd=ROOT,
                 timeout=SECONDS + each * count,
                 check=False,
             )

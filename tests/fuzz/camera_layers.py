@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.cameras import colmap, nerfstudio
 from stages.scene import Camera, View
-from tests.cameras.test_colmap import example
+from tests.cameras.models import example
 from tests.fuzz.layer import Layer
 
 _MOST = 1 << 12  # more cannot come out of files of some 20 kB

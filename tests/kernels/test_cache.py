@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 from stages.kernels import cache
-from tests.sample import environment
 
 ROOT = Path(__file__).parent.parent.parent
 SHOW = "import os; print(os.environ['NUMBA_CACHE_DIR'])"
@@ -17,7 +16,7 @@ SHOW = "import os; print(os.environ['NUMBA_CACHE_DIR'])"
 
 def python(code: str, home: Path, **more: str) -> str:
     """What a fresh process prints that has `home` as its home folder."""
-    env = {name: value for name, value in environment().items() if name != "NUMBA_CACHE_DIR"}
+    env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     env |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache"), **more}
     done = subprocess.run(
         [sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=60

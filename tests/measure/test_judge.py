@@ -87,7 +87,7 @@ def test_figures_stay_finite() -> None:
 def test_flip_is_that_of_its_authors_worked_cases() -> None:
     """0 for equal pictures; nearly 1 for blue against yellow, which are as far apart as the
     measure's colours go; and one noisy pixel in a thousand hardly counts."""
-    blue = np.zeros((32, 32, 3), np.float32) + np.float32([0, 0, 1])
+    blue = np.zeros((32, 32, 3), np.float32) + np.array([0, 0, 1], np.float32)
     yellow = 1 - blue
     assert flip(blue, blue) == 0.0
     assert flip(blue, yellow) > 0.9

@@ -44,11 +44,11 @@ def written(prover: Prover, folder: Path, name: str, splats: Splats) -> Proof:
 
 
 def turned_about_x(splats: Splats) -> Splats:
-    return replace(splats, means=splats.means * np.float32([1, -1, -1]))
+    return replace(splats, means=splats.means * np.array([1, -1, -1], np.float32))
 
 
 def mirrored(splats: Splats) -> Splats:
-    return replace(splats, means=splats.means * np.float32([-1, 1, 1]))
+    return replace(splats, means=splats.means * np.array([-1, 1, 1], np.float32))
 
 
 def rolled(splats: Splats) -> Splats:
@@ -68,7 +68,7 @@ def shrunk(splats: Splats) -> Splats:
 
 
 def moved(splats: Splats) -> Splats:
-    return replace(splats, means=splats.means + np.float32([7, 0, 0]))
+    return replace(splats, means=splats.means + np.array([7, 0, 0], np.float32))
 
 
 @pytest.mark.parametrize("name", formats.FORMATS)

@@ -16,7 +16,7 @@ SIZES = [(1, 1), (17, 1), (47, 33), (64, 48), (83, 61)]
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("size", SIZES)
 def test_pictures_agree(size, antialias):
-    scene, view = cloud(300, *size, degree=3), camera(*size)
+    scene, view = cloud(300, size[0], size[1], degree=3), camera(*size)
     settings = RasterSettings(background=(0.2, 0.5, 0.9), antialias=antialias)
     a, b = (render(scene, view, settings, backend) for backend in ("cpu", "reference"))
     assert a.image.shape == (size[1], size[0], 3)
@@ -32,7 +32,7 @@ def test_pictures_agree(size, antialias):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("size", [(1, 1), (47, 33), (83, 61)])
 def test_every_gradient_agrees(size, degree, antialias):
-    scene, view = cloud(250, *size, degree=degree, seed=degree), camera(*size)
+    scene, view = cloud(250, size[0], size[1], degree, seed=degree), camera(*size)
     settings = RasterSettings(background=(0.2, 0.5, 0.9), antialias=antialias)
     v = np.random.default_rng(1).normal(size=(size[1], size[0], 3)).astype(np.float32)
     found = gradients("cpu", scene, view, v, settings)

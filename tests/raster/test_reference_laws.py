@@ -1,5 +1,7 @@
 """What must hold for any rendering, whatever the numbers; and gradients by finite differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -82,9 +84,7 @@ def test_the_picture_is_linear_in_colours(backend):
     black = RasterSettings()
     scene.sh[:] = np.abs(scene.sh)  # all colours positive, so that no clamp interferes
     other = scene.sh * 0.5
-    total = Splats(*(getattr(scene, n) for n in PARAMETERS[:4]), scene.sh + other, scene.sh_degrees)
-    half = Splats(*(getattr(scene, n) for n in PARAMETERS[:4]), other, scene.sh_degrees)
-    grey = Splats(*(getattr(scene, n) for n in PARAMETERS[:4]), other * 0, scene.sh_degrees)
+    total, half, grey = (replace(scene, sh=sh) for sh in (scene.sh + other, other, other * 0))
     both = image(backend, scene, view, black) + image(backend, half, view, black)
     np.testing.assert_allclose(
         image(backend, total, view, black) + image(backend, grey, view, black), both, atol=3e-6
@@ -129,6 +129,7 @@ def test_reference_gradients_are_finite_differences(antialias):
                 shifted, _, _, _ = render_tensors(Parameters(**others), view, settings)
                 values.append(float((shifted * v).sum()))
             numeric[i] = (values[0] - values[1]) / (2 * step)
+        assert tensor.grad is not None
         top = tensor.grad.abs().max()
         assert top > 0, name
         error = (numeric - tensor.grad.flatten()).abs().max() / top

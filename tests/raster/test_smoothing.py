@@ -32,7 +32,7 @@ def widths_for(scene, seed=3):
 def test_a_filter_as_wide_as_the_splat_worked_by_hand():
     """Scales grow by sqrt(2), and the opacity falls by sqrt(2) for each axis."""
     scene = splats((0, 0, 2), scales=0.25, opacities=0.8)
-    soft = smoothed(scene, np.float32([0.25]))
+    soft = smoothed(scene, np.array([0.25], np.float32))
     np.testing.assert_allclose(np.exp(soft.log_scales), 0.25 * np.sqrt(2), rtol=1e-6)
     assert soft.opacities[0] == pytest.approx(0.8 / 2**1.5, rel=1e-6)
 
@@ -87,6 +87,7 @@ def test_the_definition_of_the_filter_has_the_gradient_of_its_finite_differences
         shift[row, axis] = step
         with torch.no_grad():
             wanted = (total(p.log_scales + shift) - total(p.log_scales - shift)) / (2 * step)
+        assert p.log_scales.grad is not None
         assert float(p.log_scales.grad[row, axis]) == pytest.approx(
             float(wanted), abs=FINITE_DIFFERENCE
         )
@@ -107,7 +108,7 @@ def test_splats_of_no_size_under_the_filter_leave_all_finite(backend):
 
 
 def test_the_width_is_set_by_the_photograph_that_samples_most_finely():
-    means = np.float32([(0, 0, 0), (50, 0, 0)])
+    means = np.array([(0, 0, 0), (50, 0, 0)], np.float32)
     near, far = (
         Camera(640, 480, 800.0, 800.0, 320.0, 240.0, look_at(np.array([0, 0, -z]), np.zeros(3)))
         for z in (4.0, 8.0)

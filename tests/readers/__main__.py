@@ -8,7 +8,6 @@ exports and the pictures. What is not installed here is left out, and said.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from contextlib import closing
 from dataclasses import replace
@@ -168,4 +167,4 @@ def _engines(camera: Camera, ours: np.ndarray, folder: Path, names: list[str]) -
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -22,9 +22,6 @@ from tests.readers.engines import (
 from tests.tolerances import ENGINE_DB
 from tests.viewer.browser import Browser
 from tests.viewer.screenshots import coloured_scene, views, wrong_versions
-from tests.viewer.test_in_browser import browser
-
-__all__ = ["browser"]
 
 pytestmark = pytest.mark.slow
 WORSE_DB = 5.0

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from stages import formats
-from tests.formats.test_round_trip import edited_glb
+from tests.formats.files import edited_glb
 from tests.formats.truth import many_splats
 from tests.readers.validators import gltf_complaints, usd_complaints
 

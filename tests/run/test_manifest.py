@@ -67,7 +67,7 @@ def test_sealed_file_reads_back_and_every_changed_byte_is_noticed(tmp_path: Path
                 read_sealed(path)
 
 
-def json_equal(a: bytes, b: bytes) -> bool:
+def json_equal(a: bytes | bytearray, b: bytes) -> bool:
     try:
         return bool(json.loads(a) == json.loads(b))
     except ValueError:

@@ -9,7 +9,8 @@ from stages.scene import Camera, look_at, morton
 
 def test_points_worked_by_hand_land_where_they_should() -> None:
     camera = Camera(100, 60, 80.0, 40.0, 50.0, 30.0, np.eye(4))
-    pixels, z = camera.project(np.float32([[0, 0, 2], [0.5, -0.25, 2], [1, 1, -1], [-2, 0, 2]]))
+    points = np.array([[0, 0, 2], [0.5, -0.25, 2], [1, 1, -1], [-2, 0, 2]], np.float32)
+    pixels, z = camera.project(points)
     np.testing.assert_allclose(pixels[:2], [[50, 30], [70, 25]])
     np.testing.assert_allclose(z, [2, 2, -1, 2])
     assert camera.shows(pixels).tolist() == [True, True, False, False]

@@ -30,7 +30,7 @@ def capture_of(folder: Path, images: dict[str, np.ndarray]) -> Capture:
 
 def pictures(count: int | None = None, step: int = 1) -> list[np.ndarray]:
     """Photographs of the sample capture, [480, 640, 3] uint8."""
-    return [cv2.imread(str(path)) for path in sorted(SAMPLE.glob("*.jpg"))[::step][:count]]
+    return [_read(path) for path in sorted(SAMPLE.glob("*.jpg"))[::step][:count]]
 
 
 def two_scenes(folder: Path, each: int = 8) -> Capture:
@@ -45,7 +45,7 @@ def turning_on_the_spot(folder: Path, count: int = 30) -> Capture:
     """What a camera sees that only turns: homographies K R K^-1 of one photograph."""
     image = pictures(1)[0]
     focal, width, height = 600.0, 400, 300
-    to_rays = np.linalg.inv([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
+    to_rays = np.linalg.inv(np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]]))
     to_pixels = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     random = np.random.default_rng(0)
     images = {}
@@ -108,8 +108,14 @@ def duplicates(folder: Path, count: int = 10) -> Capture:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    height, width = cv2.imread(str(path)).shape[:2]
+    height, width = _read(path).shape[:2]
     return width, height
+
+
+def _read(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image
 
 
 def _photo(name: str, width: int, height: int) -> Photo:

@@ -53,4 +53,6 @@ def test_a_picture_is_of_the_kind_that_its_name_says_and_of_its_photograph(tmp_p
         path = folder / view.image
         with Image.open(path) as picture:
             assert picture.format == ("PNG" if path.suffix == ".png" else "JPEG")
-        assert np.abs(cv2.imread(str(path)).astype(int) - 50 * number).max() <= 2
+        image = cv2.imread(str(path))
+        assert image is not None
+        assert np.abs(image.astype(int) - 50 * number).max() <= 2

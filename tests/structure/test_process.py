@@ -15,20 +15,9 @@ import pytest
 
 from stages.base.errors import Interrupted, SplatError
 from stages.structure import process
-from stages.structure.job import CameraGuess, Job
-
-
-def job(tmp_path: Path) -> Job:
-    return Job(
-        step="features",
-        images_root=str(tmp_path),
-        database=str(tmp_path / "a.db"),
-        out="",
-        progress="",
-        names=("é 1.jpg",),
-        camera_of=(0,),
-        cameras=(CameraGuess(640, 480, None),),
-    )
+from stages.structure.job import Job
+from tests import processes
+from tests.structure.jobs import job
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
@@ -66,6 +55,18 @@ def test_an_abort_is_told_with_its_last_words(
     assert "Check failed: x > 0" in error.given
     assert str(tmp_path / "log.txt") in error.hint
     assert "Check failed" in (tmp_path / "log.txt").read_text()
+
+
+def test_last_words_are_not_what_others_told_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP's other threads, and other processes, go on telling how far they are."""
+    told = "I20261121 22:16:11.982047 140047659562688 pairing.cc:938] Processing block [1/1]"
+    code = f"import os; print('Check failed: x > 0'); print({told!r}, flush=True); os.abort()"
+    pretend(monkeypatch, code)
+    with pytest.raises(process.WorkerCrashed) as crash:
+        run(tmp_path)
+    assert process.crash_error(crash.value, tmp_path).given.endswith("Check failed: x > 0")
 
 
 def test_a_full_disk_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,19 +129,21 @@ def test_kill_minus_nine_of_the_parent_ends_the_worker(tmp_path: Path) -> None:
 import sys, threading
 from pathlib import Path
 from stages.structure import process
-from tests.structure.test_process import job
+from tests.structure.jobs import job
 process._command = lambda path: [sys.executable, "-c", {sleeper!r}]
 folder = Path({str(tmp_path)!r})
 process.run_worker(job(folder), folder, threading.Event(), 60.0, lambda: None)
 """
-    parent = subprocess.Popen([sys.executable, "-c", parent_code])
     log = tmp_path / "log.txt"
-    deadline = time.monotonic() + 20
-    while not (log.exists() and log.read_text().strip()) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    pid = int(log.read_text())
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
+    with processes.running(processes.python(parent_code)) as parent:
+        deadline = time.monotonic() + 60
+        while not (log.exists() and log.read_text().endswith("\n")):
+            assert time.monotonic() < deadline
+            assert parent.poll() is None
+            time.sleep(0.05)
+        pid = int(log.read_text())
+        parent.send_signal(signal.SIGKILL)
+        parent.wait(timeout=20)
     deadline = time.monotonic() + 10
     while _alive(pid) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,10 @@ def sphere(rgb: tuple[float, float, float] = (1.0, 0.5, 0.0), logit: float = 4.0
 
 def joined(*parts: Splats) -> Splats:
     names = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
-    return Splats(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+    }
+    return Splats(**arrays)
 
 
 def seen_from(
@@ -82,7 +86,11 @@ def seen_from(
 
 def _view(number: int, eye: NDArray[np.floating], target: NDArray[np.float64]) -> View:
     name = f"{number:03}.png"
-    return View(name, name, Camera(160, 120, 150.0, 150.0, 80.0, 60.0, look_at(eye, target)))
+    return View(
+        name,
+        name,
+        Camera(160, 120, 150.0, 150.0, 80.0, 60.0, look_at(eye.astype(np.float64), target)),
+    )
 
 
 def all_around(count: int = 14) -> Reconstruction:

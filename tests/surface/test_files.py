@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def test_the_tent_is_closed_and_its_normals_point_out() -> None:
 
 def test_the_glb_stands_upright_for_another_reader(tmp_path: Path) -> None:
     assert write(tmp_path / "a.mesh.glb", tent(), "metres") == ""
-    read = trimesh.load(tmp_path / "a.mesh.glb", force="mesh", process=False)
+    read: Any = trimesh.load(tmp_path / "a.mesh.glb", force="mesh", process=False)
     np.testing.assert_array_equal(read.vertices[3], [0, 2, -3])
     assert read.vertices[:, 1].min() == 0
     assert read.is_watertight
@@ -80,7 +81,7 @@ def test_the_ply_lies_where_the_splats_do(tmp_path: Path) -> None:
     assert "splat_origin 500000.0 7.0 -4.0" in data.comments
     assert [float(data["vertex"][axis][3]) for axis in "xyz"] == [0, -2, 3]
     assert [int(data["vertex"][name][2]) for name in ("red", "green", "blue")] == [0, 0, 255]
-    read = trimesh.load(tmp_path / "a.mesh.ply", process=False)
+    read: Any = trimesh.load(tmp_path / "a.mesh.ply", process=False)
     assert read.volume == pytest.approx(4 / 3)
 
 

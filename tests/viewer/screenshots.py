@@ -12,6 +12,8 @@ from stages.scene import Camera, Splats, View, look_at
 from tests import scenes
 
 SIZE = (320, 240)
+WORSE_DB = 8.0
+"""By how much at least a wrong picture is worse than the right one."""
 
 
 def coloured_scene() -> Splats:

@@ -15,10 +15,10 @@ from stages.formats import ply
 from stages.measure.images import psnr
 from stages.viewer.server import LocalServer
 from stages.viewer.site import site
-from tests.packages import UnavailableError
-from tests.viewer.browser import Browser, chromium
+from tests.viewer.browser import Browser
 from tests.viewer.screenshots import (
     SIZE,
+    WORSE_DB,
     coloured_scene,
     drawn,
     views,
@@ -28,18 +28,6 @@ from tests.viewer.screenshots import (
 SAME_DB = 30.0
 """The viewer keeps scales and rotations as 16-bit floats, cuts splats off earlier and blends in 8
 bits; on this scene that costs about 35 dB."""
-WORSE_DB = 8.0
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    try:
-        program = chromium()
-    except UnavailableError as reason:
-        pytest.skip(str(reason))
-    opened = Browser(program, tmp_path_factory.mktemp("profile"), SIZE)
-    yield opened
-    opened.close()
 
 
 @pytest.fixture(scope="module")

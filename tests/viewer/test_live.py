@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlencode
 
 import numpy as np
@@ -22,8 +23,8 @@ from stages.scene import Camera
 from stages.viewer.live import SIDES, LivePage
 from stages.viewer.server import LocalServer
 from tests import scenes
-from tests.viewer.test_page import HOSTILE, Elements, views
-from tests.viewer.test_server import ask
+from tests.viewer.asking import ask
+from tests.viewer.pages import HOSTILE, Elements, views
 
 SHOTS = shots_of(views(), scenes.cloud(20))
 
@@ -177,7 +178,8 @@ def test_time_left_counts_from_where_training_was_resumed() -> None:
     page.progressed("training", 900, 1000, {})
     time.sleep(0.02)
     page.progressed("training", 901, 1000, {})
-    state = json.loads(page.items["/state"]({}).content)  # type: ignore[operator]
+    answer: Any = page.items["/state"]
+    state = json.loads(answer({}).content)
     assert state["left_s"] == pytest.approx(99 * state["spent_s"])
 
 

@@ -9,6 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,29 +20,24 @@ from PIL import Image
 
 from stages.measure.images import psnr
 from stages.page.shots import shots_of
-from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
-from stages.scene import Camera, Splats, scene_extent
+from stages.scene import Camera, Splats
 from stages.scene.framing import depth_of_interest
-from stages.training.trainer import NEAR
 from stages.viewer.live import LivePage
 from stages.viewer.server import LocalServer
-from tests.sample import command, environment, process_words
+from tests import processes, sample
 from tests.tolerances import LIVE_PICTURE_DB
 from tests.viewer.browser import Browser
-from tests.viewer.screenshots import coloured_scene, views, wrong_versions
-from tests.viewer.test_in_browser import WORSE_DB, browser
-
-__all__ = ["browser"]
+from tests.viewer.screenshots import WORSE_DB, coloured_scene, views, wrong_versions
 
 WAIT_S = 60.0
 SETTLED = "const p = splatLive.picture; p && p.sharp && p.version === splatLive.version"
 
 
-def ours(splats: Splats, camera: Camera, settings: RasterSettings | None = None) -> np.ndarray:
+def ours(splats: Splats, camera: Camera) -> np.ndarray:
     """By the reference: the kernels are the worker's."""
-    return np.clip(render(splats, camera, settings, backend="reference").image, 0, 1)
+    return np.clip(render(splats, camera, backend="reference").image, 0, 1)
 
 
 class Worker(threading.Thread):
@@ -115,7 +111,7 @@ def mouse(browser: Browser, *path: tuple[int, int], button: str = "left") -> Non
     held = {"left": 1, "right": 2}[button]
     for number, (x, y) in enumerate(path):
         kind = "mouseMoved" if number else "mousePressed"
-        where = {"x": x, "y": y, "button": button, "buttons": held, "clickCount": 1}
+        where: dict[str, Any] = {"x": x, "y": y, "button": button, "buttons": held, "clickCount": 1}
         browser.call("Input.dispatchMouseEvent", type=kind, **where)
     x, y = path[-1]
     where = {"x": x, "y": y, "button": button, "buttons": 0, "clickCount": 1}
@@ -214,57 +210,49 @@ def test_at_rest_a_picture_is_asked_for_seldom(browser: Browser, worker: Any) ->
     assert sum("/picture" in address for address in browser.requests) <= 4
 
 
-class Running:
-    """`splat WORDS --view --json`, and the events that it has told."""
-
-    def __init__(self, folder: Path, *words: str) -> None:
-        self.process = subprocess.Popen(
-            command(*words, "--view", "--json"),
-            cwd=folder,
-            env={**environment(), "DISPLAY": "", "WAYLAND_DISPLAY": "", "BROWSER": ""},
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        self.lines = map(json.loads, self.process.stdout)
-
-    def address(self) -> str:
-        return str(next(e["address"] for e in self.lines if e["event"] == "view"))
-
-    def end(self) -> int:
-        for _ in self.lines:
-            pass
-        return self.process.wait(timeout=60)
+@contextmanager
+def watched(folder: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """(`splat WORDS --view --json`, the address of its page)."""
+    environment = {**os.environ, "DISPLAY": "", "WAYLAND_DISPLAY": "", "BROWSER": ""}
+    command = processes.splat(*words, "--view", "--json")
+    with processes.running(command, cwd=folder, env=environment) as process:
+        event: dict[str, Any] = {"event": ""}
+        while event["event"] != "view":
+            event = json.loads(processes.line_of(process))
+        yield process, event["address"]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.skipif(os.name != "posix", reason="sends the signal of Ctrl-C")
 def test_a_training_is_watched_stopped_and_watched_to_its_end(
-    browser: Browser, tmp_path: Path
+    browser: Browser, sample_run: Path, tmp_path: Path
 ) -> None:
-    first = Running(tmp_path, *process_words("--steps", "1500"))
-    bare(browser, first.address())
-    until(browser, SETTLED)
-    early, step = browser.picture(), browser.run("splatLive.picture.step")
-    until(browser, f"splatLive.picture.step > {step + 100}")
-    time.sleep(0.2)  # for the screen
-    assert psnr(browser.picture(), early) < LIVE_PICTURE_DB
-    first.process.send_signal(signal.SIGINT)
-    assert first.end() == 130
-    until(browser, "splatLive.state.end === 'stopped'")
+    """A run whose photographs have been placed before; training itself begins anew."""
+    sample.copied(sample_run, tmp_path)
+    with watched(tmp_path, *sample.process_words("--steps", "1500")) as (process, address):
+        bare(browser, address)
+        until(browser, SETTLED)
+        early, step = browser.picture(), browser.run("splatLive.picture.step")
+        until(browser, f"splatLive.picture.step > {step + 100}")
+        time.sleep(0.2)  # for the screen
+        assert psnr(browser.picture(), early) < LIVE_PICTURE_DB
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+        assert process.returncode == 130
+        until(browser, "splatLive.state.end === 'stopped'")
 
-    second = Running(tmp_path, "train", "run")
     run = Pipeline(tmp_path / "run")
-    seen, address = run.load("sfm"), second.address()
+    seen = run.load("sfm")
     view = sorted(seen.views, key=lambda v: v.name)[0]
-    size = {"width": view.camera.width, "height": view.camera.height}
-    browser.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False)
-    bare(browser, address)
-    assert second.end() == 0
+    with watched(tmp_path, "train", "run") as (process, address):
+        browser.resize((view.camera.width, view.camera.height))
+        bare(browser, address)
+        process.communicate(timeout=300)
+        assert process.returncode == 0
     until(browser, "splatLive.picture && splatLive.picture.step === 1500")
     assert browser.run("splatLive.state.end") == "finished"
-    settings = RasterSettings(near=NEAR * scene_extent(seen.views))
-    right = ours(run.load("train"), view.camera, settings)
+    right = ours(run.load("train"), view.camera)
     assert psnr(browser.picture(), right) > LIVE_PICTURE_DB
     manifest = run.manifest("train")
     assert manifest is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.client
 import socket
 import threading
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.viewer.server import Item, LocalServer
+from tests.viewer.asking import ask
 
 
 @pytest.fixture
@@ -28,19 +28,6 @@ def server(tmp_path: Path) -> Iterator[LocalServer]:
         yield running
         running.shutdown()
         thread.join()
-
-
-def ask(
-    server: LocalServer, path: str, method: str = "GET", host: str | None = None
-) -> tuple[int, bytes, dict[str, str]]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
-    connection.putrequest(method, path, skip_host=True)
-    connection.putheader("Host", host or f"127.0.0.1:{server.server_port}")
-    connection.endheaders()
-    answer = connection.getresponse()
-    body = answer.read()
-    connection.close()
-    return answer.status, body, dict(answer.getheaders())
 
 
 def test_what_is_listed_is_served_with_its_kind(server: LocalServer) -> None:

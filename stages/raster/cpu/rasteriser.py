@@ -17,6 +17,7 @@ from stages.raster.cpu.splat_kernels import (
     project_splats,
     splat_gradients,
 )
+from stages.raster.cpu.tile import PIXELS
 from stages.raster.definition import (
     NO_SMOOTHING,
     Arrays,
@@ -139,8 +140,8 @@ class CpuRasteriser:
         background = np.asarray(settings.background, np.float32)
         tiles = len(lists.starts) - 1
         image = get("image", (6 if depths else 4, height, width), np.float32)
-        light = get("light", (tiles, blend.PIXELS), np.float32)
-        last = get("last", (tiles, blend.PIXELS), np.float32)
+        light = get("light", (tiles, PIXELS), np.float32)
+        last = get("last", (tiles, PIXELS), np.float32)
         self.pool.share(
             blend.blend_tiles,
             width,

@@ -1,0 +1,34 @@
+"""A COLMAP model of a capture, whose numbers are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.cameras.colmap import ColmapModel
+from stages.scene import Camera
+from tests.structure.synthetic import orbit_model
+
+
+def example() -> ColmapModel:
+    """Five views, two of them with another focal length; pinhole observations."""
+    model = orbit_model(views=5, points=30)
+    focals = (500.0, 500.0, 510.0, 510.0, 500.0)
+    cameras = tuple(
+        Camera(640, 480, focal, focal, 320.0, 240.0, pose)
+        for focal, pose in zip(focals, model.world_to_camera, strict=True)
+    )
+    keep = (model.observed_points + model.observing_views) % 4 != 0
+    points, views = model.observed_points[keep], model.observing_views[keep]
+    poses = model.world_to_camera[views]
+    xyz = np.einsum("oij,oj->oi", poses[:, :3, :3], model.points[points]) + poses[:, :3, 3]
+    px = np.array(focals)[views, None] * xyz[:, :2] / xyz[:, 2:] + (320.0, 240.0)
+    return ColmapModel(
+        names=("a.jpg", "day 1/b.jpg", "ü.jpg", "d.jpg", "e.jpg"),
+        cameras=cameras,
+        points=model.points,
+        colours=model.colours,
+        errors_px=np.linspace(0, 1, 30),
+        observed_points=points,
+        observing_views=views,
+        observed_px=px,
+    )

@@ -1,0 +1,35 @@
+"""`python -m tests.compile_kernels`: a small scene through all stages that compile, unless one was
+before."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from stages.kernels import cache
+
+
+def main() -> None:
+    if cache.are_compiled():
+        return
+    print("compiling kernels, once ...", flush=True)
+    from stages import export, prune, quantise, train
+    from stages.base.stage import Report
+    from stages.surface import fuse
+    from tests.small_scene import small_scene
+
+    fuse.VOXELS = 32**3  # what types are compiled counts, not sizes
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        scene = small_scene(folder)
+        settings = train.TrainSettings(steps=150, train_side=72, max_splats=400, smooth=True)
+        inputs: dict[str, Any] = {"sfm": scene.reconstruction, "seed": scene.splats}
+        inputs["train"] = train.run(inputs, settings, folder, Report())
+        inputs["prune"] = prune.run(inputs, prune.PruneSettings(), folder, Report())
+        inputs["quantise"] = quantise.run(inputs, quantise.QuantiseSettings(), folder, Report())
+        export.run(inputs, export.ExportSettings(formats=("mesh",)), folder, Report())
+
+
+if __name__ == "__main__":
+    main()
