@@ -38,7 +38,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_configure(config: pytest.Config) -> None:
     if fault := _fault_of_installation():
-        raise pytest.UsageError(f'{fault}: pip install ".[test]" first')
+        raise pytest.UsageError(f'{fault}: rm -rf build && pip install ".[test]"')
 
 
 def _fault_of_installation() -> str | None:
