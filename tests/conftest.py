@@ -38,7 +38,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_configure(config: pytest.Config) -> None:
     if fault := _fault_of_installation():
-        raise pytest.UsageError(f'{fault}: pip install ".[test]" first')
+        raise pytest.UsageError(f'{fault}: rm -rf build && pip install ".[test]"')
 
 
 def _fault_of_installation() -> str | None:
@@ -65,12 +65,12 @@ def _fault_of_installation() -> str | None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compiles the kernels before tests begin side by side, each of which would compile them and
-    be the slower for it."""
+    be the slower for it. If that fails, tests will tell."""
     from tests import processes
 
     first = session.config.getoption("numprocesses", None) and not _is_worker(session.config)
     if first and not session.config.option.collectonly:
-        subprocess.run(processes.module("tests.compile_kernels"), check=True)
+        subprocess.run(processes.module("tests.compile_kernels"), check=False)
 
 
 def _is_worker(config: pytest.Config) -> bool:
