@@ -204,12 +204,15 @@ def info(
     target: Annotated[
         Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
     ] = None,
+    speed: Annotated[
+        bool, typer.Option("--speed", help="Draw some pictures too: frames a second, here.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Count the splats of a file or a run: degrees, bounds, bytes, and what is wrong with them."""
     from splatcli.commands import info as work
 
-    work.show(target, as_json)
+    work.show(target, speed, as_json)
 
 
 def convert(

@@ -93,17 +93,22 @@ def fit(pictures, scene, steps, rates, degree=0):
     return renders
 
 
-@pytest.mark.parametrize(("side", "worst"), [(4, 0.04), (8, 0.006), (16, 0.002)])
-def test_more_splats_fit_a_disc_and_a_square_better(side, worst):
-    """About 0.02 with 16 splats, low 1e-3 with 64, 0.001 to 0.002 with 256."""
+def test_more_splats_fit_a_disc_and_a_square_better():
+    """Mean squared error about 0.02 with 16 splats, low 1e-3 with 64, 0.001 to 0.002 with 256."""
     picture = disc_and_square()
-    (image,) = fit([(picture, camera(48, 48))], grid(side), 800, TOY_RATES)
-    assert float(np.mean((image - picture) ** 2)) < worst
+    errors = []
+    for side in (4, 8, 16):
+        (image,) = fit([(picture, camera(48, 48))], grid(side), 800, TOY_RATES)
+        errors.append(float(np.mean((image - picture) ** 2)))
+    assert errors == sorted(errors, reverse=True)
+    assert 0.006 < errors[0] < 0.04
+    assert errors[1] < 0.006
+    assert errors[2] < 0.002
 
 
 def test_view_dependence_needs_more_than_a_constant_colour():
     """Two greys 0.08 apart, seen from the front and the back: one constant colour can at best be
-    their mean, which is 28 dB from both. Degree 2 can be each of them."""
+    their mean, which is 28 dB from both. Degree 3 can be each of them."""
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
     behind[2, 3] = 2.0
     pictures = [
@@ -113,14 +118,14 @@ def test_view_dependence_needs_more_than_a_constant_colour():
     # splats that move could hide one layer behind another
     colours_only = LearningRates(0.0, 0.0, 0.0, 0.0, 3e-2, 3e-2)
     worst = {}
-    for degree in (0, 2):
+    for degree in (0, 3):
         renders = fit(pictures, grid(8), 600, colours_only, degree)
         worst[degree] = min(
             psnr(image[8:40, 8:40], picture[8:40, 8:40])
             for image, (picture, _) in zip(renders, pictures, strict=True)
         )
-    assert worst[0] < 28
-    assert worst[2] > 35
+    assert 26 < worst[0] < 28
+    assert worst[3] > 35
 
 
 def small_problem(tmp_path, name, report=None, steps=60, backend="cpu"):
