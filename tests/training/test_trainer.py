@@ -18,6 +18,7 @@ from stages.scene import Look, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training import cap
 from stages.training.checkpoint import MAGIC
+from stages.training.clock import Clock, Spent
 from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -167,6 +168,27 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, stop_at):
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
     assert second.history == whole.history
+
+
+def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its_own(tmp_path):
+    report = Report()
+    t, start = small_problem(tmp_path, "parts", report, steps=40)
+
+    def stop(label, done, total, numbers):
+        if done == 20:
+            t.clock = Clock(Spent(100.0, 300.0))  # as if it had taken so long
+            report.stop_requested.set()
+
+    report.listener = stop
+    with pytest.raises(Interrupted):
+        t.run(start)
+    second, start = small_problem(tmp_path, "parts", steps=40)
+    second.run(start)
+    seconds = [spent.seconds for spent in second.times]
+    assert len(second.times) == len(second.history) == EVALUATIONS
+    assert seconds == sorted(seconds)
+    assert 0 < seconds[4] < 100 < seconds[5]
+    assert second.times[-1].cpu_seconds > 300
 
 
 def test_looking_on_does_not_change_what_is_trained(tmp_path):
