@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PSNR = "held-out PSNR (dB)"
+_CLOSE, _CLOSE_DB = 1.4, 0.02  # of sizes, and of PSNR: what labels need to stand apart
 
 
 def write_plots(folder: Path, trade: Trade) -> list[Path]:
@@ -52,16 +53,33 @@ def _formats(trade: Trade) -> Figure:
     figure, axes = new_plot("The same splats in each file format", "file size (MB)", _PSNR)
     for point in trade.formats:
         written = point.label.removeprefix(".") in trade.exported
-        colour = ORANGE if written else BLUE
-        x = (point.size_bytes or 0) / 1e6
-        _with_bars(axes, [x], [point], colour, "o")
-        axes.annotate(
-            point.label, (x, point.psnr_db), (4, 5), textcoords="offset points", fontsize=8
-        )
+        _with_bars(axes, [_megabytes(point)], [point], ORANGE if written else BLUE, "o")
+    for alike in _alike(trade.formats):
+        place = (_megabytes(alike[0]), alike[0].psnr_db)
+        names = "\n".join(point.label for point in alike)
+        axes.annotate(names, place, (5, -3), textcoords="offset points", fontsize=8, va="top")
     axes.axhline(trade.own.psnr_db, color=GREY, linewidth=0.8, linestyle=":")
+    axes.margins(x=0.1)
     _logarithmic(axes)
     _legend(axes, ("other formats", BLUE), ("written by this run", ORANGE))
     return figure
+
+
+def _megabytes(point: Point) -> float:
+    return (point.size_bytes or 0) / 1e6
+
+
+def _alike(points: Sequence[Point]) -> list[list[Point]]:
+    """Points, smallest first, in groups that lie too close to be labelled one by one."""
+    groups: list[list[Point]] = []
+    for point in points:
+        first = groups[-1][0] if groups else None
+        near = first is not None and _megabytes(point) < _CLOSE * _megabytes(first)
+        if first is not None and near and abs(point.psnr_db - first.psnr_db) < _CLOSE_DB:
+            groups[-1].append(point)
+        else:
+            groups.append([point])
+    return groups
 
 
 def _splats(trade: Trade) -> Figure:

@@ -11,7 +11,7 @@ CHEAP_DB = 0.1  # a loss that few would see
 NO_TIMES = "Training kept no times (an older splat trained this run): `splat train` again has them."
 NOT_FINE_TUNED = (
     "Splats were only taken away: nothing was fine-tuned afterwards. Training with so few from the "
-    "start, or going on after the cut, loses less; the figures are a floor."
+    "start, or going on after the cut, loses less: the losses are upper bounds."
 )
 
 
@@ -50,13 +50,13 @@ def about_formats(trade: Trade) -> list[str]:
     if cheap and cheap[0] not in whole:
         told.append(
             f"{cheap[0].label} is the smallest within {CHEAP_DB:g} dB: {_share(cheap[0], largest)} "
-            f"of {largest.label} {costs(cheap[0].change)}."
+            f"of {largest.label}; it {costs(cheap[0].change)}."
         )
     smallest = trade.formats[0]
     if smallest not in (*whole[:1], *cheap[:1]):
         told.append(
             f"{smallest.label} is the smallest of all: {_share(smallest, largest)} of "
-            f"{largest.label} {costs(smallest.change)}."
+            f"{largest.label}; it {costs(smallest.change)}."
         )
     return told
 
@@ -113,7 +113,7 @@ def _toward(end: float, mean: float) -> float:
 
 
 def _less(point: Point, own: Point) -> str:
-    return f"{point.splats / own.splats:.0%} of the splats {costs(point.change)}"
+    return f"having {point.splats / own.splats:.0%} of the splats {costs(point.change)}"
 
 
 def _share(point: Point, of: Point) -> str:
