@@ -204,12 +204,52 @@ def info(
     target: Annotated[
         Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
     ] = None,
+    speed: Annotated[
+        bool, typer.Option("--speed", help="Draw some pictures too: frames a second, here.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Count the splats of a file or a run: degrees, bounds, bytes, and what is wrong with them."""
     from splatcli.commands import info as work
 
-    work.show(target, as_json)
+    work.show(target, speed, as_json)
+
+
+def tradeoff(
+    run: Run = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for the report.", show_default="RUN/tradeoff"),
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what time, bytes and splats are worth in this scene: a report with plots.
+
+    Judged on photographs that training never saw. Nothing is trained: the course of training comes
+    from its log, files are really written and read, splats are taken away by what they are worth.
+    """
+    from splatcli.commands import tradeoff as work
+
+    work.tradeoff(run, out, quiet, as_json)
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(help="Run folder.")],
+    second: Annotated[Path, typer.Argument(help="Another, of the same photographs.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path(
+        "comparison"
+    ),
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Put two runs side by side: better, worse, or not told apart.
+
+    Both are judged at one size on photographs that neither learnt from, photograph by photograph.
+    """
+    from splatcli.commands import compare as work
+
+    work.compare(first, second, out, quiet, as_json)
 
 
 def convert(
@@ -289,6 +329,8 @@ def _register() -> None:
         (render, "splat render run/ --path orbit --out film.mp4"),
         (view, "splat view run/"),
         (info, "splat info run/7-export/scene.ply"),
+        (tradeoff, "splat tradeoff run/"),
+        (compare, "splat compare run/ other-run/"),
         (convert, "splat convert scene.ply scene.sog"),
         (verify, "splat verify run/7-export/scene.glb"),
         (cameras, "splat cameras run/ transforms.json"),

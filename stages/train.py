@@ -212,6 +212,11 @@ def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
             f"{h['step']},{h['splats']},{h.get('psnr_db', float('nan')):.4f},"
             f"{h.get('ssim', float('nan')):.5f}"
         )
+    # With the time that each took, which no two runs share, in the manifest alone.
+    report.metric(
+        "history",
+        [h | asdict(t) for h, t in zip(trainer.history, trainer.times, strict=True)],
+    )
     with replacing(folder / "history.csv") as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     training_plot(folder / "training.png", trainer.history)
@@ -241,5 +246,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="train", version=4, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=5, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

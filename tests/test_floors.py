@@ -23,6 +23,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "stages.seeding",
         "stages.training",
         "stages.proof",
+        "stages.trade",
         "stages.surface",
         "stages.film",
     ),

@@ -6,7 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatcli import console
-from splatcli.sources import newest_with_splats, splats_of
+from splatcli.sources import backend_of, newest_with_splats, pipeline_around, splats_of
+from splatcli.viewpoints import views_of
+from stages.kernels import cache
+from stages.raster.backends import backend_of as chosen_backend
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -21,9 +24,12 @@ _ATTRIBUTES = {
     "sh": "colours",
 }
 
+_TIMED_FRAMES = 8
 
-def show(target: Path | None, as_json: bool) -> None:
-    """Print counts, degrees, bounds, bytes and warnings of a file or of a run's newest splats.
+
+def show(target: Path | None, speed: bool, as_json: bool) -> None:
+    """Print counts, degrees, bounds, bytes and warnings of a file or of a run's newest splats;
+    speed: also how fast they are drawn here.
 
     Raises SplatError for what cannot be read; values that are not finite are warned of.
     """
@@ -36,6 +42,8 @@ def show(target: Path | None, as_json: bool) -> None:
         facts = {**_about_file(target, len(splats)), **facts}
     if pipeline is not None:
         facts = {**_about_run(pipeline), **facts}
+    if speed and census.count:
+        facts |= _speed(splats, pipeline or pipeline_around(target))
     warnings = warnings_of(census)
     if as_json:
         console.emit("info", **facts, warnings=dict(warnings))
@@ -61,7 +69,50 @@ def describe(splats: Splats, census: Census) -> dict[str, Any]:
         facts["median_scale"] = census.median_scale
         facts["median_opacity"] = census.median_opacity
     facts["origin"] = [float(value) for value in splats.origin]
-    return facts
+    return facts | _cost(splats)
+
+
+def _cost(splats: Splats) -> dict[str, Any]:
+    """What they take in memory, and the few numbers that explain a splat."""
+    from stages.proof.cost import DEGREES, floats_of, mass_within, memory_of
+
+    one, every = (memory_of(splats.sh_degree, count) for count in (1, len(splats)))
+    return {
+        "floats_per_splat": floats_of(splats.sh_degree),
+        "floats_per_splat_by_degree": {str(degree): floats_of(degree) for degree in DEGREES},
+        "memory_bytes_per_splat": {
+            "float32": one.single,
+            "half precision": one.half,
+            "while trained": one.trained,
+        },
+        "memory": {
+            "float32": console.size(every.single),
+            "half precision": console.size(every.half),
+            "while trained": console.size(every.trained),
+        },
+        "mass_within_sigmas": {str(n): f"{mass_within(n):.1%}" for n in (1, 2, 3)},
+    }
+
+
+def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
+    """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
+    around the splats where there are none."""
+    from stages.measure.speed import seconds_a_frame
+    from stages.scene.framing import around
+
+    if not cache.are_compiled():
+        console.note("Compiling the kernels; this is done once and takes about half a minute.")
+    views = views_of(pipeline)
+    chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
+    cameras = [splats.look.camera(v.camera) for v in chosen] or around(splats, _TIMED_FRAMES, 0.9)
+    backend = backend_of(pipeline)
+    seconds = seconds_a_frame(splats, cameras, backend)
+    return {
+        "frames_a_second": round(1 / float(seconds.mean()), 2),
+        "frame_size": f"{cameras[0].width} x {cameras[0].height}",
+        "frames_timed": len(cameras),
+        "drawn_by": chosen_backend(backend).name,
+    }
 
 
 def warnings_of(census: Census) -> list[tuple[str, str]]:

@@ -70,8 +70,10 @@ def render(target: Path | None, wanted: Wanted) -> None:
         sink = sinks.folder_sink(out, len(cameras), wanted.depth)
     else:
         sink = sinks.picture_sink(out, wanted.depth)
-    _draw_all(draw, cameras, sink, wanted)
+    rate = _draw_all(draw, cameras, sink, wanted)
     facts |= {"frames": len(cameras), "width": cameras[0].width, "height": cameras[0].height}
+    if rate is not None:
+        facts["frames_a_second"] = round(rate, 2)
     facts |= {"splats": len(splats), "seconds": round(time.monotonic() - begun, 2)}
     _tell(wanted, kind, facts)
 
@@ -81,12 +83,19 @@ def _draw_all(
     cameras: list[Camera],
     sink: AbstractContextManager[Callable[[Rendering], None]],
     wanted: Wanted,
-) -> None:
+) -> float | None:
+    """Frames drawn in a second, writing left out; None for a single one, since the first readies
+    kernels and buffers."""
     quiet = wanted.quiet or (len(cameras) == 1 and not wanted.as_json)
+    seconds = []
     with counting("frames", len(cameras), quiet, wanted.as_json) as tick, sink as put:
         for camera in cameras:
-            put(draw(camera))
+            begun = time.perf_counter()
+            drawn = draw(camera)
+            seconds.append(time.perf_counter() - begun)
+            put(drawn)
             tick()
+    return len(seconds[1:]) / sum(seconds[1:]) if len(seconds) > 1 else None
 
 
 def _tell(wanted: Wanted, kind: str, facts: dict[str, Any]) -> None:
@@ -101,7 +110,9 @@ def _tell(wanted: Wanted, kind: str, facts: dict[str, Any]) -> None:
         return
     many = f"{facts['frames']} frames, " if kind != "picture" else ""
     size = f"{facts['width']} x {facts['height']}"
-    console.note(f"{wanted.out}: {many}{size}, {facts['splats']:,} splats")
+    told = facts.get("frames_a_second")
+    rate = f", drawn at {told:.3g} frames a second" if told else ""
+    console.note(f"{wanted.out}: {many}{size}, {facts['splats']:,} splats{rate}")
     if "depth_near" in facts:
         ends = f"{facts['depth_near']:.3g} to {facts['depth_far']:.3g}"
         console.note(f"Depth, light to dark: {ends} world units")

@@ -43,31 +43,24 @@ def contact_sheet(
 
 
 def training_plot(path: Path, history: list[dict[str, Any]]) -> None:
-    """A PNG of held-out PSNR (dB) and number of splats over the steps."""
-    import cv2
+    """A PNG of held-out PSNR (dB) and number of splats over the steps; none without two figures."""
+    from stages.measure.plots import BLUE, ORANGE, new_plot, write_plot
 
     points = [h for h in history if "psnr_db" in h]
     if len(points) < 2:
         return
-    height, width, margin = 360, 640, 56
-    canvas = np.full((height, width, 3), 255, np.uint8)
-    steps = np.array([h["step"] for h in points], float)
-    for values, colour, label, x in (
-        (np.array([h["psnr_db"] for h in points]), (200, 60, 20), "held-out PSNR, dB", margin),
-        (np.array([h["splats"] for h in points], float), (40, 110, 200), "splats", width // 2),
-    ):
-        low, high = float(values.min()), float(max(values.max(), values.min() + 1e-9))
-        xs = margin + (steps - steps[0]) / (steps[-1] - steps[0]) * (width - 2 * margin)
-        ys = height - margin - (values - low) / (high - low) * (height - 2 * margin)
-        line = np.round(np.stack([xs, ys], 1)).astype(np.int32)
-        cv2.polylines(canvas, [line], False, colour, 2, cv2.LINE_AA)
-        text = f"{label}: {low:.4g} to {values[-1]:.4g}"
-        cv2.putText(canvas, text, (x, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
-    cv2.rectangle(canvas, (margin, margin), (width - margin, height - margin), (180,) * 3, 1)
-    text = f"step {int(steps[0])} to {int(steps[-1])}"
-    at = (width // 2 - 60, height - 20)
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60,) * 3, 1, cv2.LINE_AA)
-    _write_png(path, canvas)
+    steps = [h["step"] for h in points]
+    figure, quality = new_plot("The course of training", "step", "held-out PSNR (dB)")
+    counts = quality.twinx()
+    counts.set_ylabel("splats")
+    lines = [
+        *quality.plot(steps, [h["psnr_db"] for h in points], "o-", color=BLUE, ms=4),
+        *counts.plot(steps, [h["splats"] for h in points], "s--", color=ORANGE, ms=3),
+    ]
+    counts.set_ylim(bottom=0)
+    counts.yaxis.set_major_formatter("{x:,.0f}")
+    quality.legend(lines, ["held-out PSNR", "splats"], loc="lower right")
+    write_plot(path, figure)
 
 
 def _fitted(image: NDArray[np.float32]) -> NDArray[np.uint8]:

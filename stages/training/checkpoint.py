@@ -11,20 +11,25 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
+from stages.training.clock import Spent
 from stages.training.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP2"
+MAGIC = b"SPLATCP3"
 
 
-def save_checkpoint(folder: Path, model: Model, step: int, history: list[dict[str, Any]]) -> None:
+def save_checkpoint(
+    folder: Path, model: Model, step: int, history: list[dict[str, Any]], times: list[Spent]
+) -> None:
     """Write the state after `step` steps; a checkpoint that stands there stays until this is whole.
+    times: of each entry of the history, and, last, now.
 
     Random numbers and schedules depend on the seed and the step alone, so they need no place.
     """
     temporary = folder / (FILE_NAME + ".tmp")
     with temporary.open("wb") as file:
-        header = json.dumps({"step": step, "history": history}).encode()
+        spent = [[t.seconds, t.cpu_seconds] for t in times]
+        header = json.dumps({"step": step, "history": history, "times": spent}).encode()
         file.write(MAGIC + len(header).to_bytes(8, "little") + header)
         for array in vars(model).values():
             npy.write_array(file, array, allow_pickle=False)
@@ -33,8 +38,8 @@ def save_checkpoint(folder: Path, model: Model, step: int, history: list[dict[st
     os.replace(temporary, folder / FILE_NAME)
 
 
-def load_checkpoint(folder: Path) -> tuple[Model, int, list[dict[str, Any]]] | None:
-    """(model, steps done, history), or None where there is none or it cannot be read."""
+def load_checkpoint(folder: Path) -> tuple[Model, int, list[dict[str, Any]], list[Spent]] | None:
+    """(model, steps done, history, times), or None where there is none or it cannot be read."""
     try:
         with (folder / FILE_NAME).open("rb") as file:
             if file.read(8) != MAGIC:
@@ -43,7 +48,8 @@ def load_checkpoint(folder: Path) -> tuple[Model, int, list[dict[str, Any]]] | N
             arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
     except (OSError, ValueError, EOFError, MemoryError):
         return None
-    return Model(*(np.ascontiguousarray(a) for a in arrays)), int(header["step"]), header["history"]
+    model = Model(*(np.ascontiguousarray(a) for a in arrays))
+    return model, int(header["step"]), header["history"], [Spent(*t) for t in header["times"]]
 
 
 def remove_checkpoint(folder: Path) -> None:

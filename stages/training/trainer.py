@@ -20,6 +20,7 @@ from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import Camera, Look, Splats, morton
 from stages.training.checkpoint import load_checkpoint, save_checkpoint
+from stages.training.clock import Clock, Spent
 from stages.training.densify import densify, reset_opacities
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.schedule import THRESHOLD, Schedule
@@ -49,6 +50,7 @@ class Trainer:
     def __post_init__(self) -> None:
         self.stepper = step_of(self.backend)
         self.history: list[dict[str, Any]] = []
+        self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
 
     def run(self, start: Splats) -> Model:
         """Train from `start`, or go on from the folder's checkpoint; the finished model.
@@ -56,6 +58,7 @@ class Trainer:
         Raises Interrupted at a step boundary, checkpoint written, when the report asks to stop.
         """
         self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
+        self.clock = Clock()
         step = self._begin(start)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
@@ -67,10 +70,10 @@ class Trainer:
             if self.schedule.resets_after(step - 1):  # once its pictures have been judged
                 self._reset_opacities()
             if self.report.stop_requested.is_set() and step < self.schedule.steps:
-                save_checkpoint(self.folder, self.model, step, self.history)
+                self._save(step)
                 raise Interrupted(f"train stopped after step {step} of {self.schedule.steps}")
             if time.monotonic() - last_saved > CHECKPOINT_SECONDS:
-                save_checkpoint(self.folder, self.model, step, self.history)
+                self._save(step)
                 last_saved = time.monotonic()
             self._tick(step, loss)
             self.report.offer(partial(self.draw, step))
@@ -85,12 +88,17 @@ class Trainer:
         """Have the stepper hold the model to go on with; the steps that it has had."""
         saved = load_checkpoint(self.folder)
         if saved is not None:
-            model, step, self.history = saved
+            model, step, self.history, (*self.times, spent) = saved
+            self.clock = Clock(spent)
             self.report.metric("resumed_from_step", step)
         else:
             model, step = self._first(start), 0
         self.stepper.load(model)
         return step
+
+    def _save(self, step: int) -> None:
+        times = [*self.times, self.clock.spent()]
+        save_checkpoint(self.folder, self.model, step, self.history, times)
 
     def _first(self, start: Splats) -> Model:
         start = start.with_sh_degree(self.schedule.sh_degree)
@@ -156,6 +164,7 @@ class Trainer:
             entry["psnr_db"] = float(np.mean([score.psnr_db for score in found]))
             entry["ssim"] = float(np.mean([score.ssim for score in found]))
         self.history.append(entry)
+        self.times.append(self.clock.spent())
 
     def drawn(self, camera: Camera) -> NDArray[np.float32]:
         """[H, W, 3] of the model as it is, with all of its view-dependent colour."""

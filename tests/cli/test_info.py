@@ -107,3 +107,25 @@ def test_a_usd_file_that_is_not_finite_is_described_too(tmp_path: Path) -> None:
     place = text.index("positions = [(") + len("positions = [(")
     path.write_text(text[:place] + "nan" + text[text.index(",", place) :])
     assert info(path)["warnings"]["not-finite-positions"].startswith("1 splats")
+
+
+def test_what_a_splat_costs_is_told_at_its_own_degree(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(1000))  # degree 3
+    formats.write(tmp_path / "a.splat", many_splats(1000))  # degree 0
+    told, plain = info(tmp_path / "a.ply"), info(tmp_path / "a.splat")
+    assert (told["floats_per_splat"], plain["floats_per_splat"]) == (59, 14)
+    assert told["floats_per_splat_by_degree"] == {"0": 14, "1": 23, "2": 38, "3": 59}
+    assert list(told["memory_bytes_per_splat"].values()) == [236, 118, 944]
+    assert list(told["memory"].values()) == ["236.0 kB", "118.0 kB", "944.0 kB"]
+    assert list(told["mass_within_sigmas"].values()) == ["39.3%", "86.5%", "98.9%"]
+
+
+def test_speed_is_measured_when_asked_for_and_says_of_what(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    formats.write(path, many_splats(300))
+    assert "frames_a_second" not in info(path)
+    result = CliRunner().invoke(app, ["info", str(path), "--speed", "--json"])
+    told = json.loads(result.stdout)
+    assert told["frames_a_second"] > 0
+    assert (told["frame_size"], told["frames_timed"]) == ("960 x 720", 8)
+    assert told["splats"] == 300

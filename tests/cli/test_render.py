@@ -70,6 +70,7 @@ def test_a_film_shows_what_the_pictures_show(splat, scene: Path, captured) -> No
     told = last_event(splat(*words, "--out", "a.mp4", "--fps", "12", "--json"))
     splat(*words, "--out", "frames", "--width", "64")
     assert (told["frames"], told["width"], told["height"]) == (4, 64, 48)  # even
+    assert told["frames_a_second"] > 0
     film = frames_of(Path("a.mp4"))
     assert cv2.VideoCapture("a.mp4").get(cv2.CAP_PROP_FPS) == 12
     names = sorted(path.name for path in Path("frames").iterdir())

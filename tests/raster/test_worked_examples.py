@@ -69,6 +69,19 @@ def test_twice_the_depth_halves_the_footprint(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_the_mass_of_a_drawn_splat_within_one_two_and_three_sigma(backend):
+    """39.3, 86.5 and 98.9 % of 2 pi sigma^2 times its opacity."""
+    sigma = 30.0
+    view = camera(201, 201, 60.0)
+    scene = splats((0, 0, 4.0), scales=4.0 * sigma / 60.0, opacities=0.99)
+    alpha = render(scene, view, NO_DILATION, backend).alpha
+    ys, xs = np.mgrid[:201, :201] - 100.0
+    mass = 2 * np.pi * sigma**2 * 0.99
+    within = [alpha[np.hypot(xs, ys) <= n * sigma].sum() / mass for n in (1, 2, 3)]
+    np.testing.assert_allclose(within, (0.393, 0.865, 0.989), atol=0.003)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     ("alphas", "weights", "residual"),
     [((0.6, 0.5, 0.2), (0.6, 0.2, 0.04), 0.16), ((0.5, 0.4, 0.25), (0.5, 0.2, 0.075), 0.225)],

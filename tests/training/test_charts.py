@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from stages.measure import plots
 from stages.training import charts
 
 
@@ -30,4 +31,27 @@ def test_contact_sheet_never_shows_a_name_that_its_font_cannot_draw(
 
 def test_contact_sheet_of_nothing_is_none(tmp_path: Path) -> None:
     charts.contact_sheet(tmp_path / "held_out.png", [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_plot_of_training_has_axes_units_and_a_legend(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = []
+    write = plots.write_plot
+    monkeypatch.setattr(
+        plots, "write_plot", lambda p, figure: (shown.append(figure), write(p, figure))
+    )
+    history = [{"step": s, "splats": 10 * s, "psnr_db": 20.0 + s / 100} for s in (100, 200, 300)]
+    charts.training_plot(tmp_path / "a.png", history)
+    quality, counts = shown[0].axes
+    assert (quality.get_xlabel(), quality.get_ylabel()) == ("step", "held-out PSNR (dB)")
+    assert counts.get_ylabel() == "splats"
+    assert [t.get_text() for t in quality.get_legend().get_texts()] == ["held-out PSNR", "splats"]
+    charts.training_plot(tmp_path / "b.png", history)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_no_plot_of_training_without_held_out_photographs(tmp_path: Path) -> None:
+    charts.training_plot(tmp_path / "a.png", [{"step": s, "splats": 5} for s in (1, 2, 3)])
     assert not list(tmp_path.iterdir())

@@ -18,6 +18,7 @@ from stages.scene import Look, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training import cap
 from stages.training.checkpoint import MAGIC
+from stages.training.clock import Clock, Spent
 from stages.training.densify import densify
 from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -93,17 +94,22 @@ def fit(pictures, scene, steps, rates, degree=0):
     return renders
 
 
-@pytest.mark.parametrize(("side", "worst"), [(4, 0.04), (8, 0.006), (16, 0.002)])
-def test_more_splats_fit_a_disc_and_a_square_better(side, worst):
-    """About 0.02 with 16 splats, low 1e-3 with 64, 0.001 to 0.002 with 256."""
+def test_more_splats_fit_a_disc_and_a_square_better():
+    """Mean squared error about 0.02 with 16 splats, low 1e-3 with 64, 0.001 to 0.002 with 256."""
     picture = disc_and_square()
-    (image,) = fit([(picture, camera(48, 48))], grid(side), 800, TOY_RATES)
-    assert float(np.mean((image - picture) ** 2)) < worst
+    errors = []
+    for side in (4, 8, 16):
+        (image,) = fit([(picture, camera(48, 48))], grid(side), 800, TOY_RATES)
+        errors.append(float(np.mean((image - picture) ** 2)))
+    assert errors == sorted(errors, reverse=True)
+    assert 0.006 < errors[0] < 0.04
+    assert errors[1] < 0.006
+    assert errors[2] < 0.002
 
 
 def test_view_dependence_needs_more_than_a_constant_colour():
     """Two greys 0.08 apart, seen from the front and the back: one constant colour can at best be
-    their mean, which is 28 dB from both. Degree 2 can be each of them."""
+    their mean, which is 28 dB from both. Degree 3 can be each of them."""
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
     behind[2, 3] = 2.0
     pictures = [
@@ -113,14 +119,14 @@ def test_view_dependence_needs_more_than_a_constant_colour():
     # splats that move could hide one layer behind another
     colours_only = LearningRates(0.0, 0.0, 0.0, 0.0, 3e-2, 3e-2)
     worst = {}
-    for degree in (0, 2):
+    for degree in (0, 3):
         renders = fit(pictures, grid(8), 600, colours_only, degree)
         worst[degree] = min(
             psnr(image[8:40, 8:40], picture[8:40, 8:40])
             for image, (picture, _) in zip(renders, pictures, strict=True)
         )
-    assert worst[0] < 28
-    assert worst[2] > 35
+    assert 26 < worst[0] < 28
+    assert worst[3] > 35
 
 
 def small_problem(tmp_path, name, report=None, steps=60, backend="cpu"):
@@ -162,6 +168,27 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, stop_at):
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
     assert second.history == whole.history
+
+
+def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its_own(tmp_path):
+    report = Report()
+    t, start = small_problem(tmp_path, "parts", report, steps=40)
+
+    def stop(label, done, total, numbers):
+        if done == 20:
+            t.clock = Clock(Spent(100.0, 300.0))  # as if it had taken so long
+            report.stop_requested.set()
+
+    report.listener = stop
+    with pytest.raises(Interrupted):
+        t.run(start)
+    second, start = small_problem(tmp_path, "parts", steps=40)
+    second.run(start)
+    seconds = [spent.seconds for spent in second.times]
+    assert len(second.times) == len(second.history) == EVALUATIONS
+    assert seconds == sorted(seconds)
+    assert 0 < seconds[4] < 100 < seconds[5]
+    assert second.times[-1].cpu_seconds > 300
 
 
 def test_looking_on_does_not_change_what_is_trained(tmp_path):

@@ -1,0 +1,86 @@
+"""`splat compare`: two runs of the same photographs, and whether they can be told apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatcli import console, sources
+from splatcli.folders import find_run_folder
+from stages.base.errors import Family, SplatError
+from stages.kernels import cache
+from stages.run.pipeline import Pipeline
+from stages.run.planning import PHOTOS
+
+if TYPE_CHECKING:
+    from stages.trade.pair import Side
+
+
+def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
+    """Judge both, write the report into `out`, print the verdict.
+
+    Raises SplatError: stage-not-finished, compare-other-photographs, compare-nothing-in-common,
+    and what keeps files from being written."""
+    from stages.base.atomic import make_folder
+    from stages.trade.pair import default_name, pair, verdict
+    from stages.trade.pair_report import facts, write_pair
+
+    runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
+    _check_photographs(*runs)
+    sides = [
+        _side(run, default_name(run.run_folder, other.run_folder))
+        for run, other in zip(runs, reversed(runs), strict=True)
+    ]
+    if not quiet and not as_json and not cache.are_compiled():
+        console.note("Compiling the kernels; this is done once and takes about half a minute.")
+    pairing = pair(sides[0], sides[1])
+    make_folder(out)
+    files = write_pair(out, pairing)
+    if as_json:
+        change = pairing.psnr
+        console.emit(
+            "compared",
+            verdict=change.verdict,
+            psnr_change_db=change.mean,
+            interval_db=[change.low, change.high] if change.photographs > 1 else None,
+            photographs=change.photographs,
+            files=[str(file) for file in files],
+        )
+        return
+    if not quiet:
+        console.table(("", sides[0].name, sides[1].name), facts(pairing))
+    for line in verdict(pairing):
+        console.out.print(line, markup=False)
+    console.out.print(str(files[0]), markup=False)
+
+
+def _check_photographs(first: Pipeline, second: Pipeline) -> None:
+    """Raises SplatError (stage-not-finished, compare-other-photographs)."""
+    digests = []
+    for run in (first, second):
+        run.load("quantise")  # the last that compares; says what has not finished
+        manifest = run.manifest("ingest")
+        digests.append(manifest.inputs.get(PHOTOS) if manifest else None)
+    if digests[0] != digests[1]:
+        raise SplatError(
+            "compare-other-photographs",
+            given=f"{first.run_folder} and {second.run_folder} were made from other photographs.",
+            wanted="Two runs of the same photographs: others are not equally hard to draw.",
+            hint="Run `splat process` on the same folder twice, with another --out.",
+            family=Family.USAGE,
+        )
+
+
+def _side(run: Pipeline, name: str) -> Side:
+    from stages.trade.pair import Side
+
+    splats = run.load("quantise").splats
+    told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
+    trained, exported = run.manifest("train"), run.manifest("export")
+    if trained is not None:
+        told["training"] = console.duration(trained.seconds)
+        told["steps"] = f"{trained.settings['steps']:,}"
+        told["seed"] = str(trained.settings["seed"])
+    for ending, figures in (exported.metrics.get("formats", {}) if exported else {}).items():
+        told[f".{ending}"] = console.size(figures["size_bytes"])
+    return Side(name, splats, run.load("sfm"), sources.backend_of(run), told)

@@ -1,0 +1,28 @@
+"""Time that training took, over interruptions."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Spent:
+    """Wall seconds, and CPU seconds of all threads of this process."""
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+
+class Clock:
+    """Runs from when it is made, on top of what was spent before."""
+
+    def __init__(self, before: Spent | None = None) -> None:
+        self._before = before or Spent()
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def spent(self) -> Spent:
+        return Spent(
+            self._before.seconds + time.monotonic() - self._wall,
+            self._before.cpu_seconds + time.process_time() - self._cpu,
+        )

@@ -1,0 +1,116 @@
+"""`splat tradeoff` and `splat compare`: what is printed, and runs that cannot be measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stages
+from stages.base.stage import Report, Stage
+from stages.run import pipeline
+from stages.scene.storage import save_splats
+from tests.small_scene import small_scene
+
+Splat = Callable[..., Any]
+
+
+@pytest.fixture
+def views() -> dict[str, int]:
+    """How many photographs the next run has; more than four hold one out."""
+    return {"count": 10}
+
+
+@pytest.fixture
+def splat(splat: Splat, monkeypatch: pytest.MonkeyPatch, views: dict[str, int]) -> Splat:
+    """Runs of a little scene: its cameras and photographs stand there, training to export are real
+    but short. `splat("process", ...)` ends after seconds."""
+
+    def sfm(inputs: Any, settings: Any, folder: Path, report: Report) -> None:
+        small_scene(folder, views["count"])
+
+    def load_sfm(folder: Path) -> Any:
+        return replace(small_scene(folder, views["count"]).reconstruction, origin=np.zeros(3))
+
+    def seed(inputs: Any, settings: Any, folder: Path, report: Report) -> Any:
+        scene = small_scene(folder, views["count"]).splats.with_sh_degree(0)
+        save_splats(folder, scene)
+        return scene
+
+    def load_stage(name: str) -> Stage:
+        real = stages.load_stage(name)
+        if name == "ingest":
+            return replace(real, run=lambda *_: None, load=lambda folder: None)
+        if name == "sfm":
+            return replace(real, run=sfm, load=load_sfm)
+        return replace(real, run=seed) if name == "seed" else real
+
+    monkeypatch.setattr(pipeline, "load_stage", load_stage)
+    return splat
+
+
+SHORT = ("--steps", "40", "--train-side", "72", "--max-splats", "300")
+
+
+def made(splat: Splat, run: str, *more: str) -> None:
+    result = splat("process", "photos", "--out", run, *SHORT, "--format", "ply", *more)
+    assert result.exit_code == 0, result.output
+
+
+def failed(result: Any) -> str:
+    assert result.exit_code not in (0, 1), result.output
+    return str(json.loads(result.stdout.splitlines()[-1])["code"])
+
+
+def test_the_trade_is_printed_and_its_report_lies_in_the_run(splat: Splat) -> None:
+    made(splat, "run")
+    result = splat("tradeoff", "run")
+    assert result.exit_code == 0, result.output
+    assert Path("run/tradeoff/report.html").is_file()
+    assert str(Path("run/tradeoff/report.html")) in result.stdout
+    assert "CPU" in result.stdout  # the log of training has times
+    assert "nothing was fine-tuned" in result.stdout
+    status = json.loads(splat("status", "run", "--json").stdout)
+    assert {row["state"] for row in status["stages"]} == {"finished"}
+
+
+def test_a_run_without_held_out_photographs_is_told_in_words(splat: Splat, views) -> None:
+    views["count"] = 3
+    made(splat, "run")
+    assert failed(splat("tradeoff", "run", "--json")) == "nothing-held-out"
+
+
+def test_an_unfinished_run_is_told_in_words(splat: Splat) -> None:
+    assert splat("ingest", "photos", "--out", "run").exit_code == 0
+    assert failed(splat("tradeoff", "run", "--json")) == "stage-not-finished"
+    assert failed(splat("compare", "run", "run", "--json")) == "stage-not-finished"
+    assert failed(splat("tradeoff", "nowhere", "--json")) == "run-folder-missing"
+
+
+def test_a_run_compared_with_itself_is_not_told_apart(splat: Splat) -> None:
+    made(splat, "run")
+    result = splat("compare", "run", "run", "--json")
+    told = json.loads(result.stdout)
+    assert told["verdict"] == "not told apart"
+    assert told["psnr_change_db"] == 0
+    assert Path("comparison/report.html").is_file()
+
+
+def test_runs_of_other_photographs_are_not_compared(splat: Splat) -> None:
+    made(splat, "one")
+    Path("photos/a.jpg").write_text("b")
+    made(splat, "two")
+    assert failed(splat("compare", "one", "two", "--json")) == "compare-other-photographs"
+
+
+def test_two_runs_are_named_by_their_folders(splat: Splat) -> None:
+    made(splat, "one")
+    made(splat, "two", "--seed", "3")
+    result = splat("compare", "one", "two")
+    assert result.exit_code == 0, result.output
+    assert "two against one:" in result.stdout
