@@ -1,5 +1,8 @@
 """Curves whose answers are known by hand."""
 
+from typing import Any, cast
+
+import numpy as np
 import pytest
 
 from stages.measure.bootstrap import paired_difference
@@ -42,7 +45,7 @@ def test_a_curve_that_pays_more_and_more_has_no_knee():
 
 
 def test_a_loss_is_told_as_a_cost_and_its_interval_the_same_way_round():
-    change = paired_difference([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19])
+    change = paired_difference(np.array([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19]))
     told = words.costs(change)
     assert told.startswith("costs 0.20 dB (95 %: 0.1")
     low, high = (float(x) for x in told.split("%: ")[1].rstrip(")").split(" to "))
@@ -50,8 +53,8 @@ def test_a_loss_is_told_as_a_cost_and_its_interval_the_same_way_round():
 
 
 def test_one_photograph_makes_no_interval():
-    assert words.costs(paired_difference([-0.2])) == "costs 0.20 dB (one judge)"
-    assert words.costs(paired_difference([0.2])) == "gains 0.20 dB (one judge)"
+    assert words.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (one judge)"
+    assert words.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one judge)"
 
 
 @pytest.mark.parametrize("moment_count", [0, 1])
@@ -59,4 +62,4 @@ def test_a_run_without_a_log_says_so(moment_count):
     class OfNothing:
         moments = tuple(globals()["moments"](20.0)[:moment_count])
 
-    assert words.about_time(OfNothing()) == [words.NO_TIMES]
+    assert words.about_time(cast(Any, OfNothing())) == [words.NO_TIMES]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,11 +38,14 @@ def test_contact_sheet_of_nothing_is_none(tmp_path: Path) -> None:
 def test_the_plot_of_training_has_axes_units_and_a_legend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shown = []
+    shown: list[Any] = []
     write = plots.write_plot
-    monkeypatch.setattr(
-        plots, "write_plot", lambda p, figure: (shown.append(figure), write(p, figure))
-    )
+
+    def watched(path: Path, figure: Any) -> None:
+        shown.append(figure)
+        write(path, figure)
+
+    monkeypatch.setattr(plots, "write_plot", watched)
     history = [{"step": s, "splats": 10 * s, "psnr_db": 20.0 + s / 100} for s in (100, 200, 300)]
     charts.training_plot(tmp_path / "a.png", history)
     quality, counts = shown[0].axes
