@@ -67,8 +67,10 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     points = reconstruction.points[keep]
     if len(points) < _FEWEST_SPLATS:
         raise _too_few(len(points), len(reconstruction.points))
-    scales, clamped = _scales(points, reconstruction)
     colours = reconstruction.colours[keep].astype(np.float64) / 255.0
+    if settings.fill:
+        points, colours = _with_agreed(reconstruction, points, colours, report)
+    scales, clamped = _scales(points, reconstruction)
     report.metric("median_scale", float(np.median(scales)))
     report.metric("scales_clamped", clamped)
     if settings.fill:
@@ -87,6 +89,24 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     save_splats(folder, splats)
     report.metric("splats", len(splats))
     return splats
+
+
+def _with_agreed(
+    reconstruction: Reconstruction,
+    points: NDArray[np.float64],
+    colours: NDArray[np.float64],
+    report: Report,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """With the points that `sweep` finds. Held-out photographs lend none: they are the judges."""
+    import numpy as np
+
+    from stages.scene import split_held_out
+    from stages.seeding.sweep import agreed_points
+
+    training, _ = split_held_out(reconstruction.views)
+    more, more_colours = agreed_points(reconstruction.folder, training, points)
+    report.metric("agreed", len(more))
+    return np.concatenate([points, more]), np.concatenate([colours, more_colours])
 
 
 def _filled(
@@ -204,5 +224,5 @@ def _too_few(usable: int, points: int) -> SplatError:
 
 
 STAGE = Stage(
-    name="seed", version=2, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
+    name="seed", version=3, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
 )

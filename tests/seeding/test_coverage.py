@@ -173,3 +173,44 @@ def test_held_out_photographs_lend_nothing(tmp_path: Path) -> None:
         Report(),
     )
     assert len(bare) == len(points)
+
+
+def hoop_before_wall() -> np.ndarray:
+    """Points of a bent hoop and of a wall far behind it, but for what is seen through the hoop."""
+    random = np.random.default_rng(6)
+    angle = random.uniform(0, 2 * np.pi, 80)
+    hoop = np.c_[0.6 * np.cos(angle), 0.6 * np.sin(angle), random.uniform(2.0, 2.8, 80)]
+    wall = np.c_[random.uniform(-5, 5, 2000), random.uniform(-4, 4, 2000), np.full(2000, 8.0)]
+    return np.concatenate([hoop, wall[np.linalg.norm(wall[:, :2], axis=1) > 2.8]])
+
+
+def facing(folder: Path, eyes: tuple[float, ...]) -> tuple[View, ...]:
+    """Cameras at these x, side by side, that look at the wall."""
+    made = []
+    for number, x in enumerate(eyes):
+        name = f"{number}.png"
+        Image.new("RGB", (WIDTH, HEIGHT), COLOURS[0]).save(folder / name)
+        matrix = look_at(np.array([x, 0.0, 0.0]), np.array([x, 0.0, 8.0]))
+        made.append(View(name, name, Camera(WIDTH, HEIGHT, 50.0, 50.0, 40.0, 30.0, matrix)))
+    return tuple(made)
+
+
+def test_what_other_photographs_contradict_goes_to_the_back(tmp_path: Path) -> None:
+    """The nearest points around the hoop's hole are the hoop's; who sees past it knows better."""
+    several = facing(tmp_path, (0.0, -1.4, 1.4))
+    more, _, _ = fill_cells(tmp_path, several, hoop_before_wall())
+    through = more[np.abs(more[:, :2] / more[:, 2:]).max(1) < 0.1]
+    assert len(through) > 10
+    assert through[:, 2].min() > 7.0
+
+
+def test_nothing_is_guessed_beyond_a_rim_where_another_photograph_looks(tmp_path: Path) -> None:
+    (left, right), points = views(tmp_path), floor_points()
+    alone, _, _ = fill_cells(tmp_path, (left,), points)
+    beyond = alone[~in_picture(left.camera, alone)]
+    assert in_picture(right.camera, beyond).any()
+    both, _, _ = fill_cells(tmp_path, (left, right), points)
+    at = ~in_picture(left.camera, both) & ~in_picture(right.camera, both)
+    assert at.any()
+    inside = both[: len(both) - at.sum()]  # what lies within a picture comes first
+    assert (in_picture(left.camera, inside) | in_picture(right.camera, inside)).all()
