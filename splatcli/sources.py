@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from splatcli.folders import find_run_folder
 from splatcli.viewpoints import views_of
 from stages.base.errors import Family, SplatError
 from stages.run import runfolder
+from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View
 
 _STAGES_WITH_SPLATS = ("quantise", "prune", "train", "seed")
+_STAGES_OF_SPLATS = ("sfm", *reversed(_STAGES_WITH_SPLATS))  # as they run
 
 
 def splats_of(target: Path | None, strict: bool = True) -> tuple[Splats, Pipeline | None]:
@@ -63,6 +65,41 @@ def newest_with_splats(pipeline: Pipeline) -> str:
         hint="Run `splat process` to go on.",
         family=Family.USAGE,
     )
+
+
+def finished_splats(pipeline: Pipeline) -> Splats:
+    """A run's last splats, where all that they were made from is still what lies there.
+
+    Raises SplatError (stage-not-finished, run-half-anew)."""
+    made: dict[str, Manifest] = {}
+    for name in _STAGES_OF_SPLATS:
+        manifest = pipeline.manifest(name)
+        if manifest is None:
+            pipeline.load(name)  # which says so
+            raise AssertionError(name)
+        for source, before in made.items():
+            if manifest.inputs.get(source, before.output_digest) != before.output_digest:
+                raise SplatError(
+                    "run-half-anew",
+                    given=f"In {pipeline.run_folder}, {source} was made again, and {name} was not.",
+                    wanted="A run whose stages belong together.",
+                    hint="Run `splat process` to finish it.",
+                    family=Family.USAGE,
+                )
+        made[name] = manifest
+    splats: Splats = pipeline.load("quantise").splats
+    return splats
+
+
+def exported_formats(pipeline: Pipeline) -> dict[str, dict[str, Any]]:
+    """Figures of each file that a run's last splats were written to, by format; none where export
+    has not finished, or wrote others."""
+    quantised, exported = pipeline.manifest("quantise"), pipeline.manifest("export")
+    if quantised is None or exported is None:
+        return {}
+    if exported.inputs.get("quantise") != quantised.output_digest:
+        return {}
+    return dict(exported.metrics.get("formats", {}))
 
 
 def pipeline_around(file: Path | None) -> Pipeline | None:

@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
     """Judge both, write the report into `out`, print the verdict.
 
-    Raises SplatError: stage-not-finished, compare-other-photographs, compare-nothing-in-common,
-    and what keeps files from being written."""
+    Raises SplatError: stage-not-finished, run-half-anew, compare-other-photographs,
+    compare-nothing-in-common, and what keeps files from being written."""
     from stages.base.atomic import make_folder
     from stages.trade.pair import default_name, pair, verdict
     from stages.trade.pair_report import facts, write_pair
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
-    _check_photographs(*runs)
     sides = [
         _side(run, default_name(run.run_folder, other.run_folder))
         for run, other in zip(runs, reversed(runs), strict=True)
     ]
+    _check_photographs(*runs)
     if not quiet and not as_json and not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     pairing = pair(sides[0], sides[1])
@@ -55,10 +55,9 @@ def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) ->
 
 
 def _check_photographs(first: Pipeline, second: Pipeline) -> None:
-    """Raises SplatError (stage-not-finished, compare-other-photographs)."""
+    """Raises SplatError (compare-other-photographs)."""
     digests = []
     for run in (first, second):
-        run.load("quantise")  # the last that compares; says what has not finished
         manifest = run.manifest("ingest")
         digests.append(manifest.inputs.get(PHOTOS) if manifest else None)
     if digests[0] != digests[1]:
@@ -74,13 +73,13 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 def _side(run: Pipeline, name: str) -> Side:
     from stages.trade.pair import Side
 
-    splats = run.load("quantise").splats
+    splats = sources.finished_splats(run)
     told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
-    trained, exported = run.manifest("train"), run.manifest("export")
+    trained = run.manifest("train")
     if trained is not None:
         told["training"] = console.duration(trained.seconds)
         told["steps"] = f"{trained.settings['steps']:,}"
         told["seed"] = str(trained.settings["seed"])
-    for ending, figures in (exported.metrics.get("formats", {}) if exported else {}).items():
+    for ending, figures in sources.exported_formats(run).items():
         told[f".{ending}"] = console.size(figures["size_bytes"])
     return Side(name, splats, run.load("sfm"), sources.backend_of(run), told)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> None:
     """Measure, write the report into `out` (by default a folder in the run), and say the gist.
 
-    Raises SplatError: stage-not-finished, nothing-held-out, and what keeps files from being
-    written."""
+    Raises SplatError: stage-not-finished, run-half-anew, nothing-held-out, and what keeps files
+    from being written."""
     from stages.base.atomic import make_folder
     from stages.trade.measuring import measure_trade
     from stages.trade.report import sentences, write_report
@@ -51,13 +51,13 @@ def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> 
 
 
 def material_of(pipeline: Pipeline) -> Material:
-    """What is measured of a finished run. Raises SplatError (stage-not-finished,
+    """What is measured of a finished run. Raises SplatError (stage-not-finished, run-half-anew,
     nothing-held-out)."""
     from stages.measure.judge import load_photographs
     from stages.scene import split_held_out
     from stages.trade.measuring import DECIDING_PHOTOGRAPHS, Material, spread_over
 
-    splats = pipeline.load("quantise").splats
+    splats = sources.finished_splats(pipeline)
     reconstruction = pipeline.load("sfm")
     training, held = split_held_out(reconstruction.views)
     if not held:
@@ -68,7 +68,7 @@ def material_of(pipeline: Pipeline) -> Material:
             hint="Take more photographs: four are the least; of every eight, one judges.",
             family=Family.USAGE,
         )
-    trained, exported = pipeline.manifest("train"), pipeline.manifest("export")
+    trained = pipeline.manifest("train")
     chosen = spread_over(training, DECIDING_PHOTOGRAPHS)
     return Material(
         splats=splats,
@@ -78,5 +78,5 @@ def material_of(pipeline: Pipeline) -> Material:
         units=reconstruction.units,
         backend=sources.backend_of(pipeline),
         history=trained.metrics.get("history", ()) if trained else (),
-        exported=tuple(exported.metrics.get("formats", {})) if exported else (),
+        exported=tuple(sources.exported_formats(pipeline)),
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.base.errors import Family, SplatError
+from stages.base.words import counted
 from stages.measure.bootstrap import Difference, paired_difference
 from stages.measure.judge import Photograph, Score, drawing_of, load_photographs, scores
 from stages.scene import Reconstruction, Splats, View, split_held_out
@@ -89,22 +90,17 @@ def _side(one: Side, name: str) -> int:
 def verdict(pairing: Pairing) -> list[str]:
     """What may be said of the two."""
     change, (a, b) = pairing.psnr, pairing.sides
-    told = [
-        f"{b.name} against {a.name}: {change.mean:+.2f} dB (95 %: {change.low:+.2f} to "
-        f"{change.high:+.2f}): {change.verdict}.",
-        f"SSIM: {pairing.ssim.mean:+.4f} ({pairing.ssim.low:+.4f} to {pairing.ssim.high:+.4f}): "
-        f"{pairing.ssim.verdict}.",
-    ]
-    if change.photographs == 1:
-        told.append(
-            "A single photograph judges: it says nothing of others, so no interval has ends."
-        )
-    told.append(
-        f"Judged on {change.photographs} held-out photographs, {pairing.side_px} pixels large. One "
-        "run each: whether the same settings would win again with another seed is not in the "
-        "interval."
+    interval, ssim = (
+        f"95 %: {d.low:+.{digits}f} to {d.high:+.{digits}f}" if d.photographs > 1 else "one judge"
+        for d, digits in ((change, 2), (pairing.ssim, 4))
     )
-    return told
+    judges = counted(change.photographs, "held-out photograph")
+    return [
+        f"{b.name} against {a.name}: {change.mean:+.2f} dB ({interval}): {change.verdict}.",
+        f"SSIM: {pairing.ssim.mean:+.4f} ({ssim}): {pairing.ssim.verdict}.",
+        f"Judged on {judges}, {pairing.side_px} pixels large. One run each: whether the same "
+        "settings would win again with another seed is not in the interval.",
+    ]
 
 
 def default_name(folder: Path, other: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from stages.base.words import counted
 from stages.measure.bootstrap import Difference
 from stages.trade.points import Moment, Point, Trade, knee, time_to
 
@@ -11,7 +12,7 @@ CHEAP_DB = 0.1  # a loss that few would see
 NO_TIMES = "Training kept no times (an older splat trained this run): `splat train` again has them."
 NOT_FINE_TUNED = (
     "Splats were only taken away: nothing was fine-tuned afterwards. Training with so few from the "
-    "start, or going on after the cut, loses less: the losses are upper bounds."
+    "start, or going on after the cut, usually loses less."
 )
 
 
@@ -95,7 +96,7 @@ def about_photographs(trade: Trade) -> list[str]:
     told = [f"The worst of {count} is no. {trade.scores.index(worst) + 1}, {worst.name}: "]
     told[0] += f"{worst.psnr_db:.2f} dB, {trade.own.psnr_db - worst.psnr_db:.2f} below the mean."
     if count < 8:
-        told.append(f"Only {count} photographs judge: intervals are wide, and no accident.")
+        told.append(f"Only {counted(count, 'photograph')} to judge by: intervals are wide.")
     return told
 
 

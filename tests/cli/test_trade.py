@@ -92,6 +92,13 @@ def test_an_unfinished_run_is_told_in_words(splat: Splat) -> None:
     assert failed(splat("tradeoff", "nowhere", "--json")) == "run-folder-missing"
 
 
+def test_a_run_of_which_half_was_made_anew_is_told_in_words(splat: Splat) -> None:
+    made(splat, "run")
+    assert splat("train", "run", "--steps", "30").exit_code == 0
+    assert failed(splat("tradeoff", "run", "--json")) == "run-half-anew"
+    assert failed(splat("compare", "run", "run", "--json")) == "run-half-anew"
+
+
 def test_a_run_compared_with_itself_is_not_told_apart(splat: Splat) -> None:
     made(splat, "run")
     result = splat("compare", "run", "run", "--json")

@@ -134,6 +134,19 @@ def test_a_run_without_a_log_gets_the_other_curves(material, tmp_path) -> None:
     assert words.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+def test_a_single_judge_makes_no_interval_and_no_fuss(scene, material, tmp_path) -> None:
+    trade = measure_trade(replace(material, held_out=material.held_out[:1]), lambda label: None)
+    write_report(tmp_path, "scene", trade, material)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "one judge" in text
+    assert "inf" not in re.sub(r"<[^>]*>", " ", text)
+    few = replace(scene.reconstruction, views=scene.reconstruction.views[:5])
+    both = [replace(side(scene, name), reconstruction=few) for name in "ab"]
+    told = verdict(pair(*both))
+    assert told[0] == "b against a: +0.00 dB (one judge): not told apart."
+    assert "1 held-out photograph," in told[-1]
+
+
 def side(scene, name: str, splats=None) -> Side:
     look = Look(near=0.01, side=72)
     return Side(name, replace(splats or scene.splats, look=look), scene.reconstruction, "cpu", {})
