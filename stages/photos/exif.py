@@ -89,11 +89,13 @@ def read_exif(image: Any) -> Exif:
     """The tags of an open PIL image. Damaged EXIF counts as none: cameras' makers err a lot."""
     try:
         main = image.getexif()
-        details = main.get_ifd(_EXIF_IFD)
-        interoperability = main.get_ifd(_INTEROPERABILITY_IFD)
+        tags = {**dict(main), **dict(main.get_ifd(_EXIF_IFD))}
     except Exception:  # Pillow's parsers raise whatever the damage leads to
         return Exif()
-    tags = {**dict(main), **dict(details)}
+    try:
+        interoperability = main.get_ifd(_INTEROPERABILITY_IFD)
+    except Exception:  # before Pillow 13 also where there is none
+        interoperability = {}
     orientation = _number(tags.get(0x0112))
     width, height = _number(tags.get(0xA002)), _number(tags.get(0xA003))
     return Exif(
