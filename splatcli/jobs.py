@@ -26,6 +26,8 @@ PROCESS_OPTIONS = (
     "steps",
     "max_splats",
     "formats",
+    "cameras",
+    "split",
     "allow_partial",
     "seed",
 )
