@@ -22,6 +22,7 @@ DEFAULT_PRESET = "standard"
 PROCESS_OPTIONS = (
     "backend",
     "max_side",
+    "alpha_over",
     "train_side",
     "steps",
     "max_splats",

@@ -1,0 +1,293 @@
+"""Handedness and axes are right because pictures say so.
+
+Known points are drawn into photographs by the formula that each format's own description gives,
+or by a library of others, and must be found there by the cameras that were read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from stages.base.errors import SplatError
+from stages.cameras.table import CAMERA_FILES, files_of, read_cameras, read_points
+from stages.scene import look_at
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
+POINTS = np.random.default_rng(5).uniform(-0.6, 0.6, (12, 3))
+COLOURS = np.random.default_rng(6).integers(60, 256, (12, 3)).astype(np.uint8)
+EYES = np.array([[3.0, -1, 0.5], [0.3, 2.5, -1], [-2, -0.7, -2.2], [0.5, 0.2, 2.9]])
+POSES = np.array([look_at(eye, np.zeros(3), np.array([0.1, 0.2, 1.0])) for eye in EYES])
+K1, K2, P1, P2 = 0.08, -0.03, 0.004, -0.006
+NAMES = [f"p_{number}.png" for number in range(len(POSES))]
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+Project = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def draw(folder: Path, projects: list[Project]) -> None:
+    """A disc a point; nearer ones first, so that none is hidden by one drawn later."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, project in zip(NAMES, projects, strict=True):
+        picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        for (x, y), colour in zip(project(POINTS), COLOURS, strict=True):
+            at = int(np.floor(x)), int(np.floor(y))
+            cv2.circle(picture, at, 2, tuple(map(int, colour)), -1)
+        Image.fromarray(picture).save(folder / name)
+
+
+def opengl_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Camera to world, y up and z backward."""
+    return np.linalg.inv(OPENGL @ pose)
+
+
+def colmap(folder: Path) -> Path:
+    """COLMAP itself draws and writes: a fisheye."""
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction()
+    lens = [FOCAL, FOCAL, 155, 124, 0.05, 0.01, 0.002, -0.001]
+    camera = pycolmap.Camera(
+        camera_id=1, model="OPENCV_FISHEYE", width=WIDTH, height=HEIGHT, params=lens
+    )
+    model.add_camera_with_trivial_rig(camera)
+    projects = []
+    for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True), 1):
+        image = pycolmap.Image(name=name, camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+        posed = model.images[number]
+        projects.append(
+            lambda points, posed=posed: np.array([posed.project_point(p) for p in points])
+        )
+    for point, colour in zip(POINTS, COLOURS, strict=True):
+        model.add_point3D(point, pycolmap.Track(), colour)
+    draw(folder / "images", projects)
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    model.write_binary(str(sparse))
+    return folder
+
+
+def nerfstudio(folder: Path) -> Path:
+    """instant-ngp: y up, looking along -z, OpenCV's lens."""
+    frames, projects = [], []
+    for name, pose in zip(NAMES, POSES, strict=True):
+        matrix = opengl_pose(pose)
+
+        def project(points: NDArray[np.float64], matrix: NDArray = matrix) -> NDArray[np.float64]:
+            at = (points - matrix[:3, 3]) @ matrix[:3, :3]
+            x, y = at[:, 0] / -at[:, 2], -at[:, 1] / -at[:, 2]
+            r2 = x * x + y * y
+            radial = 1 + K1 * r2 + K2 * r2 * r2
+            xd = x * radial + 2 * P1 * x * y + P2 * (r2 + 2 * x * x)
+            yd = y * radial + 2 * P2 * x * y + P1 * (r2 + 2 * y * y)
+            return np.stack([FOCAL * xd + 150, FOCAL * yd + 126], axis=1)
+
+        projects.append(project)
+        frames.append({"file_path": f"images/{name}", "transform_matrix": matrix.tolist()})
+    draw(folder / "images", projects)
+    lens = {"fl_x": FOCAL, "cx": 150, "cy": 126, "k1": K1, "k2": K2, "p1": P1, "p2": P2}
+    data = {"w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV", **lens, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder / "transforms.json"
+
+
+def blender(folder: Path) -> Path:
+    """NeRF's own loader: an angle of view, pictures without suffixes, one file a split."""
+    angle = 2 * np.arctan(0.5 * WIDTH / FOCAL)
+    projects: list[Project] = []
+    frames = []
+    for name, pose in zip(NAMES, POSES, strict=True):
+        matrix = opengl_pose(pose)
+
+        def project(points: NDArray[np.float64], matrix: NDArray = matrix) -> NDArray[np.float64]:
+            # Rays of NeRF: d = ((i - W/2) / f, -(j - H/2) / f, -1) in the camera.
+            at = (points - matrix[:3, 3]) @ matrix[:3, :3]
+            d = at / -at[:, 2:]
+            return np.stack([d[:, 0] * FOCAL + WIDTH / 2, -d[:, 1] * FOCAL + HEIGHT / 2], axis=1)
+
+        projects.append(project)
+        stem = name.removesuffix(".png")
+        frames.append({"file_path": f"./train/{stem}", "transform_matrix": matrix.tolist()})
+    draw(folder / "train", projects)
+    for role, mine in (("train", frames[:2]), ("test", frames[2:3]), ("val", frames[3:])):
+        data = {"camera_angle_x": angle, "frames": mine}
+        (folder / f"transforms_{role}.json").write_text(json.dumps(data))
+    return folder
+
+
+def llff(folder: Path) -> Path:
+    """Columns: down, right, backward, position, (height, width, focal length)."""
+    rows, projects = [], []
+    for pose in POSES:
+        to_world = np.linalg.inv(pose)
+        right, down, ahead, eye = to_world[:3].T
+
+        def project(points: NDArray[np.float64], axes=(right, down, ahead, eye)):
+            x, y, z = ((points - axes[3]) @ axis for axis in axes[:3])
+            return np.stack([FOCAL * x / z + WIDTH / 2, FOCAL * y / z + HEIGHT / 2], axis=1)
+
+        projects.append(project)
+        hwf = [HEIGHT, WIDTH, FOCAL]
+        rows.append([*np.stack([down, right, -ahead, eye, hwf], axis=1).ravel(), 1.0, 9.0])
+    draw(folder / "images", projects)
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
+def opensfm(folder: Path) -> Path:
+    """OpenCV draws: angle-axis rotations, OpenCV's lens."""
+    side = max(WIDTH, HEIGHT)
+    matrix = np.array([[FOCAL, 0, 158.0], [0, FOCAL * 1.02, 122.0], [0, 0, 1]])
+    shots, projects = {}, []
+    for name, pose in zip(NAMES, POSES, strict=True):
+        turn, shift = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
+        projects.append(
+            lambda points, turn=turn, shift=shift: cv2.projectPoints(
+                points, turn, shift, matrix, np.array([K1, K2, P1, P2])
+            )[0][:, 0]
+        )
+        shots[name] = {
+            "camera": "c",
+            "rotation": turn.ravel().tolist(),
+            "translation": shift.tolist(),
+        }
+    draw(folder / "images", projects)
+    lens = {"k1": K1, "k2": K2, "p1": P1, "p2": P2, "k3": 0.0}
+    lens |= {"focal_x": FOCAL / side, "focal_y": FOCAL * 1.02 / side}
+    lens |= {"c_x": (158 - WIDTH / 2) / side, "c_y": (122 - HEIGHT / 2) / side}
+    camera = {"projection_type": "brown", "width": WIDTH, "height": HEIGHT, **lens}
+    points = {
+        str(i): {"coordinates": p.tolist(), "color": c.tolist()}
+        for i, (p, c) in enumerate(zip(POINTS, COLOURS, strict=True))
+    }
+    small = {"cameras": {"c": camera}, "shots": {}, "points": {}}
+    data = [small, {"cameras": {"c": camera}, "shots": shots, "points": points}]
+    (folder / "reconstruction.json").write_text(json.dumps(data))
+    return folder / "reconstruction.json"
+
+
+def bundler(folder: Path) -> Path:
+    """The manual: P = R X + t, p = -P / P.z, p' = f r(p) p, from the middle, y up."""
+    lines = ["# Bundle file v0.3", f"{len(POSES) + 1} {len(POINTS)}", *["0 0 0"] * 5]
+    projects = []
+    for pose in POSES:
+        turned = OPENGL @ pose
+
+        def project(points: NDArray[np.float64], turned: NDArray = turned) -> NDArray[np.float64]:
+            at = points @ turned[:3, :3].T + turned[:3, 3]
+            p = -at[:, :2] / at[:, 2:]
+            r2 = (p * p).sum(axis=1, keepdims=True)
+            x, y = (FOCAL * (1 + K1 * r2 + K2 * r2 * r2) * p).T
+            return np.stack([WIDTH / 2 + x, HEIGHT / 2 - y], axis=1)
+
+        projects.append(project)
+        lines.append(f"{FOCAL} {K1} {K2}")
+        lines += [" ".join(map(repr, map(float, row))) for row in turned[:3, :3]]
+        lines.append(" ".join(map(repr, map(float, turned[:3, 3]))))
+    for point, colour in zip(POINTS, COLOURS, strict=True):
+        lines += [" ".join(map(repr, map(float, point))), " ".join(map(str, colour)), "1 0 0 1 1"]
+    draw(folder, projects)
+    (folder / "bundle.out").write_text("\n".join(lines) + "\n")
+    (folder / "list.txt").write_text("\n".join(["lost.png", *NAMES]) + "\n")
+    return folder / "bundle.out"
+
+
+MADE = {
+    "colmap": colmap,
+    "nerfstudio": nerfstudio,
+    "blender": blender,
+    "llff": llff,
+    "opensfm": opensfm,
+    "bundler": bundler,
+}
+
+
+def test_every_format_of_the_table_is_drawn() -> None:
+    assert set(MADE) == {row.module for row in CAMERA_FILES}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_points_are_where_the_pictures_show_them(tmp_path: Path, name: str) -> None:
+    found = read_cameras(MADE[name](tmp_path))
+    assert len(found.views) == len(POSES)
+    for view, lens in zip(found.views, found.lenses, strict=True):
+        image = found.folder / view.image
+        image = image if image.exists() else image.with_suffix(".png")
+        if not image.exists():
+            (image,) = tmp_path.rglob(Path(view.image).name)
+        picture = np.asarray(Image.open(image))
+        camera = view.camera
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+        at = POINTS @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        assert (at[:, 2] > 0).all()
+        uv = lens.distort(at[:, :2] / at[:, 2:])
+        px = np.floor(uv * (camera.fx, camera.fy) + (camera.cx, camera.cy)).astype(int)
+        hit = [
+            np.abs(picture[y, x].astype(int) - colour).max() == 0
+            for (x, y), colour in zip(px, COLOURS, strict=True)
+        ]
+        assert np.mean(hit) >= 0.8  # discs may cover each other
+
+
+@pytest.mark.parametrize("name", ["colmap", "opensfm", "bundler"])
+def test_points_of_the_file_are_in_the_cameras_world(tmp_path: Path, name: str) -> None:
+    found = read_points(MADE[name](tmp_path))
+    assert found is not None
+    order = [int(np.argmin(np.abs(POINTS - p).sum(axis=1))) for p in found.points]
+    np.testing.assert_allclose(found.points, POINTS[order], atol=1e-9)
+    np.testing.assert_array_equal(found.colours, COLOURS[order])
+    assert sorted(order) == list(range(len(POINTS)))
+
+
+def test_a_benchmarks_split_is_read(tmp_path: Path) -> None:
+    roles = [view.role for view in read_cameras(blender(tmp_path)).views]
+    assert roles == ["train", "train", "val", "test"]
+
+
+def test_nerfstudios_split_is_read(tmp_path: Path) -> None:
+    path = nerfstudio(tmp_path)
+    data = json.loads(path.read_text())
+    data["train_filenames"] = ["images/p_0.png", "images/p_1.png"]
+    data["test_filenames"] = ["images/p_2.png"]
+    path.write_text(json.dumps(data))
+    assert [view.role for view in read_cameras(path).views] == ["train", "train", "test", ""]
+
+
+def test_nerfstudios_points_come_back_into_the_cameras_world(tmp_path: Path) -> None:
+    from stages.cameras.nerfstudio import write
+
+    views = read_cameras(nerfstudio(tmp_path)).views
+    target = tmp_path / "again.json"
+    write(target, views, tmp_path, POINTS, COLOURS)
+    found = read_points(target)
+    assert found is not None
+    np.testing.assert_allclose(found.points, POINTS, atol=1e-6)
+    assert {path.name for path in files_of(target)} == {"again.json", "again.ply"}
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("blender", "transforms_test.json"),
+        ("llff", "poses_bounds.npy"),
+        ("opensfm", "reconstruction.json"),
+        ("bundler", "bundle.out"),
+    ],
+)
+def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:
+    path = MADE[name](tmp_path)
+    _cut(tmp_path / file)
+    with pytest.raises(SplatError) as caught:
+        read_cameras(path)
+    assert caught.value.code == "cameras-unreadable"
+    assert file in caught.value.given
