@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 MatchedPair = tuple[int, int, NDArray[np.float64], NDArray[np.float64]]
 
 NEAR = 0.0025  # of the longer side: 4 px of 1600
+_ROUNDING = 1e-9
 _OURS_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -30,7 +31,7 @@ def agreement(
     for first, second, a, b in pairs:
         relative = world_to_camera[second] @ np.linalg.inv(world_to_camera[first])
         shift = relative[:3, 3]
-        if not np.linalg.norm(shift) > 0:
+        if np.linalg.norm(shift) <= _ROUNDING * np.abs(world_to_camera[:, :3, 3]).max():
             continue
         essential = _cross(shift) @ relative[:3, :3]
         left, right = _pixel_matrix(intrinsics[second]), _pixel_matrix(intrinsics[first])

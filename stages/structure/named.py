@@ -13,9 +13,11 @@ from stages.base.stage import Report
 from stages.base.words import counted
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import Lens
+from stages.photos.find import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
 from stages.scene import Camera, Capture, Photo, View
 
 _NAMED = 6
+_SUFFIXES = LOSSY | LOSSLESS | RAW | OTHER_PICTURES
 _FEWEST = 3
 _SHAPE_TOLERANCE = 0.01
 _PARTIAL = "--allow-partial goes on with those that have both."
@@ -65,8 +67,7 @@ def _matched(views: Sequence[View], photos: Sequence[Photo]) -> tuple[dict[int, 
     missing: list[str] = []
     owner: dict[int, str] = {}
     for number, view in enumerate(views):
-        stems = (_parts(view.name)[0], _parts(view.name + ".")[0])
-        candidates = {position for stem in stems for position in by_stem.get(stem, ())}
+        candidates = set(by_stem.get(_parts(view.name)[0], ()))
         scores = {i: _agreement(view.name, photos[i]) for i in candidates}
         best = [i for i in sorted(scores) if scores[i] == max(scores.values())]
         if not best:
@@ -85,7 +86,8 @@ def _parts(name: str) -> list[str]:
     """The name without its suffix, then its folders from the innermost on, folded."""
     plain = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
     path = PurePosixPath(plain)
-    return [path.stem, *reversed([part for part in path.parent.parts if part not in (".", "..")])]
+    stem = path.stem if path.suffix in _SUFFIXES else path.name
+    return [stem, *reversed([part for part in path.parent.parts if part not in (".", "..")])]
 
 
 def _suffix(name: str) -> str:
