@@ -8,15 +8,18 @@ position, and height, width and focal length in pixels.
 from __future__ import annotations
 
 import io
+import tokenize
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import CameraFile, make_views
 from stages.cameras.lens import PINHOLE
 
 _NAME = "poses_bounds.npy"
+_COLUMNS = 17
 _PICTURES = (".jpg", ".jpeg", ".png")
 
 
@@ -31,11 +34,9 @@ def read(path: Path) -> CameraFile:
     """The cameras of the pictures in a folder beside the file that begins with "images" (the
     largest ones), or beside the file itself. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        rows = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
-        if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind != "f":
-            raise BadFileError("it is no table of 17 numbers a picture")
+        rows = _rows(path.read_bytes())
         names = _names(path.parent, len(rows))
-        matrices = rows[:, :15].reshape(-1, 3, 5).astype(np.float64)
+        matrices = rows[:, :15].reshape(-1, 3, 5)
         down, right, backward, centre, sizes = np.moveaxis(matrices, 2, 0)
         rotations = np.stack([right, down, -backward], axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -45,6 +46,26 @@ def read(path: Path) -> CameraFile:
         poses = np.concatenate([rotations, shifts[:, :, None]], axis=2)
         views = make_views(names, np.stack([width, height], axis=1), lens, poses)
         return CameraFile(views, path.parent, (PINHOLE,) * len(views))
+
+
+def _rows(data: bytes) -> NDArray[np.float64]:
+    """[V, 17] of the file. Not by `np.load`, which allocates what a header claims."""
+    file = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        read_header = np.lib.format.read_array_header_1_0
+        if version != (1, 0):
+            read_header = np.lib.format.read_array_header_2_0
+        shape, by_columns, dtype = read_header(file)
+    except (tokenize.TokenError, SyntaxError) as error:
+        raise BadFileError(f"its header is damaged ({error})") from error
+    if len(shape) != 2 or shape[1] != _COLUMNS or dtype.kind != "f":
+        raise BadFileError(f"it is no table of {_COLUMNS} numbers a picture")
+    count = shape[0] * _COLUMNS
+    if count * dtype.itemsize > len(data) - file.tell():
+        raise BadFileError("it was cut short")
+    rows = np.frombuffer(data, dtype, count, file.tell())
+    return rows.reshape(shape, order="F" if by_columns else "C").astype(np.float64)
 
 
 def _names(folder: Path, count: int) -> list[str]:
