@@ -31,6 +31,7 @@ CAMERA_FILES = (
     CameraFormat("colmap", "a folder with COLMAP's images.bin or images.txt"),
     CameraFormat("llff", "LLFF's poses_bounds.npy"),
     CameraFormat("bundler", "Bundler's .out"),
+    CameraFormat("metashape", "Metashape's cameras as .xml"),
 )
 _READ_WITH_IT = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cameras
 

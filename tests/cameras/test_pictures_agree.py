@@ -198,7 +198,44 @@ def bundler(folder: Path) -> Path:
     return folder / "bundle.out"
 
 
+def metashape(folder: Path) -> Path:
+    """The manual: x' = x (1 + K1 r^2 + K2 r^4) + P1 (r^2 + 2 x^2) + 2 P2 x y, y' likewise,
+    u = w / 2 + cx + x' f + x' B1, v = h / 2 + cy + y' f; camera to world, x right, y down."""
+    cameras, projects = [], []
+    for name, pose in zip(NAMES, POSES, strict=True):
+        matrix = np.linalg.inv(pose)
+
+        def project(points: NDArray[np.float64], pose: NDArray = pose) -> NDArray[np.float64]:
+            at = points @ pose[:3, :3].T + pose[:3, 3]
+            x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
+            r2 = x * x + y * y
+            radial = 1 + K1 * r2 + K2 * r2 * r2
+            xd = x * radial + P1 * (r2 + 2 * x * x) + 2 * P2 * x * y
+            yd = y * radial + P2 * (r2 + 2 * y * y) + 2 * P1 * x * y
+            u = WIDTH / 2 + 3 + xd * FOCAL + xd * 5
+            return np.stack([u, HEIGHT / 2 - 4 + yd * FOCAL], axis=1)
+
+        projects.append(project)
+        words = " ".join(map(repr, map(float, matrix.ravel())))
+        label = name.removesuffix(".png")
+        cameras.append(
+            f'<camera id="1" sensor_id="0" label="{label}"><transform>{words}</transform></camera>'
+        )
+    draw(folder, projects)
+    lens = {"f": FOCAL, "cx": 3, "cy": -4, "b1": 5, "k1": K1, "k2": K2, "p1": P1, "p2": P2}
+    terms = "".join(f"<{key}>{value}</{key}>" for key, value in lens.items())
+    (folder / "cameras.xml").write_text(
+        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>'
+        '<sensor id="0" type="frame"><calibration type="frame" class="adjusted">'
+        f'<resolution width="{WIDTH}" height="{HEIGHT}"/>{terms}</calibration></sensor></sensors>'
+        f'<cameras>{"".join(cameras)}<camera id="9" sensor_id="0" label="lost"/></cameras>'
+        "</chunk></document>"
+    )
+    return folder / "cameras.xml"
+
+
 MADE = {
+    "metashape": metashape,
     "colmap": colmap,
     "nerfstudio": nerfstudio,
     "blender": blender,
@@ -282,6 +319,7 @@ def _cut(path: Path) -> None:
         ("llff", "poses_bounds.npy"),
         ("opensfm", "reconstruction.json"),
         ("bundler", "bundle.out"),
+        ("metashape", "cameras.xml"),
     ],
 )
 def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:

@@ -11,7 +11,7 @@ from types import ModuleType
 
 import numpy as np
 
-from stages.cameras import blender, bundler, colmap, llff, nerfstudio, opensfm
+from stages.cameras import blender, bundler, colmap, llff, metashape, nerfstudio, opensfm
 from stages.scene import Camera, View
 from tests.cameras import test_pictures_agree as drawn
 from tests.cameras.test_colmap import example
@@ -109,6 +109,7 @@ LAYERS = {
     "synthetic NeRF transforms_train.json": _other(blender, "transforms_train.json"),
     "poses_bounds.npy": _other(llff, "poses_bounds.npy", text=False),
     "OpenSfM reconstruction.json": _other(opensfm, "reconstruction.json"),
+    "Metashape cameras.xml": _other(metashape, "cameras.xml"),
     "Bundler bundle.out": _other(bundler, "bundle.out"),
     "Bundler list.txt": replace(_other(bundler, "list.txt"), read=_bundle_of_list),
     "transforms.json": Layer(
