@@ -152,7 +152,7 @@ def _check_missing(
             wanted="A camera for every photograph, and a photograph for every camera, by name.",
             hint="Name the photographs' folder that the file speaks of. " + _PARTIAL,
         )
-    report.warn(code, f"{given} They are left out.")
+    report.warn(code, f"{given} What has no counterpart is left out.")
 
 
 def _listed(names: list[str]) -> str:
