@@ -22,10 +22,13 @@ DEFAULT_PRESET = "standard"
 PROCESS_OPTIONS = (
     "backend",
     "max_side",
+    "alpha_over",
     "train_side",
     "steps",
     "max_splats",
     "formats",
+    "cameras",
+    "split",
     "allow_partial",
     "seed",
 )

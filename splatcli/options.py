@@ -92,6 +92,7 @@ def shown_default(setting: Setting) -> str | bool:
 def given_only(given: Mapping[str, Any]) -> dict[str, Any]:
     """What was typed: None and empty lists left out, lists as tuples."""
     typed = {name: value for name, value in given.items() if value is not None and value != []}
+    typed |= {n: value.absolute() for n, value in typed.items() if isinstance(value, Path)}
     return {n: tuple(value) if isinstance(value, list) else value for n, value in typed.items()}
 
 

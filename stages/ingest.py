@@ -40,6 +40,14 @@ class IngestSettings:
             "max": 32_768,
         },
     )
+    alpha_over: str = field(
+        default="white",
+        metadata={
+            "help": "What shows where a picture is transparent: white or black. Splats are drawn "
+            "over black, so that black leaves cut-out objects alone in empty space.",
+            "choices": ("white", "black"),
+        },
+    )
 
 
 @dataclass(frozen=True)
@@ -69,7 +77,7 @@ def run(
     root = Path(inputs["photos"])
     found = find.find(root)
     folder.mkdir(parents=True, exist_ok=True)
-    taken = _take_all(found, settings.max_side, folder, report)
+    taken = _take_all(found, settings, folder, report)
     names = [source.name for source in found.sources]
     reasons = [(n, t.unusable) for n, t in zip(names, taken, strict=True) if t.photo is None]
     advice.about_files(found, report.warn)
@@ -81,6 +89,7 @@ def run(
         [n for n, t in zip(names, taken, strict=True) if t.alpha],
         [n for n, t in zip(names, taken, strict=True) if t.hdr],
         [n for n, t in zip(names, taken, strict=True) if t.bad_profile],
+        settings.alpha_over,
         report.warn,
     )
     duplicates = near_duplicates([t.measures.thumbnail for t in taken if t.measures is not None])
@@ -100,7 +109,9 @@ def load(folder: Path) -> Capture:
     return load_capture(folder)
 
 
-def _take_all(found: Findings, max_side: int, folder: Path, report: Report) -> list[_Taken]:
+def _take_all(
+    found: Findings, settings: IngestSettings, folder: Path, report: Report
+) -> list[_Taken]:
     """Each source read, measured and written, in order, a few at a time."""
     from stages.photos.decode import PixelBudget, readers_set_up
 
@@ -110,7 +121,7 @@ def _take_all(found: Findings, max_side: int, folder: Path, report: Report) -> l
     report.progress(0, total, "reading photographs")
     with readers_set_up(), ThreadPoolExecutor(threads.count()) as pool:
         futures: list[Future[_Taken]] = [
-            pool.submit(_take, source, max_side, folder, budget) for source in found.sources
+            pool.submit(_take, source, settings, folder, budget) for source in found.sources
         ]
         try:
             for done, (source, future) in enumerate(zip(found.sources, futures, strict=True), 1):
@@ -123,7 +134,7 @@ def _take_all(found: Findings, max_side: int, folder: Path, report: Report) -> l
     return taken
 
 
-def _take(source: Source, max_side: int, folder: Path, budget: PixelBudget) -> _Taken:
+def _take(source: Source, settings: IngestSettings, folder: Path, budget: PixelBudget) -> _Taken:
     """Read one photograph, write its normalised picture and measure it."""
     from stages.photos.decode import Unusable, decode
     from stages.photos.quality import measure
@@ -131,7 +142,7 @@ def _take(source: Source, max_side: int, folder: Path, budget: PixelBudget) -> _
     from stages.scene import Photo
 
     try:
-        decoded = decode(source.path, max_side, budget)
+        decoded = decode(source.path, settings.max_side, budget, settings.alpha_over)
     except Unusable as finding:
         return _Taken(unusable=str(finding))
     target = folder / source.image

@@ -66,6 +66,18 @@ class SfmSettings:
         default=False,
         metadata={"help": "Go on with the best reconstruction found even if it fails its gates."},
     )
+    cameras: Path | None = field(
+        default=None,
+        metadata={
+            "help": "File or folder of cameras that are known already, of COLMAP, nerfstudio, a "
+            "synthetic NeRF scene, LLFF, OpenSfM, Bundler or Metashape: nothing is searched.",
+            "affects_output": False,  # its content does, which is an input
+        },
+    )
+    split: bool = field(
+        default=False,
+        metadata={"help": "Keep the training and test photographs that --cameras tells apart."},
+    )
     max_minutes: float = field(
         default=120.0,
         metadata={
@@ -93,6 +105,8 @@ def run(
     if (folder / _FINISHED).exists():
         return _again(folder, report)
     work = folder / _WORK
+    if settings.cameras is not None:
+        return _with_known_cameras(capture, settings, settings.cameras, folder, report)
     base = _base_job(capture, settings, work)
     _reuse_or_clear(work, base)
     bench = attempts.Workbench(
@@ -117,6 +131,41 @@ def run(
     _write_finished(folder, report)
     shutil.rmtree(work)
     return reconstruction
+
+
+def _with_known_cameras(
+    capture: Capture, settings: SfmSettings, cameras: Path, folder: Path, report: Report
+) -> Reconstruction:
+    import numpy as np
+
+    from stages.structure import known, reconstruction_files
+
+    deadline = time.monotonic() + 60.0 * settings.max_minutes
+    found = known.reconstruct(
+        capture,
+        cameras,
+        folder,
+        folder / _WORK,
+        report,
+        split=settings.split,
+        allow_partial=settings.allow_partial,
+        seed=settings.seed,
+        max_features=settings.max_features,
+        seconds_left=lambda: deadline - time.monotonic(),
+    )
+    reconstruction_files.save_reconstruction(folder, found)
+    names = {view.name for view in found.views}
+    report.metric("photographs", len(capture.photos))
+    report.metric("registered", len(found.views))
+    report.metric("left_out", [p.name for p in capture.photos if p.name not in names])
+    report.metric("points", len(found.points))
+    report.metric("mean_reprojection_error_px", round(float(np.mean(found.errors_px)), 4))
+    report.metric("rung", "cameras given")
+    report.metric("levelled", found.levelled)
+    report.metric("units", found.units)
+    _write_finished(folder, report)
+    shutil.rmtree(folder / _WORK)
+    return found
 
 
 def load(folder: Path) -> Reconstruction:

@@ -34,7 +34,7 @@ SPLATS = Kind(
 CAMERAS = Kind(
     "cameras-unreadable",
     "cameras",
-    "A transforms.json of nerfstudio's, or a COLMAP model with pinhole cameras.",
+    "A whole file of cameras in one of the formats that README.md lists.",
     "Export the cameras again; a run's own are written by `splat cameras RUN OUT`.",
 )
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
+from stages.cameras.lens import Lens
 from stages.scene import Camera, View
 
 LARGEST_SIDE = 100_000  # pixels; no lens shows more
@@ -25,12 +26,28 @@ _ROUNDED = 1e-9  # of R^T R: more than float64 leaves
 
 @dataclass(frozen=True)
 class CameraFile:
-    """views: pinhole cameras, in the file's order; a lens's distortion is left out.
-    folder: where `View.image` starts. distorted: how many views have a lens that distorts."""
+    """views: pinhole cameras, in the file's order; their role is that in the file's own split.
+    folder: where `View.image` starts. lenses [V]: what bends each picture besides."""
 
     views: tuple[View, ...]
     folder: Path
-    distorted: int
+    lenses: tuple[Lens, ...]
+
+    @property
+    def distorted(self) -> int:
+        """How many views have a lens that distorts."""
+        return sum(lens.bends for lens in self.lenses)
+
+
+@dataclass(frozen=True)
+class FilePoints:
+    """A camera file's sparse points, in the world of its cameras. points [P, 3], colours [P, 3]
+    uint8, errors_px [P], tracks [P] views that see each; 0 where the file does not say."""
+
+    points: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    errors_px: NDArray[np.float64]
+    tracks: NDArray[np.int32]
 
 
 def make_views(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras import colmap_records as records
-from stages.cameras.camera_file import CameraFile, make_views
+from stages.cameras.camera_file import CameraFile, FilePoints, make_views
 from stages.cameras.colmap_records import POINT2D, Image
 from stages.scene import Camera
 from stages.scene.rotations import matrices_of, quaternions_of
@@ -140,6 +140,15 @@ def read_model(folder: Path) -> tuple[CameraFile, ColmapModel]:
         )
 
 
+def read_points(folder: Path) -> FilePoints | None:
+    """The model's points; None if the folder has none. Raises SplatError "cameras-unreadable"."""
+    if not _part(folder, "points3D")[0].is_file():
+        return None
+    model = read_model(folder)[1]
+    tracks = np.bincount(model.observed_points, minlength=len(model.points)).astype(np.int32)
+    return FilePoints(model.points, model.colours, model.errors_px, tracks)
+
+
 def _part(folder: Path, name: str) -> tuple[Path, bool]:
     """(the file, whether it is text); the binary one where there are both, as COLMAP does."""
     binary = folder / f"{name}.bin"
@@ -150,14 +159,14 @@ def _part(folder: Path, name: str) -> tuple[Path, bool]:
 def _read(folder: Path) -> tuple[CameraFile, list[Image]]:
     path, text = _part(folder, "cameras")
     with reading(path, CAMERAS):
-        lenses = dict((records.text_cameras if text else records.binary_cameras)(path))
+        optics = dict((records.text_cameras if text else records.binary_cameras)(path))
     path, text = _part(folder, "images")
     with reading(path, CAMERAS):
         images = list((records.text_images if text else records.binary_images)(path))
-        missing = {image.camera for image in images} - lenses.keys()
+        missing = {image.camera for image in images} - optics.keys()
         if missing:
             raise BadFileError(f"there is no camera {min(missing)}")
-        numbers = np.array([lenses[image.camera][:6] for image in images]).reshape(-1, 6)
+        numbers = np.array([optics[image.camera].numbers for image in images]).reshape(-1, 6)
         poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
         with np.errstate(invalid="ignore"):  # `make_views` refuses a quaternion of length 0
             rotations = matrices_of(poses[:, :4])
@@ -167,7 +176,7 @@ def _read(folder: Path) -> tuple[CameraFile, list[Image]]:
             numbers[:, 2:],
             np.concatenate([rotations, poses[:, 4:, None]], axis=2),
         )
-    bent = sum(any(lenses[image.camera][6:]) for image in images)
+    lenses = tuple(optics[image.camera].lens for image in images)
     near = [base / "images" for base in (folder, folder.parent, folder.parent.parent)]
     pictures = next((path for path in near if path.is_dir()), near[0])
-    return CameraFile(views, pictures, bent), images
+    return CameraFile(views, pictures, lenses), images

@@ -16,16 +16,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
+from stages.cameras.lens import Lens
 
-_PERSPECTIVE = {  # by number: name and how many parameters; the others are fisheyes
+_MODELS = {  # by number: name and how many parameters
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
     2: ("SIMPLE_RADIAL", 4),
     3: ("RADIAL", 5),
     4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
     6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
 }
-_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_ONE_FOCAL = (
+    *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+    *("SIMPLE_DIVISION", "SIMPLE_FISHEYE"),
+)
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
@@ -40,22 +55,47 @@ class Image:
     seen: NDArray[np.void]
 
 
-def _lens(model: str, width: int, height: int, params: tuple[float, ...]) -> tuple[float, ...]:
-    """width, height, fx, fy, cx, cy, then what distorts."""
+@dataclass(frozen=True)
+class Optics:
+    """numbers: width, height, fx, fy, cx, cy, pixels."""
+
+    numbers: tuple[float, ...]
+    lens: Lens
+
+
+def _optics(model: str, width: int, height: int, params: tuple[float, ...]) -> Optics:
+    if not np.isfinite(params).all():
+        raise BadFileError("a camera has a parameter that is not a number")
     if model in _ONE_FOCAL:
         params = params[:1] + params
-    return width, height, *params
+    return Optics((width, height, *params[:4]), _lens(model, params[4:]))
 
 
-def binary_cameras(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
-    """(number, lens) of cameras.bin; see `_lens`. Raises BadFileError and struct.error."""
+def _lens(model: str, k: tuple[float, ...]) -> Lens:
+    """k: the parameters after the principal point."""
+    kind = "fisheye" if "FISHEYE" in model else "perspective"
+    if model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        return Lens("prism fisheye", k[:6], tangential=(k[7], k[6]), prism=k[8:])  # type: ignore[arg-type]
+    if model == "THIN_PRISM_FISHEYE":
+        prism = (k[6], 0.0, k[7], 0.0)
+        return Lens(kind, (*k[:2], *k[4:6]), tangential=(k[2], k[3]), prism=prism)
+    if model in ("OPENCV", "FULL_OPENCV"):
+        return Lens(kind, (*k[:2], *k[4:5]), k[5:], tangential=(k[2], k[3]))
+    if model in ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM"):
+        straight = not k[0]  # of FOV this is the limit; the formula divides by it
+        return Lens() if straight else Lens(model.removeprefix("SIMPLE_").lower(), own=k)
+    return Lens(kind, k)
+
+
+def binary_cameras(path: Path) -> Iterator[tuple[int, Optics]]:
+    """(number, optics) of cameras.bin. Raises BadFileError and struct.error."""
     data, at = path.read_bytes(), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, kind, width, height = struct.unpack_from("<IiQQ", data, at)
-        if kind not in _PERSPECTIVE:
-            raise BadFileError(f"its camera model {kind} is no perspective")
-        model, count = _PERSPECTIVE[kind]
-        yield number, _lens(model, width, height, struct.unpack_from(f"<{count}d", data, at + 24))
+        if kind not in _MODELS:
+            raise BadFileError(f"its camera model {kind} is none that is known")
+        model, count = _MODELS[kind]
+        yield number, _optics(model, width, height, struct.unpack_from(f"<{count}d", data, at + 24))
         at += 24 + 8 * count
 
 
@@ -87,14 +127,14 @@ def _lines(path: Path) -> Iterator[str]:
         yield from (line.rstrip("\r\n") for line in file if not line.startswith("#"))
 
 
-def text_cameras(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
+def text_cameras(path: Path) -> Iterator[tuple[int, Optics]]:
     """As `binary_cameras`, of cameras.txt. Raises BadFileError and ValueError."""
-    counts = dict(_PERSPECTIVE.values())
+    counts = dict(_MODELS.values())
     for line in filter(str.strip, _lines(path)):
         number, model, width, height, *params = line.split()
         if counts.get(model) != len(params):
-            raise BadFileError(f"its camera model {model[:40]} is no perspective that is known")
-        yield int(number), _lens(model, int(width), int(height), tuple(map(float, params)))
+            raise BadFileError(f"its camera model {model[:40]} is none that is known")
+        yield int(number), _optics(model, int(width), int(height), tuple(map(float, params)))
 
 
 def text_images(path: Path) -> Iterator[Image]:

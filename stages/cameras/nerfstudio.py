@@ -6,7 +6,7 @@ camera to world with OpenGL's axes: x right, y up, z backward.
 The world: z up. We write our y-down world turned by `applied_transform` (x, z, -y), the same turn
 as nerfstudio's own import from COLMAP makes, so that what it exports with the turn undone is in
 our world again. Reading undoes `applied_scale` and `applied_transform`; a file without them is
-taken to be in the world that it was made for.
+taken to be in the world that it was made for. A frame without a size has its picture's.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import math
 import os
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,16 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, make_views
+from stages.cameras.camera_file import CameraFile, FilePoints, make_views
+from stages.cameras.lens import Lens
 from stages.scene import View
 
 OPENGL_FROM_OURS = np.diag([1.0, -1.0, -1.0])
 SAVED_FROM_OURS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_FISHEYE = "OPENCV_FISHEYE"
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # of pictures that are named without one
+_ROLES = {"train_filenames": "train", "test_filenames": "test", "val_filenames": "val"}
 _LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
@@ -86,15 +90,39 @@ def read(path: Path) -> CameraFile:
         frames = data["frames"]
         if not all(isinstance(frame, dict) for frame in frames):
             raise BadFileError("a frame is not an object")
-        lenses = np.array([_read_lens(data, frame) for frame in frames], np.float64).reshape(-1, 6)
-        if not np.isfinite(lenses).all():
+        numbers = np.array(
+            [_read_numbers(ChainMap(frame, data), path.parent) for frame in frames], np.float64
+        ).reshape(-1, 6)
+        if not np.isfinite(numbers).all():
             raise BadFileError("a size or focal length is not a number")
         saved = np.zeros((len(frames), 3, 4))
         for row, frame in zip(saved, frames, strict=True):
             row[:] = np.array(_wanted(frame, "transform_matrix"), np.float64)[:3]
         names = [str(_wanted(frame, "file_path")) for frame in frames]
-        views = make_views(names, lenses[:, :2], lenses[:, 2:], _our_poses(data, saved))
-        return CameraFile(views, path.parent, sum(_is_distorted(data, frame) for frame in frames))
+        views = make_views(names, numbers[:, :2], numbers[:, 2:], _our_poses(data, saved))
+        lenses = tuple(_read_lens(ChainMap(frame, data)) for frame in frames)
+        return CameraFile(_with_roles(views, data), path.parent, lenses)
+
+
+def read_points(path: Path) -> FilePoints | None:
+    """The points of `ply_file_path`, if the file names one that is there. Raises SplatError
+    "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        data = json.loads(path.read_text(encoding="utf-8"))
+        named = data.get("ply_file_path")
+        if not named or not (path.parent / str(named)).is_file():
+            return None
+    with reading(path.parent / str(named), CAMERAS):
+        points, colours = _ply_points(path.parent / str(named))
+        turn, shift, scale = _applied(data)
+        none = np.zeros(len(points))
+        points = (points / scale - shift) @ turn
+        return FilePoints(points, colours, none, none.astype(np.int32))
+
+
+def _with_roles(views: tuple[View, ...], data: dict[str, Any]) -> tuple[View, ...]:
+    roles = {str(name): role for key, role in _ROLES.items() for name in data.get(key) or ()}
+    return tuple(replace(view, role=roles.get(view.name, "")) for view in views)
 
 
 def _saved_pose(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -108,6 +136,16 @@ def _saved_pose(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _our_poses(data: dict[str, Any], saved: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 4] world to camera of OpenGL camera-to-world matrices [V, 3, 4]."""
+    turn, shift, scale = _applied(data)
+    with np.errstate(over="ignore", invalid="ignore"):  # `make_views` looks at what comes out
+        centres = (saved[:, :, 3] / scale - shift) @ turn
+        rotations = OPENGL_FROM_OURS @ saved[:, :, :3].transpose(0, 2, 1) @ turn
+        shifts = -np.einsum("vij,vj->vi", rotations, centres)
+    return np.concatenate([rotations, shifts[:, :, None]], axis=2)
+
+
+def _applied(data: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Turn [3, 3], shift [3] and scale that took the file's own world to the saved one."""
     applied = np.array(data.get("applied_transform", np.eye(4)[:3]), np.float64)[:3]
     scale = float(data.get("applied_scale", 1.0))
     turn = applied[:, :3] if applied.shape == (3, 4) else np.zeros((3, 3))
@@ -117,11 +155,7 @@ def _our_poses(data: dict[str, Any], saved: NDArray[np.float64]) -> NDArray[np.f
         raise BadFileError("its applied_transform is not a rotation and a shift")
     if not (math.isfinite(scale) and scale > 0):
         raise BadFileError("its applied_scale is not a positive number")
-    with np.errstate(over="ignore", invalid="ignore"):  # `make_views` looks at what comes out
-        centres = (saved[:, :, 3] / scale - applied[:, 3]) @ turn
-        rotations = OPENGL_FROM_OURS @ saved[:, :, :3].transpose(0, 2, 1) @ turn
-        shifts = -np.einsum("vij,vj->vi", rotations, centres)
-    return np.concatenate([rotations, shifts[:, :, None]], axis=2)
+    return turn, applied[:, 3], scale
 
 
 def _lens(view: View) -> dict[str, float]:
@@ -130,33 +164,58 @@ def _lens(view: View) -> dict[str, float]:
     return dict(zip(_LENS, lens, strict=True))
 
 
-def _read_lens(data: dict[str, Any], frame: dict[str, Any]) -> list[float]:
+def _read_numbers(merged: Mapping[str, Any], folder: Path) -> list[float]:
     """w, h, fl_x, fl_y, cx, cy: the frame's own, or the file's. Those that may be missing have
     instant-ngp's defaults."""
-    merged = ChainMap(frame, data)
-    model = str(merged.get("camera_model", "OPENCV"))
-    if model not in _PERSPECTIVE:
-        raise BadFileError(f"its camera model is {model[:40]}, which is no perspective")
-    width, height = float(_wanted(merged, "w")), float(_wanted(merged, "h"))
-    if "fl_x" not in merged and "camera_angle_x" in merged:
-        angle = float(merged["camera_angle_x"])
-        fx = 0.5 * width / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
+    if "w" in merged and "h" in merged:
+        width, height = float(merged["w"]), float(merged["h"])
     else:
-        fx = float(_wanted(merged, "fl_x"))
-    fy = float(merged.get("fl_y", fx))
+        width, height = _picture_size(folder, str(_wanted(merged, "file_path")))
+    fx = _focal(merged, "x", width, None)
     return [
         width,
         height,
         fx,
-        fy,
+        _focal(merged, "y", height, fx),
         float(merged.get("cx", width / 2)),
         float(merged.get("cy", height / 2)),
     ]
 
 
-def _is_distorted(data: dict[str, Any], frame: dict[str, Any]) -> bool:
-    merged = ChainMap(frame, data)
-    return any(float(merged.get(key) or 0.0) != 0.0 for key in _DISTORTION)
+def _focal(merged: Mapping[str, Any], axis: str, side: float, otherwise: float | None) -> float:
+    """fl_x or fl_y, or what the angle of view gives."""
+    angle_key = f"camera_angle_{axis}"
+    if f"fl_{axis}" not in merged and angle_key in merged:
+        angle = float(merged[angle_key])
+        return 0.5 * side / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
+    if otherwise is not None and f"fl_{axis}" not in merged:
+        return otherwise
+    return float(_wanted(merged, f"fl_{axis}"))
+
+
+def _picture_size(folder: Path, name: str) -> tuple[int, int]:
+    """Width and height of the picture itself, whose suffix may have been left out."""
+    from PIL import Image
+
+    for path in (folder / f"{name}{suffix}" for suffix in ("", *_SUFFIXES)):
+        if path.is_file():
+            with Image.open(path) as picture:
+                return picture.size
+    raise BadFileError(f"a frame has no w and h, and {name[:80]} is not there to be measured")
+
+
+def _read_lens(merged: Mapping[str, Any]) -> Lens:
+    """What bends the picture: nerfstudio's models, of which instant-ngp's are a part."""
+    model = str(merged.get("camera_model", "OPENCV"))
+    fisheye = model == _FISHEYE or bool(merged.get("is_fisheye", False))
+    if not fisheye and model not in _PERSPECTIVE:
+        raise BadFileError(f"its camera model is {model[:40]}, which is no lens that is known")
+    k1, k2, k3, k4, p1, p2 = values = [
+        float(merged.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
+    ]
+    if not np.isfinite(values).all():
+        raise BadFileError("a lens has a parameter that is not a number")
+    return Lens("fisheye" if fisheye else "perspective", (k1, k2, k3, k4), tangential=(p1, p2))
 
 
 def _wanted(values: Mapping[str, Any], key: str) -> Any:
@@ -183,3 +242,20 @@ def _write_points(path: Path, points: NDArray[np.float64], colours: NDArray[np.u
         rows[name] = colours[:, channel]
     with replacing(path) as partial:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(partial))
+
+
+def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Positions [P, 3] and colours [P, 3], grey where there are none."""
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        rows = PlyData.read(str(path))["vertex"].data
+    except PlyParseError as error:
+        raise BadFileError(f"it is damaged ({error})") from error
+    points = np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
+    if not np.isfinite(points).all():
+        raise BadFileError("a point has a value that is not a number")
+    channels = ("red", "green", "blue")
+    if not all(name in rows.dtype.names for name in channels):
+        return points, np.full((len(points), 3), 128, np.uint8)
+    return points, np.stack([rows[name].astype(np.uint8) for name in channels], axis=1)

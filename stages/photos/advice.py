@@ -56,13 +56,18 @@ def about_left_out(reasons: Sequence[tuple[str, str]], warn: Warn) -> None:
 
 
 def about_conversions(
-    alpha: Sequence[str], hdr: Sequence[str], bad_profiles: Sequence[str], warn: Warn
+    alpha: Sequence[str],
+    hdr: Sequence[str],
+    bad_profiles: Sequence[str],
+    behind: str,
+    warn: Warn,
 ) -> None:
-    """Names of photographs of which something was lost on the way to 8-bit sRGB."""
+    """Names of photographs of which something was lost on the way to 8-bit sRGB. behind: the colour
+    that shows where they were transparent."""
     if alpha:
         warn(
             "ingest-transparency",
-            f"Transparent parts were laid over white: {listed(alpha)}. "
+            f"Transparent parts were laid over {behind}: {listed(alpha)}. "
             "Photographs with their background serve better: it helps to find the cameras.",
         )
     if hdr:

@@ -103,8 +103,9 @@ def readers_set_up() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(log_level)
 
 
-def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
-    """Read the photograph at `path`, its longer side at most `max_side` pixels.
+def decode(path: Path, max_side: int, budget: PixelBudget, behind: str = "white") -> Decoded:
+    """Read the photograph at `path`, its longer side at most `max_side` pixels. behind: the colour
+    that shows where it is transparent.
 
     Raises Unusable for a file that is damaged, truncated, of another kind, too large or too small.
     """
@@ -114,7 +115,7 @@ def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
         with Image.open(io.BytesIO(data), formats=readable) as image:
             stored = _check_size(image.size)
             with budget.spend(stored[0] * stored[1]):
-                return _decode(image, data, max_side)
+                return _decode(image, data, max_side, behind)
     except (Unusable, MemoryError):
         raise
     except UnidentifiedImageError as error:
@@ -145,7 +146,7 @@ def _check_size(size: tuple[int, int]) -> tuple[int, int]:
     return size
 
 
-def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
+def _decode(image: Image.Image, data: bytes, max_side: int, behind: str) -> Decoded:
     stored, exif, info = image.size, read_exif(image), dict(image.info)
     size = fitted_size(*stored, max_side)
     jpeg = image.format in ("JPEG", "MPO")
@@ -154,7 +155,8 @@ def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
     if image.format == "HEIF":
         exif = replace(exif, orientation=1)  # the decoder has turned the pixels already
     native_mode = image.mode
-    shown, alpha = _without_alpha(_resized(_plain_mode(_loaded(image, data)), size, stored))
+    plain = _resized(_plain_mode(_loaded(image, data)), size, stored)
+    shown, alpha = _without_alpha(plain, behind)
     shown, converted, bad_profile = _in_srgb(shown, info.get("icc_profile"))
     upright = exif.orientation == 1
     if not upright:
@@ -225,15 +227,15 @@ def _plain_mode(image: Image.Image) -> Image.Image:
     return image if image.mode in ("RGB", "L", "CMYK", "RGBA", "LA") else image.convert("RGB")
 
 
-def _without_alpha(image: Image.Image) -> tuple[Image.Image, bool]:
-    """(the picture over white where it is transparent, whether it is anywhere)."""
+def _without_alpha(image: Image.Image, behind: str) -> tuple[Image.Image, bool]:
+    """(the picture over a colour where it is transparent, whether it is anywhere)."""
     if image.mode not in ("RGBA", "LA"):
         return image, False
     layered = image.convert("RGBA")
     if layered.getchannel("A").getextrema() == (255, 255):
         return layered.convert("RGB"), False
-    white = Image.new("RGBA", image.size, (255, 255, 255, 255))
-    return Image.alpha_composite(white, layered).convert("RGB"), True
+    below = Image.new("RGBA", image.size, behind)
+    return Image.alpha_composite(below, layered).convert("RGB"), True
 
 
 def _resized(image: Image.Image, size: tuple[int, int], stored: tuple[int, int]) -> Image.Image:

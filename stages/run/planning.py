@@ -94,13 +94,34 @@ class Planner:
         """What `stage` is asked to do. Raises SplatError (photographs-missing), OSError."""
         if stage.reads:
             inputs = {name: self._digests[name] for name in stage.reads}
-            return request_for(stage, settings, inputs, {})
+            files = self._files_of(stage, settings)
+            inputs |= {name: combined_digest(records) for name, records in files.items()}
+            return request_for(stage, settings, inputs, files)
         if self._photo_records is None:
             done = Manifest.read(self.layout.workspace(stage).final)
             known = done.input_files.get(PHOTOS) if done else None
             self._photo_records = record_files(self.existing_photos(), known, users=True)
         inputs = {PHOTOS: combined_digest(self._photo_records)}
         return request_for(stage, settings, inputs, {PHOTOS: self._photo_records})
+
+    def _files_of(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
+        """The user's own files that settings name, by setting. Those that have gone since the
+        stage finished count as unchanged, as photographs do. Raises SplatError, OSError."""
+        from stages.cameras.table import files_of
+
+        found = {}
+        done = Manifest.read(self.layout.workspace(stage).final)
+        for name, value in vars(settings).items():
+            if not isinstance(value, Path):
+                continue
+            known = done.input_files.get(name) if done else None
+            if known is not None and not value.exists():
+                found[name] = known
+                continue
+            files = files_of(value)
+            records = (record_files(path, known, users=True) for path in files)
+            found[name] = {key: record for part in records for key, record in part.items()}
+        return found
 
     def existing_photos(self) -> Path:
         """Where the photographs are. Raises SplatError (photographs-missing)."""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from stages.base.stage import Stage
 from stages.base.words import counted
@@ -61,7 +61,7 @@ def settings_from_data(settings_type: type, data: Mapping[str, Any]) -> Any:
         if field.name in data:
             value = data[field.name]
             known[field.name] = tuple(value) if isinstance(value, list) else value
-            if hints[field.name] is Path:
+            if value is not None and Path in (hints[field.name], *get_args(hints[field.name])):
                 known[field.name] = Path(value)
     return settings_type(**known)
 
@@ -97,10 +97,11 @@ def _input_changes(name: str, request: Request, done: Manifest) -> list[str]:
     if name not in request.input_files:
         return [f"{name} changed"]
     now, then = request.input_files[name], done.input_files.get(name, {})
-    changes = [f"photograph {words}" for words in differences(then, now)]
+    what = "photograph" if name == "photos" else f"{name} file"
+    changes = [f"{what} {words}" for words in differences(then, now)]
     if len(changes) > 3:
         rest = len(changes) - 3
-        return [*changes[:3], f"{counted(rest, 'more photograph')} changed"]
+        return [*changes[:3], f"{counted(rest, f'more {what}')} changed"]
     return changes or [f"{name} changed"]
 
 

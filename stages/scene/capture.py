@@ -57,12 +57,13 @@ class Capture:
 @dataclass(frozen=True)
 class View:
     """A registered photograph, undistorted. image: relative to the reconstruction's folder. twin:
-    as in `Photo`."""
+    as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody does."""
 
     name: str
     image: str
     camera: Camera
     twin: str = ""
+    role: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,16 @@ class Reconstruction:
 
 def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """(training, held out): of every eight by name the first is held out, to judge and for nothing
-    else.
+    else. Where views have roles, those for "test" are.
 
     A photograph that has a twin would be judged by how well its twin was learnt: the first of the
     eight that has none takes its place. Fewer than 4 views are too few to spare one: then nothing
     is held out.
     """
     ordered = tuple(sorted(views, key=lambda view: view.name))
+    if any(view.role for view in ordered):
+        judges = tuple(view for view in ordered if view.role == "test")
+        return tuple(view for view in ordered if view.role != "test"), judges
     if len(ordered) < 4:
         return ordered, ()
     eights = (ordered[i : i + HELD_OUT_EVERY] for i in range(0, len(ordered), HELD_OUT_EVERY))

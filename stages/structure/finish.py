@@ -93,17 +93,17 @@ def _write_pictures(
         if camera not in made:
             made = {camera: maps(pinholes[camera], model.camera_params[camera])}
         image = cv2.remap(
-            _read(source / photo.image),
+            read_picture(source / photo.image),
             *made[camera],
             interpolation=cv2.INTER_CUBIC,
             borderMode=cv2.BORDER_REPLICATE,
         )
         target.parent.mkdir(parents=True, exist_ok=True)
-        _write(target, image)
+        write_picture(target, image)
     report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
 
 
-def _read(path: Path) -> np.ndarray:
+def read_picture(path: Path) -> np.ndarray:
     try:
         data = np.fromfile(path, np.uint8)  # cv2.imread fails on some paths under Windows
     except OSError:
@@ -120,7 +120,7 @@ def _read(path: Path) -> np.ndarray:
     return image
 
 
-def _write(path: Path, image: np.ndarray) -> None:
+def write_picture(path: Path, image: np.ndarray) -> None:
     """As the suffix says: what came without loss goes on without."""
     if path.suffix.lower() == ".png":
         encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1]

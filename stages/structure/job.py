@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-STEPS = ("features", "matching", "share", "mapping")
+STEPS = ("features", "matching", "share", "mapping", "neighbours", "triangulation")
 
 
 @dataclass(frozen=True)
@@ -63,3 +63,9 @@ class Job:
         data["camera_of"] = tuple(data["camera_of"])
         data["cameras"] = tuple(CameraGuess(**camera) for camera in data["cameras"])
         return cls(**data)
+
+
+def known_path(job: Job) -> Path:
+    """Of the steps "neighbours" and "triangulation": what is known of the cameras of `job.names`.
+    intrinsics [V, 4] fx, fy, cx, cy; sizes [V, 2]; world_to_camera [V, 4, 4]; pairs [Q, 2]."""
+    return Path(job.database).with_suffix(".known.npz")

@@ -62,7 +62,7 @@ def upright(model: SparseModel) -> tuple[SparseModel, bool]:
     centre = subject_centre(model)
     rotations = model.world_to_camera[:, :3, :3]
     up = up_direction(rotations)
-    turn = np.eye(3) if up is None else _levelling_rotation(up, rotations[0, 2], rotations[0, 0])
+    turn = np.eye(3) if up is None else levelling_rotation(up, rotations[0, 2], rotations[0, 0])
     moved = model.world_to_camera.copy()
     moved[:, :3, :3] = rotations @ turn.T
     moved[:, :3, 3] += rotations @ centre
@@ -70,7 +70,7 @@ def upright(model: SparseModel) -> tuple[SparseModel, bool]:
     return replace(model, world_to_camera=moved, points=points), up is not None
 
 
-def _levelling_rotation(
+def levelling_rotation(
     up: NDArray[np.float64], heading: NDArray[np.float64], right: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """[3, 3] new from old: -Y is `up`, +Z the horizontal part of `heading` (of the direction that

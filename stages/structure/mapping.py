@@ -135,7 +135,7 @@ def _plain(model: pycolmap.Reconstruction, job: Job) -> SparseModel:
     position = {image_id: i for i, image_id in enumerate(image_ids)}
     point_ids = sorted(model.point3D_ids())
     points = [model.points3D[point_id] for point_id in point_ids]
-    observations = _observations(model, points, position)
+    seen = observations(model, points, position)
     rotations = _two_view_rotations(Path(job.database), model, position)
     cameras = [
         model.cameras[camera_id + 1]
@@ -156,7 +156,7 @@ def _plain(model: pycolmap.Reconstruction, job: Job) -> SparseModel:
         ),
         points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
         colours=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-        **observations,
+        **seen,
         **rotations,
     )
 
@@ -167,7 +167,7 @@ def _matrix(pose: Any) -> np.ndarray:
     return matrix
 
 
-def _observations(
+def observations(
     model: pycolmap.Reconstruction, points: list[Any], position: dict[int, int]
 ) -> dict[str, np.ndarray]:
     keypoints = {i: model.images[i].points2D for i in position}

@@ -78,6 +78,7 @@ def _view_to_dict(view: View) -> dict[str, Any]:
         "name": view.name,
         "image": view.image,
         "twin": view.twin,
+        **({"role": view.role} if view.role else {}),
         "width": camera.width,
         "height": camera.height,
         "fx": float(camera.fx),
@@ -94,4 +95,6 @@ def _view_from_dict(data: dict[str, Any]) -> View:
     camera = Camera(
         width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
     )
-    return View(str(data["name"]), str(data["image"]), camera, str(data["twin"]))
+    return View(
+        str(data["name"]), str(data["image"]), camera, str(data["twin"]), str(data.get("role", ""))
+    )

@@ -163,7 +163,8 @@ def test_damaged_models_are_refused_quickly(tmp_path: Path, name: str, change) -
 @pytest.mark.parametrize(
     ("cameras", "images", "said"),
     [
-        ("1 OPENCV_FISHEYE 64 48 50 50 32 24 0 0 0 0", "1 1 0 0 0 0 0 0 1 a", "OPENCV_FISHEYE"),
+        ("1 EQUIRECTANGULAR 64 48 64 48", "1 1 0 0 0 0 0 0 1 a", "EQUIRECTANGULAR"),
+        ("1 SIMPLE_RADIAL 64 48 50 32 24 nan", "1 1 0 0 0 0 0 0 1 a", "not a number"),
         ("1 PINHOLE 64 48 50 50 32", "1 1 0 0 0 0 0 0 1 a", "PINHOLE"),
         ("1 PINHOLE 64 48 50 50 32 24", "1 1 0 0 0 0 0 0 2 a", "no camera 2"),
         ("1 PINHOLE 64 48 50 50 32 24", "1 0 0 0 0 0 0 0 1 a", "direction"),

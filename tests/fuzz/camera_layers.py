@@ -1,16 +1,19 @@
-"""Cameras of other programs: nerfstudio's file, each file of a COLMAP model, binary and text."""
+"""Cameras of other programs: each of their files; of a COLMAP model as binary and as text."""
 
 from __future__ import annotations
 
 import functools
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
-from stages.cameras import colmap, nerfstudio
+from stages.cameras import blender, bundler, colmap, llff, metashape, nerfstudio, opensfm
 from stages.scene import Camera, View
+from tests.cameras import drawn
 from tests.cameras.models import example
 from tests.fuzz.layer import Layer
 
@@ -65,11 +68,50 @@ def _part(kind: str, name: str) -> Layer:
     )
 
 
+@functools.cache
+def _drawn(kind: str) -> dict[str, bytes]:
+    """A capture of four views, its pictures too, as `kind` names them."""
+    with tempfile.TemporaryDirectory() as name:
+        drawn.MADE[kind](Path(name))
+        files = [path for path in Path(name).rglob("*") if path.is_file()]
+        return {path.relative_to(name).as_posix(): path.read_bytes() for path in files}
+
+
+def _other(module: ModuleType, name: str, text: bool = True) -> Layer:
+    """A file of a format of one reader, with what lies around it. The split's folder is read
+    whole."""
+    kind = module.__name__.rpartition(".")[2]
+
+    def read(path: Path) -> int:
+        place = path.parent if kind == "blender" else path
+        if hasattr(module, "read_points"):
+            found = module.read_points(place)
+            assert found is None or np.isfinite(found.points).all()
+        for lens in module.read(place).lenses:
+            assert np.isfinite([*lens.radial, *lens.tangential]).all()
+        return _checked([view.camera for view in module.read(place).views])
+
+    def beside() -> dict[str, bytes]:
+        return {other: content for other, content in _drawn(kind).items() if other != name}
+
+    return Layer(name, lambda: _drawn(kind)[name], beside=beside, text=text, read=read, holds=4)
+
+
+def _bundle_of_list(path: Path) -> int:
+    return _checked([view.camera for view in bundler.read(path.with_name("bundle.out")).views])
+
+
 def _content(kind: str, name: str) -> Callable[[], bytes]:
     return lambda: _files(kind)[name]
 
 
 LAYERS = {
+    "synthetic NeRF transforms_train.json": _other(blender, "transforms_train.json"),
+    "poses_bounds.npy": _other(llff, "poses_bounds.npy", text=False),
+    "OpenSfM reconstruction.json": _other(opensfm, "reconstruction.json"),
+    "Metashape cameras.xml": _other(metashape, "cameras.xml"),
+    "Bundler bundle.out": _other(bundler, "bundle.out"),
+    "Bundler list.txt": replace(_other(bundler, "list.txt"), read=_bundle_of_list),
     "transforms.json": Layer(
         "transforms.json",
         _content("json", "transforms.json"),

@@ -39,6 +39,7 @@ def main(name: str, count: int, folder: Path) -> None:
     layer = LAYERS[name]
     whole = layer.content()
     for beside, content in layer.beside().items():
+        (folder / beside).parent.mkdir(parents=True, exist_ok=True)
         (folder / beside).write_bytes(content)
     path = folder / layer.name
     path.write_bytes(layer.pack(whole))

@@ -1,0 +1,41 @@
+"""The layout of the synthetic NeRF scenes: transforms_train.json, _val and _test in one folder.
+
+https://github.com/bmild/nerf: each file is a transforms.json with an angle of view and no sizes,
+pictures are named without their suffix, and the files are the benchmark's own split.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from stages.cameras import nerfstudio
+from stages.cameras.camera_file import CameraFile, FilePoints
+
+_SPLITS = ("train", "val", "test")
+
+
+def recognised(path: Path) -> Path | None:
+    """The folder, if it holds transforms_train.json."""
+    return path if _part(path, "train").is_file() else None
+
+
+def read(folder: Path) -> CameraFile:
+    """The cameras of all files that are there; a view's role is its file's. Raises SplatError
+    "cameras-unreadable"."""
+    parts = [name for name in _SPLITS if _part(folder, name).is_file()]
+    found = [(name, nerfstudio.read(_part(folder, name))) for name in parts]
+    return CameraFile(
+        tuple(replace(view, role=name) for name, part in found for view in part.views),
+        folder,
+        tuple(lens for _, part in found for lens in part.lenses),
+    )
+
+
+def read_points(folder: Path) -> FilePoints | None:
+    """Those that the training part names, if any. Raises SplatError "cameras-unreadable"."""
+    return nerfstudio.read_points(_part(folder, "train"))
+
+
+def _part(folder: Path, name: str) -> Path:
+    return folder / f"transforms_{name}.json"

@@ -1,0 +1,98 @@
+"""Bundler's bundle.out: https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html
+
+World to camera, x right, y up, z backward; the principal point in the middle of the picture;
+x = f (1 + k1 r^2 + k2 r^4) p, from there. A list of pictures beside it (list.txt) names them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.cameras.camera_file import CameraFile, FilePoints, make_views
+from stages.cameras.lens import Lens
+from stages.cameras.nerfstudio import OPENGL_FROM_OURS
+
+_LINES = 5  # a camera's
+
+
+def recognised(path: Path) -> Path | None:
+    """The path itself, if it is an .out file."""
+    return path if path.suffix.lower() == ".out" else None
+
+
+def read(path: Path) -> CameraFile:
+    """The cameras that were placed. Raises SplatError "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        cameras, _ = _numbers(path)
+        names = _names(path)
+        if len(names) != len(cameras):
+            raise BadFileError(f"it has {len(cameras)} cameras, and its list {len(names)} pictures")
+        placed = cameras[:, 0] != 0  # a focal length of 0 is Bundler's word for one that was not
+        names = [name for name, there in zip(names, placed, strict=True) if there]
+        cameras = cameras[placed]
+        sizes = np.array([_size(path.parent, name) for name in names], np.float64).reshape(-1, 2)
+        lens = np.concatenate([cameras[:, :1], cameras[:, :1], sizes / 2], axis=1)
+        with np.errstate(all="ignore"):
+            rotations = OPENGL_FROM_OURS @ cameras[:, 3:12].reshape(-1, 3, 3)
+            shifts = cameras[:, 12:] @ OPENGL_FROM_OURS
+        poses = np.concatenate([rotations, shifts[:, :, None]], axis=2)
+        views = make_views(names, sizes, lens, poses)
+        if not np.isfinite(cameras).all():
+            raise BadFileError("a lens has a parameter that is not a number")
+        lenses = tuple(Lens(radial=(float(k1), float(k2))) for k1, k2 in cameras[:, 1:3])
+        return CameraFile(views, path.parent, lenses)
+
+
+def read_points(path: Path) -> FilePoints | None:
+    """Its points. Raises SplatError "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        _, points = _numbers(path)
+        if not len(points):
+            return None
+        if not np.isfinite(points).all():
+            raise BadFileError("a point has a value that is not a number")
+        colours = np.clip(points[:, 3:6], 0, 255).astype(np.uint8)
+        tracks = points[:, 6].astype(np.int32)
+        return FilePoints(points[:, :3], colours, np.zeros(len(points)), tracks)
+
+
+def _numbers(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Cameras [V, 15]: f, k1, k2, rotation, translation; points [P, 7]: position, colour, views."""
+    text = path.read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    views, count = (int(word) for word in lines[0].split()[:2])
+    if views < 0 or count < 0 or len(lines) < 1 + _LINES * views + 3 * count:
+        raise BadFileError("it was cut short")
+    flat = [" ".join(lines[1 + _LINES * i : 1 + _LINES * (i + 1)]).split() for i in range(views)]
+    cameras = np.array(flat, np.float64).reshape(-1, 15)
+    start = 1 + _LINES * views
+    rows = []
+    for i in range(start, start + 3 * count, 3):
+        seen = lines[i + 2].split()[0]
+        rows.append([*lines[i].split(), *lines[i + 1].split(), seen])
+    return cameras, np.array(rows, np.float64).reshape(-1, 7)
+
+
+def _names(path: Path) -> list[str]:
+    """Of the list of pictures: a line each, the name its first word."""
+    near = (path.with_suffix(".txt"), path.parent / "list.txt", path.parent.parent / "list.txt",
+            path.with_name(f"{path.name}.list.txt"))  # fmt: skip
+    found = next((place for place in near if place.is_file()), None)
+    if found is None:
+        raise BadFileError(f"no list of pictures (list.txt) lies beside {path.name}")
+    lines = found.read_text(encoding="utf-8").splitlines()
+    return [line.split()[0] for line in lines if line.strip()]
+
+
+def _size(folder: Path, name: str) -> tuple[int, int]:
+    from PIL import Image
+
+    for place in (folder, folder / "images", folder.parent, folder.parent / "images"):
+        if (place / name).is_file():
+            with Image.open(place / name) as picture:
+                return picture.size
+    raise BadFileError(f"{name[:80]} is not there, and its size is needed")

@@ -1,0 +1,129 @@
+"""Lenses that bend straight lines: where on the image plane a direction is seen.
+
+Image-plane coordinates: u = X / Z, v = Y / Z of a pinhole camera; a lens moves them before focal
+length and principal point make pixels of them. The models are those of COLMAP
+(https://colmap.github.io/cameras.html), of which those of other programs are special cases.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+WIDEST = 1.5  # radians from the axis; a pinhole camera sees less than pi / 2
+_ROUNDS = 60
+_STEP = 1e-6
+_CLOSE = 1e-9
+
+
+@dataclass(frozen=True)
+class Lens:
+    """kind: "perspective", "fisheye" (angle from the axis in place of its tangent), "prism fisheye"
+    (the same, tangential terms after the radial ones), "fov", "division" or "eucm".
+
+    radial: factors of r^2, r^4, ... in 1 + ...; below: the same in the denominator. tangential: p1
+    and p2 in OpenCV's order. prism: what r^2 and r^4 add to u, then to v. own: parameters of the
+    last three kinds.
+    """
+
+    kind: str = "perspective"
+    radial: tuple[float, ...] = ()
+    below: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    own: tuple[float, ...] = ()
+
+    @property
+    def bends(self) -> bool:
+        """Whether it differs from a pinhole."""
+        terms = (*self.radial, *self.below, *self.tangential, *self.prism, *self.own)
+        return "fisheye" in self.kind or any(terms)
+
+    def distort(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[..., 2] where the lens shows what a pinhole camera has at `uv` [..., 2]."""
+        if "fisheye" not in self.kind:
+            return self._moved(uv)
+        radius = np.linalg.norm(uv, axis=-1, keepdims=True)
+        return self._moved(uv * _ratio(np.arctan(radius), radius))
+
+    def undistort(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 2] the inverse of `distort`, on the part around the axis where it is one to one; NaN
+        beyond it, and beyond `WIDEST`."""
+        at = seen.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(_ROUNDS):
+                off = self._moved(at) - seen
+                step = np.einsum("nij,nj->ni", _inverse(self._slopes(at)), off)
+                length = np.linalg.norm(step, axis=1, keepdims=True)
+                at = at - step * np.minimum(1.0, 0.3 / np.maximum(length, 1e-12))
+            found = np.abs(self._moved(at) - seen).max(axis=1) < _CLOSE
+            # Steps may jump over a fold: along the way from the axis the slope stays positive.
+            for share in np.linspace(0.0, 1.0, 17):
+                found &= np.linalg.det(self._slopes(share * at)) > 0
+            if "fisheye" in self.kind:
+                angle = np.linalg.norm(at, axis=1, keepdims=True)
+                found &= angle[:, 0] < WIDEST
+                at = at * _ratio(np.tan(angle), angle)
+        return np.where(found[:, None], at, np.nan)
+
+    def _slopes(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 2, 2] derivatives of `_moved`."""
+        columns = [
+            (self._moved(at + step) - self._moved(at - step)) / (2 * _STEP)
+            for step in _STEP * np.eye(2)
+        ]
+        return np.stack(columns, axis=-1)
+
+    def _moved(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What comes after a fisheye's angles."""
+        r2 = np.sum(uv**2, axis=-1, keepdims=True)
+        if self.kind == "fov":
+            (omega,) = self.own
+            r = np.sqrt(r2)
+            return uv * _ratio(np.arctan(2 * r * np.tan(omega / 2)) / omega, r)
+        if self.kind == "division":
+            (k,) = self.own
+            with np.errstate(invalid="ignore"):
+                return np.asarray(uv * (2.0 / (1.0 + np.sqrt(1.0 - 4.0 * k * r2))))
+        if self.kind == "eucm":
+            alpha, beta = self.own
+            return np.asarray(uv / (alpha * np.sqrt(beta * r2 + 1.0) + 1.0 - alpha))
+        scaled = uv * (_polynomial(self.radial, r2) / _polynomial(self.below, r2))
+        return scaled + self._shift(scaled if self.kind == "prism fisheye" else uv)
+
+    def _shift(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of the tangential and prism terms."""
+        if not any((*self.tangential, *self.prism)):
+            return np.zeros_like(uv)
+        (p1, p2), (s1, s2, s3, s4) = self.tangential, self.prism
+        u, v = uv[..., 0], uv[..., 1]
+        r2 = u**2 + v**2
+        du = 2 * p1 * u * v + p2 * (r2 + 2 * u**2) + s1 * r2 + s2 * r2**2
+        dv = 2 * p2 * u * v + p1 * (r2 + 2 * v**2) + s3 * r2 + s4 * r2**2
+        return np.stack([du, dv], axis=-1)
+
+
+PINHOLE = Lens()
+
+
+def _polynomial(factors: tuple[float, ...], r2: NDArray[np.float64]) -> NDArray[np.float64]:
+    value = np.zeros_like(r2)
+    for factor in reversed(factors):
+        value = (value + factor) * r2
+    return 1.0 + value
+
+
+def _ratio(over: NDArray[np.float64], below: NDArray[np.float64]) -> NDArray[np.float64]:
+    """over / below; 1 on the axis, where it is multiplied by 0."""
+    return np.where(below > 0, over, 1.0) / np.where(below > 0, below, 1.0)
+
+
+def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of [N, 2, 2]; zero where there is none."""
+    (a, b), (c, d) = matrices.transpose(1, 2, 0)
+    determinant = a * d - b * c
+    usable = np.abs(determinant) > 1e-12
+    swapped = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2)
+    return np.where(usable[:, None, None], swapped / determinant[:, None, None], 0.0)

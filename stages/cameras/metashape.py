@@ -1,0 +1,88 @@
+"""Metashape's cameras ("Export Cameras", Agisoft XML); its manual's appendix "Camera models".
+
+A camera's transform is camera to world with our axes; the world is the chunk's own. Principal
+points are counted from the middle of the picture; P1 and P2 are OpenCV's p2 and p1.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.cameras.camera_file import CameraFile, make_views
+from stages.cameras.lens import Lens
+
+_KINDS = {"frame": "perspective", "fisheye": "fisheye"}
+
+
+def recognised(path: Path) -> Path | None:
+    """The path itself, if it is an .xml file."""
+    return path if path.suffix.lower() == ".xml" else None
+
+
+def read(path: Path) -> CameraFile:
+    """The cameras that were placed. Raises SplatError "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        root = _parsed(path)
+        optics = {
+            sensor.get("id", ""): _optics(sensor)
+            for sensor in root.iter("sensor")
+            if sensor.find("calibration") is not None
+        }
+        placed = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
+        missing = {camera.get("sensor_id", "") for camera in placed} - optics.keys()
+        if missing:
+            raise BadFileError(f"there is no calibrated sensor {min(missing)[:80]!r}")
+        mine = [optics[camera.get("sensor_id", "")] for camera in placed]
+        words = [(camera.findtext("transform") or "").split() for camera in placed]
+        poses = np.array(words, np.float64).reshape(-1, 4, 4)
+        turns = poses[:, :3, :3].transpose(0, 2, 1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            shifts = -np.einsum("vij,vj->vi", turns, poses[:, :3, 3])
+        numbers = np.array([values for values, _ in mine], np.float64).reshape(-1, 6)
+        views = make_views(
+            [camera.get("label", "") for camera in placed],
+            numbers[:, :2],
+            numbers[:, 2:],
+            np.concatenate([turns, shifts[:, :, None]], axis=2),
+        )
+        return CameraFile(views, path.parent, tuple(lens for _, lens in mine))
+
+
+def _parsed(path: Path) -> Element:
+    data = path.read_bytes()
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # an entity may stand for gigabytes
+        raise BadFileError("it declares entities, which Metashape does not")
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise BadFileError(f"it is damaged ({error})") from error
+
+
+def _optics(sensor: Element) -> tuple[list[float], Lens]:
+    """(width, height, fx, fy, cx, cy in pixels; the lens), adjusted if both are there."""
+    every = sensor.findall("calibration")
+    calibration = next((c for c in every if c.get("class") == "adjusted"), every[0])
+    resolution = calibration.find("resolution")
+    kind = sensor.get("type", "frame")
+    if kind not in _KINDS or resolution is None:
+        raise BadFileError(f"a sensor of type {kind[:40]} has no lens that is known")
+
+    def value(name: str) -> float:
+        return float(calibration.findtext(name) or 0.0)
+
+    width, height = float(resolution.get("width", 0)), float(resolution.get("height", 0))
+    terms = [value(name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    if not np.isfinite(terms).all():
+        raise BadFileError("a lens has a parameter that is not a number")
+    if value("b2") or value("p3") or value("p4"):
+        raise BadFileError("a lens is skewed (b2) or has terms p3 and p4, which are not known here")
+    k1, k2, k3, k4, p1, p2 = terms
+    focal = value("f")
+    numbers = [width, height, focal + value("b1"), focal]
+    centre = [width / 2 + value("cx"), height / 2 + value("cy")]
+    return numbers + centre, Lens(_KINDS[kind], (k1, k2, k3, k4), tangential=(p2, p1))

@@ -1,0 +1,111 @@
+"""OpenSfM's reconstruction.json, which ODM writes too: https://opensfm.org/docs/dataset.html
+
+Rotations are axis and angle, world to camera, with our axes. Focal lengths and principal points
+are in units of the longer side, the latter from the picture's centre. The largest of several
+reconstructions counts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.cameras.camera_file import CameraFile, FilePoints, make_views
+from stages.cameras.lens import Lens
+from stages.scene.rotations import matrices_of
+
+_NAME = "reconstruction.json"
+_PERSPECTIVE = ("perspective", "simple_radial", "radial", "brown")
+_FISHEYE = ("fisheye", "fisheye_opencv")
+
+
+def recognised(path: Path) -> Path | None:
+    """A .json that holds a list, itself or in the folder `path` or ODM's project `path`."""
+    if path.is_dir():
+        near = (path / _NAME, path / "opensfm" / _NAME)
+        return next((place for place in near if place.is_file()), None)
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return path if file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"[" else None
+
+
+def read(path: Path) -> CameraFile:
+    """The cameras of the largest reconstruction; pictures are in `images` beside the file. Raises
+    SplatError "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        data = _largest(path)
+        shots = data["shots"]
+        optics = {name: _optics(camera) for name, camera in data["cameras"].items()}
+        missing = {str(shot["camera"]) for shot in shots.values()} - optics.keys()
+        if missing:
+            raise BadFileError(f"there is no camera {min(missing)[:80]!r}")
+        numbers = np.array([optics[shot["camera"]][0] for shot in shots.values()]).reshape(-1, 6)
+        turns = np.array([shot["rotation"] for shot in shots.values()], np.float64).reshape(-1, 3)
+        shifts = np.array([shot["translation"] for shot in shots.values()], np.float64)
+        with np.errstate(all="ignore"):  # `make_views` looks at what comes out
+            rotations = _rotations(turns)
+        poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
+        views = make_views(list(shots), numbers[:, :2], numbers[:, 2:], poses)
+        lenses = tuple(optics[shot["camera"]][1] for shot in shots.values())
+        return CameraFile(views, path.parent / "images", lenses)
+
+
+def read_points(path: Path) -> FilePoints | None:
+    """The points of the largest reconstruction. Raises SplatError "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        points = list((_largest(path).get("points") or {}).values())
+        if not points:
+            return None
+        where = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
+        colours = np.array([point.get("color", (128,) * 3) for point in points], np.float64)
+        if not (np.isfinite(where).all() and np.isfinite(colours).all()):
+            raise BadFileError("a point has a value that is not a number")
+        none = np.zeros(len(points))
+        rgb = np.clip(colours.reshape(-1, 3), 0, 255).astype(np.uint8)
+        return FilePoints(where, rgb, none, none.astype(np.int32))
+
+
+def _largest(path: Path) -> dict[str, Any]:
+    data = json.loads(path.read_text(encoding="utf-8-sig"))
+    if not isinstance(data, list) or not data:
+        raise BadFileError("it holds no reconstruction")
+    for part in data:
+        whole = isinstance(part, dict) and isinstance(part.get("cameras"), dict)
+        if not (whole and isinstance(part.get("shots"), dict)):
+            raise BadFileError("a reconstruction lacks cameras or shots")
+    largest: dict[str, Any] = max(data, key=lambda part: len(part["shots"]))
+    return largest
+
+
+def _optics(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
+    """(width, height, fx, fy, cx, cy in pixels; the lens)."""
+    width, height = float(camera["width"]), float(camera["height"])
+    kind = str(camera.get("projection_type", "perspective"))
+    if kind not in _PERSPECTIVE + _FISHEYE:
+        raise BadFileError(f"its projection type is {kind[:40]}, which no pinhole comes near")
+    side = max(width, height)
+    fx = float(camera["focal_x"] if "focal_x" in camera else camera["focal"])
+    fy = float(camera.get("focal_y", fx))
+    cx, cy = float(camera.get("c_x", 0.0)), float(camera.get("c_y", 0.0))
+    k = [float(camera.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4")]
+    p = float(camera.get("p1", 0.0)), float(camera.get("p2", 0.0))
+    if not np.isfinite([*k, *p]).all():
+        raise BadFileError("a lens has a parameter that is not a number")
+    # Pixels are counted here from the first one's corner, there from its centre.
+    centre = (width / 2 + side * cx, height / 2 + side * cy)
+    lens = Lens("fisheye" if kind in _FISHEYE else "perspective", tuple(k), tangential=p)
+    return [width, height, side * fx, side * fy, *centre], lens
+
+
+def _rotations(turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, 3, 3] of axes times angles [V, 3]."""
+    angles = np.linalg.norm(turns, axis=1, keepdims=True)
+    axes = turns / np.where(angles > 0, angles, 1.0)
+    return matrices_of(np.concatenate([np.cos(angles / 2), np.sin(angles / 2) * axes], axis=1))

@@ -1,0 +1,65 @@
+"""The space that many cameras see at once, for a start where nothing is known of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import SplatError
+from stages.scene import Camera
+
+RANDOM_POINTS = 20_000
+_PARALLEL = 0.02  # smallest eigenvalue a camera: below, axes meet nowhere in particular
+_SHARE = 0.5  # of the cameras must see a point
+
+
+def seen_by(cameras: Sequence[Camera], points: NDArray[np.float64]) -> NDArray[np.int32]:
+    """[P] how many cameras have each point in their picture."""
+    count = np.zeros(len(points), np.int32)
+    for camera in cameras:
+        pixels, z = camera.project(points)
+        count += camera.shows(pixels) & (z > 0)
+    return count
+
+
+def random_points(
+    cameras: Sequence[Camera], seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """(points [P, 3] in the ball that the cameras look at together, its centre [3], its radius).
+
+    The centre is nearest to all optical axes; the radius is what the typical camera sees around it.
+    Raises SplatError "cameras-no-common-view".
+    """
+    centres = np.array([camera.centre for camera in cameras])
+    forward = np.array([camera.forward for camera in cameras])
+    across = np.eye(3) - np.einsum("vi,vj->vij", forward, forward)
+    scatter = across.mean(axis=0)
+    if np.linalg.eigvalsh(scatter)[0] < _PARALLEL:
+        raise _none("Their axes are nearly parallel")
+    middle = np.linalg.solve(scatter, np.einsum("vij,vj->i", across, centres) / len(cameras))
+    depth = np.einsum("vi,vi->v", middle - centres, forward)
+    half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]
+    ahead = depth > 0
+    if ahead.mean() < _SHARE:
+        raise _none("Most of them look away from where their axes meet")
+    radius = float(np.median(depth[ahead] * np.sin(np.arctan(half))[ahead]))
+    random = np.random.default_rng(seed)
+    directions = random.normal(size=(4 * RANDOM_POINTS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    lengths = radius * np.cbrt(random.uniform(size=(len(directions), 1)))
+    points = middle + lengths * directions
+    points = points[seen_by(cameras, points) >= _SHARE * len(cameras)][:RANDOM_POINTS]
+    if len(points) < RANDOM_POINTS // 20:
+        raise _none("Few of them see the same part of the space")
+    return points, middle, radius
+
+
+def _none(why: str) -> SplatError:
+    return SplatError(
+        "cameras-no-common-view",
+        given=f"The photographs give no points, and the cameras no space to start in. {why}.",
+        wanted="Cameras around a subject, photographs with texture, or points in the file.",
+        hint="Export the cameras together with their sparse points.",
+    )

@@ -1,0 +1,383 @@
+"""A reconstruction from cameras that are known: pictures undistorted, poses checked against
+matches, points from the file, from matches with the poses held, or at random."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base import threads
+from stages.base.atomic import replacing
+from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.stage import Report
+from stages.base.words import counted
+from stages.cameras.camera_file import FilePoints
+from stages.cameras.colmap import ColmapModel, write_colmap_model
+from stages.cameras.table import read_cameras, read_points
+from stages.scene import Camera, Capture, Reconstruction, View
+from stages.structure import database as sqlite
+from stages.structure.attempts import _repair_or_delete as repair_or_delete
+from stages.structure.common_view import random_points, seen_by
+from stages.structure.finish import COLMAP, IMAGES, SPARSE, read_picture, write_picture
+from stages.structure.job import CameraGuess, Job, known_path
+from stages.structure.lenses import maps, straightened
+from stages.structure.levelling import levelling_rotation, up_direction
+from stages.structure.named import Posed, posed_photographs
+from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
+
+NEIGHBOURS = 10
+_IN_ORDER = 2  # photographs ahead, also compared, whatever the poses say
+EXHAUSTIVE_UP_TO = 25
+FITS, ROUGHLY_FITS = 0.5, 0.5  # of the matches of the typical pair
+FEWEST_PAIRS = 3
+POINTS_PER_VIEW = 20
+_SEEN_SHARE = 0.1  # of a file's points, by two cameras at least
+_LOST_SHARE = 0.02
+
+
+def reconstruct(
+    capture: Capture,
+    path: Path,
+    folder: Path,
+    work: Path,
+    report: Report,
+    *,
+    split: bool,
+    allow_partial: bool,
+    seed: int,
+    max_features: int,
+    seconds_left: Callable[[], float],
+) -> Reconstruction:
+    """The capture with the cameras in `path`. Leaves what `finish` leaves, but reconstruction.json.
+
+    split: see `posed_photographs`. Raises SplatError, and Interrupted.
+    """
+    found = read_cameras(path)
+    from_file = read_points(path)
+    posed = posed_photographs(found, capture, split, allow_partial, report)
+    if len(posed) < 3:
+        raise _too_few(len(posed))
+    shutil.rmtree(folder / COLMAP, ignore_errors=True)
+    cameras = _undistorted(posed, capture.folder, folder, report)
+    training = [i for i, one in enumerate(posed) if one.role != "test"]
+    job = _job(posed, cameras, training, folder, work, seed, max_features)
+    _match(job, work, report, seconds_left)
+    _judge(Path(job.out), report, allow_partial)
+    seen = [cameras[i] for i in training]
+    cloud = _file_points(from_file, seen, report)
+    source = "the cameras' file"
+    observed = _Observed.none()
+    if cloud is None:
+        cloud, observed = _triangulated(Path(job.out) / "points.npz", training)
+        source = "matches"
+        if len(cloud.points) < POINTS_PER_VIEW * len(training):
+            cloud, source = _with_random(cloud, seen, seed, report), "chance"
+    report.metric("points_from", source)
+    return _finished(posed, cameras, cloud, observed, folder, report)
+
+
+def _undistorted(posed: list[Posed], source: Path, folder: Path, report: Report) -> list[Camera]:
+    """The pinhole camera of each photograph, whose picture is written. A photograph that is
+    straight already stays as it is, byte for byte."""
+    cameras, kept = [], []
+    known: dict[tuple[object, ...], tuple[Camera, float]] = {}
+    for done, one in enumerate(posed):
+        if report.stop_requested.is_set():
+            raise Interrupted
+        report.progress(done, len(posed), "undistorting", photographs=done)
+        c = one.camera
+        key = (one.lens, c.width, c.height, c.fx, c.fy, c.cx, c.cy)
+        if key not in known:
+            known[key] = straightened(c, one.lens)
+        pinhole, share = known[key]
+        cameras.append(replace(pinhole, world_to_camera=c.world_to_camera))
+        kept.append(share)
+        target = folder / IMAGES / one.photo.picture
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if one.lens.bends:
+            image = read_picture(source / one.photo.image)
+            x, y = maps(c, one.lens, pinhole)
+            write_picture(
+                target,
+                cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE),
+            )
+        else:
+            read_picture(source / one.photo.image)  # raises if it is gone
+            with replacing(target) as partial:
+                shutil.copyfile(source / one.photo.image, partial)
+    lost = 1.0 - float(np.mean(kept))
+    report.metric("lost_by_undistortion", round(lost, 4))
+    if lost > _LOST_SHARE:
+        report.warn(
+            "sfm-edges-lost",
+            f"The lens bends so much that {lost:.0%} of the photographs' area, at their edges, "
+            "has no place in straight pictures and is not used.",
+        )
+    return cameras
+
+
+def _job(
+    posed: list[Posed],
+    cameras: list[Camera],
+    training: list[int],
+    folder: Path,
+    work: Path,
+    seed: int,
+    max_features: int,
+) -> Job:
+    """Of the training photographs alone, undistorted, each with a camera of its own. What an
+    interrupted run left is kept if it was about the same."""
+    chosen = [cameras[i] for i in training]
+    known = {
+        "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in chosen]),
+        "sizes": np.array([(c.width, c.height) for c in chosen], np.int32),
+        "world_to_camera": np.array([c.world_to_camera for c in chosen]),
+    }
+    known["pairs"] = neighbours(known["world_to_camera"])
+    job = Job(
+        step="",
+        images_root=str((folder / IMAGES).resolve()),
+        database=str(work / "known.db"),
+        out=str(work / "known"),
+        progress="",
+        names=tuple(posed[i].photo.picture for i in training),
+        camera_of=tuple(range(len(training))),
+        cameras=tuple(CameraGuess(c.width, c.height, (c.fx * c.fy) ** 0.5) for c in chosen),
+        seed=seed,
+        threads=threads.count(),
+        max_features=max_features,
+    )
+    digest = hashlib.sha256(b"".join(np.ascontiguousarray(v).tobytes() for v in known.values()))
+    about = json.dumps([job.names, seed, max_features, digest.hexdigest()])
+    described = work / "known.json"
+    if not described.is_file() or described.read_text(encoding="utf-8") != about:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        described.write_text(about, encoding="utf-8")
+    np.savez(known_path(job), **known)  # type: ignore[arg-type]
+    return job
+
+
+def neighbours(poses: NDArray[np.float64]) -> NDArray[np.int32]:
+    """[Q, 2] pairs to compare, of world-to-camera matrices [V, 4, 4]: each with those that stand
+    nearest and look the same way, and with the next in order, in case the poses are wrong."""
+    count = len(poses)
+    first, second = np.triu_indices(count, 1)
+    if count > EXHAUSTIVE_UP_TO:
+        rotations = poses[:, :3, :3]
+        centres = -np.einsum("vij,vi->vj", rotations, poses[:, :3, 3])
+        apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        turned = np.arccos(np.clip(rotations[:, 2] @ rotations[:, 2].T, -1.0, 1.0))
+        cost = apart / max(float(np.median(apart)), 1e-300) + turned
+        np.fill_diagonal(cost, np.inf)
+        near = np.argsort(cost, axis=1, kind="stable")[:, :NEIGHBOURS]
+        wanted = np.zeros((count, count), np.bool_)
+        np.put_along_axis(wanted, near, True, axis=1)
+        wanted |= wanted.T
+        keep = wanted[first, second] | (second - first <= _IN_ORDER)
+        first, second = first[keep], second[keep]
+    return np.stack([first, second], axis=1).astype(np.int32)
+
+
+def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], float]) -> None:
+    """Features, matches, agreement and points of the job, each step unless it is done."""
+    database = Path(job.database)
+    pairs = len(np.load(known_path(job))["pairs"])
+    steps = (
+        ("features", "features", "finding features", len(job.names)),
+        ("neighbours", "matching", "matching", pairs),
+        ("triangulation", "", "measuring depth", 0),
+    )
+    try:
+        for step, counted_as, label, total in steps:
+            marker = work / f"{step}.done"
+            if marker.exists():
+                continue
+            if database.exists():
+                repair_or_delete(database)
+
+            def tick(counted_as: str = counted_as, label: str = label, total: int = total) -> None:
+                done = sqlite.count_done(database, counted_as) if counted_as else None
+                if done is not None:
+                    report.progress(min(done, total), total, label)
+
+            run_worker(replace(job, step=step), work, report.stop_requested, seconds_left(), tick)
+            marker.touch()
+    except WorkerTimedOut:
+        raise _timed_out() from None
+    except WorkerCrashed as crash:
+        raise crash_error(crash, work) from crash
+
+
+def _judge(out: Path, report: Report, allow_partial: bool) -> None:
+    """Refuse poses that do not fit the matches, with the likely cause."""
+    found = json.loads((out / "agreement.json").read_text(encoding="utf-8"))
+    given, roughly = found["given"], found["roughly"]
+    report.metric("matched_pairs", found["pairs"])
+    report.metric("matches_that_fit", None if given is None else round(given, 4))
+    if given is None or found["pairs"] < FEWEST_PAIRS:
+        report.warn(
+            "cameras-unchecked",
+            "Too few photographs show the same recognisable spots to check the cameras by: they "
+            "are taken as they are.",
+        )
+        return
+    if given >= FITS:
+        return
+    name, best = max(found["others"].items(), key=lambda other: other[1] or 0.0)
+    if (best or 0.0) < FITS and roughly >= ROUGHLY_FITS:
+        report.warn(
+            "cameras-rough",
+            f"Only {given:.0%} of what photographs have in common lies where the cameras want it "
+            "to within 4 px of 1600, but most of it nearby: the cameras are rough, and the result "
+            "will be blurred. Leave --cameras away to find better ones.",
+        )
+        return
+    likely = (
+        f"The pictures agree ({best:.0%}) if {name}"
+        if (best or 0.0) >= FITS
+        else ("Check that the file belongs to these photographs, under these names, uncropped.")
+    )
+    error = SplatError(
+        "cameras-do-not-fit",
+        given=f"Only {given:.0%} of what two photographs have in common lies where the file's "
+        "cameras want it.",
+        wanted=f"At least {FITS:.0%}, as cameras of these photographs have.",
+        hint=f"{likely} --allow-partial goes on all the same; without --cameras, splat finds "
+        "cameras itself.",
+        family=Family.RECONSTRUCTION,
+    )
+    if not allow_partial:
+        raise error
+    report.warn(error.code, f"Accepted all the same: {error.given} {likely}")
+
+
+class _Observed:
+    """Which points each view sees, and where; sorted by point, then view."""
+
+    def __init__(
+        self, points: NDArray[np.int32], views: NDArray[np.int32], px: NDArray[np.float64]
+    ) -> None:
+        self.points, self.views, self.px = points, views, px
+
+    @classmethod
+    def none(cls) -> _Observed:
+        return cls(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)))
+
+
+def _file_points(
+    found: FilePoints | None, cameras: list[Camera], report: Report
+) -> FilePoints | None:
+    """The file's points if they lie where its cameras look."""
+    if found is None or not len(found.points):
+        return None
+    seen = seen_by(cameras, found.points)
+    if (seen >= 2).mean() < _SEEN_SHARE:
+        report.warn(
+            "cameras-points-elsewhere",
+            f"Only {np.mean(seen >= 2):.0%} of the file's {counted(len(seen), 'point')} lie before "
+            "two of its cameras: they are not used. Do they belong to another world or scale?",
+        )
+        return None
+    tracks = np.where(found.tracks > 0, found.tracks, seen).astype(np.int32)
+    return replace(found, tracks=tracks)
+
+
+def _triangulated(path: Path, training: list[int]) -> tuple[FilePoints, _Observed]:
+    data = np.load(path)
+    views = np.array(training, np.int32)[data["observing_views"]]
+    seen = _Observed(data["observed_points"], views, data["observed_px"])
+    pairs = np.unique(np.stack([seen.points, seen.views], axis=1), axis=0)
+    tracks = np.bincount(pairs[:, 0], minlength=len(data["points"])).astype(np.int32)
+    return FilePoints(data["points"], data["colours"], data["errors_px"], tracks), seen
+
+
+def _with_random(cloud: FilePoints, cameras: list[Camera], seed: int, report: Report) -> FilePoints:
+    """More points where the cameras look together: matches gave too few."""
+    points, centre, radius = random_points(cameras, seed)
+    at = ", ".join(f"{value:.3g}" for value in centre)
+    report.warn(
+        "cameras-random-start",
+        f"Matches give only {counted(len(cloud.points), 'point')}: training starts from "
+        f"{len(points):,} more at random, within {radius:.3g} of ({at}) in the file's units.",
+    )
+    grey = np.random.default_rng(seed).integers(0, 256, (len(points), 3)).astype(np.uint8)
+    return FilePoints(
+        np.concatenate([cloud.points, points]),
+        np.concatenate([cloud.colours, grey]),
+        np.concatenate([cloud.errors_px, np.zeros(len(points))]),
+        np.concatenate([cloud.tracks, seen_by(cameras, points)]),
+    )
+
+
+def _finished(
+    posed: list[Posed],
+    cameras: list[Camera],
+    cloud: FilePoints,
+    observed: _Observed,
+    folder: Path,
+    report: Report,
+) -> Reconstruction:
+    """Levelled and recentred; the COLMAP model is written."""
+    rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
+    up = up_direction(rotations)
+    turn = np.eye(3) if up is None else levelling_rotation(up, rotations[0, 2], rotations[0, 0])
+    middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
+    world_from_new = np.eye(4)
+    world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
+    cameras = [camera.moved(world_from_new) for camera in cameras]
+    points = (cloud.points - middle) @ turn.T
+    pictures = [one.photo.picture for one in posed]
+    write_colmap_model(
+        folder / SPARSE,
+        ColmapModel(
+            names=tuple(pictures),
+            cameras=tuple(cameras),
+            points=points,
+            colours=cloud.colours,
+            errors_px=cloud.errors_px,
+            observed_points=observed.points,
+            observing_views=observed.views,
+            observed_px=observed.px,
+        ),
+    )
+    report.metric("file_from_world", world_from_new.tolist())
+    return Reconstruction(
+        folder=folder,
+        views=tuple(
+            View(one.photo.name, f"{IMAGES}/{picture}", camera, one.photo.twin, one.role)
+            for one, picture, camera in zip(posed, pictures, cameras, strict=True)
+        ),
+        points=points,
+        colours=cloud.colours,
+        errors_px=cloud.errors_px,
+        tracks=cloud.tracks,
+        levelled=up is not None,
+    )
+
+
+def _too_few(count: int) -> SplatError:
+    return SplatError(
+        "sfm-too-few-photographs",
+        given=f"{counted(count, 'photograph')} of the capture have a camera.",
+        wanted="At least 3.",
+        hint="Check that the file's names are those of the photographs.",
+    )
+
+
+def _timed_out() -> SplatError:
+    return SplatError(
+        "sfm-timed-out",
+        given="Features and matches of the photographs were not ready in time.",
+        wanted="The cameras are checked against matches before they are used.",
+        hint="Allow more time with --max-minutes, or use fewer or smaller photographs.",
+        family=Family.RECONSTRUCTION,
+    )

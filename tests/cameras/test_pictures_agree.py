@@ -1,0 +1,113 @@
+"""Handedness and axes are right because pictures say so.
+
+Known points are drawn into photographs by the formula that each format's own description gives,
+or by a library of others, and must be found there by the cameras that were read.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages.base.errors import SplatError
+from stages.cameras.table import CAMERA_FILES, files_of, read_cameras, read_points
+from tests.cameras.drawn import (
+    COLOURS,
+    HEIGHT,
+    MADE,
+    POINTS,
+    POSES,
+    WIDTH,
+    blender,
+    nerfstudio,
+)
+
+
+def test_every_format_of_the_table_is_drawn() -> None:
+    assert set(MADE) == {row.module for row in CAMERA_FILES}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_points_are_where_the_pictures_show_them(tmp_path: Path, name: str) -> None:
+    found = read_cameras(MADE[name](tmp_path))
+    assert len(found.views) == len(POSES)
+    for view, lens in zip(found.views, found.lenses, strict=True):
+        image = found.folder / view.image
+        image = image if image.exists() else image.with_suffix(".png")
+        if not image.exists():
+            (image,) = tmp_path.rglob(Path(view.image).name)
+        picture = np.asarray(Image.open(image))
+        camera = view.camera
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+        at = POINTS @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        assert (at[:, 2] > 0).all()
+        uv = lens.distort(at[:, :2] / at[:, 2:])
+        px = np.floor(uv * (camera.fx, camera.fy) + (camera.cx, camera.cy)).astype(int)
+        hit = [
+            np.abs(picture[y, x].astype(int) - colour).max() == 0
+            for (x, y), colour in zip(px, COLOURS, strict=True)
+        ]
+        assert np.mean(hit) >= 0.8  # discs may cover each other
+
+
+@pytest.mark.parametrize("name", ["colmap", "opensfm", "bundler"])
+def test_points_of_the_file_are_in_the_cameras_world(tmp_path: Path, name: str) -> None:
+    found = read_points(MADE[name](tmp_path))
+    assert found is not None
+    order = [int(np.argmin(np.abs(POINTS - p).sum(axis=1))) for p in found.points]
+    np.testing.assert_allclose(found.points, POINTS[order], atol=1e-9)
+    np.testing.assert_array_equal(found.colours, COLOURS[order])
+    assert sorted(order) == list(range(len(POINTS)))
+
+
+def test_a_benchmarks_split_is_read(tmp_path: Path) -> None:
+    roles = [view.role for view in read_cameras(blender(tmp_path)).views]
+    assert roles == ["train", "train", "val", "test"]
+
+
+def test_nerfstudios_split_is_read(tmp_path: Path) -> None:
+    path = nerfstudio(tmp_path)
+    data = json.loads(path.read_text())
+    data["train_filenames"] = ["images/p_0.png", "images/p_1.png"]
+    data["test_filenames"] = ["images/p_2.png"]
+    path.write_text(json.dumps(data))
+    assert [view.role for view in read_cameras(path).views] == ["train", "train", "test", ""]
+
+
+def test_nerfstudios_points_come_back_into_the_cameras_world(tmp_path: Path) -> None:
+    from stages.cameras.nerfstudio import write
+
+    views = read_cameras(nerfstudio(tmp_path)).views
+    target = tmp_path / "again.json"
+    write(target, views, tmp_path, POINTS, COLOURS)
+    found = read_points(target)
+    assert found is not None
+    np.testing.assert_allclose(found.points, POINTS, atol=1e-6)
+    assert {path.name for path in files_of(target)} == {"again.json", "again.ply"}
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("blender", "transforms_test.json"),
+        ("llff", "poses_bounds.npy"),
+        ("opensfm", "reconstruction.json"),
+        ("bundler", "bundle.out"),
+        ("metashape", "cameras.xml"),
+    ],
+)
+def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:
+    path = MADE[name](tmp_path)
+    _cut(tmp_path / file)
+    with pytest.raises(SplatError) as caught:
+        read_cameras(path)
+    assert caught.value.code == "cameras-unreadable"
+    assert file in caught.value.given
