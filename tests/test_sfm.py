@@ -21,8 +21,8 @@ from stages.scene import Capture, Reconstruction
 from stages.structure import ladder
 from tests import processes
 from tests.structure import bad_captures
+from tests.structure.truth import TRUTH, centres, similarity
 
-TRUTH = bad_captures.SAMPLE.parent / "truth.json"
 FEW = sfm.SfmSettings(max_features=2000)  # enough for the sample, and quick
 
 
@@ -259,17 +259,3 @@ def test_killed_at_any_moment_a_run_ends_in_the_same_bytes(
             time.sleep(float(random.uniform(0.5, 5.0)))
     subprocess.run(processes.python(code, str(folder)), check=True)
     assert digests(folder) == digests(whole)
-
-
-def centres(poses: np.ndarray) -> np.ndarray:
-    return -np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3])
-
-
-def similarity(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Rotation, scale, shift with target = scale R source + shift (Umeyama 1991)."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = u @ np.diag(signs) @ vt
-    scale = float((s * signs).sum() / (a**2).sum())
-    return turn, scale, target.mean(axis=0) - scale * turn @ source.mean(axis=0)

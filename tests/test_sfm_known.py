@@ -15,7 +15,7 @@ from stages.base.stage import Report
 from stages.scene import Reconstruction, split_held_out
 from stages.scene.rotations import quaternions_of
 from tests.structure import bad_captures
-from tests.test_sfm import TRUTH, centres, similarity
+from tests.structure.truth import TRUTH, centres, similarity
 
 POSES = {
     photo["name"]: np.array(photo["world_to_camera"])
