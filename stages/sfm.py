@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from stages.structure.ladder import Attempt, Climb
     from stages.structure.sparse_model import SparseModel
 
-EXHAUSTIVE_UP_TO = 300  # photographs; beyond, matching every pair takes hours
 _FEWEST_PHOTOGRAPHS = 3
 _FEWEST_PARTIAL_POINTS = 50
 _FINISHED = "sfm.json"
@@ -47,7 +46,7 @@ class SfmSettings:
         },
     )
     max_features: int = field(
-        default=8192,
+        default=12_288,
         metadata={
             "help": "Features to look for in each photograph (about).",
             "min": 100,
@@ -58,7 +57,7 @@ class SfmSettings:
         default="auto",
         metadata={
             "help": "Which photographs to compare: exhaustive (every pair), sequential (neighbours "
-            "in order of name) or auto (exhaustive up to 300 photographs).",
+            "in order of name) or auto (those that look alike at a first look).",
             "choices": ("auto", "exhaustive", "sequential"),
         },
     )
@@ -199,9 +198,6 @@ def _base_job(capture: Capture, settings: SfmSettings, work: Path) -> Job:
             positions[key] = len(guesses)
             guesses.append(CameraGuess(photo.width, photo.height, photo.focal_px))
         camera_of.append(positions[key])
-    matching = settings.matching
-    if matching == "auto":
-        matching = "exhaustive" if len(capture.photos) <= EXHAUSTIVE_UP_TO else "sequential"
     return Job(
         step="",
         images_root=str(capture.folder.resolve()),
@@ -214,7 +210,7 @@ def _base_job(capture: Capture, settings: SfmSettings, work: Path) -> Job:
         seed=settings.seed,
         threads=threads.count(),
         max_features=settings.max_features,
-        matching=matching,
+        matching="chosen" if settings.matching == "auto" else settings.matching,
     )
 
 
@@ -356,5 +352,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=3, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=4, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -7,7 +7,6 @@ database, whose content does not depend on how often it was interrupted.
 
 from __future__ import annotations
 
-import json
 import re
 import sqlite3
 import time
@@ -18,6 +17,7 @@ from statistics import median
 
 from stages.base.stage import Report
 from stages.structure import database as sqlite
+from stages.structure import ticks
 from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
 from stages.structure.job import Job
 from stages.structure.ladder import LADDER, Attempt, Rung
@@ -116,8 +116,7 @@ class Workbench:
             return
         if database.exists():
             _repair_or_delete(database)
-        total = len(job.names)
-        self._run(replace(job, step="features"), lambda: self._count(job, "features", total))
+        self._run(replace(job, step="features"), lambda: self._tick(job, "photographs"))
         marker.touch()
 
     def _matching(self, job: Job, rung: Rung) -> Job:
@@ -135,48 +134,32 @@ class Workbench:
             return job
         if not rung.drop_stationary:
             sqlite.repair(database)
-        total = pair_count(len(job.names), job.matching)
-        self._run(replace(job, step="matching"), lambda: self._count(job, "matching", total))
+        self._run(replace(job, step="matching"), lambda: self._tick(job, "pairs"))
         marker.touch()
         return job
 
     def _mapping(self, job: Job, rung: Rung) -> None:
         if _finished(Path(job.out)):
             return
-        Path(job.progress).unlink(missing_ok=True)
         total = len(job.names)
-        label = "placing photographs"
-        if rung is not LADDER[0]:
-            label += f" ({rung.name})"
+        more = "" if rung is LADDER[0] else f" ({rung.name})"
         budget = min(self.seconds_left(), mapping_seconds(total))
         timed = replace(job, step="mapping", max_seconds=max(1, int(budget)))
 
-        def tick() -> None:
-            registered = _registered(Path(job.progress))
-            self.report.progress(registered, total, label, registered=registered)
-
         # COLMAP looks at its own clock only between photographs.
-        self._run(timed, tick, timed.max_seconds + 60.0)
+        self._run(timed, lambda: self._tick(job, "registered", more), timed.max_seconds + 60.0)
 
     def _run(self, job: Job, tick: Callable[[], None], max_seconds: float | None = None) -> None:
         seconds = self.seconds_left() if max_seconds is None else max_seconds
+        Path(job.progress).unlink(missing_ok=True)
         run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
 
-    def _count(self, job: Job, step: str, total: int) -> None:
-        done = sqlite.count_done(Path(job.database), step)
-        label, unit = ("finding features", "photographs")
-        if step == "matching":
-            label, unit = ("matching", "pairs")
-        if done is not None:
-            self.report.progress(min(done, total), total, label, **{unit: done})
-
-
-def pair_count(photographs: int, matching: str) -> int:
-    """Pairs that will be matched (for sequential matching about, and at most)."""
-    every = photographs * (photographs - 1) // 2
-    if matching == "exhaustive":
-        return every
-    return min(every, photographs * 24)
+    def _tick(self, job: Job, unit: str, more: str = "") -> None:
+        """Pass on how far the worker says it is."""
+        told = ticks.read(Path(job.progress))
+        if told is not None:
+            phase, done, total = told
+            self.report.progress(done, total, phase + more, **{unit: done})
 
 
 def mapping_seconds(photographs: int) -> float:
@@ -198,13 +181,6 @@ def _finished(out: Path) -> bool:
         return not load_result(out).timed_out
     except (OSError, ValueError):
         return False
-
-
-def _registered(progress: Path) -> int:
-    try:
-        return int(json.loads(progress.read_text())["registered"])
-    except (OSError, ValueError, KeyError):
-        return 0
 
 
 def _too_slow(photographs: int) -> Failure:
