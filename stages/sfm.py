@@ -8,6 +8,7 @@ user is told what to photograph differently.
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Mapping
@@ -94,8 +95,8 @@ def run(
     """Reconstruct the capture in inputs["ingest"]; see the module's docstring.
 
     Leaves in `folder`: reconstruction.json and arrays (`load` reads them), colmap/ (undistorted
-    pictures and a COLMAP model of them), sfm.json (metrics and warnings). Raises SplatError of
-    family RECONSTRUCTION when no reconstruction passes, and Interrupted.
+    pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
+    SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
     from stages.structure import attempts, finish, ladder, reconstruction_files
 
@@ -127,7 +128,13 @@ def run(
     reconstruction = finish.finish(model, capture, folder, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
     _model_metrics(best, model, reconstruction, capture, report)
+    looked_at = base.matching == "chosen"
+    report.metric("pairs_looked_at", math.comb(len(base.names), 2) if looked_at else 0)
+    report.metric("pairs_matched", best.pairs_matched)
+    report.metric("pairs_verified", best.pairs_verified)
     _write_finished(folder, report)
+    for step, seconds in bench.seconds_by_step().items():  # the clock never says the same twice
+        report.metric(f"{step}_seconds", round(seconds, 1))
     shutil.rmtree(work)
     return reconstruction
 

@@ -7,6 +7,7 @@ database, whose content does not depend on how often it was interrupted.
 
 from __future__ import annotations
 
+import json
 import re
 import sqlite3
 import time
@@ -15,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
+from stages.base.atomic import replacing
 from stages.base.stage import Report
 from stages.structure import database as sqlite
 from stages.structure import ticks
@@ -26,6 +28,7 @@ from stages.structure.sparse_model import load_result, measure, without_odd_view
 
 MORE_FEATURES = 2.0  # times as many, at most
 LOWER_PEAK = 0.4  # times SIFT's peak threshold
+_SECONDS = "seconds.json"
 
 
 @dataclass
@@ -60,7 +63,13 @@ class Workbench:
             if failures and not self._hopeful(rung):
                 return replace(attempt, failures=tuple(failures))
             job = self._matching(job, rung)
-            failures = check_pairs(sqlite.verified_pairs(Path(job.database)), photographs)
+            verified = sqlite.verified_pairs(Path(job.database))
+            attempt = replace(
+                attempt,
+                pairs_matched=len(sqlite.inliers_of_pairs(Path(job.database))),
+                pairs_verified=len(verified),
+            )
+            failures = check_pairs(verified, photographs)
             if failures and not self.allow_partial:
                 return replace(attempt, failures=tuple(failures))
             if any(failure.code == "sfm-no-matches" for failure in failures):
@@ -152,7 +161,20 @@ class Workbench:
     def _run(self, job: Job, tick: Callable[[], None], max_seconds: float | None = None) -> None:
         seconds = self.seconds_left() if max_seconds is None else max_seconds
         Path(job.progress).unlink(missing_ok=True)
-        run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+        started, before = time.monotonic(), self.seconds_by_step()
+        try:
+            run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+        finally:
+            before[job.step] = before.get(job.step, 0.0) + time.monotonic() - started
+            with replacing(self.folder / _SECONDS) as path:
+                path.write_text(json.dumps(before))
+
+    def seconds_by_step(self) -> dict[str, float]:
+        """Of all rungs and of interrupted runs; wall clock."""
+        try:
+            return dict(json.loads((self.folder / _SECONDS).read_text()))
+        except (OSError, ValueError):
+            return {}
 
     def _tick(self, job: Job, unit: str, more: str = "") -> None:
         """Pass on how far the worker says it is."""

@@ -34,7 +34,7 @@ class Sorted:
     rows: NDArray[np.int32]
     descriptors: NDArray[np.uint8]
     near: NDArray[np.int32]
-    starts: NDArray[np.int64]
+    starts: NDArray[np.signedinteger]
 
 
 def vocabulary(sample: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -61,9 +61,9 @@ def sort_by_word(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> 
     order = np.argsort(nearest, kind="stable")
     wanted = max(LOOKED_UNDER, math.ceil(COMPARED * len(words) / max(1, len(order))))
     count = min(wanted, len(words))
-    near = np.argpartition(-likeness, count - 1, axis=1)[:, :count]
+    under = np.argpartition(-likeness, count - 1, axis=1)[:, :count]
     # In order of words, neighbours in the list look at the same descriptors, which are at hand.
-    near = np.sort(near, axis=1).astype(np.int32)
+    near = np.sort(under, axis=1).astype(np.int32)
     counts = np.bincount(nearest, minlength=len(words))
     starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     return Sorted(order.astype(np.int32), descriptors[order], near[order], starts)
