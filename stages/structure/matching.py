@@ -19,7 +19,9 @@ from stages.structure.ticks import Ticks
 from stages.structure.words import SAMPLE, Sorted, sort_by_word, vocabulary
 
 FIRST_LOOK = 1000  # features: the largest, which are seen from farthest
+FIRST_COMPARED = 64  # see `words.COMPARED`; a first look need not be right about single features
 FEWEST_INLIERS = 15  # COLMAP's
+MOST_TRIALS = 3000  # where few matches fit, as between pictures of other places
 _KEPT = 256  # photographs whose sorted features stay in memory
 
 
@@ -71,7 +73,7 @@ class _Album:
 
     def largest(self, position: int) -> Sorted:
         """For a first look."""
-        return sort_by_word(self.descriptors(position)[:FIRST_LOOK], self._words)
+        return sort_by_word(self.descriptors(position)[:FIRST_LOOK], self._words, FIRST_COMPARED)
 
     def _sorted(self, position: int) -> Sorted:
         return sort_by_word(self.descriptors(position), self._words)
@@ -157,6 +159,7 @@ def _spread(rows: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
 def _verification(job: Job) -> pycolmap.TwoViewGeometryOptions:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.seed
+    options.ransac.max_num_trials = MOST_TRIALS
     options.compute_relative_pose = True  # also tells a turn on the spot from a planar scene
     options.filter_stationary_matches = job.drop_stationary
     return options

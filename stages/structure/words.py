@@ -54,12 +54,17 @@ def vocabulary(sample: NDArray[np.uint8]) -> NDArray[np.float32]:
     return words
 
 
-def sort_by_word(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> Sorted:
-    """The features with these descriptors [N, 128], sorted by their nearest words."""
+def sort_by_word(
+    descriptors: NDArray[np.uint8], words: NDArray[np.float32], compared: int = COMPARED
+) -> Sorted:
+    """The features with these descriptors [N, 128], sorted by their nearest words.
+
+    compared: with about so many features each will be compared, or with more.
+    """
     likeness = _likeness(descriptors.astype(np.float32), words)
     nearest = likeness.argmax(axis=1)
     order = np.argsort(nearest, kind="stable")
-    wanted = max(LOOKED_UNDER, math.ceil(COMPARED * len(words) / max(1, len(order))))
+    wanted = max(LOOKED_UNDER, math.ceil(compared * len(words) / max(1, len(order))))
     count = min(wanted, len(words))
     under = np.argpartition(-likeness, count - 1, axis=1)[:, :count]
     # In order of words, neighbours in the list look at the same descriptors, which are at hand.
