@@ -116,4 +116,5 @@ def _reduced(width: int, height: int) -> tuple[int, int]:
 def _root(descriptors: np.ndarray) -> NDArray[np.uint8]:
     """RootSIFT: distances of square roots of histograms tell more than those of histograms."""
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
-    return np.minimum(np.rint(_LENGTH * np.sqrt(descriptors / sums)), 255).astype(np.uint8)
+    roots: NDArray[np.float32] = np.rint(_LENGTH * np.sqrt(descriptors / sums))
+    return np.minimum(roots, 255).astype(np.uint8)

@@ -76,4 +76,5 @@ def sort_by_word(
 
 def _likeness(points: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
     """[N, W] the larger, the nearer."""
-    return points @ words.T - 0.5 * np.sum(words**2, axis=1)
+    likeness: NDArray[np.float32] = points @ words.T - 0.5 * np.sum(words**2, axis=1)
+    return likeness
