@@ -14,7 +14,11 @@ from stages.run.pipeline import Pipeline, Step
 # The figures worth a line in the final table, by stage; whatever of them a stage reports is shown.
 _HEADLINES = {
     "ingest": ("photographs", "left_out"),
-    "sfm": ("registered", "photographs", "points", "mean_reprojection_error_px"),
+    "sfm": (
+        *("registered", "photographs", "points", "mean_reprojection_error_px"),
+        *("pairs_looked_at", "pairs_matched", "pairs_verified"),
+        *("features_seconds", "matching_seconds", "mapping_seconds"),
+    ),
     "seed": ("splats",),
     "train": ("splats", "psnr_db", "ssim"),
     # Later stages measure at sizes of their own: their PSNR is no sequel of training's.

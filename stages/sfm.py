@@ -8,6 +8,7 @@ user is told what to photograph differently.
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Mapping
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from stages.structure.ladder import Attempt, Climb
     from stages.structure.sparse_model import SparseModel
 
-EXHAUSTIVE_UP_TO = 300  # photographs; beyond, matching every pair takes hours
 _FEWEST_PHOTOGRAPHS = 3
 _FEWEST_PARTIAL_POINTS = 50
 _FINISHED = "sfm.json"
@@ -47,7 +47,7 @@ class SfmSettings:
         },
     )
     max_features: int = field(
-        default=8192,
+        default=12_288,
         metadata={
             "help": "Features to look for in each photograph (about).",
             "min": 100,
@@ -58,7 +58,7 @@ class SfmSettings:
         default="auto",
         metadata={
             "help": "Which photographs to compare: exhaustive (every pair), sequential (neighbours "
-            "in order of name) or auto (exhaustive up to 300 photographs).",
+            "in order of name) or auto (those that look alike at a first look).",
             "choices": ("auto", "exhaustive", "sequential"),
         },
     )
@@ -95,8 +95,8 @@ def run(
     """Reconstruct the capture in inputs["ingest"]; see the module's docstring.
 
     Leaves in `folder`: reconstruction.json and arrays (`load` reads them), colmap/ (undistorted
-    pictures and a COLMAP model of them), sfm.json (metrics and warnings). Raises SplatError of
-    family RECONSTRUCTION when no reconstruction passes, and Interrupted.
+    pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
+    SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
     from stages.structure import attempts, finish, ladder, reconstruction_files
 
@@ -128,7 +128,13 @@ def run(
     reconstruction = finish.finish(model, capture, folder, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
     _model_metrics(best, model, reconstruction, capture, report)
+    looked_at = base.matching == "chosen"
+    report.metric("pairs_looked_at", math.comb(len(base.names), 2) if looked_at else 0)
+    report.metric("pairs_matched", best.pairs_matched)
+    report.metric("pairs_verified", best.pairs_verified)
     _write_finished(folder, report)
+    for step, seconds in bench.seconds_by_step().items():  # the clock never says the same twice
+        report.metric(f"{step}_seconds", round(seconds, 1))
     shutil.rmtree(work)
     return reconstruction
 
@@ -199,9 +205,6 @@ def _base_job(capture: Capture, settings: SfmSettings, work: Path) -> Job:
             positions[key] = len(guesses)
             guesses.append(CameraGuess(photo.width, photo.height, photo.focal_px))
         camera_of.append(positions[key])
-    matching = settings.matching
-    if matching == "auto":
-        matching = "exhaustive" if len(capture.photos) <= EXHAUSTIVE_UP_TO else "sequential"
     return Job(
         step="",
         images_root=str(capture.folder.resolve()),
@@ -214,7 +217,7 @@ def _base_job(capture: Capture, settings: SfmSettings, work: Path) -> Job:
         seed=settings.seed,
         threads=threads.count(),
         max_features=settings.max_features,
-        matching=matching,
+        matching="chosen" if settings.matching == "auto" else settings.matching,
     )
 
 
@@ -356,5 +359,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=3, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=4, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

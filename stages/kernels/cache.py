@@ -19,7 +19,7 @@ from typing import IO
 
 KEPT = 3  # folders of compiled kernels: one for each version or machine that is in turn
 _VARIABLE = "NUMBA_CACHE_DIR"
-_ROOMS = ("kernels", "raster", "training", "surface", "seeding")
+_ROOMS = ("kernels", "raster", "training", "surface", "seeding", "structure")
 _IN_USE = "in-use"  # locked, as long as its process lives, by each that compiles into the folder
 _held: list[IO[str]] = []
 

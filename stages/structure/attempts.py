@@ -16,8 +16,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
+from stages.base.atomic import replacing
 from stages.base.stage import Report
 from stages.structure import database as sqlite
+from stages.structure import ticks
 from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
 from stages.structure.job import Job
 from stages.structure.ladder import LADDER, Attempt, Rung
@@ -26,6 +28,7 @@ from stages.structure.sparse_model import load_result, measure, without_odd_view
 
 MORE_FEATURES = 2.0  # times as many, at most
 LOWER_PEAK = 0.4  # times SIFT's peak threshold
+_SECONDS = "seconds.json"
 
 
 @dataclass
@@ -60,7 +63,13 @@ class Workbench:
             if failures and not self._hopeful(rung):
                 return replace(attempt, failures=tuple(failures))
             job = self._matching(job, rung)
-            failures = check_pairs(sqlite.verified_pairs(Path(job.database)), photographs)
+            verified = sqlite.verified_pairs(Path(job.database))
+            attempt = replace(
+                attempt,
+                pairs_matched=len(sqlite.inliers_of_pairs(Path(job.database))),
+                pairs_verified=len(verified),
+            )
+            failures = check_pairs(verified, photographs)
             if failures and not self.allow_partial:
                 return replace(attempt, failures=tuple(failures))
             if any(failure.code == "sfm-no-matches" for failure in failures):
@@ -116,8 +125,7 @@ class Workbench:
             return
         if database.exists():
             _repair_or_delete(database)
-        total = len(job.names)
-        self._run(replace(job, step="features"), lambda: self._count(job, "features", total))
+        self._run(replace(job, step="features"), lambda: self._tick(job, "photographs"))
         marker.touch()
 
     def _matching(self, job: Job, rung: Rung) -> Job:
@@ -135,48 +143,45 @@ class Workbench:
             return job
         if not rung.drop_stationary:
             sqlite.repair(database)
-        total = pair_count(len(job.names), job.matching)
-        self._run(replace(job, step="matching"), lambda: self._count(job, "matching", total))
+        self._run(replace(job, step="matching"), lambda: self._tick(job, "pairs"))
         marker.touch()
         return job
 
     def _mapping(self, job: Job, rung: Rung) -> None:
         if _finished(Path(job.out)):
             return
-        Path(job.progress).unlink(missing_ok=True)
         total = len(job.names)
-        label = "placing photographs"
-        if rung is not LADDER[0]:
-            label += f" ({rung.name})"
+        more = "" if rung is LADDER[0] else f" ({rung.name})"
         budget = min(self.seconds_left(), mapping_seconds(total))
         timed = replace(job, step="mapping", max_seconds=max(1, int(budget)))
 
-        def tick() -> None:
-            registered = _registered(Path(job.progress))
-            self.report.progress(registered, total, label, registered=registered)
-
         # COLMAP looks at its own clock only between photographs.
-        self._run(timed, tick, timed.max_seconds + 60.0)
+        self._run(timed, lambda: self._tick(job, "registered", more), timed.max_seconds + 60.0)
 
     def _run(self, job: Job, tick: Callable[[], None], max_seconds: float | None = None) -> None:
         seconds = self.seconds_left() if max_seconds is None else max_seconds
-        run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+        Path(job.progress).unlink(missing_ok=True)
+        started, before = time.monotonic(), self.seconds_by_step()
+        try:
+            run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+        finally:
+            before[job.step] = before.get(job.step, 0.0) + time.monotonic() - started
+            with replacing(self.folder / _SECONDS) as path:
+                path.write_text(json.dumps(before))
 
-    def _count(self, job: Job, step: str, total: int) -> None:
-        done = sqlite.count_done(Path(job.database), step)
-        label, unit = ("finding features", "photographs")
-        if step == "matching":
-            label, unit = ("matching", "pairs")
-        if done is not None:
-            self.report.progress(min(done, total), total, label, **{unit: done})
+    def seconds_by_step(self) -> dict[str, float]:
+        """Of all rungs and of interrupted runs; wall clock."""
+        try:
+            return dict(json.loads((self.folder / _SECONDS).read_text()))
+        except (OSError, ValueError):
+            return {}
 
-
-def pair_count(photographs: int, matching: str) -> int:
-    """Pairs that will be matched (for sequential matching about, and at most)."""
-    every = photographs * (photographs - 1) // 2
-    if matching == "exhaustive":
-        return every
-    return min(every, photographs * 24)
+    def _tick(self, job: Job, unit: str, more: str = "") -> None:
+        """Pass on how far the worker says it is."""
+        told = ticks.read(Path(job.progress))
+        if told is not None:
+            phase, done, total = told
+            self.report.progress(done, total, phase + more, **{unit: done})
 
 
 def mapping_seconds(photographs: int) -> float:
@@ -198,13 +203,6 @@ def _finished(out: Path) -> bool:
         return not load_result(out).timed_out
     except (OSError, ValueError):
         return False
-
-
-def _registered(progress: Path) -> int:
-    try:
-        return int(json.loads(progress.read_text())["registered"])
-    except (OSError, ValueError, KeyError):
-        return 0
 
 
 def _too_slow(photographs: int) -> Failure:

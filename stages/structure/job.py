@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-STEPS = ("features", "matching", "share", "mapping", "neighbours", "triangulation")
+STEPS = ("features", "matching", "mapping", "neighbours", "triangulation")
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,12 @@ class Job:
     """One step of structure from motion.
 
     step: one of `STEPS`. images_root: folder that `names` are relative to. database: COLMAP's.
-    out: where mapping leaves its model (`sparse_model.save_model`). progress: a small JSON file
-    that mapping keeps up to date.
+    out: where mapping leaves its model (`sparse_model.save_model`). progress: where the worker says
+    how far it is (`ticks`).
     names [P] in order of the capture, which fixes the image ids (position + 1);
     camera_of [P] position in `cameras` of each photograph's camera.
-    max_features, peak_threshold: of SIFT (Lowe 2004). matching: "exhaustive" or "sequential".
+    max_features, peak_threshold: of SIFT (Lowe 2004). matching: "chosen" by a first
+    look, "exhaustive" or "sequential".
     drop_stationary: leave out matches that stay in place in the picture (a date stamp).
     mapper: "incremental" or "global". loose: register photographs with fewer matches.
     other_pair: start from another pair of photographs than COLMAP would. max_seconds: of mapping.
@@ -43,9 +44,9 @@ class Job:
     cameras: tuple[CameraGuess, ...]
     seed: int = 0
     threads: int = 1
-    max_features: int = 8192
-    peak_threshold: float = 0.02 / 3
-    matching: str = "exhaustive"
+    max_features: int = 12288
+    peak_threshold: float = 0.0045
+    matching: str = "chosen"
     drop_stationary: bool = False
     mapper: str = "incremental"
     loose: bool = False

@@ -23,7 +23,7 @@ from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.cameras.table import read_cameras, read_points
 from stages.scene import Camera, Capture, Reconstruction, View
-from stages.structure import database as sqlite
+from stages.structure import ticks
 from stages.structure.attempts import _repair_or_delete as repair_or_delete
 from stages.structure.common_view import random_points, seen_by
 from stages.structure.finish import COLMAP, IMAGES, SPARSE, read_picture, write_picture
@@ -147,7 +147,7 @@ def _job(
         images_root=str((folder / IMAGES).resolve()),
         database=str(work / "known.db"),
         out=str(work / "known"),
-        progress="",
+        progress=str(work / "progress.json"),
         names=tuple(posed[i].photo.picture for i in training),
         camera_of=tuple(range(len(training))),
         cameras=tuple(CameraGuess(c.width, c.height, (c.fx * c.fy) ** 0.5) for c in chosen),
@@ -190,24 +190,26 @@ def neighbours(poses: NDArray[np.float64]) -> NDArray[np.int32]:
 def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], float]) -> None:
     """Features, matches, agreement and points of the job, each step unless it is done."""
     database = Path(job.database)
-    pairs = len(np.load(known_path(job))["pairs"])
     steps = (
-        ("features", "features", "finding features", len(job.names)),
-        ("neighbours", "matching", "matching", pairs),
-        ("triangulation", "", "measuring depth", 0),
+        "features",
+        "neighbours",
+        "triangulation",
     )
     try:
-        for step, counted_as, label, total in steps:
+        for step in steps:
             marker = work / f"{step}.done"
             if marker.exists():
                 continue
             if database.exists():
                 repair_or_delete(database)
 
-            def tick(counted_as: str = counted_as, label: str = label, total: int = total) -> None:
-                done = sqlite.count_done(database, counted_as) if counted_as else None
-                if done is not None:
-                    report.progress(min(done, total), total, label)
+            Path(job.progress).unlink(missing_ok=True)
+
+            def tick() -> None:
+                told = ticks.read(Path(job.progress))
+                if told is not None:
+                    phase, done, total = told
+                    report.progress(done, total, phase)
 
             run_worker(replace(job, step=step), work, report.stop_requested, seconds_left(), tick)
             marker.touch()

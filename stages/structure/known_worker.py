@@ -11,11 +11,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from stages.structure import features
 from stages.structure.agreement import agreement, alternatives
 from stages.structure.job import Job, known_path
 from stages.structure.mapping import observations
-from stages.structure.shares import match_in_shares
+from stages.structure.matching import match_pairs
 
 FEWEST_MATCHES = 30  # of a pair that is asked whether poses are right
 
@@ -26,8 +25,7 @@ def match_neighbours(job: Job) -> None:
     with pycolmap.Database.open(job.database) as database:
         for number, lens in enumerate(zip(known["intrinsics"], known["sizes"], strict=True), 1):
             database.update_camera(_camera(number, *lens))
-    wanted = [(int(first) + 1, int(second) + 1) for first, second in known["pairs"]]
-    match_in_shares(job, wanted, features._processes(job))
+    match_pairs(job, [(int(first), int(second)) for first, second in known["pairs"]])
 
 
 def triangulate(job: Job) -> None:

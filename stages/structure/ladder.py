@@ -63,13 +63,16 @@ LADDER = (
 @dataclass(frozen=True)
 class Attempt:
     """What one rung gave. failures: empty if it passed. result: None where mapping was not
-    reached. keypoints_median: before matching."""
+    reached. keypoints_median: before matching. pairs_matched, pairs_verified: of photographs that
+    were compared in full, and that were found to show the same thing."""
 
     rung: Rung
     failures: tuple[Failure, ...]
     figures: Figures
     result: MappingResult | None = None
     keypoints_median: float = 0.0
+    pairs_matched: int = 0
+    pairs_verified: int = 0
 
     @property
     def passed(self) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
 import time
 from pathlib import Path
@@ -15,6 +13,7 @@ import pycolmap
 from stages.structure import database as sqlite
 from stages.structure.job import Job
 from stages.structure.sparse_model import SparseModel, save_model
+from stages.structure.ticks import Ticks
 
 SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without a word
 MOST_MODELS = 8
@@ -54,6 +53,9 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
     options.min_model_size = SMALLEST_MODEL
     options.max_num_models = MOST_MODELS
     options.max_runtime_seconds = job.max_seconds
+    # An eighth of the time less than COLMAP's 5 and 2, and the same poses. Adjusting all cameras
+    # less often than after each tenth photograph saves more, but moves them.
+    options.ba_global_max_refinements, options.ba_local_max_refinements = 3, 1
     if job.loose:
         options.mapper.abs_pose_min_num_inliers = LOOSE_INLIERS
         options.mapper.abs_pose_min_inlier_ratio = 0.15
@@ -65,7 +67,7 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
             options.init_image_id1, options.init_image_id2 = pair
             options.multiple_models = False
             options.mapper.init_min_tri_angle = 4.0
-    counter = _Counter(Path(job.progress))
+    counter = _Counter(job)
     return dict(
         pycolmap.incremental_mapping(
             job.database,
@@ -111,22 +113,16 @@ def _other_pair(database: Path) -> tuple[int, int] | None:
 class _Counter:
     """Keeps the job's progress file up to date."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.count = 0
+    def __init__(self, job: Job) -> None:
+        self._ticks, self._total, self._count = Ticks(Path(job.progress)), len(job.names), 0
 
     def began(self) -> None:
-        self.count = 2
-        self._write()
+        self._count = 1
+        self.registered()
 
     def registered(self) -> None:
-        self.count += 1
-        self._write()
-
-    def _write(self) -> None:
-        partial = self.path.with_name(self.path.name + ".partial")
-        partial.write_text(json.dumps({"registered": self.count}))
-        os.replace(partial, self.path)
+        self._count += 1
+        self._ticks.write("placing photographs", min(self._count, self._total), self._total)
 
 
 def _plain(model: pycolmap.Reconstruction, job: Job) -> SparseModel:

@@ -20,12 +20,11 @@ def main(arguments: list[str]) -> int:
     """Run the job named on the command line. Returns the exit status (0: done)."""
     _die_with_parent()
     job = Job.read(Path(arguments[0]))
-    from stages.structure import features, known_worker, mapping
+    from stages.structure import features, known_worker, mapping, matching
 
     steps = {
         "features": features.extract,
-        "matching": features.match,
-        "share": features.match_share,
+        "matching": matching.match,
         "mapping": mapping.map_photographs,
         "neighbours": known_worker.match_neighbours,
         "triangulation": known_worker.triangulate,

@@ -36,8 +36,8 @@ def test_half_written_photographs_and_pairs_are_forgotten(tmp_path: Path) -> Non
     sqlite.repair(path)
     assert sqlite.keypoint_counts(path, 4) == [900, 0, 0, 0]
     assert sqlite.verified_pairs(path) == [(0, 1, 44, 2)]
-    assert sqlite.count_done(path, "features") == 2
-    assert sqlite.count_done(path, "matching") == 1
+    assert sqlite.photographs_with_features(path) == {0, 1}
+    assert sqlite.inliers_of_pairs(path) == {(0, 1): 44}
 
 
 def test_a_copy_holds_the_same_and_can_be_reset_alone(tmp_path: Path) -> None:
@@ -48,11 +48,9 @@ def test_a_copy_holds_the_same_and_can_be_reset_alone(tmp_path: Path) -> None:
     assert len(sqlite.verified_pairs(path)) == 2
 
 
-def test_counting_never_fails(tmp_path: Path) -> None:
-    assert sqlite.count_done(tmp_path / "none.db", "features") is None
+def test_what_is_no_database_is_told_and_can_be_deleted(tmp_path: Path) -> None:
     garbage = tmp_path / "garbage.db"
     garbage.write_bytes(b"no database at all" * 100)
-    assert sqlite.count_done(garbage, "matching") is None
     with pytest.raises(sqlite3.DatabaseError):
         sqlite.repair(garbage)
     sqlite.delete(garbage)

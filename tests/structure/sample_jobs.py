@@ -1,0 +1,37 @@
+"""Jobs for the worker on photographs of the sample capture."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from threading import Event
+
+from stages.structure.job import CameraGuess, Job
+from stages.structure.process import run_worker
+from tests.structure.bad_captures import SAMPLE
+
+__all__ = ["SAMPLE", "sample_job", "work"]
+
+
+def sample_job(folder: Path, photographs: int) -> Job:
+    """Finding features of copies whose names have spaces."""
+    names = []
+    for number, source in enumerate(sorted(SAMPLE.glob("*.jpg"))[:photographs]):
+        names.append(f"é {number}.jpg")
+        shutil.copy(source, folder / names[-1])
+    return Job(
+        step="features",
+        images_root=str(folder),
+        database=str(folder / "base.db"),
+        out="",
+        progress=str(folder / "progress.json"),
+        names=tuple(names),
+        camera_of=(0,) * len(names),
+        cameras=(CameraGuess(640, 480, None),),
+        max_features=800,
+    )
+
+
+def work(job: Job) -> None:
+    """Do the job's step in a worker process."""
+    run_worker(job, Path(job.database).parent, Event(), 240.0, lambda: None)

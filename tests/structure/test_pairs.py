@@ -1,0 +1,73 @@
+"""Which photographs are compared."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.structure import pairs
+
+
+def around(photographs: int, reach: int = 6) -> NDArray[np.int32]:
+    """Looking alike on a closed walk: the nearer, the more."""
+    apart = np.abs(np.subtract.outer(np.arange(photographs), np.arange(photographs)))
+    apart = np.minimum(apart, photographs - apart)
+    return np.where(apart > reach, 1, 100 - 10 * apart).astype(np.int32) * (apart > 0)
+
+
+def test_every_pair_is_there_once() -> None:
+    assert pairs.every(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+
+
+def test_sequences_are_compared_with_neighbours_and_far_ones() -> None:
+    found = pairs.sequential(200)
+    assert len(set(found)) == len(found)
+    assert all(0 <= first < second < 200 for first, second in found)
+    assert {second - first for first, second in found} == {*range(1, 21), 32, 64, 128}
+
+
+def test_a_walk_is_compared_along_it_and_where_it_closes() -> None:
+    found = pairs.promising(around(300))
+    assert (0, 299) in found
+    assert (0, 6) in found
+    assert (0, 150) not in found
+    assert len(found) <= 300 * pairs.BEST
+
+
+def test_pairs_grow_with_photographs_and_not_with_their_square() -> None:
+    alike = np.full((400, 400), 50, np.int32)
+    assert len(pairs.promising(alike)) <= 400 * (pairs.BEST + 1)
+    nothing_linked = pairs.closing_gaps(alike, [], {})
+    assert len(nothing_linked) <= 400 * pairs.MOST_TO_CLOSE_GAPS
+
+
+def test_neighbours_are_compared_even_if_nothing_looks_alike() -> None:
+    assert pairs.promising(np.zeros((4, 4), np.int32)) == [(0, 1), (1, 2), (2, 3)]
+
+
+def test_a_lonely_photograph_is_compared_with_all_and_nothing_twice() -> None:
+    alike = around(12)
+    matched = pairs.promising(alike)
+    inliers = {pair: 0 if 5 in pair else 200 for pair in matched}
+    more = pairs.closing_gaps(alike, matched, inliers)
+    assert more == [p for p in pairs.every(12) if 5 in p and p not in matched]
+
+
+def test_groups_that_nothing_links_are_compared_with_each_other() -> None:
+    alike = np.zeros((12, 12), np.int32)
+    matched = [(i, j) for i, j in pairs.every(12) if (i < 5) == (j < 5)]
+    more = pairs.closing_gaps(alike, matched, dict.fromkeys(matched, 90))
+    assert more == [(i, j) for i, j in pairs.every(12) if (i < 5) != (j < 5)]
+
+
+def test_of_too_many_those_that_look_most_alike_are_compared() -> None:
+    alike = np.zeros((100, 100), np.int32)
+    alike[3, 70] = alike[70, 3] = 9
+    more = pairs.closing_gaps(alike, [], {})
+    assert (3, 70) in more
+    assert len(more) == 100 * pairs.MOST_TO_CLOSE_GAPS
+
+
+def test_where_all_hang_together_nothing_is_added() -> None:
+    matched = pairs.promising(around(40))
+    assert pairs.closing_gaps(around(40), matched, dict.fromkeys(matched, 100)) == []
