@@ -6,9 +6,9 @@ into cells; a cell in which no point lands gets one, at the depth that its neigh
 photograph suggest and in the photograph's own colour. Photographs are taken in turn, and what one
 has filled counts for the next, so that a few thousand points cover everything that was seen.
 
-A guess too near is worse than none: training dresses it in whatever the one photograph behind it
-shows, and it hangs as a cloud before all cameras that look past it. So other photographs are asked
-(`witnesses`), and what they contradict goes as far back as the photograph sees at all: there it
+A guess too near is worse than none: training dresses it in what the one photograph shows behind
+it, and it hangs as a cloud before all cameras that look past it. So other photographs are asked
+(`witnesses`), and what they do not confirm goes as far back as the photograph sees at all: there it
 hides nothing, and leaves no hole for a cloud to grow into.
 
 Beyond its rim a photograph is continued a little in the colours of the rim, but only to where no
@@ -36,7 +36,6 @@ PLANE_MISFIT = 0.04  # of the inverse depth, root mean square
 PLANE_REACH = 1.5  # how far beyond its points' depths a plane is continued
 CLEARANCE = 0.5
 SCALE = 0.5  # of a cell's size, seen at the point's depth
-BELIEVED = 4  # times as many photographs must agree as contradict
 FARTHEST = 95  # percentile of the depths that a photograph sees
 
 
@@ -94,11 +93,11 @@ def _fill(
     empty = _empty_cells(camera, pixels)
     if len(measured[1]) < PLANE_POINTS or len(empty) == 0:
         return
-    depth, plane = _interpolated(empty, *measured)
+    depth = _interpolated(empty, *measured)
     if margin:
         free = ~_in_a_picture(unprojected(camera, empty, depth), views)
     else:
-        depth, free = _believed(view, camera, empty, depth, plane, measured[1], witnesses)
+        depth, free = _believed(view, camera, empty, depth, measured[1], witnesses)
     places = unprojected(camera, empty, depth)
     for centre, distance in filling.clear:
         free &= np.linalg.norm(places - centre, axis=1) > distance
@@ -116,14 +115,13 @@ def _believed(
     camera: Camera,
     at: NDArray[np.float64],
     depth: NDArray[np.float64],
-    plane: NDArray[np.bool_],
     measured: NDArray[np.float64],
     witnesses: Witnesses,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(depth [K], whether to fill [K]): what others contradict, or nobody can confirm but a
-    plane, is moved back to where the photograph's view ends, if nothing contradicts that."""
-    agree, before = witnesses.ask(unprojected(camera, at, depth), view.name)
-    believed = (agree > BELIEVED * before) | (plane & (agree + before == 0))
+    """(depth [K], whether to fill [K]): what nothing confirms is moved back to where the
+    photograph's view ends, if no other contradicts that."""
+    places = unprojected(camera, at, depth)
+    believed = witnesses.confirm(places, view.name) & witnesses.anchored(places)
     end = float(np.percentile(measured, FARTHEST))
     behind = np.where(believed, depth, np.maximum(depth, end))
     _, before = witnesses.ask(unprojected(camera, at, behind), view.name)
@@ -174,8 +172,8 @@ def _empty_cells(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.floa
 
 def _interpolated(
     at: NDArray[np.float64], pixels: NDArray[np.float64], depths: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """([K] depth at each place, from the nearest measured points; [K] whether it is a plane's).
+) -> NDArray[np.float64]:
+    """[K] depth at each place, from the nearest measured points.
 
     The inverse depth of a plane is affine in the picture: where the nearest points lie on a plane,
     it is continued (a floor, a wall). Elsewhere the farthest of the nearest points to all four
@@ -198,7 +196,7 @@ def _interpolated(
     flat = np.sqrt((misfit**2).mean(1)) < PLANE_MISFIT * inverse.mean(1)
     low, high = inverse.min(1) / PLANE_REACH, inverse.max(1) * PLANE_REACH
     on_plane = 1.0 / np.clip(plane[:, 0], low, high)
-    return np.where(flat, on_plane, _farthest_around(offset, distance2, depths)), flat
+    return np.where(flat, on_plane, _farthest_around(offset, distance2, depths))
 
 
 def _farthest_around(

@@ -56,34 +56,50 @@ def in_picture(camera: Camera, points: np.ndarray) -> np.ndarray:
     return (at[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
 
 
-def test_every_cell_of_every_photograph_ends_up_with_a_point(tmp_path: Path) -> None:
+def test_most_cells_of_a_photograph_end_up_with_a_point(tmp_path: Path) -> None:
+    """A quarter had one. A cell stays empty where the other photograph contradicts every guess."""
     both, points = views(tmp_path), floor_points()
     more, _, _ = fill_cells(tmp_path, both, points)
     for view in both:
-        assert not cells_hit(view, points).all()
-        assert cells_hit(view, np.concatenate([points, more])).all()
+        assert cells_hit(view, points).mean() < 0.3
+        assert cells_hit(view, np.concatenate([points, more])).mean() > 0.75
 
 
 def test_nothing_is_added_where_points_already_are(tmp_path: Path) -> None:
     both, points = views(tmp_path), floor_points()
     more, _, _ = fill_cells(tmp_path, both[:1], points)
     assert not (cells_hit(both[0], more) & cells_hit(both[0], points)).any()
-    again, _, _ = fill_cells(tmp_path, both, np.concatenate([points, more]))
-    assert not cells_hit(both[0], again).all()
-    once_more, _, _ = fill_cells(tmp_path, both, np.concatenate([points, more, again]))
-    assert len(once_more) == 0
+    once, _, _ = fill_cells(tmp_path, both, points)
+    again, _, _ = fill_cells(tmp_path, both, np.concatenate([points, once]))
+    assert len(again) < 0.1 * len(once)
 
 
-def test_a_floor_is_continued(tmp_path: Path) -> None:
-    """As far as the photograph reaches, which is about twice as far as its points."""
-    (view, _), points = views(tmp_path), floor_points()
-    more, _, _ = fill_cells(tmp_path, (view,), points)
-    rays = more - view.camera.centre
-    wanted = (FLOOR - view.camera.centre[1]) / rays[:, 1]  # 1 where the point is on the floor
-    inside = in_picture(view.camera, more)
-    assert inside.sum() > 500
-    assert np.abs(wanted[inside] - 1).max() < 0.05
-    assert np.median(np.abs(wanted[inside] - 1)) < 0.005
+def test_a_floor_is_continued_where_two_photographs_agree(tmp_path: Path) -> None:
+    both, points = views(tmp_path), floor_points()
+    more, _, _ = fill_cells(tmp_path, both, points)
+    inside = in_picture(both[0].camera, more) & in_picture(both[1].camera, more)
+    off = np.abs(towards_the_floor(both[0], more)[inside] - 1)
+    assert inside.sum() > 400
+    assert np.median(off) < 0.005
+    assert np.percentile(off, 90) < 0.01
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_nothing_is_put_before_the_floor(tmp_path: Path, count: int) -> None:
+    """Where nobody confirms a guess it goes as far back as the photograph sees: a guess too near
+    would grow into a cloud before all cameras that look past it."""
+    some, points = views(tmp_path)[:count], floor_points()
+    more, _, _ = fill_cells(tmp_path, some, points)
+    for view in some:
+        inside = in_picture(view.camera, more)
+        assert towards_the_floor(view, more)[inside].max() < 1.02
+
+
+def towards_the_floor(view: View, points: np.ndarray) -> np.ndarray:
+    """[N] distance to the floor along the ray to each point, over the point's own: 1 on the floor,
+    more where a point hangs before it."""
+    rays = points - view.camera.centre
+    return np.asarray((FLOOR - view.camera.centre[1]) / rays[:, 1])
 
 
 def test_colours_come_from_the_photograph_and_sizes_from_its_cells(tmp_path: Path) -> None:
