@@ -79,11 +79,13 @@ class Attempt:
         return not self.failures
 
     @property
-    def merit(self) -> tuple[int, int, int]:
-        """For choosing among attempts that failed: the fewer gates failed on, the better, then
-        the more photographs; the global mapper's word counts least."""
+    def merit(self) -> tuple[int, int, int, int]:
+        """For choosing among attempts that failed: the more photographs and points, the better,
+        then those of any model, who know best why it is none; the global mapper's word counts
+        least."""
         trusted = self.figures.mapper != "global"
-        return (int(trusted), self.figures.registered, self.figures.points)
+        found = max(self.figures.models, default=0)
+        return (int(trusted), self.figures.registered, self.figures.points, found)
 
 
 @dataclass
