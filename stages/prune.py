@@ -89,11 +89,13 @@ def _one_round(
     import numpy as np
 
     from stages.measure.judge import mean_psnr_db
-    from stages.measure.worth import floaters, measure_worth, unneeded
+    from stages.measure.worth import beside_pictures, floaters, measure_worth, unneeded
 
     worth = measure_worth(splats, photographs, backend)
-    floating = floaters(splats, worth, [photograph.camera for photograph in photographs])
-    candidates = np.flatnonzero(floating | unneeded(worth))
+    cameras = [photograph.camera for photograph in photographs]
+    floating = floaters(splats, worth, cameras)
+    useless = unneeded(worth, beside_pictures(splats, cameras))
+    candidates = np.flatnonzero(floating | useless)
     order = np.lexsort((candidates, worth.sse_change[candidates], ~floating[candidates]))
     chosen = candidates[order][: max(1, int(SHARE_A_ROUND * len(splats)))]
     for _ in range(BACK_OFFS):
@@ -117,5 +119,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=3, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=4, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

@@ -9,7 +9,7 @@ import pytest
 from stages import prune
 from stages.base.stage import Report
 from stages.measure.judge import load_photographs, mean_psnr_db
-from stages.measure.worth import Worth, floaters, measure_worth, unneeded
+from stages.measure.worth import Worth, beside_pictures, floaters, measure_worth, unneeded
 from stages.scene import Splats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
@@ -130,6 +130,13 @@ def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:
     assert not floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
 
 
-def test_unneeded_is_what_nobody_sees_or_is_better_without() -> None:
-    worth = worth_of([0, 1, 5, 5, 5], [0.0, 1.0, -0.1, 0.0, 1e-6])
-    assert unneeded(worth).tolist() == [True, False, True, True, False]
+def test_unneeded_is_what_photographs_are_better_without_or_lies_where_none_looks() -> None:
+    worth = worth_of([0, 0, 1, 5, 5, 5], [0.0, 0.0, 1.0, -0.1, 0.0, 1e-6])
+    beside = np.array([False, True, True, True, True, True])
+    assert unneeded(worth, beside).tolist() == [True, False, False, True, True, False]
+
+
+def test_beside_a_picture_is_a_quarter_of_its_longer_side_beyond_the_rim() -> None:
+    """A camera of 64 x 48 pixels and focal length 60 sees x of -0.53 to 0.53 at depth 1."""
+    scene = splats([[0, 0, 1], [0.75, 0, 1], [0.85, 0, 1], [0, 0, -1]])
+    assert beside_pictures(scene, [camera()]).tolist() == [True, True, False, False]

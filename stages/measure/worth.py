@@ -17,6 +17,7 @@ from stages.scene import Camera, Splats
 SEEN = 1.0 / 255.0  # a weight below it cannot change an 8-bit picture
 NEAR_CAMERA = 0.25  # of the depth at which that camera sees the scene
 FEW_PHOTOGRAPHS = 2
+RIM = 0.25  # of the longer side: as far as seeds continue a photograph beyond its rim
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,20 @@ def floaters(splats: Splats, worth: Worth, cameras: list[Camera]) -> NDArray[np.
     return np.asarray(close & (worth.photographs <= FEW_PHOTOGRAPHS))
 
 
-def unneeded(worth: Worth) -> NDArray[np.bool_]:
-    """[N] splats that no photograph is better for: never seen, or the error does not grow
-    without them."""
-    return np.asarray((worth.photographs == 0) | (worth.sse_change <= 0.0))
+def beside_pictures(splats: Splats, cameras: list[Camera]) -> NDArray[np.bool_]:
+    """[N] splats in a picture or just beyond its rim, where the next view will look."""
+    beside = np.zeros(len(splats), bool)
+    for camera in cameras:
+        pixels, z = camera.project(splats.means)
+        size = np.array([camera.width, camera.height])
+        margin = RIM * size.max()
+        beside |= (z > 0) & ((pixels > -margin) & (pixels < size + margin)).all(1)
+    return beside
+
+
+def unneeded(worth: Worth, beside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[N] splats that no photograph is better for: seen, and the error does not grow without
+    them; or never seen, and not beside any picture either (see `beside_pictures`). What continues a
+    picture beyond its rim no photograph speaks against, and views in between show it."""
+    seen = worth.photographs > 0
+    return np.asarray((seen & (worth.sse_change <= 0.0)) | (~seen & ~beside))
