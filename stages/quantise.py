@@ -148,9 +148,10 @@ def _measures(
     # Spread over the capture: views next to each other say the same.
     count = min(settings.max_views, len(training))
     lent = tuple(training[i * len(training) // count] for i in range(count))
-    decider, judge = (
-        _Measure(load_photographs(reconstruction.folder, views, look), what, settings, report)
-        for views, what in ((lent, "training"), (held or lent, "held out" if held else "training"))
+    judges, what = (held, "held out") if held else (lent, "training")
+    decider = _Measure(load_photographs(reconstruction.folder, lent, look), settings, report)
+    judge = _Measure(
+        load_photographs(reconstruction.folder, judges, look), settings, Report(), what
     )
     return decider, judge
 
@@ -160,9 +161,9 @@ class _Measure:
     """Measures splats on photographs that are loaded once."""
 
     photographs: Sequence[Photograph]
-    what: str
     settings: QuantiseSettings
     report: Report
+    what: str = "training"
     done: int = 0
 
     def psnr(self, splats: Splats) -> float:
@@ -171,8 +172,8 @@ class _Measure:
 
         mean = round(mean_psnr_db(splats, self.photographs, self.settings.backend), 4)
         self.done += 1
-        # At most: raw, three lower degrees, each threshold, .splat.
-        total = 5 + len(_THRESHOLDS_OF_255)
+        # At most: raw, three lower degrees, each threshold.
+        total = 4 + len(_THRESHOLDS_OF_255)
         self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
         return mean
 
