@@ -23,6 +23,7 @@ PROCESS_OPTIONS = (
     "backend",
     "max_side",
     "alpha_over",
+    "frames",
     "train_side",
     "steps",
     "max_splats",

@@ -1,7 +1,7 @@
 """Photographs -> Capture: every usable photograph as upright 8-bit sRGB, with what EXIF knows.
 
 Reads JPEG, PNG, TIFF, WebP, HEIC, AVIF and BMP from a folder and its sub-folders, which are only
-ever read. Says in warnings what a photographer should change.
+ever read, and takes sharp frames out of videos. Says in warnings what a photographer should change.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from stages.base.stage import Report, Stage
 from stages.base.words import counted
 
 if TYPE_CHECKING:
-    from stages.photos.decode import PixelBudget
+    from stages.photos.decode import Decoded, PixelBudget
     from stages.photos.find import Findings, Source
     from stages.photos.quality import Measures
     from stages.scene import Capture, Photo
@@ -46,6 +46,15 @@ class IngestSettings:
             "help": "What shows where a picture is transparent: white or black. Splats are drawn "
             "over black, so that black leaves cut-out objects alone in empty space.",
             "choices": ("white", "black"),
+        },
+    )
+    frames: int = field(
+        default=0,
+        metadata={
+            "help": "Frames to take from each video, at most; 0 takes as many as its motion asks "
+            "for.",
+            "min": 0,
+            "max": 100_000,
         },
     )
 
@@ -79,6 +88,10 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     taken = _take_all(found, settings, folder, report)
     names = [source.name for source in found.sources]
+    for source in found.videos:
+        frames = _frames_of(source, settings, folder, report)
+        names += [one.photo.name if one.photo else source.name for one in frames]
+        taken += frames
     reasons = [(n, t.unusable) for n, t in zip(names, taken, strict=True) if t.photo is None]
     advice.about_files(found, report.warn)
     advice.about_left_out(reasons, report.warn)
@@ -135,17 +148,43 @@ def _take_all(
 
 
 def _take(source: Source, settings: IngestSettings, folder: Path, budget: PixelBudget) -> _Taken:
-    """Read one photograph, write its normalised picture and measure it."""
+    """Read one photograph and keep it."""
     from stages.photos.decode import Unusable, decode
-    from stages.photos.quality import measure
-    from stages.photos.write import write_picture
-    from stages.scene import Photo
 
     try:
         decoded = decode(source.path, settings.max_side, budget, settings.alpha_over)
     except Unusable as finding:
         return _Taken(unusable=str(finding))
-    target = folder / source.image
+    return _kept(source.name, source.image, decoded, folder)
+
+
+def _frames_of(
+    source: Source, settings: IngestSettings, folder: Path, report: Report
+) -> list[_Taken]:
+    """The chosen frames of a video, kept as photographs of one camera."""
+    from stages.photos import from_video
+    from stages.photos.decode import Unusable
+
+    try:
+        return [
+            _kept(
+                f"{source.name}/{number}", f"{source.image}/{number}", decoded, folder, source.name
+            )
+            for number, decoded in from_video.photographs(
+                source, settings.frames, settings.max_side, report
+            )
+        ]
+    except Unusable as finding:
+        return [_Taken(unusable=str(finding))]
+
+
+def _kept(name: str, image: str, decoded: Decoded, folder: Path, film: str = "") -> _Taken:
+    """Write a normalised picture and measure it. film: the video that it comes from."""
+    from stages.photos.quality import measure
+    from stages.photos.write import write_picture
+    from stages.scene import Photo
+
+    target = folder / image
     target.parent.mkdir(parents=True, exist_ok=True)
     write_picture(target, decoded)
     measures = measure(decoded.pixels)
@@ -153,17 +192,22 @@ def _take(source: Source, settings: IngestSettings, folder: Path, budget: PixelB
     exif = decoded.exif
     focal = exif.focal_px(decoded.stored, width, height)
     photo = Photo(
-        name=source.name,
-        image=source.image,
+        name=name,
+        image=image,
         width=width,
         height=height,
         focal_px=round(focal, 3) if focal is not None else None,
-        camera=exif.camera_key(width, height),
+        camera=_film_key(film, width, height) if film else exif.camera_key(width, height),
         sharpness=measures.sharpness,
         log2_luminance=measures.log2_luminance,
         exposure_ev=round(exif.exposure_ev, 3) if exif.exposure_ev is not None else None,
     )
     return _Taken(photo, measures, "", decoded.alpha, decoded.hdr, decoded.bad_profile)
+
+
+def _film_key(film: str, width: int, height: int) -> str:
+    """As `Exif.camera_key`: a film has a lens of its own, and is no other make of camera."""
+    return f"video, {width}x{height} {film.replace(',', ' ')}"
 
 
 def _with_twins(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
@@ -206,4 +250,4 @@ def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatEr
     )
 
 
-STAGE = Stage(name="ingest", version=2, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=3, reads=(), settings_type=IngestSettings, run=run, load=load)

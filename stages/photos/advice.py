@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from stages.base.words import counted
-from stages.photos.find import RAW_ADVICE, VIDEO_ADVICE, Findings
+from stages.photos.find import RAW_ADVICE, Findings
 from stages.scene import Photo
 
 Warn = Callable[[str, str], None]
@@ -31,11 +31,6 @@ def listed(names: Sequence[str]) -> str:
 
 def about_files(found: Findings, warn: Warn) -> None:
     """Files that look like the user's material but are not read."""
-    if found.videos:
-        warn(
-            "ingest-video-not-read",
-            f"Videos and animations are not read: {listed(found.videos)}. {VIDEO_ADVICE}",
-        )
     if found.raws:
         warn("ingest-raw-not-read", f"Raw files are not read: {listed(found.raws)}. {RAW_ADVICE}")
     if found.other_pictures:

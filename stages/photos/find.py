@@ -1,4 +1,4 @@
-"""Which files of a folder are photographs, by name; and what each will be called afterwards."""
+"""Which files are photographs or videos, by name; and what each will be called afterwards."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ OTHER_PICTURES = frozenset(
 class Source:
     """A file to read. path: where it is. name: relative to the photographs' folder, posix style.
 
-    image: what its normalised picture is called, relative to the capture's folder.
+    image: what its normalised picture is called, relative to the capture's folder; of a video, the
+    folder of its frames.
     """
 
     path: Path
@@ -45,23 +46,28 @@ class Source:
 class Findings:
     """What a folder holds. sources: photographs by their names' endings, in natural order.
 
-    videos, raws, other_pictures: names of files that are not read, less those that share their
-    name with a photograph (IMG_1.NEF beside IMG_1.JPG). others: how many files are something else.
+    videos: to take frames from. raws, other_pictures: names of files that are not read. All less
+    those that share their name with a photograph (IMG_1.NEF, or a live picture's IMG_1.MOV, beside
+    IMG_1.JPG). others: how many files are something else.
     """
 
     sources: tuple[Source, ...]
-    videos: tuple[str, ...]
+    videos: tuple[Source, ...]
     raws: tuple[str, ...]
     other_pictures: tuple[str, ...]
     others: int
 
 
 def find(folder: Path) -> Findings:
-    """Look through `folder` and its sub-folders; hidden files and folders are passed over.
+    """Look through `folder` and its sub-folders; hidden files and folders are passed over. In the
+    place of a folder, a video counts as a folder that holds it.
 
     Links to folders are not followed, so that a loop cannot trap the search. Raises SplatError
-    when the folder is missing, is a file, cannot be listed or holds no photograph.
+    when the folder is missing, is another file, cannot be listed or holds no photograph or video.
     """
+    if folder.is_file() and folder.suffix.lower() in VIDEO:
+        name = _printable(Path(folder.name))
+        return Findings((), (Source(folder, name, f"{PHOTOS_FOLDER}{name}"),), (), (), 0)
     _check_folder(folder)
     files: dict[str, Path] = {}
     for path in _walk(folder):
@@ -70,19 +76,19 @@ def find(folder: Path) -> Findings:
     photographs = [name for name in names if _suffix(name) in LOSSY | LOSSLESS]
     stems = {_stem(name) for name in photographs}
     alone = [name for name in names if _stem(name) not in stems]
-    images = picture_names(photographs)
     kinds = {
         kind: tuple(name for name in alone if _suffix(name) in suffixes)
         for kind, suffixes in (("video", VIDEO), ("raw", RAW), ("other", OTHER_PICTURES))
     }
+    images = picture_names([*photographs, *kinds["video"]])
     found = Findings(
         sources=tuple(Source(files[name], name, images[name]) for name in photographs),
-        videos=kinds["video"],
+        videos=tuple(Source(files[name], name, images[name]) for name in kinds["video"]),
         raws=kinds["raw"],
         other_pictures=kinds["other"],
         others=len(names) - len(photographs) - sum(len(kind) for kind in kinds.values()),
     )
-    if not found.sources:
+    if not found.sources and not found.videos:
         raise _no_photographs(folder, found)
     return found
 
@@ -120,7 +126,7 @@ def picture_names(names: Iterable[str]) -> dict[str, str]:
 def _wanted_name(name: str) -> str:
     path = PurePosixPath(name)
     suffix = path.suffix.lower()
-    if suffix in (".jpg", ".jpeg", ".png"):
+    if suffix in (".jpg", ".jpeg", ".png") or suffix in VIDEO:
         return name
     return str(path.with_suffix(".png" if suffix in LOSSLESS else ".jpg"))
 
@@ -165,36 +171,29 @@ def _check_folder(folder: Path) -> None:
         raise SplatError(
             "ingest-no-such-folder",
             given=f"{folder} does not exist.",
-            wanted="A folder of photographs.",
+            wanted="A folder of photographs, or a video.",
             hint="Check the spelling, or drag the folder into the terminal to get its full name.",
         )
     if folder.is_dir():
         return
-    if folder.suffix.lower() in VIDEO:
-        hint = VIDEO_ADVICE
-    elif folder.suffix.lower() in LOSSY | LOSSLESS:
+    if folder.suffix.lower() in LOSSY | LOSSLESS:
         hint = f"Name the folder instead: {folder.parent}"
     else:
         hint = "If it is an archive, unpack it and name the folder that comes out."
     raise SplatError(
         "ingest-not-a-folder",
         given=f"{folder} is a file.",
-        wanted="A folder of photographs.",
+        wanted="A folder of photographs, or a video.",
         hint=hint,
     )
 
 
-VIDEO_ADVICE = (
-    "Take still pictures out of a video first, for example with "
-    "`ffmpeg -i video.mp4 -vf fps=2 -q:v 2 frames/%04d.jpg`, and name that folder."
-)
 RAW_ADVICE = "Export raw files as JPEG or TIFF first, all with the same white balance and exposure."
 
 
 def _no_photographs(folder: Path, found: Findings) -> SplatError:
     wanted = "JPEG, PNG, TIFF, WebP or HEIC photographs, at least 3; 20 to 50 do an object well."
     counts = {
-        "video": len(found.videos),
         "raw file": len(found.raws),
         "picture": len(found.other_pictures),
         "other file": found.others,
@@ -208,9 +207,7 @@ def _no_photographs(folder: Path, found: Findings) -> SplatError:
         )
     kinds = [counted(count, kind) for kind, count in counts.items() if count]
     hint = "Name the folder that holds the photographs."
-    if found.videos:
-        hint = VIDEO_ADVICE
-    elif found.raws:
+    if found.raws:
         hint = RAW_ADVICE
     elif found.other_pictures:
         hint = "Save the pictures as JPEG or PNG first."
