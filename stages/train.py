@@ -45,6 +45,24 @@ class TrainSettings:
             "max": 100_000_000,
         },
     )
+    seconds: float = field(
+        default=0.0,
+        metadata={
+            "help": "Seconds that training may take: as many steps as fit, whatever --steps says. "
+            "0: as long as the steps take.",
+            "min": 0,
+            "max": 1e7,
+        },
+    )
+    patience: float = field(
+        default=0.05,
+        metadata={
+            "help": "Training settles early once all that is left promises less than this (dB); 0 "
+            "takes every step.",
+            "min": 0,
+            "max": 10,
+        },
+    )
     smooth: bool = field(
         default=False,
         metadata={
@@ -57,6 +75,8 @@ class TrainSettings:
     )
     backend: str = backend_setting()
 
+
+MIN_TO_LEND = 16  # photographs: of fewer, each is missed more than the advice is worth
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
@@ -77,6 +97,8 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
+    if settings.seconds:
+        trainer.seconds = max(settings.seconds - (time.monotonic() - started), 1.0)
     report.metric("backend", backend_of(settings.backend).name)
     report.metric("train_photographs", len(trainer.train))
     report.metric("held_out_photographs", len(trainer.held_out))
@@ -141,7 +163,6 @@ def make_trainer(
             steps=settings.steps,
             extent=scene_extent(reconstruction.views),
             sh_degree=settings.sh_degree,
-            n_views=len(train),
             n_start=min(n_start, cap.splats),
             seed=settings.seed,
         ),
@@ -153,7 +174,15 @@ def make_trainer(
         report=report,
         smooth=settings.smooth,
         backend=settings.backend,
+        lent=lent_rows(len(train)) if settings.patience else (),
+        patience_db=settings.patience,
     )
+
+
+def lent_rows(n: int) -> tuple[int, ...]:
+    """Which of `n` training photographs decide when training settles: of every eight the fifth, so
+    that they lie between the judges; none where there are too few to lend one."""
+    return tuple(range(4, n, 8)) if n >= MIN_TO_LEND else ()
 
 
 def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
@@ -246,5 +275,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="train", version=5, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=6, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

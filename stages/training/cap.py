@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stages.base.atomic import replacing
 from stages.base.memory import available_mib
-from stages.training.densify import splat_cap
+from stages.training.density import splat_cap
 
 FILE_NAME = "cap.json"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,30 @@ from stages.training.clock import Spent
 from stages.training.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP3"
+MAGIC = b"SPLATCP4"
 
 
-def save_checkpoint(
-    folder: Path, model: Model, step: int, history: list[dict[str, Any]], times: list[Spent]
-) -> None:
-    """Write the state after `step` steps; a checkpoint that stands there stays until this is whole.
-    times: of each entry of the history, and, last, now.
+@dataclass(frozen=True)
+class Saved:
+    """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
+    done by then), see `schedule.Schedule`. history: as logged. marks: (step, PSNR in dB) of the
+    photographs that decide. times: of each entry of the history, and, last, now."""
 
-    Random numbers and schedules depend on the seed and the step alone, so they need no place.
+    step: int
+    plan: tuple[int, int, float]
+    history: list[dict[str, Any]]
+    marks: list[tuple[int, float]]
+    times: list[Spent]
+
+
+def save_checkpoint(folder: Path, model: Model, saved: Saved) -> None:
+    """Write the state after a step; a checkpoint that stands there stays until this is whole.
+
+    Random numbers depend on the seed and the step alone, so they need no place.
     """
     temporary = folder / (FILE_NAME + ".tmp")
     with temporary.open("wb") as file:
-        spent = [[t.seconds, t.cpu_seconds] for t in times]
-        header = json.dumps({"step": step, "history": history, "times": spent}).encode()
+        header = json.dumps(dataclasses.asdict(saved)).encode()
         file.write(MAGIC + len(header).to_bytes(8, "little") + header)
         for array in vars(model).values():
             npy.write_array(file, array, allow_pickle=False)
@@ -38,8 +48,8 @@ def save_checkpoint(
     os.replace(temporary, folder / FILE_NAME)
 
 
-def load_checkpoint(folder: Path) -> tuple[Model, int, list[dict[str, Any]], list[Spent]] | None:
-    """(model, steps done, history, times), or None where there is none or it cannot be read."""
+def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
+    """What was saved, or None where there is none or it cannot be read."""
     try:
         with (folder / FILE_NAME).open("rb") as file:
             if file.read(8) != MAGIC:
@@ -49,7 +59,15 @@ def load_checkpoint(folder: Path) -> tuple[Model, int, list[dict[str, Any]], lis
     except (OSError, ValueError, EOFError, MemoryError):
         return None
     model = Model(*(np.ascontiguousarray(a) for a in arrays))
-    return model, int(header["step"]), header["history"], [Spent(*t) for t in header["times"]]
+    steps, since, share = header["plan"]
+    saved = Saved(
+        int(header["step"]),
+        (int(steps), int(since), float(share)),
+        header["history"],
+        [(int(step), float(psnr_db)) for step, psnr_db in header["marks"]],
+        [Spent(**t) for t in header["times"]],
+    )
+    return model, saved
 
 
 def remove_checkpoint(folder: Path) -> None:

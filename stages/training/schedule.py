@@ -1,16 +1,15 @@
 """What happens at which step. The reference recipe is written for 30,000 steps; all its events
-move with the number of steps that a preset can afford."""
+move with the number of steps that a preset can afford, and with what becomes of it on the way."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 RECIPE_STEPS = 30_000
 MEANS_LR = 1.6e-4  # x scene extent
 MEANS_LR_END = 0.01  # of the first
-THRESHOLD = 2e-4
 GROWTH_ENDS = 0.5  # share of the run in which the model grows
 BOOST_POWER, BOOST_MAX = 0.6, 6.0
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1  # share of the run; share of the rate at its end
@@ -23,17 +22,47 @@ RESOLUTIONS = ((0.2, 0.5), (1.0, 1.0))
 @dataclass(frozen=True)
 class Schedule:
     """steps: of the whole run. extent: of the scene, world units. sh_degree: reached at the end.
-    n_views: photographs trained on. n_start: splats at the start."""
+    n_start: splats at the start. since: (step, share of the run that was done by then) of the last
+    change of plan."""
 
     steps: int
     extent: float
     sh_degree: int
-    n_views: int
     n_start: int
     seed: int
+    since: tuple[int, float] = (0, 0.0)
 
     def _scaled(self, recipe_step: int) -> int:
         return max(1, round(recipe_step * self.steps / RECIPE_STEPS))
+
+    def share(self, step: int) -> float:
+        """How much of the run is done before `step`, 0 to 1."""
+        from_step, from_share = self.since
+        if from_step == 0:
+            return step / self.steps
+        return from_share + (1.0 - from_share) * (step - from_step) / (self.steps - from_step)
+
+    def passes(self, step: int, parts: int) -> bool:
+        """Whether `step` steps end one of `parts` equal parts of the run."""
+        before, now = (int(parts * self.share(s) + 1e-9) for s in (step - 1, step))
+        return step == self.steps or now > before
+
+    def as_planned(self, steps: int, since: int, share: float) -> Schedule:
+        """The same run under a plan that was made before."""
+        return replace(self, steps=steps, since=(since, share))
+
+    def replanned(self, step: int, steps: int) -> Schedule:
+        """The same run, of which `step` steps are done, with `steps` in all: what is left of its
+        course is gone through faster, or more slowly."""
+        return replace(self, steps=max(steps, step + 1), since=(step, self.share(step)))
+
+    def settling(self, step: int) -> Schedule:
+        """A run that begins to settle now, for as long as if that had always been the plan."""
+        if self.share(step) >= SETTLE_FROM:
+            return self
+        return replace(
+            self, steps=max(step + 1, round(step / SETTLE_FROM)), since=(step, SETTLE_FROM)
+        )
 
     @property
     def boost(self) -> float:
@@ -42,28 +71,29 @@ class Schedule:
 
     def means_lr(self, step: int) -> float:
         """Exponential decay to 1 %."""
-        decay = MEANS_LR_END ** (step / max(self.steps - 1, 1))
+        decay = MEANS_LR_END ** self.share(step)
         return float(MEANS_LR * self.extent * self.boost * decay)
 
     def rate_factor(self, step: int) -> float:
         """What all other rates are multiplied by: the boost, and a settling at the end."""
-        settling = max(0.0, (step / self.steps - SETTLE_FROM) / (1.0 - SETTLE_FROM))
+        settling = max(0.0, (self.share(step) - SETTLE_FROM) / (1.0 - SETTLE_FROM))
         return float(self.boost * SETTLE_TO**settling)
 
     def active_sh_degree(self, step: int) -> int:
         """One degree more every 1000 steps of the recipe."""
-        return min(self.sh_degree, step * RECIPE_STEPS // (1000 * self.steps))
+        return min(self.sh_degree, int(RECIPE_STEPS / 1000 * self.share(step) + 1e-9))
 
     def densifies_after(self, step: int) -> bool:
         """Whether to densify once `step` is done."""
         interval = max(self._scaled(100), MIN_DENSIFY_INTERVAL)
         done = step + 1
-        return self._scaled(500) <= done <= GROWTH_ENDS * self.steps and done % interval == 0
+        starts, ends = 500 / RECIPE_STEPS, GROWTH_ENDS
+        return starts <= self.share(done) <= ends and done % interval == 0
 
     def budget(self, step: int, cap: int) -> int:
         """Splats allowed after `step`: grows evenly to the cap, so that early, noisy gradients do
         not spend what later, better ones will want."""
-        share = min(1.0, (step + 1) / (GROWTH_ENDS * self.steps))
+        share = min(1.0, self.share(step + 1) / GROWTH_ENDS)
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
     def resets_after(self, step: int) -> bool:
@@ -72,20 +102,20 @@ class Schedule:
         if self.steps < MIN_STEPS_FOR_RESET:
             return False
         done, interval = step + 1, self._scaled(3000)
-        return done % interval == 0 and done + interval <= GROWTH_ENDS * self.steps
+        return done % interval == 0 and self.share(done) <= GROWTH_ENDS - 3000 / RECIPE_STEPS
 
     def prunes_giants(self, step: int) -> bool:
-        return step >= self._scaled(3000)
+        return self.share(step) >= 3000 / RECIPE_STEPS
 
     def level(self, step: int) -> int:
         """Index into RESOLUTIONS."""
-        share = step / self.steps
+        share = self.share(step)
         return next(i for i, (end, _) in enumerate(RESOLUTIONS) if share < end)
 
-    def view(self, step: int) -> int:
-        """Every photograph once in each round, in a new order each round."""
-        round_number, place = divmod(step, self.n_views)
-        order = np.random.default_rng([self.seed, 1, round_number]).permutation(self.n_views)
+    def view(self, step: int, n_views: int) -> int:
+        """Every one of `n_views` photographs once in each round, in a new order each round."""
+        round_number, place = divmod(step, n_views)
+        order = np.random.default_rng([self.seed, 1, round_number]).permutation(n_views)
         return int(order[place])
 
     def rng(self, step: int) -> np.random.Generator:

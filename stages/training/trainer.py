@@ -14,28 +14,36 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
+from stages.measure.images import psnr
 from stages.measure.judge import Photograph, scores
 from stages.raster.backends import AUTO
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import Camera, Look, Splats, morton
-from stages.training.checkpoint import load_checkpoint, save_checkpoint
+from stages.training.checkpoint import Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
-from stages.training.densify import densify, reset_opacities
+from stages.training.density import AdaptiveDensity
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.schedule import THRESHOLD, Schedule
+from stages.training.pace import Pace, remaining_gain_db
+from stages.training.schedule import SETTLE_FROM, Schedule
 from stages.training.step import step_of
+from stages.training.strategy import Strategy
 from stages.training.views import TrainingView
 
 CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
+LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
+MARKS = 25  # as often the photographs that were lent are looked at
 
 
 @dataclass
 class Trainer:
-    """One run. held_out: what judges it. look: how they are drawn. cap: splats at most. folder:
-    where checkpoints go. smooth: under the 3D smoothing filter. backend: what draws and steps."""
+    """One run. schedule: as planned so far; a time limit or a plateau changes it. held_out: what
+    judges it. look: how they are drawn. cap: splats at most. folder: where checkpoints go. smooth:
+    under the 3D smoothing filter. backend: what draws and steps. lent: rows of `train` that decide,
+    and are trained on only once the run settles. patience_db: what going on must promise to give.
+    seconds: of wall time in all, 0 for as long as the steps take."""
 
     schedule: Schedule
     train: list[TrainingView]
@@ -46,9 +54,16 @@ class Trainer:
     report: Report
     smooth: bool = False
     backend: str = AUTO
+    lent: tuple[int, ...] = ()
+    patience_db: float = 0.0
+    seconds: float = 0.0
 
     def __post_init__(self) -> None:
         self.stepper = step_of(self.backend)
+        self._strategy: Strategy = AdaptiveDensity(self.schedule.extent)
+        self._pace = Pace(self.seconds)
+        self.ended = ""  # why before all steps, if it did
+        self.marks: list[tuple[int, float]] = []  # (step, PSNR in dB) of the photographs lent
         self.history: list[dict[str, Any]] = []
         self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
 
@@ -65,8 +80,9 @@ class Trainer:
             loss = self.step(step)
             self._adapt(step)
             step += 1
-            if step % max(1, self.schedule.steps // EVALUATIONS) == 0:
+            if self.schedule.passes(step, EVALUATIONS):
                 self._record(step)
+            self._replan(step)
             if self.schedule.resets_after(step - 1):  # once its pictures have been judged
                 self._reset_opacities()
             if self.report.stop_requested.is_set() and step < self.schedule.steps:
@@ -88,7 +104,10 @@ class Trainer:
         """Have the stepper hold the model to go on with; the steps that it has had."""
         saved = load_checkpoint(self.folder)
         if saved is not None:
-            model, step, self.history, (*self.times, spent) = saved
+            model, told = saved
+            step, self.history, self.marks = told.step, told.history, told.marks
+            *self.times, spent = told.times
+            self.schedule = self.schedule.as_planned(*told.plan)
             self.clock = Clock(spent)
             self.report.metric("resumed_from_step", step)
         else:
@@ -97,8 +116,10 @@ class Trainer:
         return step
 
     def _save(self, step: int) -> None:
+        plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        save_checkpoint(self.folder, self.model, step, self.history, times)
+        saved = Saved(step, plan, self.history, self.marks, times)
+        save_checkpoint(self.folder, self.model, saved)
 
     def _first(self, start: Splats) -> Model:
         start = start.with_sh_degree(self.schedule.sh_degree)
@@ -119,37 +140,58 @@ class Trainer:
         """One step of Adam on one photograph; the loss before it."""
         if self.smooth and step % SMOOTHING_INTERVAL == 0:
             self._smooth_anew(self.model)
-        view = self.train[self.schedule.view(step)]
+        view = self.train[self._row(step)]
         level = view.levels[self.schedule.level(step)]
         settings = self.settings(self.schedule.active_sh_degree(step))
         factor = self.schedule.rate_factor(step)
         rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
         return self.stepper.step(level, settings, rates, self.smooth)
 
+    def _row(self, step: int) -> int:
+        """Which photograph is trained on in `step`: those that are lent not before it settles."""
+        lent = self.lent if self.schedule.share(step) < SETTLE_FROM else ()
+        rows = [row for row in range(len(self.train)) if row not in lent]
+        return rows[self.schedule.view(step, len(rows))]
+
     def _smooth_anew(self, model: Model) -> None:
         model.smoothing[:] = self.widths(model.means)
         self.stepper.load(model)
 
+    def _replan(self, step: int) -> None:
+        """Change the plan after `step` steps, if time or a plateau asks for it."""
+        if self.seconds and (steps := self._pace.steps(step, self.clock.spent().seconds)):
+            self.schedule = self.schedule.replanned(step, steps)
+        if not self.lent or not self.schedule.passes(step, MARKS):
+            return
+        if self.schedule.share(step) < SETTLE_FROM:
+            self.marks.append((step, self._decided_db()))
+            end = round(SETTLE_FROM * self.schedule.steps)
+            if remaining_gain_db(self.marks, end) < self.patience_db:
+                self.schedule = self.schedule.settling(step)
+                self.ended = f"after {step} steps no more than {self.patience_db} dB was expected"
+
+    def _decided_db(self) -> float:
+        """Mean PSNR of the photographs that were lent, as the model is."""
+        values = []
+        for row in self.lent:
+            level = self.train[row].levels[-1]
+            truth = level.pixels.transpose(1, 2, 0) / np.float32(255)
+            values.append(psnr(np.clip(self.drawn(level.camera), 0.0, 1.0), truth))
+        return float(np.mean(values))
+
     def _adapt(self, step: int) -> None:
         if not self.schedule.densifies_after(step):
             return
-        model, _ = densify(
-            self.model,
-            THRESHOLD,
-            self.schedule.extent,
-            self.schedule.budget(step, self.cap),
-            self.schedule.prunes_giants(step),
-            self.schedule.rng(step),
-        )
+        model = self._strategy.prune(self.model, self.schedule.prunes_giants(step))
+        budget = self.schedule.budget(step, self.cap)
+        model = self._strategy.grow(model, budget, self.schedule.rng(step))
         model = model.take(morton.order_of(model.means))
         if self.smooth:
             model.smoothing[:] = self.widths(model.means)
         self.stepper.load(model)
 
     def _reset_opacities(self) -> None:
-        model = self.model
-        reset_opacities(model)
-        self.stepper.load(model)
+        self.stepper.load(self._strategy.reset(self.model))
 
     def _tick(self, step: int, loss: float) -> None:
         numbers: dict[str, float | int | str] = {"splats": len(self.model), "loss": round(loss, 4)}
@@ -158,8 +200,10 @@ class Trainer:
         self.report.progress(step, self.schedule.steps, "training", **numbers)
 
     def _record(self, step: int) -> None:
+        began = self.clock.spent().seconds
         found = scores(self.drawn, self.held_out)
         entry: dict[str, Any] = {"step": step, "splats": len(self.model)}
+        self._pace.reserve = LAST_WORDS * (self.clock.spent().seconds - began)
         if found:
             entry["psnr_db"] = float(np.mean([score.psnr_db for score in found]))
             entry["ssim"] = float(np.mean([score.ssim for score in found]))

@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.kernels.pool import Pool
 from stages.raster.definition import OPACITY, SH_REST, Backward, gradient_columns, used_columns
-from stages.training.densify import reset_opacities
+from stages.training.density import AdaptiveDensity
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from tests.extremes.measured import Measured, broken, worst
 from tests.tolerances import FIRST_STEP
@@ -53,7 +53,7 @@ def switched_on_late(backend):
     for _ in range(999):
         _step(pool, model, 0, r.normal(size=used_columns(1)), bands=1)
     band = _strides(pool, model, 0, _strong(r))[SH_REST:]
-    reset_opacities(model)
+    model = AdaptiveDensity(1.0).reset(model)
     opacity = _strides(pool, model, 0, _strong(r))[OPACITY]
     what = "over its rate, less 1"
     return [

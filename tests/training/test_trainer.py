@@ -19,7 +19,7 @@ from stages.train import TrainSettings, finished
 from stages.training import cap
 from stages.training.checkpoint import MAGIC
 from stages.training.clock import Clock, Spent
-from stages.training.densify import densify
+from stages.training.density import AdaptiveDensity
 from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from stages.training.schedule import RESOLUTIONS, Schedule
@@ -38,9 +38,7 @@ def view_of(name, picture, where):
 
 def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, backend="cpu"):
     # of an extent of 10, no splat of these toys is large enough to be pruned as a giant
-    schedule = Schedule(
-        steps=steps, extent=10.0, sh_degree=degree, n_views=len(views), n_start=len(start), seed=0
-    )
+    schedule = Schedule(steps=steps, extent=10.0, sh_degree=degree, n_start=len(start), seed=0)
     judges = [
         Photograph(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
         for view in views
@@ -303,9 +301,10 @@ def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
 
 def test_nothing_at_all_can_be_taken_grown_and_pruned():
     empty = new_model(*splat_arrays(grid(2).take(np.zeros(4, bool))))
-    grown, growth = densify(empty, 2e-4, 1.0, 100, True, np.random.default_rng(0))
-    assert len(grown) == len(empty.take(np.zeros(0, bool))) == 0
-    assert (growth.cloned, growth.split, growth.pruned, growth.refused) == (0, 0, 0, 0)
+    strategy = AdaptiveDensity(1.0)
+    assert len(strategy.grow(empty, 100, np.random.default_rng(0))) == 0
+    assert len(strategy.prune(empty, settled=True)) == len(strategy.reset(empty)) == 0
+    assert len(empty.take(np.zeros(0, bool))) == 0
 
 
 def test_under_the_smoothing_filter_no_trained_splat_is_finer_than_its_photographs(tmp_path):

@@ -1,0 +1,83 @@
+"""Where the model grows and where it shrinks (adaptive density control, Kerbl et al. 2023)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.raster.definition import OPACITY
+from stages.scene import logit
+from stages.scene.rotations import matrices_of
+from stages.training.optimiser import OPACITY_STEPS, Model
+
+SPLIT_FACTOR = 1.6  # children of a split are that much smaller
+LARGE = 0.01  # of the scene's extent: above it a splat is split, below it cloned
+GIANT = 0.1  # of the scene's extent
+THRESHOLD = 2e-4  # of the mean gradient, see `AdaptiveDensity`
+OPACITY_MIN = 0.005
+OPACITY_RESET = 0.01
+BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
+
+
+def splat_cap(available_mib: float | None) -> int:
+    """How many splats may be trained in half of the free memory (of 4 GiB where unknown)."""
+    mib = 4096.0 if available_mib is None else available_mib
+    return max(10_000, int(0.5 * mib * 1024 * 1024 / BYTES_PER_SPLAT))
+
+
+@dataclass(frozen=True)
+class AdaptiveDensity:
+    """Clones small splats and splits large ones where the picture pulls at them hardest; see
+    `strategy.Strategy`.
+
+    extent: of the scene, world units. threshold: of the mean gradient by the position on the
+    picture (NDC units of the mean loss).
+    """
+
+    extent: float
+    threshold: float = THRESHOLD
+
+    def prune(self, model: Model, settled: bool) -> Model:
+        keep = model.opacity_logits >= logit(OPACITY_MIN)
+        for array in model.arrays:
+            keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
+        if settled:
+            keep &= np.exp(model.log_scales.max(1)) <= GIANT * self.extent
+        return model.take(keep)
+
+    def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
+        pull = model.gradient_sum / np.maximum(model.gradient_count, 1)
+        wanted = np.flatnonzero(pull >= self.threshold)
+        room = max(0, budget - len(model))
+        if len(wanted) > room:  # the strongest gradients go first
+            strongest = np.argsort(-pull[wanted], kind="stable")[:room]
+            wanted = np.sort(wanted[strongest])
+        large = np.exp(model.log_scales[wanted].max(1)) > LARGE * self.extent
+        clones = model.take(wanted[~large]).fresh()
+        parents = model.take(wanted[large])
+        stay = np.ones(len(model), bool)
+        stay[wanted[large]] = False
+        grown = model.take(stay).joined(clones).joined(_children(parents, rng))
+        grown.forget_gradients()
+        return grown
+
+    def reset(self, model: Model) -> Model:
+        reset = model.take(np.arange(len(model)))
+        faint = np.float32(logit(OPACITY_RESET))
+        np.minimum(reset.opacity_logits, faint, out=reset.opacity_logits)
+        reset.moment1[:, OPACITY] = 0.0
+        reset.moment2[:, OPACITY] = 0.0
+        reset.steps[:, OPACITY_STEPS] = 0
+        return reset
+
+
+def _children(parents: Model, rng: np.random.Generator) -> Model:
+    """Two for each parent, drawn from its own Gaussian."""
+    twice = parents.take(np.repeat(np.arange(len(parents)), 2)).fresh()
+    offsets = rng.normal(size=(len(twice), 3)) * np.exp(twice.log_scales.astype(np.float64))
+    twice.means += np.einsum("nij,nj->ni", matrices_of(twice.quaternions), offsets).astype(
+        np.float32
+    )
+    twice.log_scales -= np.float32(np.log(SPLIT_FACTOR))
+    return twice

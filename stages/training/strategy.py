@@ -1,0 +1,27 @@
+"""How many splats there are, and where they are: three verbs, whatever the rule behind them.
+
+A strategy is a small object without a memory: models go in and come out, and what a verb needs to
+know of the run it is told. To add one: write the class, and name it in STRATEGIES.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from stages.training.optimiser import Model
+
+
+class Strategy(Protocol):
+    """What the trainer asks for after some of its steps. Each returns the model to go on with."""
+
+    def prune(self, model: Model, settled: bool) -> Model:
+        """Without what does not show. settled: whether sizes mean something by now."""
+
+    def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
+        """With more splats where the photographs ask for them, at most `budget` in all; what was
+        added up since the last time is forgotten."""
+
+    def reset(self, model: Model) -> Model:
+        """Nearly transparent, so that only what photographs need comes back; or as it is."""

@@ -1,0 +1,93 @@
+"""Runs that end when their time is up, or when nothing is left to gain."""
+
+import numpy as np
+import pytest
+
+from stages.training.pace import PLATEAU_POINTS, Pace, remaining_gain_db
+from stages.training.schedule import SETTLE_FROM, SETTLE_TO, Schedule
+
+
+def schedule(steps=3000):
+    return Schedule(steps=steps, extent=1.0, sh_degree=2, n_start=1000, seed=0)
+
+
+def simulated(seconds, cost, steps=100_000):
+    """(seconds that a run takes, its schedule at the end), if a step at a share costs `cost`."""
+    plan, pace = schedule(steps), Pace(seconds, reserve=1.0)
+    spent, step = 0.0, 0
+    while step < plan.steps:
+        spent += cost(plan.share(step))
+        step += 1
+        if new := pace.steps(step, spent):
+            plan = plan.replanned(step, new)
+    return spent + 1.0, plan
+
+
+@pytest.mark.parametrize("seconds", [20.0, 60.0, 900.0])
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda share: 0.02,
+        lambda share: 0.02 if share < 0.2 else 0.09,  # pictures at half size come first
+        lambda share: 0.02 + 0.2 * min(share, 0.5),  # splats become more
+        lambda share: 0.05 * (1 + 0.8 * np.sin(40 * share)),  # another program on the machine
+    ],
+)
+def test_a_run_with_a_time_limit_ends_within_a_tenth_of_it_and_goes_through_all_of_its_course(
+    seconds, cost
+):
+    took, plan = simulated(seconds, cost)
+    assert took == pytest.approx(seconds, rel=0.1)
+    assert plan.share(plan.steps) == pytest.approx(1.0)
+    assert plan.rate_factor(plan.steps) == pytest.approx(SETTLE_TO * plan.boost)
+
+
+def test_steps_that_take_a_second_each_still_end_in_time():
+    took, _ = simulated(60.0, lambda share: 1.0)
+    assert 30 < took < 66
+
+
+def test_a_plan_that_is_never_changed_is_the_share_of_steps():
+    plan = schedule(400)
+    assert [plan.share(step) for step in (0, 100, 400)] == [0.0, 0.25, 1.0]
+    assert sum(plan.passes(step, 10) for step in range(1, 401)) == 10
+
+
+def test_a_changed_plan_goes_on_from_where_the_run_is_and_ends_at_its_end():
+    plan = schedule(1000).replanned(300, 600)
+    assert plan.share(300) == pytest.approx(0.3)
+    assert plan.share(450) == pytest.approx(0.65)
+    assert plan.share(600) == 1.0
+    again = schedule(1000).as_planned(plan.steps, *plan.since)
+    assert again == plan
+
+
+def test_a_run_that_settles_early_is_as_long_as_if_that_had_been_the_plan():
+    plan = schedule(3000).settling(600)
+    assert plan.share(600) == SETTLE_FROM
+    assert plan.steps == round(600 / SETTLE_FROM)
+    assert not any(plan.densifies_after(step) for step in range(600, plan.steps))
+    late = schedule(3000)
+    assert late.settling(2500) is late
+
+
+def test_what_rises_with_every_doubling_promises_that_much_more():
+    steps = [100, 200, 400, 800, 1600]
+    marks = [(step, 20 + 0.5 * k) for k, step in enumerate(steps)]
+    assert remaining_gain_db(marks, 3200) == pytest.approx(0.5)
+    assert remaining_gain_db(marks, 6400) == pytest.approx(1.0)
+
+
+def test_a_flat_course_promises_nothing_and_a_noisy_one_is_not_believed():
+    steps = np.linspace(1000, 2000, PLATEAU_POINTS).astype(int)
+    flat = [(int(step), 25.0) for step in steps]
+    assert abs(remaining_gain_db(flat, 4000)) < 1e-9
+    noise = (0.4, -0.4, 0.0, 0.4, -0.4)
+    noisy = [(step, db + d) for (step, db), d in zip(flat, noise, strict=True)]
+    assert remaining_gain_db(noisy, 4000) > 0.1
+    falling = [(step, 25.0 - 0.1 * k) for k, (step, _) in enumerate(flat)]
+    assert remaining_gain_db(falling, 4000) < 0
+
+
+def test_too_few_marks_promise_everything():
+    assert remaining_gain_db([(100, 20.0)] * (PLATEAU_POINTS - 1), 1000) == float("inf")
