@@ -49,6 +49,7 @@ class Trainer:
 
     def __post_init__(self) -> None:
         self.stepper = step_of(self.backend)
+        self.cut_out = any(view.levels[0].outside == TRANSPARENT for view in self.train)
         self.history: list[dict[str, Any]] = []
         self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
 
@@ -123,7 +124,7 @@ class Trainer:
         view = self.train[self.schedule.view(step)]
         level = view.levels[self.schedule.level(step)]
         settings = self.settings(self.schedule.active_sh_degree(step))
-        if any(view.levels[0].outside == TRANSPARENT for view in self.train):
+        if self.cut_out:
             settings = replace(settings, background=self.schedule.background(step))
         factor = self.schedule.rate_factor(step)
         rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
