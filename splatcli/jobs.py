@@ -22,7 +22,9 @@ DEFAULT_PRESET = "standard"
 PROCESS_OPTIONS = (
     "backend",
     "max_side",
-    "alpha_over",
+    "masks",
+    "invert_masks",
+    "mask_means",
     "frames",
     "train_side",
     "steps",

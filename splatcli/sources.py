@@ -42,10 +42,10 @@ def splats_of(target: Path | None, strict: bool = True) -> tuple[Splats, Pipelin
 
 def _as_in_its_run(file: Path, splats: Splats) -> Splats:
     """A file says nothing of how it is drawn; the run whose export folder it lies in does."""
-    from stages.scene import Look, near_plane
+    from stages.scene import look_of
 
     views = views_around(file)
-    return replace(splats, look=Look(near_plane(views))) if views else splats
+    return replace(splats, look=look_of(tuple(views))) if views else splats
 
 
 def backend_of(pipeline: Pipeline | None) -> str:

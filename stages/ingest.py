@@ -40,12 +40,26 @@ class IngestSettings:
             "max": 32_768,
         },
     )
-    alpha_over: str = field(
-        default="white",
+    masks: Path | None = field(
+        default=None,
         metadata={
-            "help": "What shows where a picture is transparent: white or black. Splats are drawn "
-            "over black, so that black leaves cut-out objects alone in empty space.",
-            "choices": ("white", "black"),
+            "help": "Folder of masks, white where a photograph counts, named as the photographs "
+            "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside the "
+            "photographs' is found without.",
+            "affects_output": False,  # its content does, which is an input
+        },
+    )
+    invert_masks: bool = field(
+        default=False,
+        metadata={"help": "Masks are black where a photograph counts, not white."},
+    )
+    mask_means: str = field(
+        default="auto",
+        metadata={
+            "help": "What is outside a mask: ignore (something that does not count), transparent "
+            "(nothing, as around an object cut out) or auto (nothing where pictures themselves are "
+            "transparent, ignored where masks are files).",
+            "choices": ("auto", "ignore", "transparent"),
         },
     )
     frames: int = field(
@@ -61,12 +75,15 @@ class IngestSettings:
 
 @dataclass(frozen=True)
 class _Taken:
-    """A photograph that was read, or `unusable`: why it was not."""
+    """A photograph that was read, or `unusable`: why it was not. inside: the share of it that its
+    mask keeps."""
 
     photo: Photo | None = None
     measures: Measures | None = None
     unusable: str = ""
     alpha: bool = False
+    inside: float = 1.0
+    mask_scaled: bool = False
     hdr: bool = False
     bad_profile: bool = False
 
@@ -76,15 +93,18 @@ def run(
 ) -> Capture:
     """Read the photographs in the folder inputs["photos"]; see the module's docstring.
 
-    Leaves in `folder`: photos/ (the normalised pictures) and capture.json (`load` reads it).
-    Raises SplatError for a folder without at least 3 usable photographs, and Interrupted.
+    Leaves in `folder`: photos/ (the normalised pictures), masks/ (where there are any) and
+    capture.json (`load` reads it). Raises SplatError for a folder without at least 3 usable
+    photographs and for masks that do not fit them, and Interrupted.
     """
-    from stages.photos import advice, capture_file, find
+    from stages.photos import advice, capture_file, cut_out, find, masks
     from stages.photos.quality import near_duplicates
     from stages.scene import Capture
 
     root = Path(inputs["photos"])
-    found = find.find(root)
+    apart = masks.mask_folder(root, settings.masks)
+    found = find.find(root, apart)
+    masks.check_pairing(found, apart, settings.masks)
     folder.mkdir(parents=True, exist_ok=True)
     taken = _take_all(found, settings, folder, report)
     names = [source.name for source in found.sources]
@@ -99,10 +119,17 @@ def run(
     if len(photos) < FEWEST_PHOTOGRAPHS:
         raise _too_few(root, len(photos), reasons)
     advice.about_conversions(
-        [n for n, t in zip(names, taken, strict=True) if t.alpha],
         [n for n, t in zip(names, taken, strict=True) if t.hdr],
         [n for n, t in zip(names, taken, strict=True) if t.bad_profile],
-        settings.alpha_over,
+        report.warn,
+    )
+    inside = [t.inside for t in taken if t.photo is not None]
+    cut_out.check_shares(photos, inside, bool(found.masks))
+    advice.about_masks(
+        photos,
+        [n for n, t in zip(names, taken, strict=True) if t.alpha],
+        [n for n, t in zip(names, taken, strict=True) if t.mask_scaled],
+        found.stray_masks,
         report.warn,
     )
     duplicates = near_duplicates([t.measures.thumbnail for t in taken if t.measures is not None])
@@ -134,7 +161,8 @@ def _take_all(
     report.progress(0, total, "reading photographs")
     with readers_set_up(), ThreadPoolExecutor(threads.count()) as pool:
         futures: list[Future[_Taken]] = [
-            pool.submit(_take, source, settings, folder, budget) for source in found.sources
+            pool.submit(_take, source, found.masks.get(source.name), settings, folder, budget)
+            for source in found.sources
         ]
         try:
             for done, (source, future) in enumerate(zip(found.sources, futures, strict=True), 1):
@@ -147,15 +175,17 @@ def _take_all(
     return taken
 
 
-def _take(source: Source, settings: IngestSettings, folder: Path, budget: PixelBudget) -> _Taken:
-    """Read one photograph and keep it."""
+def _take(
+    source: Source, mask: Path | None, settings: IngestSettings, folder: Path, budget: PixelBudget
+) -> _Taken:
+    """Read one photograph and its mask, and keep it."""
     from stages.photos.decode import Unusable, decode
 
     try:
-        decoded = decode(source.path, settings.max_side, budget, settings.alpha_over)
+        decoded = decode(source.path, settings.max_side, budget)
     except Unusable as finding:
         return _Taken(unusable=str(finding))
-    return _kept(source.name, source.image, decoded, folder)
+    return _kept(source.name, source.image, decoded, settings, folder, mask)
 
 
 def _frames_of(
@@ -166,28 +196,46 @@ def _frames_of(
     from stages.photos.decode import Unusable
 
     try:
+        chosen = from_video.photographs(source, settings.frames, settings.max_side, report)
         return [
             _kept(
-                f"{source.name}/{number}", f"{source.image}/{number}", decoded, folder, source.name
+                f"{source.name}/{number}",
+                f"{source.image}/{number}",
+                decoded,
+                settings,
+                folder,
+                film=source.name,
             )
-            for number, decoded in from_video.photographs(
-                source, settings.frames, settings.max_side, report
-            )
+            for number, decoded in chosen
         ]
     except Unusable as finding:
         return [_Taken(unusable=str(finding))]
 
 
-def _kept(name: str, image: str, decoded: Decoded, folder: Path, film: str = "") -> _Taken:
-    """Write a normalised picture and measure it. film: the video that it comes from."""
+def _kept(
+    name: str,
+    image: str,
+    decoded: Decoded,
+    settings: IngestSettings,
+    folder: Path,
+    mask: Path | None = None,
+    film: str = "",
+) -> _Taken:
+    """Write a normalised picture and its mask, and measure it. film: the video that it comes
+    from."""
+    from stages.photos.cut_out import Masked
     from stages.photos.quality import measure
-    from stages.photos.write import write_picture
+    from stages.photos.write import write_mask, write_picture
     from stages.scene import Photo
 
+    masked = Masked.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
+    decoded = masked.decoded
     target = folder / image
     target.parent.mkdir(parents=True, exist_ok=True)
     write_picture(target, decoded)
-    measures = measure(decoded.pixels)
+    if masked.mask is not None:
+        write_mask(folder / masked.file(image), masked.mask)
+    measures = measure(decoded.pixels, masked.mask)
     height, width = decoded.pixels.shape[:2]
     exif = decoded.exif
     focal = exif.focal_px(decoded.stored, width, height)
@@ -201,8 +249,18 @@ def _kept(name: str, image: str, decoded: Decoded, folder: Path, film: str = "")
         sharpness=measures.sharpness,
         log2_luminance=measures.log2_luminance,
         exposure_ev=round(exif.exposure_ev, 3) if exif.exposure_ev is not None else None,
+        mask=masked.file(image),
+        outside=masked.outside,
     )
-    return _Taken(photo, measures, "", decoded.alpha, decoded.hdr, decoded.bad_profile)
+    return _Taken(
+        photo,
+        measures,
+        alpha=decoded.alpha is not None,
+        inside=masked.share,
+        mask_scaled=masked.scaled,
+        hdr=decoded.hdr,
+        bad_profile=decoded.bad_profile,
+    )
 
 
 def _film_key(film: str, width: int, height: int) -> str:
@@ -227,6 +285,7 @@ def _report_capture(
     known = [photo.exposure_ev for photo in photos if photo.exposure_ev is not None]
     report.metric("photographs", len(photos))
     report.metric("with_focal_length", sum(photo.focal_px is not None for photo in photos))
+    report.metric("masked", sum(bool(photo.mask) for photo in photos))
     report.metric("cameras", len({photo.camera for photo in photos}))
     report.metric("blurred", len(blurred))
     report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))
@@ -250,4 +309,4 @@ def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatEr
     )
 
 
-STAGE = Stage(name="ingest", version=3, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=4, reads=(), settings_type=IngestSettings, run=run, load=load)

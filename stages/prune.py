@@ -119,5 +119,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=4, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=5, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

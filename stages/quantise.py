@@ -198,7 +198,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=3,
+    version=4,
     reads=("sfm", "prune"),
     settings_type=QuantiseSettings,
     run=run,

@@ -52,7 +52,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     """
     import numpy as np
 
-    from stages.scene import Look, Splats, logit, near_plane, rgb_to_dc
+    from stages.scene import Splats, logit, look_of, rgb_to_dc
     from stages.scene.storage import save_splats
 
     reconstruction: Reconstruction = inputs["sfm"]
@@ -84,7 +84,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
         sh=rgb_to_dc(colours)[:, None, :].astype(np.float32),
         sh_degrees=np.zeros(len(points), np.uint8),
         origin=reconstruction.origin.copy(),
-        look=Look(near_plane(reconstruction.views)),
+        look=look_of(reconstruction.views),
     )
     save_splats(folder, splats)
     report.metric("splats", len(splats))
@@ -224,5 +224,5 @@ def _too_few(usable: int, points: int) -> SplatError:
 
 
 STAGE = Stage(
-    name="seed", version=3, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
+    name="seed", version=4, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
 )

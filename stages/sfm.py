@@ -212,6 +212,7 @@ def _base_job(capture: Capture, settings: SfmSettings, work: Path) -> Job:
         out="",
         progress="",
         names=tuple(photo.image for photo in capture.photos),
+        masks=tuple(photo.mask for photo in capture.photos),
         camera_of=tuple(camera_of),
         cameras=tuple(guesses),
         seed=settings.seed,
@@ -359,5 +360,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=4, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=5, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

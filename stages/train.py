@@ -133,7 +133,7 @@ def make_trainer(
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
     from stages.measure.judge import load_photographs
-    from stages.scene import Look, near_plane, scene_extent, split_held_out
+    from stages.scene import look_of, scene_extent, split_held_out
     from stages.training.cap import cap_for
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
@@ -141,7 +141,7 @@ def make_trainer(
 
     kept, held = split_held_out(reconstruction.views)
     train = load_views(reconstruction.folder, kept, settings.train_side)
-    look = Look(near_plane(reconstruction.views), settings.train_side)
+    look = look_of(reconstruction.views, settings.train_side)
     held_out = load_photographs(reconstruction.folder, held, look)
     smaller = [
         v
@@ -213,7 +213,7 @@ def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.measure.judge import scores
+    from stages.measure.judge import inside_db, scores
     from stages.training.charts import contact_sheet, training_plot
 
     found = scores(trainer.drawn, trainer.held_out, with_flip=True)
@@ -231,6 +231,9 @@ def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
             "train-nothing-held-out",
             "Too few photographs to hold one out: quality was not measured.",
         )
+    inside = inside_db(trainer.drawn, trainer.held_out)
+    if inside is not None:
+        report.metric("psnr_inside_db", round(inside, 3))
     report.metric("held_out", [asdict(score) for score in found])
     report.metric(
         "judged_side_px", max((max(p.pixels.shape[:2]) for p in trainer.held_out), default=0)

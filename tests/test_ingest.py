@@ -175,14 +175,14 @@ def test_grey_and_palette_pictures_become_rgb(photos: Path) -> None:
     assert np.abs(picture(capture, "palette.png") - textured(6)).mean() < 30
 
 
-def test_transparency_is_laid_over_white_and_said(photos: Path) -> None:
+def test_what_is_transparent_is_empty_before_black_and_said(photos: Path) -> None:
     layered = np.dstack([textured(5), np.full((64, 96), 255, np.uint8)])
     save(photos / "opaque.png", layered)
     layered[:10, :, 3] = 0
     save(photos / "cut out.png", layered)
     capture, warnings, _ = ingested(photos)
     shown = picture(capture, "cut out.png")
-    assert shown[:10].min() == 255
+    assert shown[:10].max() == 0
     np.testing.assert_array_equal(shown[10:].round(), textured(5)[10:])
     assert "cut out.png" in warnings["ingest-transparency"]
     assert "opaque.png" not in warnings["ingest-transparency"]

@@ -47,6 +47,8 @@ def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: st
         forward = rasteriser.forward(arrays, photograph.camera, settings, depths=True)
         target = photograph.image.transpose(2, 0, 1)
         residual = np.ascontiguousarray(forward.image[:3] - target)
+        if photograph.kept is not None:
+            residual *= photograph.kept
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
         depths.append(float(np.median(solid)) if solid.size else np.inf)

@@ -9,7 +9,7 @@ import numpy as np
 
 from stages.base.words import counted
 from stages.photos.find import RAW_ADVICE, Findings
-from stages.scene import Photo
+from stages.scene import TRANSPARENT, Photo
 
 Warn = Callable[[str, str], None]
 
@@ -51,20 +51,11 @@ def about_left_out(reasons: Sequence[tuple[str, str]], warn: Warn) -> None:
 
 
 def about_conversions(
-    alpha: Sequence[str],
     hdr: Sequence[str],
     bad_profiles: Sequence[str],
-    behind: str,
     warn: Warn,
 ) -> None:
-    """Names of photographs of which something was lost on the way to 8-bit sRGB. behind: the colour
-    that shows where they were transparent."""
-    if alpha:
-        warn(
-            "ingest-transparency",
-            f"Transparent parts were laid over {behind}: {listed(alpha)}. "
-            "Photographs with their background serve better: it helps to find the cameras.",
-        )
+    """Names of photographs of which something was lost on the way to 8-bit sRGB."""
     if hdr:
         warn(
             "ingest-hdr",
@@ -77,6 +68,46 @@ def about_conversions(
             f"The colour profile is damaged, so sRGB was assumed: {listed(bad_profiles)}. "
             "Export these photographs again if their colours look wrong.",
         )
+
+
+def about_masks(
+    photos: Sequence[Photo],
+    by_alpha: Sequence[str],
+    scaled: Sequence[str],
+    stray: Sequence[str],
+    warn: Warn,
+) -> None:
+    """by_alpha: photographs that are partly transparent. scaled: whose masks had another size.
+    stray: masks of no photograph."""
+    cut_out = [name for name in by_alpha if _outside(photos, name) == TRANSPARENT]
+    if cut_out:
+        warn(
+            "ingest-transparency",
+            f"Transparent parts are taken for empty space: {listed(cut_out)}. "
+            "--mask-means ignore takes them for parts that are not known.",
+        )
+    if scaled:
+        warn(
+            "ingest-mask-scaled",
+            f"Masks of another size than their photographs were scaled: {listed(scaled)}. "
+            "Masks as large as the photographs have sharper edges.",
+        )
+    if stray:
+        warn(
+            "ingest-mask-unused",
+            f"Masks of no photograph, by their names, are not used: {listed(stray)}.",
+        )
+    bare = [photo.name for photo in photos if not photo.mask]
+    if 0 < len(bare) < len(photos):
+        warn(
+            "ingest-mask-missing",
+            f"Nothing is masked in {counted(len(bare), 'photograph')}: {listed(bare)}. "
+            "There everything counts.",
+        )
+
+
+def _outside(photos: Sequence[Photo], name: str) -> str:
+    return next((photo.outside for photo in photos if photo.name == name), "")
 
 
 def about_capture(

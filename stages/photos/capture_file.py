@@ -13,7 +13,7 @@ from stages.base.errors import Family, SplatError
 from stages.scene import Capture, Photo
 
 FILE = "capture.json"
-_SCHEMA = 2
+_SCHEMA = 3
 _TYPES: dict[str, tuple[type, ...]] = {
     "name": (str,),
     "image": (str,),
@@ -25,6 +25,8 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "log2_luminance": (float, int),
     "exposure_ev": (float, int, type(None)),
     "twin": (str,),
+    "mask": (str,),
+    "outside": (str,),
 }
 
 
@@ -70,9 +72,11 @@ def _photo(path: Path, number: int, row: Any) -> Photo:
     for name in ("width", "height", "focal_px"):
         if row[name] is not None and row[name] <= 0:
             raise _damaged(path, f"{name} of {where} is {row[name]}")
-    image = PurePosixPath(row["image"])
-    if image.is_absolute() or ".." in image.parts or not (path.parent / image).is_file():
-        raise _damaged(path, f"the picture of {where}, {row['image']}, is not there")
+    for what, file in (("picture", row["image"]), ("mask", row["mask"])):
+        inside = PurePosixPath(file)
+        outside = inside.is_absolute() or ".." in inside.parts
+        if outside or (not (path.parent / inside).is_file() and (file or what == "picture")):
+            raise _damaged(path, f"the {what} of {where}, {file}, is not there")
     return Photo(**row)
 
 

@@ -27,7 +27,7 @@ MAX_MEGAPIXELS = 200
 MAX_FILE_BYTES = 2**31
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP")  # MPO opens as JPEG
 _SMALLEST_SIDE_PX = 16
-_UPRIGHT = {
+UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -47,14 +47,15 @@ class Decoded:
     """pixels: [H, W, 3] uint8 sRGB, upright, fitted to the size asked for.
 
     stored: (width, height) in the file, before turning. as_it_was: the bytes of the file, if it is
-    a JPEG that already is what `pixels` says. alpha, hdr, bad_profile: what was met on the way.
+    a JPEG that already is what `pixels` says. alpha [H, W]: how solid each pixel is, where not all
+    of them are; `pixels` are over black then. hdr, bad_profile: what was met on the way.
     """
 
     pixels: NDArray[np.uint8]
     stored: tuple[int, int]
     exif: Exif
     as_it_was: bytes | None = None
-    alpha: bool = False
+    alpha: NDArray[np.uint8] | None = None
     hdr: bool = False
     bad_profile: bool = False
 
@@ -103,9 +104,8 @@ def readers_set_up() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(log_level)
 
 
-def decode(path: Path, max_side: int, budget: PixelBudget, behind: str = "white") -> Decoded:
-    """Read the photograph at `path`, its longer side at most `max_side` pixels. behind: the colour
-    that shows where it is transparent.
+def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
+    """Read the photograph at `path`, its longer side at most `max_side` pixels.
 
     Raises Unusable for a file that is damaged, truncated, of another kind, too large or too small.
     """
@@ -115,7 +115,7 @@ def decode(path: Path, max_side: int, budget: PixelBudget, behind: str = "white"
         with Image.open(io.BytesIO(data), formats=readable) as image:
             stored = _check_size(image.size)
             with budget.spend(stored[0] * stored[1]):
-                return _decode(image, data, max_side, behind)
+                return _decode(image, data, max_side)
     except (Unusable, MemoryError):
         raise
     except UnidentifiedImageError as error:
@@ -146,7 +146,7 @@ def _check_size(size: tuple[int, int]) -> tuple[int, int]:
     return size
 
 
-def _decode(image: Image.Image, data: bytes, max_side: int, behind: str) -> Decoded:
+def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
     stored, exif, info = image.size, read_exif(image), dict(image.info)
     size = fitted_size(*stored, max_side)
     jpeg = image.format in ("JPEG", "MPO")
@@ -156,11 +156,12 @@ def _decode(image: Image.Image, data: bytes, max_side: int, behind: str) -> Deco
         exif = replace(exif, orientation=1)  # the decoder has turned the pixels already
     native_mode = image.mode
     plain = _resized(_plain_mode(_loaded(image, data)), size, stored)
-    shown, alpha = _without_alpha(plain, behind)
+    shown, alpha = _over_black(plain)
     shown, converted, bad_profile = _in_srgb(shown, info.get("icc_profile"))
     upright = exif.orientation == 1
     if not upright:
-        shown = shown.transpose(_UPRIGHT[exif.orientation])
+        shown = shown.transpose(UPRIGHT[exif.orientation])
+        alpha = None if alpha is None else alpha.transpose(UPRIGHT[exif.orientation])
     pixels = np.array(shown if shown.mode == "RGB" else shown.convert("RGB"))
     declared = None if info.get("icc_profile") else _declared_space(exif, info)
     if declared is not None:
@@ -171,7 +172,7 @@ def _decode(image: Image.Image, data: bytes, max_side: int, behind: str) -> Deco
         stored=stored,
         exif=exif,
         as_it_was=data if unchanged and not converted else None,
-        alpha=alpha,
+        alpha=np.array(alpha) if alpha is not None else None,
         hdr=colour.nclx_is_hdr(info.get("nclx_profile")),
         bad_profile=bad_profile,
     )
@@ -227,15 +228,16 @@ def _plain_mode(image: Image.Image) -> Image.Image:
     return image if image.mode in ("RGB", "L", "CMYK", "RGBA", "LA") else image.convert("RGB")
 
 
-def _without_alpha(image: Image.Image, behind: str) -> tuple[Image.Image, bool]:
-    """(the picture over a colour where it is transparent, whether it is anywhere)."""
+def _over_black(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:
+    """(the picture over black where it is transparent, its alpha if it is anywhere)."""
     if image.mode not in ("RGBA", "LA"):
-        return image, False
+        return image, None
     layered = image.convert("RGBA")
-    if layered.getchannel("A").getextrema() == (255, 255):
-        return layered.convert("RGB"), False
-    below = Image.new("RGBA", image.size, behind)
-    return Image.alpha_composite(below, layered).convert("RGB"), True
+    alpha = layered.getchannel("A")
+    if alpha.getextrema() == (255, 255):
+        return layered.convert("RGB"), None
+    below = Image.new("RGBA", image.size, "black")
+    return Image.alpha_composite(below, layered).convert("RGB"), alpha
 
 
 def _resized(image: Image.Image, size: tuple[int, int], stored: tuple[int, int]) -> Image.Image:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import re
 import unicodedata
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from stages.base.errors import Family, SplatError
 from stages.base.words import counted
+from stages.photos import masks
 from stages.scene.capture import PHOTOS_FOLDER
 
 LOSSY = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".heic", ".heif", ".hif", ".avif"})
@@ -49,6 +50,8 @@ class Findings:
     videos: to take frames from. raws, other_pictures: names of files that are not read. All less
     those that share their name with a photograph (IMG_1.NEF, or a live picture's IMG_1.MOV, beside
     IMG_1.JPG). others: how many files are something else.
+    masks: files by the name of the photograph that they belong to. stray_masks: files among the
+    masks that belong to no photograph.
     """
 
     sources: tuple[Source, ...]
@@ -56,11 +59,14 @@ class Findings:
     raws: tuple[str, ...]
     other_pictures: tuple[str, ...]
     others: int
+    masks: Mapping[str, Path] = field(default_factory=dict)
+    stray_masks: tuple[str, ...] = ()
 
 
-def find(folder: Path) -> Findings:
+def find(folder: Path, more_masks: Path | None = None) -> Findings:
     """Look through `folder` and its sub-folders; hidden files and folders are passed over. In the
-    place of a folder, a video counts as a folder that holds it.
+    place of a folder, a video counts as a folder that holds it. more_masks: a folder of masks
+    besides those in `folder`.
 
     Links to folders are not followed, so that a loop cannot trap the search. Raises SplatError
     when the folder is missing, is another file, cannot be listed or holds no photograph or video.
@@ -72,6 +78,7 @@ def find(folder: Path) -> Findings:
     files: dict[str, Path] = {}
     for path in _walk(folder):
         files[_printable(path.relative_to(folder))] = path
+    mask_of, stray = _masks_taken_out(files, folder, more_masks)
     names = sorted(files, key=natural_key)
     photographs = [name for name in names if _suffix(name) in LOSSY | LOSSLESS]
     stems = {_stem(name) for name in photographs}
@@ -87,10 +94,42 @@ def find(folder: Path) -> Findings:
         raws=kinds["raw"],
         other_pictures=kinds["other"],
         others=len(names) - len(photographs) - sum(len(kind) for kind in kinds.values()),
+        masks=mask_of,
+        stray_masks=stray,
     )
     if not found.sources and not found.videos:
         raise _no_photographs(folder, found)
     return found
+
+
+def _masks_taken_out(
+    files: dict[str, Path], folder: Path, apart: Path | None
+) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """(mask by photograph's name, masks of none). They are removed from `files`: those in a folder
+    called masks, those of `apart` where that lies within, and those beside their photographs."""
+    apart = apart.resolve() if apart is not None else None
+    inside = {
+        name: name.partition("/")[2]
+        for name in files
+        if name.casefold().startswith(f"{masks.FOLDER}/")
+    }
+    if len(inside) == len(files):
+        inside = {}  # whoever names such a folder's parent alone wants them as photographs
+    found = {short: files.pop(name) for name, short in inside.items()}
+    if apart is not None and apart.is_dir() and apart != folder.resolve():
+        for path in _walk(apart):
+            found[_printable(path.relative_to(apart))] = path
+        for name in [name for name, path in files.items() if path.resolve().is_relative_to(apart)]:
+            del files[name]
+    found = {name: path for name, path in found.items() if _suffix(name) in masks.MASK_SUFFIXES}
+    pictures = [name for name in files if _suffix(name) in LOSSY | LOSSLESS]
+    beside = masks.beside(pictures)
+    paired = masks.paired((name for name in pictures if name not in beside), found)
+    for mask, photograph in beside.items():
+        paired.setdefault(photograph, files.pop(mask))
+    used = set(paired.values())
+    stray = (name for name, path in found.items() if path not in used)
+    return paired, tuple(sorted(stray, key=natural_key))
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
+from stages.scene.capture import TRANSPARENT, View
 
 
 def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
@@ -36,6 +37,21 @@ def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
     if pixels.shape[:2] != (height, width):
         pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(np.clip(pixels, 0.0, 1.0), dtype=np.float32)
+
+
+def load_mask(path: Path, width: int, height: int, outside: str) -> NDArray[np.uint8]:
+    """[height, width] of a mask as ingest and structure from motion write them; 0 is outside.
+
+    Scaled down as `load_image` does it: what is cut out keeps its share of each new pixel; of what
+    is to be ignored, a pixel that holds any is ignored. Raises SplatError "photo-unreadable".
+    """
+    mask = np.round(load_image(path, width, height)[..., 0] * 255).astype(np.uint8)
+    return mask if outside == TRANSPARENT else np.where(mask == 255, mask, np.uint8(0))
+
+
+def mask_of(folder: Path, view: View, width: int, height: int) -> NDArray[np.uint8] | None:
+    """A view's mask by `load_mask`; None where everything counts."""
+    return load_mask(folder / view.mask, width, height, view.outside) if view.mask else None
 
 
 def _unreadable(path: Path, reason: str) -> SplatError:

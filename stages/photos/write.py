@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from stages.base.atomic import replacing
@@ -31,3 +33,12 @@ def write_picture(path: Path, decoded: Decoded) -> None:
         data = encoded.getvalue()
     with replacing(path) as temporary:
         temporary.write_bytes(data)
+
+
+def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
+    """Write a mask [H, W] as grey PNG. Raises SplatError if the disk refuses."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    encoded = io.BytesIO()
+    Image.fromarray(mask).save(encoded, "PNG", compress_level=3)
+    with replacing(path) as temporary:
+        temporary.write_bytes(encoded.getvalue())

@@ -60,4 +60,5 @@ def renderer(
 
 def settings_of(splats: Splats) -> RasterSettings:
     """How these splats are drawn: by their own look, or by their size where they have none."""
-    return RasterSettings(near=splats.look.near or near_plane_of(splats.means))
+    near = splats.look.near or near_plane_of(splats.means)
+    return RasterSettings(near=near, background=(splats.look.background,) * 3)

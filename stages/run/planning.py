@@ -15,6 +15,7 @@ from stages.run.request import Request, request_for, why_again
 from stages.run.workspace import Layout
 
 PHOTOS = "photos"  # the input of a stage that reads no other
+MASKS = "masks"
 _NAMED_AT_MOST = 3
 
 
@@ -101,8 +102,22 @@ class Planner:
             done = Manifest.read(self.layout.workspace(stage).final)
             known = done.input_files.get(PHOTOS) if done else None
             self._photo_records = record_files(self.existing_photos(), known, users=True)
-        inputs = {PHOTOS: combined_digest(self._photo_records)}
-        return request_for(stage, settings, inputs, {PHOTOS: self._photo_records})
+        files = {PHOTOS: self._photo_records, **self._masks(stage, settings)}
+        inputs = {name: combined_digest(records) for name, records in files.items()}
+        return request_for(stage, settings, inputs, files)
+
+    def _masks(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
+        """The masks that lie apart from the photographs, if there are any."""
+        from stages.photos.masks import mask_folder
+
+        folder = mask_folder(self.existing_photos(), getattr(settings, MASKS, None))
+        if folder is None:
+            return {}
+        done = Manifest.read(self.layout.workspace(stage).final)
+        known = done.input_files.get(MASKS) if done else None
+        if known is not None and not folder.exists():
+            return {MASKS: known}
+        return {MASKS: record_files(folder, known, users=True)}
 
     def _files_of(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
         """The user's own files that settings name, by setting. Those that have gone since the

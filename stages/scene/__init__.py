@@ -8,6 +8,8 @@ max(0, 0.5 + SH), in the photographs' own sRGB values. Images: [H, W, 3] float32
 from stages.scene.assets import ExportedAssets, ExportedFile
 from stages.scene.camera import Camera, fitted_size, look_at
 from stages.scene.capture import (
+    IGNORE,
+    TRANSPARENT,
     Capture,
     Photo,
     Reconstruction,
@@ -15,12 +17,14 @@ from stages.scene.capture import (
     scene_extent,
     split_held_out,
 )
-from stages.scene.look import Look, near_plane
+from stages.scene.look import Look, look_of, near_plane
 from stages.scene.splats import SH_C0, QuantisedSplats, Splats, dc_to_rgb, logit, rgb_to_dc
 from stages.scene.storage import load_splats, save_splats
 
 __all__ = [
+    "IGNORE",
     "SH_C0",
+    "TRANSPARENT",
     "Camera",
     "Capture",
     "ExportedAssets",
@@ -36,6 +40,7 @@ __all__ = [
     "load_splats",
     "logit",
     "look_at",
+    "look_of",
     "near_plane",
     "rgb_to_dc",
     "save_splats",

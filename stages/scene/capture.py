@@ -12,6 +12,7 @@ from stages.scene.camera import Camera
 
 HELD_OUT_EVERY = 8
 PHOTOS_FOLDER = "photos/"  # of a capture: where its normalised pictures are
+IGNORE, TRANSPARENT = "ignore", "transparent"  # what masks may mean
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,9 @@ class Photo:
     sharpness: the higher the sharper; comparable within one capture.
     twin: the first photograph of those that show nearly the same as this one; "" if none does.
     log2_luminance: log2 of the median linear luminance. exposure_ev: EV at ISO 100 from EXIF.
+    mask: a grey picture of the same size, relative to the capture's folder; "" for none. 0 is
+        outside. outside: what that means: IGNORE (nobody knows what is there) or TRANSPARENT
+        (nothing is there; `image` is over black, and the mask says how much of it is solid).
     """
 
     name: str
@@ -38,6 +42,8 @@ class Photo:
     log2_luminance: float
     exposure_ev: float | None
     twin: str = ""
+    mask: str = ""
+    outside: str = ""
 
     @property
     def picture(self) -> str:
@@ -57,13 +63,16 @@ class Capture:
 @dataclass(frozen=True)
 class View:
     """A registered photograph, undistorted. image: relative to the reconstruction's folder. twin:
-    as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody does."""
+    as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody does. mask,
+    outside: as in `Photo`, the mask relative to the reconstruction's folder."""
 
     name: str
     image: str
     camera: Camera
     twin: str = ""
     role: str = ""
+    mask: str = ""
+    outside: str = ""
 
 
 @dataclass(frozen=True)

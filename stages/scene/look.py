@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
-from stages.scene.capture import View, scene_extent
+from stages.scene.capture import TRANSPARENT, View, scene_extent
 
 NEAR_SHARE = 0.01  # of the cameras' extent: nearer than that no photograph is in focus
 # Of the box of the middle 98 % of the splats, where no camera tells: a scene is mostly seen from
@@ -25,14 +25,22 @@ class Look:
         files of other programs do not tell.
     side: longer side of the photographs that the splats were fitted to and are judged on, pixels;
         0 where there were none.
+    background: grey behind everything, 0 to 1: black, or white where photographs are cut out.
     """
 
     near: float = 0.0
     side: int = 0
+    background: float = 0.0
 
     def camera(self, camera: Camera) -> Camera:
         """`camera` at the size that the splats are judged at; never enlarged."""
         return camera.fitted(self.side) if self.side else camera
+
+
+def look_of(views: tuple[View, ...], side: int = 0) -> Look:
+    """How splats fitted to these photographs are drawn."""
+    cut_out = any(view.outside == TRANSPARENT for view in views)
+    return Look(near_plane(views), side, float(cut_out))
 
 
 def near_plane(views: tuple[View, ...]) -> float:

@@ -1,14 +1,15 @@
 """Splats on disk between stages: exact, deterministic, and quick to load.
 
 Layout: the 8 bytes of `MAGIC`, then one block in NumPy's .npy format (version 1.0) for each array
-in the order of `FIELDS`, and a last one [2] float64 for the look: near plane and side. No
-compression and no timestamps (a zip, and so .npz, would carry them), so equal splats give equal
-bytes.
+in the order of `FIELDS`, and a last one [3] float64 for the look: near plane, side and
+background. No compression and no timestamps (a zip, and so .npz, would carry them), so equal splats
+give equal bytes.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,7 +22,7 @@ from stages.base.errors import Family, SplatError
 from stages.scene.look import Look
 from stages.scene.splats import Splats
 
-MAGIC = b"SPLATS2\n"
+MAGIC = b"SPLATS3\n"
 FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees", "origin")
 FILE_NAME = "splats.bin"
 _DTYPES = {"<f4", "<f8", "|u1"}
@@ -40,7 +41,7 @@ def save_splats(path: Path, splats: Splats) -> Path:
             array = np.ascontiguousarray(getattr(splats, name))
             array = array.astype(array.dtype.newbyteorder("<"), copy=False)
             npy.write_array(file, array, version=(1, 0), allow_pickle=False)
-        look = np.array([splats.look.near, splats.look.side], "<f8")
+        look = np.array(astuple(splats.look), "<f8")
         npy.write_array(file, look, version=(1, 0), allow_pickle=False)
     return target
 
@@ -57,10 +58,10 @@ def load_splats(path: Path) -> Splats:
             if file.read(len(MAGIC)) != MAGIC:
                 raise ValueError("it does not start as a splats file")
             arrays = {name: _read_array(file, size, name) for name in FIELDS}
-            near, side = _read_array(file, size, "look").astype(np.float64)
+            near, side, grey = _read_array(file, size, "look").astype(np.float64)
             if file.read(1):
                 raise ValueError("bytes follow its end")
-        look = Look(float(near), int(side))
+        look = Look(float(near), int(side), float(grey))
         return Splats(**arrays, look=look)  # type: ignore[arg-type]
     except (OSError, ValueError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.photos.load import load_image
+from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
 from stages.seeding.places import cells, centres, seen, unprojected
 from stages.seeding.witnesses import Witnesses
@@ -36,6 +36,7 @@ PLANE_MISFIT = 0.04  # of the inverse depth, root mean square
 PLANE_REACH = 1.5  # how far beyond its points' depths a plane is continued
 CLEARANCE = 0.5
 SCALE = 0.5  # of a cell's size, seen at the point's depth
+SOLID = 250  # of 255: less of a cell holds what a mask takes away
 FARTHEST = 95  # percentile of the depths that a photograph sees
 
 
@@ -102,11 +103,13 @@ def _fill(
     for centre, distance in filling.clear:
         free &= np.linalg.norm(places - centre, axis=1) > distance
     picture = load_image(folder / view.image, small.width, small.height)
-    rows, columns = cells(empty[free] - margin)
+    rows, columns = cells(empty - margin)
+    at = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
+    mask = mask_of(folder, view, small.width, small.height)
+    if mask is not None:
+        free &= mask[at] > SOLID
     filling.places.append(places[free])
-    filling.colours.append(
-        picture[rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)]
-    )
+    filling.colours.append(picture[at][free])
     filling.scales.append(SCALE * depth[free] / camera.fx)
 
 

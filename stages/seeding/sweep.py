@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.photos.load import load_image
+from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
 from stages.seeding.places import cells, centres, seen, unprojected
 from stages.seeding.witnesses import Witnesses
@@ -35,6 +35,7 @@ AGREE = 0.015  # of a depth
 # (correlation, confirmations): fewer others will do where the likeness is closer
 CONFIRMED = ((0.6, 3), (0.8, 2))
 CELL = 2.0  # pixels: at most one point in each
+SOLID = 250  # of 255: less of a pixel holds what a mask takes away
 SAME_SURFACE = 0.05  # of a depth
 
 
@@ -63,6 +64,10 @@ def agreed_points(
     grey = [np.ascontiguousarray(picture.mean(2), np.float32) for picture in pictures]
     partners = _partners(cameras, points)
     guesses = [_swept(i, cameras, grey, partners[i], points) for i in range(len(cameras))]
+    for view, guess in zip(ordered, guesses, strict=True):
+        mask = mask_of(folder, view, guess.camera.width, guess.camera.height)
+        if mask is not None:
+            guess.score[mask < SOLID] = -1
     places, colours = [points], [np.zeros((0, 3), np.float32)]
     for i, guess in enumerate(guesses):
         others = [j for j in range(len(guesses)) if j in partners[i] or i in partners[j]]

@@ -25,11 +25,13 @@ def seen_by(cameras: Sequence[Camera], points: NDArray[np.float64]) -> NDArray[n
 
 
 def random_points(
-    cameras: Sequence[Camera], seed: int
+    cameras: Sequence[Camera], seed: int, outside: Sequence[NDArray[np.bool_] | None] = ()
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """(points [P, 3] in the ball that the cameras look at together, its centre [3], its radius).
 
     The centre is nearest to all optical axes; the radius is what the typical camera sees around it.
+    outside: pixels [H, W] of each camera before which nothing is; None for none.
+
     Raises SplatError "cameras-no-common-view".
     """
     centres = np.array([camera.centre for camera in cameras])
@@ -50,10 +52,26 @@ def random_points(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     lengths = radius * np.cbrt(random.uniform(size=(len(directions), 1)))
     points = middle + lengths * directions
-    points = points[seen_by(cameras, points) >= _SHARE * len(cameras)][:RANDOM_POINTS]
+    points = points[seen_by(cameras, points) >= _SHARE * len(cameras)]
+    for camera, empty in zip(cameras, outside, strict=False):
+        if empty is not None:
+            points = points[~_in_empty_space(camera, empty, points)]
+    points = points[:RANDOM_POINTS]
     if len(points) < RANDOM_POINTS // 20:
         raise _none("Few of them see the same part of the space")
     return points, middle, radius
+
+
+def _in_empty_space(
+    camera: Camera, empty: NDArray[np.bool_], points: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """[P] whether a point lands on a pixel of `empty`."""
+    pixels, z = camera.project(points)
+    shown = camera.shows(pixels) & (z > 0)
+    columns, rows = np.floor(pixels[shown]).astype(np.int64).T
+    found = np.zeros(len(points), np.bool_)
+    found[shown] = empty[rows, columns]
+    return found
 
 
 def _none(why: str) -> SplatError:

@@ -56,8 +56,9 @@ def _found(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
     with ThreadPoolExecutor(threads) as pool:
         waiting: list[tuple[int, Future[Features]]] = []
         for position in positions:
-            photograph = Path(job.images_root) / job.names[position]
-            future = pool.submit(find, photograph, job.max_features, job.peak_threshold)
+            root, mask = Path(job.images_root), job.masks[position] if job.masks else ""
+            arguments = root / job.names[position], job.max_features, job.peak_threshold
+            future = pool.submit(find, *arguments, root / mask if mask else None)
             waiting.append((position, future))
             if len(waiting) > threads:
                 position, future = waiting.pop(0)
@@ -73,23 +74,24 @@ def _threads(job: Job) -> int:
     return max(1, int(min(job.threads, 0.5 * available_mib / (pixels * _PIXEL_BYTES / MIB))))
 
 
-def find(photograph: Path, most: int, peak_threshold: float) -> Features:
+def find(photograph: Path, most: int, peak_threshold: float, mask: Path | None = None) -> Features:
     """(keypoints, descriptors) of a picture on disk, largest first, in COLMAP's conventions.
 
     keypoints [N, 4] float32: x, y (pixels, pixel centres at +0.5), scale (pixels), orientation
     (radians, from x to y). descriptors [N, 128] uint8 (RootSIFT: Arandjelovic 2012). most: the
-    strongest are kept. peak_threshold: of differences of blurred pictures, white being 1.
-    Raises ValueError if the picture cannot be read.
+    strongest are kept. peak_threshold: of differences of blurred pictures, white being 1. mask:
+    a picture of the same size; none are looked for where it is below half.
+    Raises ValueError if a picture cannot be read.
     """
-    picture = cv2.imdecode(
-        np.fromfile(photograph, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    )
-    if picture is None:
-        raise ValueError(f"{photograph} cannot be read")
+    picture = _grey(photograph)
     height, width = picture.shape
     reduced = _reduced(width, height)
     if reduced != (width, height):
-        picture = cv2.resize(picture, reduced, interpolation=cv2.INTER_AREA)
+        picture = np.asarray(cv2.resize(picture, reduced, interpolation=cv2.INTER_AREA), np.uint8)
+    inside = None
+    if mask is not None:
+        small = cv2.resize(_grey(mask), reduced, interpolation=cv2.INTER_NEAREST)
+        inside = np.where(small > 127, np.uint8(255), np.uint8(0))
     sift = cv2.SIFT.create(
         nfeatures=most,
         nOctaveLayers=LAYERS,
@@ -97,7 +99,7 @@ def find(photograph: Path, most: int, peak_threshold: float) -> Features:
         # Otherwise everything lies a quarter of a pixel off: the doubled picture is.
         enable_precise_upscale=True,
     )
-    found, descriptors = sift.detectAndCompute(picture, None)
+    found, descriptors = sift.detectAndCompute(picture, inside)
     if descriptors is None:
         return np.empty((0, 4), np.float32), np.empty((0, 128), np.uint8)
     rows = np.array([(*point.pt, point.size / 2, point.angle) for point in found], np.float32)
@@ -106,6 +108,14 @@ def find(photograph: Path, most: int, peak_threshold: float) -> Features:
     rows[:, 3] = np.radians(rows[:, 3])
     order = np.lexsort((rows[:, 3], rows[:, 1], rows[:, 0], -rows[:, 2]))[:most]
     return rows[order], _root(descriptors[order])
+
+
+def _grey(path: Path) -> NDArray[np.uint8]:
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    picture = cv2.imdecode(np.fromfile(path, np.uint8), flags)
+    if picture is None:
+        raise ValueError(f"{path} cannot be read")
+    return np.asarray(picture, np.uint8)
 
 
 def _reduced(width: int, height: int) -> tuple[int, int]:

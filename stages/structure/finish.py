@@ -12,13 +12,14 @@ from stages.base.atomic import replacing
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.cameras.colmap import ColmapModel, write_colmap_model
-from stages.scene import Camera, Capture, Photo, Reconstruction, View
+from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
 from stages.structure.levelling import upright
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px
 
 COLMAP = "colmap"
 IMAGES = f"{COLMAP}/images"
+MASKS = f"{COLMAP}/masks"
 SPARSE = f"{COLMAP}/sparse/0"
 _JPEG = (
     *(cv2.IMWRITE_JPEG_QUALITY, 97),
@@ -51,7 +52,14 @@ def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -
     return Reconstruction(
         folder=folder,
         views=tuple(
-            View(photo.name, f"{IMAGES}/{picture}", camera, photo.twin)
+            View(
+                photo.name,
+                f"{IMAGES}/{picture}",
+                camera,
+                photo.twin,
+                mask=mask_file(photo),
+                outside=photo.outside,
+            )
             for photo, picture, camera in zip(ordered, pictures, cameras, strict=True)
         ),
         points=model.points,
@@ -100,7 +108,28 @@ def _write_pictures(
         )
         target.parent.mkdir(parents=True, exist_ok=True)
         write_picture(target, image)
+        write_mask(photo, source, folder, made[camera])
     report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
+
+
+def mask_file(photo: Photo) -> str:
+    """Of a photograph's undistorted mask, relative to the reconstruction; "" without one."""
+    return f"{MASKS}/{photo.picture}.png" if photo.mask else ""
+
+
+def write_mask(
+    photo: Photo, source: Path, folder: Path, maps: tuple[np.ndarray, np.ndarray] | None
+) -> None:
+    """A photograph's mask, undistorted by `maps` as its picture is, if it has one."""
+    if not photo.mask:
+        return
+    mask = read_picture(source / photo.mask)[..., 0]
+    if maps is not None:
+        soft = cv2.INTER_LINEAR if photo.outside == TRANSPARENT else cv2.INTER_NEAREST
+        mask = cv2.remap(mask, *maps, interpolation=soft, borderMode=cv2.BORDER_REPLICATE)
+    target = folder / mask_file(photo)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(target, mask)
 
 
 def read_picture(path: Path) -> np.ndarray:

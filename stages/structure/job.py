@@ -27,6 +27,7 @@ class Job:
     how far it is (`ticks`).
     names [P] in order of the capture, which fixes the image ids (position + 1);
     camera_of [P] position in `cameras` of each photograph's camera.
+    masks [P] of the photographs, relative to images_root, "" for none; () where none has one.
     max_features, peak_threshold: of SIFT (Lowe 2004). matching: "chosen" by a first
     look, "exhaustive" or "sequential".
     drop_stationary: leave out matches that stay in place in the picture (a date stamp).
@@ -42,6 +43,7 @@ class Job:
     names: tuple[str, ...]
     camera_of: tuple[int, ...]
     cameras: tuple[CameraGuess, ...]
+    masks: tuple[str, ...] = ()
     seed: int = 0
     threads: int = 1
     max_features: int = 12288
@@ -62,6 +64,7 @@ class Job:
         data = json.loads(path.read_text(encoding="utf-8"))
         data["names"] = tuple(data["names"])
         data["camera_of"] = tuple(data["camera_of"])
+        data["masks"] = tuple(data["masks"])
         data["cameras"] = tuple(CameraGuess(**camera) for camera in data["cameras"])
         return cls(**data)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,11 +23,20 @@ from stages.base.words import counted
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.cameras.table import read_cameras, read_points
-from stages.scene import Camera, Capture, Reconstruction, View
+from stages.photos.load import load_mask
+from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
 from stages.structure import ticks
 from stages.structure.attempts import _repair_or_delete as repair_or_delete
 from stages.structure.common_view import random_points, seen_by
-from stages.structure.finish import COLMAP, IMAGES, SPARSE, read_picture, write_picture
+from stages.structure.finish import (
+    COLMAP,
+    IMAGES,
+    SPARSE,
+    mask_file,
+    read_picture,
+    write_mask,
+    write_picture,
+)
 from stages.structure.job import CameraGuess, Job, known_path
 from stages.structure.lenses import maps, straightened
 from stages.structure.levelling import levelling_rotation, up_direction
@@ -77,9 +87,10 @@ def reconstruct(
     observed = _Observed.none()
     if cloud is None:
         cloud, observed = _triangulated(Path(job.out) / "points.npz", training)
+        outside = [_empty_space(folder, posed[i].photo, cameras[i]) for i in training]
         source = "matches"
         if len(cloud.points) < POINTS_PER_VIEW * len(training):
-            cloud, source = _with_random(cloud, seen, seed, report), "chance"
+            cloud, source = _with_random(cloud, seen, outside, seed, report), "chance"
     report.metric("points_from", source)
     return _finished(posed, cameras, cloud, observed, folder, report)
 
@@ -109,10 +120,12 @@ def _undistorted(posed: list[Posed], source: Path, folder: Path, report: Report)
                 target,
                 cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE),
             )
+            write_mask(one.photo, source, folder, (x, y))
         else:
             read_picture(source / one.photo.image)  # raises if it is gone
             with replacing(target) as partial:
                 shutil.copyfile(source / one.photo.image, partial)
+            write_mask(one.photo, source, folder, None)
     lost = 1.0 - float(np.mean(kept))
     report.metric("lost_by_undistortion", round(lost, 4))
     if lost > _LOST_SHARE:
@@ -149,6 +162,7 @@ def _job(
         out=str(work / "known"),
         progress=str(work / "progress.json"),
         names=tuple(posed[i].photo.picture for i in training),
+        masks=tuple(_from_images(posed[i].photo) for i in training),
         camera_of=tuple(range(len(training))),
         cameras=tuple(CameraGuess(c.width, c.height, (c.fx * c.fy) ** 0.5) for c in chosen),
         seed=seed,
@@ -164,6 +178,11 @@ def _job(
         described.write_text(about, encoding="utf-8")
     np.savez(known_path(job), **known)  # type: ignore[arg-type]
     return job
+
+
+def _from_images(photo: Photo) -> str:
+    """A photograph's mask as seen from the undistorted pictures."""
+    return os.path.relpath(mask_file(photo), IMAGES) if photo.mask else ""
 
 
 def neighbours(poses: NDArray[np.float64]) -> NDArray[np.int32]:
@@ -302,9 +321,24 @@ def _triangulated(path: Path, training: list[int]) -> tuple[FilePoints, _Observe
     return FilePoints(data["points"], data["colours"], data["errors_px"], tracks), seen
 
 
-def _with_random(cloud: FilePoints, cameras: list[Camera], seed: int, report: Report) -> FilePoints:
-    """More points where the cameras look together: matches gave too few."""
-    points, centre, radius = random_points(cameras, seed)
+def _empty_space(folder: Path, photo: Photo, camera: Camera) -> NDArray[np.bool_] | None:
+    """[H, W] where a photograph that is cut out shows that nothing is; None for any other."""
+    if photo.outside != TRANSPARENT:
+        return None
+    mask = load_mask(folder / mask_file(photo), camera.width, camera.height, photo.outside)
+    return np.asarray(mask == 0)
+
+
+def _with_random(
+    cloud: FilePoints,
+    cameras: list[Camera],
+    outside: list[NDArray[np.bool_] | None],
+    seed: int,
+    report: Report,
+) -> FilePoints:
+    """More points where the cameras look together, and none shows that nothing is (`outside`):
+    matches gave too few."""
+    points, centre, radius = random_points(cameras, seed, outside)
     at = ", ".join(f"{value:.3g}" for value in centre)
     report.warn(
         "cameras-random-start",
@@ -355,7 +389,15 @@ def _finished(
     return Reconstruction(
         folder=folder,
         views=tuple(
-            View(one.photo.name, f"{IMAGES}/{picture}", camera, one.photo.twin, one.role)
+            View(
+                one.photo.name,
+                f"{IMAGES}/{picture}",
+                camera,
+                one.photo.twin,
+                one.role,
+                mask_file(one.photo),
+                one.photo.outside,
+            )
             for one, picture, camera in zip(posed, pictures, cameras, strict=True)
         ),
         points=points,

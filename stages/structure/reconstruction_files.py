@@ -79,6 +79,7 @@ def _view_to_dict(view: View) -> dict[str, Any]:
         "image": view.image,
         "twin": view.twin,
         **({"role": view.role} if view.role else {}),
+        **({"mask": view.mask, "outside": view.outside} if view.mask else {}),
         "width": camera.width,
         "height": camera.height,
         "fx": float(camera.fx),
@@ -95,6 +96,5 @@ def _view_from_dict(data: dict[str, Any]) -> View:
     camera = Camera(
         width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
     )
-    return View(
-        str(data["name"]), str(data["image"]), camera, str(data["twin"]), str(data.get("role", ""))
-    )
+    words = (str(data.get(name, "")) for name in ("twin", "role", "mask", "outside"))
+    return View(str(data["name"]), str(data["image"]), camera, *words)

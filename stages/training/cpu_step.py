@@ -9,6 +9,7 @@ from stages.raster.definition import RasterSettings
 from stages.training.host_step import HostStep
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients
+from stages.training.target import forget_ignored, target_of
 from stages.training.views import Level
 
 
@@ -24,12 +25,15 @@ class CpuStep(HostStep):
     def step(
         self, level: Level, settings: RasterSettings, rates: LearningRates, smooth: bool
     ) -> float:
-        camera, target, model = level.camera, level.pixels, self._model
-        if self._v_image.shape != target.shape:
-            self._v_image = np.empty(target.shape, np.float32)
+        camera, model = level.camera, self._model
+        if self._v_image.shape != level.pixels.shape:
+            self._v_image = np.empty(level.pixels.shape, np.float32)
         pool, widths = self.rasteriser.pool, self.widths(smooth)
         forward = self.rasteriser.forward(model.arrays, camera, settings, widths)
-        loss = image_loss(pool, forward.image, target, self._v_image, means=level.means)
+        target = target_of(level, forward.image, settings.background)
+        means = level.means if level.mask is None else None
+        loss = image_loss(pool, forward.image, target, self._v_image, means=means)
+        forget_ignored(level, self._v_image)
         backward = self.rasteriser.backward(model.arrays, forward, self._v_image, widths)
         bands = (settings.sh_degree + 1) ** 2
         apply_gradients(pool, model, backward, bands, rates, camera.width, camera.height)

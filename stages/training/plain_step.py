@@ -20,6 +20,7 @@ from stages.raster.definition import (
     RasterSettings,
     used_columns,
 )
+from stages.scene import TRANSPARENT
 from stages.training.host_step import HostStep
 from stages.training.loss import SSIM_WEIGHT
 from stages.training.optimiser import (
@@ -32,6 +33,7 @@ from stages.training.optimiser import (
     Model,
     active_counts,
 )
+from stages.training.target import Colour
 from stages.training.views import Level
 
 _RADIUS, _SIGMA = 5, 1.5  # of SSIM's window
@@ -47,8 +49,7 @@ class PlainStep(HostStep):
         camera, model, widths = level.camera, self._model, self.widths(smooth)
         forward = self.rasteriser.forward(model.arrays, camera, settings, widths)
         image = torch.tensor(forward.image[:3], dtype=torch.float64, requires_grad=True)
-        target = torch.tensor(level.pixels, dtype=torch.float64) / 255
-        value = photograph_loss(image, target)
+        value = photograph_loss(*compared(level, image, settings.background))
         torch.autograd.backward(camera.width * camera.height * value)
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
@@ -56,6 +57,19 @@ class PlainStep(HostStep):
         bands = (settings.sh_degree + 1) ** 2
         adam(model, backward, bands, rates, camera.width, camera.height)
         return float(value.detach())
+
+
+def compared(level: Level, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
+    """(what of the drawing, what of the photograph) the loss is of; see `training.target`."""
+    target = torch.tensor(level.pixels, dtype=torch.float64) / 255
+    if level.mask is None:
+        return image, target
+    inside = torch.tensor(level.mask, dtype=torch.float64) / 255
+    if level.outside == TRANSPARENT:
+        behind = torch.tensor(background, dtype=torch.float64)[:, None, None]
+        return image, target + (1 - inside) * behind
+    drawn = image.detach()
+    return torch.where(inside > 0, image, drawn), torch.where(inside > 0, target, drawn)
 
 
 def photograph_loss(image: Tensor, target: Tensor) -> Tensor:

@@ -118,6 +118,11 @@ class Schedule:
         order = np.random.default_rng([self.seed, 1, round_number]).permutation(n_views)
         return int(order[place])
 
+    def background(self, step: int) -> tuple[float, float, float]:
+        """Any colour, behind what was cut out: what hides in one shows before the next."""
+        red, green, blue = np.random.default_rng([self.seed, 3, step]).random(3)
+        return float(red), float(green), float(blue)
+
     def rng(self, step: int) -> np.random.Generator:
         """Random numbers of one step, whatever happened before it."""
         return np.random.default_rng([self.seed, 2, step])

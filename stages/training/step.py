@@ -30,7 +30,8 @@ class TrainingStep(Protocol):
         self, level: Level, settings: RasterSettings, rates: LearningRates, smooth: bool
     ) -> float:
         """Draw, compare with one photograph, move the splats; the loss before that. The bands of
-        SH up to `settings.sh_degree` take part. smooth: under the model's smoothing widths."""
+        SH up to `settings.sh_degree` take part. smooth: under the model's smoothing widths. What a
+        masked photograph asks: `training.target`."""
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         """[H, W, 3] of the model as it is; the caller's own."""

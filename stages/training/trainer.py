@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from stages.measure.judge import Photograph, scores
 from stages.raster.backends import AUTO
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import Camera, Look, Splats, morton
+from stages.scene import TRANSPARENT, Camera, Look, Splats, morton
 from stages.training.checkpoint import Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
 from stages.training.density import AdaptiveDensity
@@ -129,7 +129,8 @@ class Trainer:
         return new_model(*(np.array(a, np.float32, order="C") for a in start.arrays))
 
     def settings(self, degree: int) -> RasterSettings:
-        return RasterSettings(near=self.look.near, sh_degree=degree)
+        grey = self.look.background
+        return RasterSettings(near=self.look.near, sh_degree=degree, background=(grey,) * 3)
 
     def widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
         """[N] of the smoothing filter, from all training photographs at full size."""
@@ -143,6 +144,8 @@ class Trainer:
         view = self.train[self._row(step)]
         level = view.levels[self.schedule.level(step)]
         settings = self.settings(self.schedule.active_sh_degree(step))
+        if any(view.levels[0].outside == TRANSPARENT for view in self.train):
+            settings = replace(settings, background=self.schedule.background(step))
         factor = self.schedule.rate_factor(step)
         rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
         return self.stepper.step(level, settings, rates, self.smooth)

@@ -17,11 +17,14 @@ from stages.training.schedule import RESOLUTIONS
 
 @dataclass(frozen=True)
 class Level:
-    """A photograph at one size: pixels [3, H, W] and the mean of each channel [3], in 0..1."""
+    """A photograph at one size: pixels [3, H, W] and the mean of each channel [3], in 0..1. mask
+    [H, W], outside: as in `scene.Photo`; None where everything counts. See `training.target`."""
 
     camera: Camera
     pixels: NDArray[np.uint8]
     means: NDArray[np.float32]
+    mask: NDArray[np.uint8] | None = None
+    outside: str = ""
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,9 @@ def load_views(folder: Path, views: Iterable[View], train_side: int) -> list[Tra
         levels = []
         for _, scale in RESOLUTIONS:
             camera = view.camera.fitted(max(16, round(train_side * scale)))
-            photograph = load_photograph(folder, view.name, view.image, camera)
+            photograph = load_photograph(folder, view, camera)
             planar = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
-            levels.append(Level(camera, planar, channel_means(planar)))
+            means = channel_means(planar)
+            levels.append(Level(camera, planar, means, photograph.mask, view.outside))
         loaded.append(TrainingView(view.name, tuple(levels)))
     return loaded

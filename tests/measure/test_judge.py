@@ -12,7 +12,16 @@ from PIL import Image
 from stages.measure.images import flip
 from stages.measure.judge import CAP_DB, decibels, drawing_of, load_photographs, scores
 from stages.raster.draw import settings_of
-from stages.scene import Look, Reconstruction, Splats, View, near_plane
+from stages.scene import (
+    IGNORE,
+    TRANSPARENT,
+    Look,
+    Reconstruction,
+    Splats,
+    View,
+    look_of,
+    near_plane,
+)
 from tests.scenes import BACKENDS, join, splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -94,3 +103,38 @@ def test_flip_is_that_of_its_authors_worked_cases() -> None:
     speck = blue.copy()
     speck[16, 16] = 1.0
     assert 0.0 < flip(speck, blue) < 0.05
+
+
+def with_masks(scene: SmallScene, folder: Path, outside: str) -> tuple[View, ...]:
+    """The scene's views, each with its right half masked."""
+    mask = np.repeat(np.uint8([255, 0]), 36)[None] * np.ones((54, 1), np.uint8)
+    for view in scene.reconstruction.views:
+        Image.fromarray(mask).save(folder / f"{view.name}.mask.png")
+    return tuple(
+        replace(view, mask=f"{view.name}.mask.png", outside=outside)
+        for view in scene.reconstruction.views
+    )
+
+
+def test_what_is_ignored_is_not_judged(scene: SmallScene) -> None:
+    folder = scene.reconstruction.folder
+    views = with_masks(scene, folder, IGNORE)
+    (photograph, *_) = load_photographs(folder, views, Look(0.01))
+    wrong = photograph.image.copy()
+    wrong[:, 36:] = 1 - wrong[:, 36:]
+    (score,) = scores(lambda _: wrong, [photograph], with_flip=True)
+    assert (score.psnr_db, score.ssim, score.flip) == (CAP_DB, pytest.approx(1), pytest.approx(0))
+    (score,) = scores(lambda _: photograph.image + 0.1, [photograph])
+    assert 20.0 <= score.psnr_db < 20.5  # but for what is clipped
+
+
+def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScene) -> None:
+    folder = scene.reconstruction.folder
+    views = with_masks(scene, folder, TRANSPARENT)
+    look = look_of(views)
+    (photograph, *_) = load_photographs(folder, views, look)
+    assert look.background == 1.0
+    assert photograph.pixels[:, 36:].min() == 255
+    assert settings_of(replace(scene.splats, look=look)).background == (1.0, 1.0, 1.0)
+    (score,) = scores(lambda _: photograph.image * (np.arange(72) < 36)[:, None], [photograph])
+    assert score.psnr_db < 4

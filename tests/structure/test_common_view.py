@@ -52,3 +52,13 @@ def test_cameras_that_look_outward_have_no_middle_before_them() -> None:
     with pytest.raises(SplatError) as caught:
         random_points(outward, seed=0)
     assert caught.value.code == "cameras-no-common-view"
+
+
+def test_no_point_lies_where_a_photograph_shows_nothing() -> None:
+    cameras = around()
+    empty = np.zeros((600, 800), np.bool_)
+    empty[:, :400] = True  # the left half of the first
+    points, _, _ = random_points(cameras, 0, [empty, *[None] * 11])
+    pixels, _ = cameras[0].project(points)
+    assert len(points) > 1000
+    assert pixels[:, 0].min() >= 400

@@ -100,3 +100,16 @@ def test_any_number_of_threads_and_a_new_start_give_the_same(tmp_path: Path) -> 
     again = rows(other.database)
     assert again[0][1] == 7, "what is there is kept"
     assert again[1:] == wanted[1:]
+
+
+def test_nothing_is_found_where_a_mask_is_black(tmp_path: Path) -> None:
+    picture = np.maximum(spot(260, 200, 60.5, 80.5, 4.0), spot(260, 200, 180.5, 80.5, 4.0))
+    mask = np.zeros_like(picture)
+    mask[:, 130:] = 255
+    for name, pixels in (("a.png", picture), ("mask.png", mask)):
+        cv2.imencode(".png", pixels)[1].tofile(tmp_path / name)
+    everywhere, _ = features.find(tmp_path / "a.png", 1000, 0.0045)
+    keypoints, _ = features.find(tmp_path / "a.png", 1000, 0.0045, tmp_path / "mask.png")
+    assert everywhere[:, 0].min() < 65
+    assert len(keypoints)
+    assert keypoints[:, 0].min() > 130

@@ -12,8 +12,10 @@ from PIL import Image
 from stages.base.stage import Report
 from stages.cameras.colmap import read_model
 from stages.photos.find import picture_names
+from stages.photos.load import load_mask
 from stages.scene import Capture, Photo
 from stages.structure.finish import finish
+from stages.structure.reconstruction_files import load_reconstruction, save_reconstruction
 from tests.structure.synthetic import SIZE, orbit_model
 
 # Two of them would share a name once they are JPEG; one is a PNG; one lies in a folder.
@@ -56,3 +58,33 @@ def test_a_picture_is_of_the_kind_that_its_name_says_and_of_its_photograph(tmp_p
         image = cv2.imread(str(path))
         assert image is not None
         assert np.abs(image.astype(int) - 50 * number).max() <= 2
+
+
+def test_a_mask_is_undistorted_with_its_photograph_and_travels_on(tmp_path: Path) -> None:
+    """The photographs are white where their masks are, so that both are bent alike."""
+    capture, folder = captured(tmp_path / "ingest"), tmp_path / "sfm"
+    photo = next(photo for photo in capture.photos if photo.image.endswith(".png"))
+    drawn = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+    drawn[SIZE[1] // 4 : -SIZE[1] // 4, : SIZE[0] // 3] = 255
+    Image.fromarray(drawn).convert("RGB").save(capture.folder / photo.image)
+    (capture.folder / "masks").mkdir()
+    Image.fromarray(drawn).save(capture.folder / "masks" / "m.png")
+    photos = tuple(
+        replace(p, mask="masks/m.png", outside="ignore") if p == photo else p
+        for p in capture.photos
+    )
+    model = orbit_model(4, 60)
+    bent = model.camera_params.copy()
+    bent[:, 3] = -0.08
+    model = replace(model, names=tuple(p.image for p in photos), camera_params=bent)
+    found = finish(model, replace(capture, photos=photos), folder, Report())
+    save_reconstruction(folder, found)
+    masked = {view.name: view for view in load_reconstruction(folder).views if view.mask}
+    assert list(masked) == [photo.name]
+    view = masked[photo.name]
+    mask = load_mask(folder / view.mask, view.camera.width, view.camera.height, view.outside)
+    image = cv2.imread(str(folder / view.image), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    assert set(np.unique(mask)) == {0, 255}
+    assert np.mean((image > 127) != (mask > 0)) < 0.01
+    assert 0.1 < np.mean(mask > 0) < 0.3

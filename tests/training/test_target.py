@@ -1,0 +1,84 @@
+"""What is masked in a photograph teaches nothing, or that nothing is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.base.stage import Report
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.draw import render
+from stages.scene import IGNORE, TRANSPARENT, Look, Splats
+from stages.training.loss import channel_means
+from stages.training.optimiser import LearningRates, new_model
+from stages.training.schedule import RESOLUTIONS, Schedule
+from stages.training.step import step_of
+from stages.training.trainer import Trainer
+from stages.training.views import Level, TrainingView
+from tests.scenes import BACKENDS, camera, cloud, join, splats
+
+WHERE = camera(48, 48)
+LEFT = np.repeat(np.uint8([255, 0]), 24)[None] * np.ones((48, 1), np.uint8)
+
+
+def level(picture: np.ndarray, outside: str) -> Level:
+    pixels = np.ascontiguousarray(np.rint(picture * 255).astype(np.uint8).transpose(2, 0, 1))
+    return Level(WHERE, pixels, channel_means(pixels), LEFT, outside)
+
+
+def after_one_step(backend: str, picture: np.ndarray, start: Splats) -> np.ndarray:
+    stepper = step_of(backend)
+    stepper.load(new_model(*(array.copy() for array in splat_arrays(start))))
+    stepper.step(level(picture, IGNORE), RasterSettings(near=0.1), LearningRates(), smooth=False)
+    return stepper.model().sh
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_stands_behind_an_ignored_part_changes_nothing(backend: str) -> None:
+    start, picture = cloud(60, 48, 48), np.random.default_rng(0).random((48, 48, 3))
+    other = picture.copy()
+    other[:, 24:] = 1 - other[:, 24:]
+    np.testing.assert_array_equal(
+        after_one_step(backend, picture, start), after_one_step(backend, other, start)
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_splat_that_only_an_ignored_part_shows_stays_as_it_is(backend: str) -> None:
+    hidden = splats([[0.3, 0.0, 1.0]], scales=0.02)  # at the right of the picture
+    assert render(hidden, WHERE).alpha[:, :24].max() == 0 < render(hidden, WHERE).alpha.max()
+    picture = np.random.default_rng(1).random((48, 48, 3))
+    np.testing.assert_array_equal(after_one_step(backend, picture, hidden), hidden.sh)
+
+
+def trained(outside: str, folder: Path) -> Splats:
+    """A red disc on the left, and black splats over the right half, which is masked."""
+    red = splats([[-0.3, 0.0, 1.0]], rgb=(0.9, 0.1, 0.1), scales=0.08, opacities=0.9)
+    dark = splats(
+        [[x, y, 0.9] for x in (0.1, 0.2, 0.3) for y in (-0.3, -0.1, 0.1, 0.3)],
+        rgb=(0.0, 0.0, 0.0),
+        scales=0.1,
+        opacities=0.6,
+    )
+    picture = render(red, WHERE).image.copy()
+    view = TrainingView("a", tuple(level(np.clip(picture, 0, 1), outside) for _ in RESOLUTIONS))
+    start = join(red, dark)
+    schedule = Schedule(steps=200, extent=1.0, sh_degree=0, n_views=1, n_start=len(start), seed=0)
+    look = Look(near=0.1, background=1.0)
+    made = Trainer(schedule, [view], [], look, len(start), folder, Report())
+    model = made.run(start)
+    arrays = model.means, model.quaternions, model.log_scales, model.opacity_logits, model.sh
+    return Splats(*arrays, np.zeros(len(model), np.uint8))
+
+
+def test_what_is_cut_out_is_empty_in_the_end_over_any_colour(tmp_path: Path) -> None:
+    """Black splats do not show over black, where the photograph came from."""
+    alpha = render(trained(TRANSPARENT, tmp_path), WHERE).alpha[:, 26:]
+    assert alpha.mean() < 0.01
+
+
+def test_what_is_ignored_keeps_what_stood_there(tmp_path: Path) -> None:
+    alpha = render(trained(IGNORE, tmp_path), WHERE).alpha[:, 26:]
+    assert alpha.mean() > 0.3
