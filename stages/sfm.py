@@ -98,7 +98,7 @@ def run(
     pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
     SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
-    from stages.structure import attempts, finish, ladder, reconstruction_files
+    from stages.structure import attempts, finish, ladder, light, reconstruction_files
 
     capture: Capture = inputs["ingest"]
     _check(capture)
@@ -125,7 +125,7 @@ def run(
     report.metric("rungs", [_rung_figures(attempt) for attempt in climbed.attempts])
     model = _accepted(best, settings, capture)
     _tell(best, climbed, capture, report)
-    reconstruction = finish.finish(model, capture, folder, report)
+    reconstruction = light.with_light(finish.finish(model, capture, folder, report), report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
     _model_metrics(best, model, reconstruction, capture, report)
     looked_at = base.matching == "chosen"
@@ -144,7 +144,7 @@ def _with_known_cameras(
 ) -> Reconstruction:
     import numpy as np
 
-    from stages.structure import known, reconstruction_files
+    from stages.structure import known, light, reconstruction_files
 
     deadline = time.monotonic() + 60.0 * settings.max_minutes
     found = known.reconstruct(
@@ -159,6 +159,7 @@ def _with_known_cameras(
         max_features=settings.max_features,
         seconds_left=lambda: deadline - time.monotonic(),
     )
+    found = light.with_light(found, report)
     reconstruction_files.save_reconstruction(folder, found)
     names = {view.name for view in found.views}
     report.metric("photographs", len(capture.photos))

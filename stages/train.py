@@ -73,6 +73,14 @@ class TrainSettings:
     seed: int = field(
         default=0, metadata={"help": "Seed of all random numbers.", "min": 0, "max": 2**31 - 1}
     )
+    light: str = field(
+        default="auto",
+        metadata={
+            "help": "Bring photographs to the exposure and white balance of the median one first: "
+            "auto (where they differ by more than a camera's noise), on or off.",
+            "choices": ("auto", "on", "off"),
+        },
+    )
     backend: str = backend_setting()
 
 
@@ -108,7 +116,7 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
         splats = smoothed(splats, trainer.widths(splats.means))
     if len(splats) == 0:
         raise _nothing_left()
-    write_quality(trainer, folder, report)
+    write_quality(trainer, reconstruction, folder, report)
     save_splats(folder, splats)
     remove_checkpoint(folder)
     forget_cap(folder)
@@ -140,8 +148,9 @@ def make_trainer(
     from stages.training.views import load_views
 
     kept, held = split_held_out(reconstruction.views)
-    train = load_views(reconstruction.folder, kept, settings.train_side)
-    look = look_of(reconstruction.views, settings.train_side)
+    light = light_wanted(reconstruction, settings.light, report)
+    train = load_views(reconstruction.folder, kept, settings.train_side, light)
+    look = look_of(reconstruction.views, settings.train_side, light)
     held_out = load_photographs(reconstruction.folder, held, look)
     smaller = [
         v
@@ -185,6 +194,24 @@ def lent_rows(n: int) -> tuple[int, ...]:
     return tuple(range(4, n, 8)) if n >= MIN_TO_LEND else ()
 
 
+def light_wanted(reconstruction: Reconstruction, wanted: str, report: Report) -> bool:
+    """Whether photographs are brought to their median light, as `TrainSettings.light` says."""
+    from stages.scene.light import NOISE_EV, spread_ev
+
+    lights = [view.light for view in reconstruction.views]
+    spread = spread_ev(lights)
+    chosen = wanted == "on" or (wanted == "auto" and spread > NOISE_EV)
+    report.metric("light_spread_ev", round(spread, 4))
+    report.metric("light_evened", chosen and any(light is not None for light in lights))
+    if chosen and wanted == "auto":
+        report.warn(
+            "train-light-evened",
+            f"Exposure or white balance differ between photographs (by {spread:.2f} EV as a rule): "
+            "they are brought to the median photograph's. Lock both in the camera to lose nothing.",
+        )
+    return chosen
+
+
 def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
     """The model as splats: unit quaternions, without rows that are not finite."""
     import numpy as np
@@ -208,12 +235,15 @@ def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
     )
 
 
-def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
+def write_quality(
+    trainer: Trainer, reconstruction: Reconstruction, folder: Path, report: Report
+) -> None:
     """Final held-out figures into the report; table, plot and contact sheet into the folder."""
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.measure.judge import inside_db, scores
+    from stages.measure.judge import as_taken_db, inside_db, scores
+    from stages.scene import split_held_out
     from stages.training.charts import contact_sheet, training_plot
 
     found = scores(trainer.drawn, trainer.held_out, with_flip=True)
@@ -231,6 +261,11 @@ def write_quality(trainer: Trainer, folder: Path, report: Report) -> None:
             "train-nothing-held-out",
             "Too few photographs to hold one out: quality was not measured.",
         )
+    if trainer.look.light and found:
+        _, held = split_held_out(reconstruction.views)
+        plain, adapted = as_taken_db(trainer.drawn, reconstruction.folder, held, trainer.look)
+        report.metric("psnr_as_taken_db", round(plain, 3))
+        report.metric("psnr_adapted_db", round(adapted, 3))
     inside = inside_db(trainer.drawn, trainer.held_out)
     if inside is not None:
         report.metric("psnr_inside_db", round(inside, 3))

@@ -17,6 +17,7 @@ from stages.measure.images import flip, psnr, ssim
 from stages.photos.load import load_image, mask_of
 from stages.raster.draw import renderer
 from stages.scene import IGNORE, TRANSPARENT, Camera, Look, Splats, View
+from stages.scene.light import BRIGHT, Light, gains_and_offsets
 
 CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
 Drawing = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
@@ -25,13 +26,15 @@ Drawing = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
 @dataclass(frozen=True)
 class Photograph:
     """One photograph at the size it is judged at: pixels [H, W, 3] uint8, sRGB. mask [H, W],
-    outside: as in `scene.Photo`; None where everything counts."""
+    outside: as in `scene.Photo`; None where everything counts. cut_off [H, W]: where a channel was
+    too bright for the picture to tell; not judged either."""
 
     name: str
     camera: Camera
     pixels: NDArray[np.uint8]
     mask: NDArray[np.uint8] | None = None
     outside: str = ""
+    cut_off: NDArray[np.bool_] | None = None
 
     @property
     def image(self) -> NDArray[np.float32]:
@@ -41,7 +44,21 @@ class Photograph:
     @property
     def kept(self) -> NDArray[np.bool_] | None:
         """[H, W] the pixels that are judged, or None for all: what is ignored is not."""
-        return self.mask > 0 if self.mask is not None and self.outside == IGNORE else None
+        kept = self.mask > 0 if self.mask is not None and self.outside == IGNORE else None
+        if self.cut_off is None:
+            return kept
+        return ~self.cut_off if kept is None else kept & ~self.cut_off
+
+    def in_median_light(self, light: Light | None) -> Photograph:
+        """As the median photograph would show it; see `scene.light`."""
+        if light is None:
+            return self
+        gains, offsets = gains_and_offsets(light)
+        cut_out = self.mask if self.outside == TRANSPARENT else None
+        solid = np.float32(1) if cut_out is None else cut_out[..., None] * np.float32(1 / 255)
+        even = (self.image - offsets * solid) / gains
+        pixels = np.rint(even * 255).clip(0, 255).astype(np.uint8)
+        return replace(self, pixels=pixels, cut_off=np.asarray((self.image >= BRIGHT).any(2)))
 
     def over(self, grey: float) -> Photograph:
         """A cut-out photograph, which is over black, over `grey` (0 to 1); any other as it is."""
@@ -63,9 +80,12 @@ class Score:
 
 
 def load_photographs(folder: Path, views: Iterable[View], look: Look) -> tuple[Photograph, ...]:
-    """The views' photographs at the size of `look`. Raises SplatError."""
+    """The views' photographs at the size of `look`, over its background and in its light. Raises
+    SplatError."""
     return tuple(
-        load_photograph(folder, view, look.camera(view.camera)).over(look.background)
+        load_photograph(folder, view, look.camera(view.camera))
+        .in_median_light(view.light if look.light else None)
+        .over(look.background)
         for view in views
     )
 
@@ -103,6 +123,36 @@ def scores(
         seen = flip(image, truth, kept) if with_flip else None
         alike = ssim(image, truth, kept)
         found.append(Score(photograph.name, decibels(image, truth, kept), alike, seen))
+    return found
+
+
+def as_taken_db(
+    draw: Drawing, folder: Path, views: Iterable[View], look: Look
+) -> tuple[float, float]:
+    """Mean PSNR of photographs in the light that they were taken in: (as they are, and the right
+    halves of drawings that an affine map of each channel, fitted on the left halves, adapts)."""
+    plain, adapted = [], []
+    for photograph in load_photographs(folder, views, replace(look, light=False)):
+        image, truth = np.clip(draw(photograph.camera), 0.0, 1.0), photograph.image
+        half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
+        kept = everywhere if photograph.kept is None else photograph.kept
+        plain.append(decibels(image, truth, kept))
+        left, right = kept.copy(), kept.copy()
+        left[:, half:], right[:, :half] = False, False
+        if left.sum() > 1 and right.any():
+            adapted.append(decibels(_adapted(image, truth, left), truth, right))
+    return float(np.mean(plain)), float(np.mean(adapted)) if adapted else 0.0
+
+
+def _adapted(
+    image: NDArray[np.floating], truth: NDArray[np.floating], where: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """`image` under the affine map of each channel that brings it nearest to `truth`."""
+    found = np.array(image, np.float64)
+    for channel in range(3):
+        known = np.stack([found[where][:, channel], np.ones(int(where.sum()))], axis=1)
+        gain, offset = np.linalg.lstsq(known, truth[where][:, channel], rcond=None)[0]
+        found[..., channel] = gain * found[..., channel] + offset
     return found
 
 

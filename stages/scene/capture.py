@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
+from stages.scene.light import Light
 
 HELD_OUT_EVERY = 8
 PHOTOS_FOLDER = "photos/"  # of a capture: where its normalised pictures are
@@ -64,7 +65,8 @@ class Capture:
 class View:
     """A registered photograph, undistorted. image: relative to the reconstruction's folder. twin:
     as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody does. mask,
-    outside: as in `Photo`, the mask relative to the reconstruction's folder."""
+    outside: as in `Photo`, the mask relative to the reconstruction's folder. light: see
+    `scene.light`; None where it could not be measured."""
 
     name: str
     image: str
@@ -73,6 +75,7 @@ class View:
     role: str = ""
     mask: str = ""
     outside: str = ""
+    light: Light | None = None
 
 
 @dataclass(frozen=True)

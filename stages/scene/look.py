@@ -26,21 +26,23 @@ class Look:
     side: longer side of the photographs that the splats were fitted to and are judged on, pixels;
         0 where there were none.
     background: grey behind everything, 0 to 1: black, or white where photographs are cut out.
+    light: whether photographs are brought to their median light (`scene.light`) first.
     """
 
     near: float = 0.0
     side: int = 0
     background: float = 0.0
+    light: bool = False
 
     def camera(self, camera: Camera) -> Camera:
         """`camera` at the size that the splats are judged at; never enlarged."""
         return camera.fitted(self.side) if self.side else camera
 
 
-def look_of(views: tuple[View, ...], side: int = 0) -> Look:
-    """How splats fitted to these photographs are drawn."""
+def look_of(views: tuple[View, ...], side: int = 0, light: bool = False) -> Look:
+    """How splats fitted to these photographs are drawn. light: as in `Look`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
-    return Look(near_plane(views), side, float(cut_out))
+    return Look(near_plane(views), side, float(cut_out), light)
 
 
 def near_plane(views: tuple[View, ...]) -> float:

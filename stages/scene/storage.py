@@ -1,8 +1,8 @@
 """Splats on disk between stages: exact, deterministic, and quick to load.
 
 Layout: the 8 bytes of `MAGIC`, then one block in NumPy's .npy format (version 1.0) for each array
-in the order of `FIELDS`, and a last one [3] float64 for the look: near plane, side and
-background. No compression and no timestamps (a zip, and so .npz, would carry them), so equal splats
+in the order of `FIELDS`, and a last one [4] float64 for the look: near plane, side, background
+and light. No compression and no timestamps (a zip, and so .npz, would carry them), so equal splats
 give equal bytes.
 """
 
@@ -58,10 +58,10 @@ def load_splats(path: Path) -> Splats:
             if file.read(len(MAGIC)) != MAGIC:
                 raise ValueError("it does not start as a splats file")
             arrays = {name: _read_array(file, size, name) for name in FIELDS}
-            near, side, grey = _read_array(file, size, "look").astype(np.float64)
+            near, side, grey, light = _read_array(file, size, "look").astype(np.float64)
             if file.read(1):
                 raise ValueError("bytes follow its end")
-        look = Look(float(near), int(side), float(grey))
+        look = Look(float(near), int(side), float(grey), bool(light))
         return Splats(**arrays, look=look)  # type: ignore[arg-type]
     except (OSError, ValueError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

@@ -80,6 +80,7 @@ def _view_to_dict(view: View) -> dict[str, Any]:
         "twin": view.twin,
         **({"role": view.role} if view.role else {}),
         **({"mask": view.mask, "outside": view.outside} if view.mask else {}),
+        **({"light": list(view.light)} if view.light else {}),
         "width": camera.width,
         "height": camera.height,
         "fx": float(camera.fx),
@@ -96,5 +97,10 @@ def _view_from_dict(data: dict[str, Any]) -> View:
     camera = Camera(
         width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
     )
-    words = (str(data.get(name, "")) for name in ("twin", "role", "mask", "outside"))
-    return View(str(data["name"]), str(data["image"]), camera, *words)
+    twin, role, mask, outside = (
+        str(data.get(name, "")) for name in ("twin", "role", "mask", "outside")
+    )
+    red, green, blue = data.get("light", (None,) * 3)
+    light = None if red is None else (float(red), float(green), float(blue))
+    name, image = str(data["name"]), str(data["image"])
+    return View(name, image, camera, twin, role, mask, outside, light)

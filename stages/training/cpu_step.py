@@ -31,7 +31,7 @@ class CpuStep(HostStep):
         pool, widths = self.rasteriser.pool, self.widths(smooth)
         forward = self.rasteriser.forward(model.arrays, camera, settings, widths)
         target = target_of(level, forward.image, settings.background)
-        means = level.means if level.mask is None else None
+        means = level.means if level.plain else None
         loss = image_loss(pool, forward.image, target, self._v_image, means=means)
         forget_ignored(level, self._v_image)
         backward = self.rasteriser.backward(model.arrays, forward, self._v_image, widths)

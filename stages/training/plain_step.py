@@ -21,6 +21,7 @@ from stages.raster.definition import (
     used_columns,
 )
 from stages.scene import TRANSPARENT
+from stages.scene.light import BRIGHT, OFFSET, POWER
 from stages.training.host_step import HostStep
 from stages.training.loss import SSIM_WEIGHT
 from stages.training.optimiser import (
@@ -62,13 +63,17 @@ class PlainStep(HostStep):
 def compared(level: Level, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
     """(what of the drawing, what of the photograph) the loss is of; see `training.target`."""
     target = torch.tensor(level.pixels, dtype=torch.float64) / 255
-    if level.mask is None:
-        return image, target
-    inside = torch.tensor(level.mask, dtype=torch.float64) / 255
+    drawn, inside = image.detach(), torch.ones_like(target[0])
+    if level.mask is not None:
+        inside = torch.tensor(level.mask, dtype=torch.float64) / 255
+    solid = inside if level.outside == TRANSPARENT else torch.ones_like(inside)
+    if level.light is not None:
+        gain = 2 ** (torch.tensor(level.light, dtype=torch.float64)[:, None, None] / POWER)
+        even = (target - OFFSET * (gain - 1) * solid) / gain
+        target = torch.where(target >= BRIGHT, torch.maximum(even, drawn), even)
     if level.outside == TRANSPARENT:
         behind = torch.tensor(background, dtype=torch.float64)[:, None, None]
         return image, target + (1 - inside) * behind
-    drawn = image.detach()
     return torch.where(inside > 0, image, drawn), torch.where(inside > 0, target, drawn)
 
 

@@ -107,7 +107,7 @@ def test_flip_is_that_of_its_authors_worked_cases() -> None:
 
 def with_masks(scene: SmallScene, folder: Path, outside: str) -> tuple[View, ...]:
     """The scene's views, each with its right half masked."""
-    mask = np.repeat(np.uint8([255, 0]), 36)[None] * np.ones((54, 1), np.uint8)
+    mask = np.repeat(np.array([255, 0], np.uint8), 36)[None] * np.ones((54, 1), np.uint8)
     for view in scene.reconstruction.views:
         Image.fromarray(mask).save(folder / f"{view.name}.mask.png")
     return tuple(
@@ -123,9 +123,11 @@ def test_what_is_ignored_is_not_judged(scene: SmallScene) -> None:
     wrong = photograph.image.copy()
     wrong[:, 36:] = 1 - wrong[:, 36:]
     (score,) = scores(lambda _: wrong, [photograph], with_flip=True)
-    assert (score.psnr_db, score.ssim, score.flip) == (CAP_DB, pytest.approx(1), pytest.approx(0))
+    assert score.psnr_db == CAP_DB
+    assert score.ssim == pytest.approx(1)
+    assert score.flip == pytest.approx(0)
     (score,) = scores(lambda _: photograph.image + 0.1, [photograph])
-    assert 20.0 <= score.psnr_db < 20.5  # but for what is clipped
+    assert 19.9 < score.psnr_db < 20.5  # but for what is clipped
 
 
 def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScene) -> None:

@@ -18,7 +18,9 @@ from stages.photos.masks import beside, paired
 from stages.scene import Capture
 from tests.photos.made_files import exif, folder_of, save, textured
 
-HALF = np.repeat(np.uint8([0, 255]), 32)[:, None] * np.ones((1, 96), np.uint8)  # white below
+HALF = np.repeat(np.array([0, 255], np.uint8), 32)[:, None] * np.ones(
+    (1, 96), np.uint8
+)  # white below
 
 
 @pytest.fixture

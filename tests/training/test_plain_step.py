@@ -10,6 +10,7 @@ import pytest
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.scene import IGNORE, TRANSPARENT, Splats
+from stages.scene.light import Light
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.step import step_of
@@ -38,11 +39,12 @@ def masked(level: Level, outside: str) -> Level:
 
 
 def stepped(
-    backend: str, steps: int, degree: int = 1, outside: str = ""
+    backend: str, steps: int, degree: int = 1, outside: str = "", light: Light | None = None
 ) -> tuple[Model, list[float]]:
     level = level_of(cloud(80, 40, 30, degree=1))
     if outside:
         level = masked(level, outside)
+    level = replace(level, light=light)
     start = cloud(60, 40, 30, degree=1, seed=4)
     stepper = step_of(backend)
     stepper.load(new_model(*(array.copy() for array in splat_arrays(start))))
@@ -61,6 +63,17 @@ def test_one_step_leaves_the_same_moments_counts_and_loss(degree: int, outside: 
         np.testing.assert_allclose(found, known, atol=2e-4 * np.abs(known).max())
     for name in ("gradient_count", "steps"):
         np.testing.assert_array_equal(getattr(kernels, name), getattr(plain, name))
+
+
+@pytest.mark.parametrize("outside", ["", IGNORE, TRANSPARENT])
+def test_another_light_is_taken_out_alike(outside: str) -> None:
+    light = (0.7, -0.4, 0.1)
+    kernels, losses = stepped("cpu", 1, 1, outside, light)
+    plain, wanted = stepped("reference", 1, 1, outside, light)
+    assert losses == pytest.approx(wanted, rel=1e-5)
+    atol = 2e-4 * np.abs(plain.moment1).max()
+    np.testing.assert_allclose(kernels.moment1, plain.moment1, atol=atol)
+    assert losses != stepped("reference", 1, 1, outside)[1]
 
 
 def test_many_steps_end_at_the_same_loss() -> None:

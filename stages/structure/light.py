@@ -1,0 +1,109 @@
+"""How much lighter or darker, and in which tint, each photograph was taken: from the spots that
+several photographs show.
+
+What light means to sRGB values is said in `scene.light`: exposure and white balance add to the
+logarithm of a value and 0.055.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from stages.base.stage import Report
+from stages.cameras.colmap import read_model
+from stages.scene import Reconstruction
+from stages.scene.light import OFFSET, POWER, spread_ev
+from stages.structure.finish import SPARSE
+
+SMALLER = 4  # times: sides of the pictures that are looked at; averages out their noise
+DARKEST, LIGHTEST = 0.06, 0.94  # sRGB values between which light can be told
+LEAST = 30  # spots of a photograph to tell its light by
+TURNS = 8  # of weighing spots that do not agree (they shine, or are hidden) ever less
+
+
+def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction:
+    """The reconstruction with `View.light`, from the COLMAP model that lies in its folder."""
+    model = read_model(reconstruction.folder / SPARSE)[1]
+    pictures = [reconstruction.folder / view.image for view in reconstruction.views]
+    observed = model.observed_points, model.observing_views, model.observed_px
+    found = measured_light(pictures, *observed).round(4).tolist()
+    lights = [None if math.isnan(red) else (red, green, blue) for red, green, blue in found]
+    report.metric("light_spread_ev", round(spread_ev(lights), 4))
+    views = (replace(v, light=light) for v, light in zip(reconstruction.views, lights, strict=True))
+    return replace(reconstruction, views=tuple(views))
+
+
+def measured_light(
+    pictures: Sequence[Path],
+    points: NDArray[np.int32],
+    views: NDArray[np.int32],
+    px: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """[V, 3] EV by which each photograph is lighter than the median one, for red, green and blue.
+
+    pictures [V]: files. points, views [O], px [O, 2]: where each view sees which spot, in pixels of
+    its picture. NaN for a view with too few usable spots.
+    """
+    spots = _values(pictures, views, px)
+    usable = ((spots > DARKEST) & (spots < LIGHTEST)).all(axis=1)
+    counts = np.bincount(views[usable], minlength=len(pictures))
+    usable &= counts[views] >= LEAST
+    points, views, spots = points[usable], views[usable], spots[usable]
+    light = np.full((len(pictures), 3), np.nan)
+    if len(points):
+        ev = POWER * np.log2(spots.astype(np.float64) + OFFSET)
+        for channel in range(3):
+            light[:, channel] = _offsets(points, views, ev[:, channel], len(pictures))
+        light[np.bincount(views, minlength=len(pictures)) == 0] = np.nan
+        light -= np.nanmedian(light, axis=0)
+    return light
+
+
+def _values(
+    pictures: Sequence[Path], views: NDArray[np.int32], px: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """[O, 3] sRGB values at each spot, 0 to 1; NaN beyond a picture."""
+    found = np.full((len(views), 3), np.nan, np.float32)
+    for number, path in enumerate(pictures):
+        mine = np.flatnonzero(views == number)
+        picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR_RGB)
+        if picture is None or not len(mine):
+            continue
+        height, width = (max(1, side // SMALLER) for side in picture.shape[:2])
+        small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        scale = np.array([width / picture.shape[1], height / picture.shape[0]])
+        x, y = np.nan_to_num(px[mine] * scale - 0.5, nan=-1.0).astype(np.float32).T
+        inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+        seen = cv2.remap(small, x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0]
+        found[mine[inside]] = seen[inside] / np.float32(255)
+    return found
+
+
+def _offsets(
+    points: NDArray[np.int32], views: NDArray[np.int32], ev: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """[count] what to take from each view's values so that they agree best spot by spot; robust."""
+    _, spot = np.unique(points, return_inverse=True)
+    weight, offsets = np.ones(len(ev)), np.zeros(count)
+    for _ in range(TURNS):
+        table = csr_array((weight, (spot, views)), shape=(int(spot.max()) + 1, count))
+        total = np.asarray(table.sum(axis=1)).ravel()
+        mean = np.bincount(spot, weight * ev) / total
+        normal = np.diag(np.bincount(views, weight, count)) - np.asarray(
+            (table.T @ (table / total[:, None])).todense()
+        )
+        right = np.bincount(views, weight * (ev - mean[spot]), count)
+        offsets = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+        left = ev - offsets[views]
+        left -= (np.bincount(spot, weight * left) / total)[spot]
+        noise = max(1.4826 * float(np.median(np.abs(left))), 1e-6)
+        weight = 1.0 / (1.0 + (left / (2.0 * noise)) ** 2)
+    return offsets

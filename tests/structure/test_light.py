@@ -1,0 +1,79 @@
+"""Exposure and white balance, from what photographs agree on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages.measure.judge import Photograph
+from stages.scene import Camera
+from stages.scene.light import NOISE_EV, spread_ev
+from stages.structure.light import measured_light
+
+SPOTS, VIEWS, CELL = 300, 6, 8
+COLUMNS = 20
+
+
+def seen(light: np.ndarray) -> np.ndarray:
+    """[..., 3] sRGB values of light, cut off at white."""
+    bent = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clip(0) ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(bent.clip(0, 1) * 255) / 255)
+
+
+def photographs(folder: Path, ev: np.ndarray, hidden: float = 0.1) -> tuple:
+    """Six photographs of cells of one colour each, [V, 3] EV lighter or darker; some cells show
+    something else. Each spot is seen by half of them."""
+    rng = np.random.default_rng(4)
+    truth = rng.uniform(0.02, 0.6, (SPOTS, 3))
+    files, points, views, px = [], [], [], []
+    for view in range(VIEWS):
+        mine = truth * 2.0 ** ev[view]
+        other = rng.random(SPOTS) < hidden
+        mine[other] = rng.uniform(0, 1, (int(other.sum()), 3))
+        cells = seen(mine).reshape(-1, COLUMNS, 3)
+        picture = np.repeat(np.repeat(cells, CELL, 0), CELL, 1)
+        files.append(folder / f"{view}.png")
+        Image.fromarray(np.rint(picture * 255).astype(np.uint8)).save(files[-1])
+        for spot in np.flatnonzero(rng.random(SPOTS) < 0.5):
+            points.append(spot)
+            views.append(view)
+            row, column = divmod(int(spot), COLUMNS)
+            px.append((CELL * (column + 0.5), CELL * (row + 0.5)))
+    return files, np.array(points, np.int32), np.array(views, np.int32), np.array(px)
+
+
+def test_a_stop_and_a_tint_are_told_though_some_spots_disagree(tmp_path: Path) -> None:
+    ev = np.array([[1, 1, 1], [-1, -1, -1], [0, 0, 0], [0.3, 0, -0.4], [0, 0, 0], [0.5, 0.5, 0.5]])
+    found = measured_light(*photographs(tmp_path, ev))
+    np.testing.assert_allclose(found, ev - np.median(ev, axis=0), atol=0.06)
+
+
+def test_even_light_is_within_a_cameras_noise(tmp_path: Path) -> None:
+    found = measured_light(*photographs(tmp_path, np.zeros((VIEWS, 3))))
+    assert spread_ev([tuple(row) for row in found.tolist()]) < NOISE_EV
+
+
+def test_a_photograph_that_shares_no_spot_is_not_known(tmp_path: Path) -> None:
+    files, points, views, px = photographs(tmp_path, np.zeros((VIEWS, 3)))
+    alone = views != 2
+    found = measured_light(files, points[alone], views[alone], px[alone])
+    assert np.isnan(found[2]).all()
+    assert np.isfinite(np.delete(found, 2, 0)).all()
+
+
+@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (-0.8, 0.3, 0.1)])
+def test_a_photograph_is_brought_back_to_what_the_median_one_shows(
+    light: tuple[float, float, float],
+) -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.02, 0.9, (20, 30, 3))
+    where = Camera(30, 20, 30.0, 30.0, 15.0, 10.0, np.eye(4))
+    as_taken = np.rint(seen(truth * 2.0 ** np.array(light)) * 255).astype(np.uint8)
+    even = Photograph("a", where, as_taken).in_median_light(light)
+    kept = even.kept
+    assert kept is not None
+    assert kept.mean() > 0.3
+    assert np.abs(even.image - seen(truth))[kept].max() < 0.012
