@@ -29,6 +29,7 @@ PROCESS_OPTIONS = (
     "train_side",
     "steps",
     "max_splats",
+    "light",
     "formats",
     "cameras",
     "split",

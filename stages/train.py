@@ -313,5 +313,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="train", version=6, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=7, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -28,6 +28,7 @@ from stages.training.pace import Pace, remaining_gain_db
 from stages.training.schedule import SETTLE_FROM, Schedule
 from stages.training.step import step_of
 from stages.training.strategy import Strategy
+from stages.training.target import target_of
 from stages.training.views import TrainingView
 
 CHECKPOINT_SECONDS = 30.0
@@ -64,6 +65,7 @@ class Trainer:
         self._pace = Pace(self.seconds)
         self.ended = ""  # why before all steps, if it did
         self.marks: list[tuple[int, float]] = []  # (step, PSNR in dB) of the photographs lent
+        self.cut_out = any(view.levels[0].outside == TRANSPARENT for view in self.train)
         self.history: list[dict[str, Any]] = []
         self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
 
@@ -144,7 +146,7 @@ class Trainer:
         view = self.train[self._row(step)]
         level = view.levels[self.schedule.level(step)]
         settings = self.settings(self.schedule.active_sh_degree(step))
-        if any(view.levels[0].outside == TRANSPARENT for view in self.train):
+        if self.cut_out:
             settings = replace(settings, background=self.schedule.background(step))
         factor = self.schedule.rate_factor(step)
         rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
@@ -178,8 +180,9 @@ class Trainer:
         values = []
         for row in self.lent:
             level = self.train[row].levels[-1]
-            truth = level.pixels.transpose(1, 2, 0) / np.float32(255)
-            values.append(psnr(np.clip(self.drawn(level.camera), 0.0, 1.0), truth))
+            image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
+            truth = target_of(level, image, (self.look.background,) * 3)
+            values.append(psnr(image, truth / np.float32(255) if level.plain else truth))
         return float(np.mean(values))
 
     def _adapt(self, step: int) -> None:

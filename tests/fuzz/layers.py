@@ -23,7 +23,7 @@ import zstandard
 
 from stages import formats
 from tests.formats.truth import many_splats
-from tests.fuzz import camera_layers
+from tests.fuzz import camera_layers, mask_layer
 from tests.fuzz.layer import SPLATS, Layer
 
 _SPZ_4 = Path(__file__).parents[1] / "formats" / "spz4" / "adobe_degree_3.spz"
@@ -177,4 +177,5 @@ LAYERS: dict[str, Layer] = {
     "quantised.glb, document": _glb_document("quantised.glb"),
     "html, unpacked": Layer("a.html", _html_inside, _html_with, text=True),
     **camera_layers.LAYERS,
+    **mask_layer.LAYERS,
 }

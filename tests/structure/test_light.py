@@ -69,7 +69,7 @@ def test_a_photograph_is_brought_back_to_what_the_median_one_shows(
     light: tuple[float, float, float],
 ) -> None:
     rng = np.random.default_rng(0)
-    truth = rng.uniform(0.02, 0.9, (20, 30, 3))
+    truth = rng.uniform(0.02, 0.5, (20, 30, 3))
     where = Camera(30, 20, 30.0, 30.0, 15.0, 10.0, np.eye(4))
     as_taken = np.rint(seen(truth * 2.0 ** np.array(light)) * 255).astype(np.uint8)
     even = Photograph("a", where, as_taken).in_median_light(light)

@@ -76,7 +76,7 @@ def trained(outside: str, folder: Path) -> Splats:
 
 def test_what_is_cut_out_is_empty_in_the_end_over_any_colour(tmp_path: Path) -> None:
     """Black splats do not show over black, where the photograph came from."""
-    alpha = render(trained(TRANSPARENT, tmp_path), WHERE).alpha[:, 26:]
+    alpha = render(trained(TRANSPARENT, tmp_path), WHERE).alpha[:, 32:]
     assert alpha.mean() < 0.01
 
 
