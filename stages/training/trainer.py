@@ -181,8 +181,8 @@ class Trainer:
         for row in self.lent:
             level = self.train[row].levels[-1]
             image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
-            truth = target_of(level, image, (self.look.background,) * 3)
-            values.append(psnr(image, truth / np.float32(255) if level.plain else truth))
+            asked = target_of(level, image, (self.look.background,) * 3)
+            values.append(psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1)))
         return float(np.mean(values))
 
     def _adapt(self, step: int) -> None:

@@ -52,7 +52,7 @@ class Stepper:
         photograph[:] = photograph.mean(2, keepdims=True)  # stripes: something to fit, not noise
         level = Level(camera, photograph, channel_means(photograph))
         photo = TrainingView("stripes", (level, level))
-        schedule = Schedule(10_000, 1e-3, splats.sh_degree, 1, len(splats), 0)
+        schedule = Schedule(10_000, 1e-3, splats.sh_degree, len(splats), 0)
         folder = Path(tempfile.gettempdir())
         self.trainer = Trainer(
             schedule, [photo], [], Look(1e-5), len(splats), folder, Report(), backend=backend

@@ -66,7 +66,7 @@ def trained(outside: str, folder: Path) -> Splats:
     picture = render(red, WHERE).image.copy()
     view = TrainingView("a", tuple(level(np.clip(picture, 0, 1), outside) for _ in RESOLUTIONS))
     start = join(red, dark)
-    schedule = Schedule(steps=200, extent=10.0, sh_degree=0, n_views=1, n_start=len(start), seed=0)
+    schedule = Schedule(steps=200, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     look = Look(near=0.1)
     made = Trainer(schedule, [view], [], look, len(start), folder, Report())
     model = made.run(start)
