@@ -28,6 +28,7 @@ from stages.training.pace import Pace, remaining_gain_db
 from stages.training.schedule import SETTLE_FROM, Schedule
 from stages.training.step import step_of
 from stages.training.strategy import Strategy
+from stages.training.target import target_of
 from stages.training.views import TrainingView
 
 CHECKPOINT_SECONDS = 30.0
@@ -179,8 +180,9 @@ class Trainer:
         values = []
         for row in self.lent:
             level = self.train[row].levels[-1]
-            truth = level.pixels.transpose(1, 2, 0) / np.float32(255)
-            values.append(psnr(np.clip(self.drawn(level.camera), 0.0, 1.0), truth))
+            image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
+            asked = target_of(level, image, (self.look.background,) * 3)
+            values.append(psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1)))
         return float(np.mean(values))
 
     def _adapt(self, step: int) -> None:
