@@ -141,7 +141,7 @@ def make_trainer(
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
     from stages.measure.judge import load_photographs
-    from stages.scene import look_of, scene_extent, split_held_out
+    from stages.scene import look_of, seen_extent, split_held_out
     from stages.training.cap import cap_for
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
@@ -170,7 +170,7 @@ def make_trainer(
     return Trainer(
         schedule=Schedule(
             steps=settings.steps,
-            extent=scene_extent(reconstruction.views),
+            extent=seen_extent(reconstruction),
             sh_degree=settings.sh_degree,
             n_start=min(n_start, cap.splats),
             seed=settings.seed,

@@ -15,6 +15,7 @@ from stages.scene.capture import (
     Reconstruction,
     View,
     scene_extent,
+    seen_extent,
     split_held_out,
 )
 from stages.scene.look import Look, look_of, near_plane
@@ -45,5 +46,6 @@ __all__ = [
     "rgb_to_dc",
     "save_splats",
     "scene_extent",
+    "seen_extent",
     "split_held_out",
 ]

@@ -129,3 +129,16 @@ def scene_extent(views: tuple[View, ...]) -> float:
     centres = np.array([view.camera.centre for view in views])
     distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
     return max(1.1 * float(np.percentile(distances, 95, method="lower")), 1e-6)
+
+
+def seen_extent(reconstruction: Reconstruction) -> float:
+    """What training measures strides and sizes by, world units: `scene_extent`, or how far away the
+    median camera sees its median point, if that is more. Cameras close together, of a phone held
+    almost still, tell little about the size of what is before them."""
+    depths = []
+    for view in reconstruction.views:
+        pixels, z = view.camera.project(reconstruction.points)
+        seen = z[(z > 0) & view.camera.shows(pixels)]
+        if len(seen):
+            depths.append(float(np.median(seen)))
+    return max(scene_extent(reconstruction.views), float(np.median(depths)) if depths else 0.0)

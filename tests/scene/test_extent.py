@@ -1,0 +1,41 @@
+"""How large a scene is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.scene import Camera, Reconstruction, View, scene_extent, seen_extent
+
+
+def held_still(apart, points):
+    """Five cameras `apart` from each other along x, looking along z at `points`."""
+    views = []
+    for k in range(5):
+        where = np.eye(4)
+        where[0, 3] = -apart * (k - 2)
+        views.append(View(f"{k}", f"{k}.jpg", Camera(64, 48, 50.0, 50.0, 32.0, 24.0, where)))
+    n = len(points)
+    colours, tracks = np.zeros((n, 3), np.uint8), np.full(n, 3, np.int32)
+    return Reconstruction(Path(), tuple(views), points, colours, np.zeros(n), tracks)
+
+
+def wall(distance):
+    r = np.random.default_rng(0)
+    return np.column_stack([r.uniform(-0.3, 0.3, (200, 2)) * distance, np.full(200, distance)])
+
+
+@pytest.mark.parametrize("apart", [1e-4, 0.01, 0.1])
+def test_cameras_close_together_see_as_large_a_scene_as_it_is_far_away(apart):
+    assert seen_extent(held_still(apart, wall(7.0))) == pytest.approx(7.0)
+
+
+def test_a_walk_longer_than_what_it_sees_is_its_own_measure():
+    walked = held_still(10.0, wall(2.0))
+    assert seen_extent(walked) == scene_extent(walked.views) > 10
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), -wall(3.0)])
+def test_without_points_in_any_picture_the_cameras_tell(points):
+    bare = held_still(0.5, points)
+    assert seen_extent(bare) == scene_extent(bare.views)
