@@ -146,7 +146,7 @@ class Trainer:
         view = self.train[self._row(step)]
         level = view.levels[self.schedule.level(step)]
         if step + 1 < self.schedule.steps:
-            self.train[self.schedule.view(step + 1)].expect(self.schedule.level(step + 1))
+            self.train[self._row(step + 1)].expect(self.schedule.level(step + 1))
         settings = self.settings(self.schedule.active_sh_degree(step))
         if self.cut_out:
             settings = replace(settings, background=self.schedule.background(step))
