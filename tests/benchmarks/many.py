@@ -59,7 +59,7 @@ def main() -> None:
     model = new_model(*(np.array(a, np.float32) for a in cloud(SPLATS, *SIZE).arrays))
     stepper = step_of("cpu")
     stepper.load(model)
-    training_views.load_photograph = _decoded_once
+    setattr(training_views, "load_photograph", _decoded_once)  # noqa: B010 - not exported from there
     with tempfile.TemporaryDirectory(dir=Path.home()) as name:
         folder = Path(name)
         files = pictures(folder)
