@@ -33,6 +33,7 @@ PROCESS_OPTIONS = (
     "formats",
     "cameras",
     "split",
+    "scale",
     "allow_partial",
     "seed",
 )

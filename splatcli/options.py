@@ -40,6 +40,12 @@ def _parameter(setting: Setting, shown: str | bool) -> inspect.Parameter:
         return keyword(
             setting.name, accepted, typer.Option(flags, help=setting.help, show_default=shown)
         )
+    if setting.together:
+        words: Any = tuple[(setting.kind,) * len(setting.together.split())]  # type: ignore[misc]
+        typed = typer.Option(
+            setting.flag, help=setting.help, show_default=shown, metavar=setting.together
+        )
+        return keyword(setting.name, words | None, typed)
     one = list[setting.kind] if setting.many else setting.kind  # type: ignore[name-defined]
     return keyword(setting.name, one | None, option(setting, shown))
 

@@ -249,6 +249,7 @@ def _kept(
         sharpness=measures.sharpness,
         log2_luminance=measures.log2_luminance,
         exposure_ev=round(exif.exposure_ev, 3) if exif.exposure_ev is not None else None,
+        gps=exif.gps,
         mask=masked.file(image),
         outside=masked.outside,
     )

@@ -77,6 +77,13 @@ class SfmSettings:
         default=False,
         metadata={"help": "Keep the training and test photographs that --cameras tells apart."},
     )
+    scale: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "help": "Two photographs and how far apart their cameras were (metres).",
+            "together": "A B METRES",
+        },
+    )
     max_minutes: float = field(
         default=120.0,
         metadata={
@@ -125,7 +132,8 @@ def run(
     report.metric("rungs", [_rung_figures(attempt) for attempt in climbed.attempts])
     model = _accepted(best, settings, capture)
     _tell(best, climbed, capture, report)
-    reconstruction = light.with_light(finish.finish(model, capture, folder, report), report)
+    found = finish.finish(model, capture, folder, report, settings.scale)
+    reconstruction = light.with_light(found, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
     _model_metrics(best, model, reconstruction, capture, report)
     report.metric("pairs_looked_at", bench.pairs_looked_at())
@@ -156,6 +164,7 @@ def _with_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
+        scale=settings.scale,
         seconds_left=lambda: deadline - time.monotonic(),
     )
     found = light.with_light(found, report)

@@ -149,7 +149,7 @@ def make_trainer(
 
     kept, held = split_held_out(reconstruction.views)
     light = light_wanted(reconstruction, settings.light, report)
-    train = load_views(reconstruction.folder, kept, settings.train_side, light)
+    train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
     look = look_of(reconstruction.views, settings.train_side, light)
     held_out = load_photographs(reconstruction.folder, held, look)
     smaller = [

@@ -3,7 +3,8 @@
 "help": with the unit. "min", "max": of numbers, both allowed. "choices": the words allowed; of a
 list's items, of which there must then be one at least. "pattern": of a text, a regular expression
 for all of it, with "wanted", the sentence that says what it asks for. "option": the option's name
-where it is not the field's. "affects_output": False where another value gives the same bytes.
+where it is not the field's. "together": of a list, the words that one use of the option takes, as
+its help shows them. "affects_output": False where another value gives the same bytes.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class Setting:
     pattern: str = ""
     wanted: str = ""
     help: str = ""
+    together: str = ""
 
     def check(self, value: Any) -> None:
         """Raises SplatError "option-value" for a value that the setting cannot have."""
@@ -117,6 +119,7 @@ def settings_of(settings_type: type) -> list[Setting]:
                 pattern=field.metadata.get("pattern", ""),
                 wanted=field.metadata.get("wanted", ""),
                 help=field.metadata.get("help", ""),
+                together=field.metadata.get("together", ""),
             )
         )
     return found

@@ -6,9 +6,10 @@ the splats were fitted at, drawn by the run's backend with the near plane of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from stages.scene import IGNORE, TRANSPARENT, Camera, Look, Splats, View
 from stages.scene.light import BRIGHT, Light, gains_and_offsets
 
 CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
+IN_MEMORY_MIB = 512  # of photographs that judge; more of them are read anew each time
 Drawing = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
 
 
@@ -79,15 +81,43 @@ class Score:
     flip: float | None = None
 
 
-def load_photographs(folder: Path, views: Iterable[View], look: Look) -> tuple[Photograph, ...]:
-    """The views' photographs at the size of `look`, over its background and in its light. Raises
-    SplatError."""
-    return tuple(
-        load_photograph(folder, view, look.camera(view.camera))
-        .in_median_light(view.light if look.light else None)
-        .over(look.background)
-        for view in views
-    )
+class _Photographs(Sequence[Photograph]):
+    """The first of them in memory, the others on disk."""
+
+    def __init__(self, folder: Path, views: Iterable[View], look: Look) -> None:
+        self._folder, self._views, self._look = folder, tuple(views), look
+        self._kept: list[Photograph] = []
+        free = IN_MEMORY_MIB * 2**20
+        for number, view in enumerate(self._views):
+            camera = look.camera(view.camera)
+            free -= 4 * camera.width * camera.height  # three colours and perhaps a mask
+            if free < 0:
+                break
+            self._kept.append(self._loaded(number))
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @overload
+    def __getitem__(self, number: int) -> Photograph: ...
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[Photograph]: ...
+    def __getitem__(self, number: int | slice) -> Photograph | Sequence[Photograph]:
+        if isinstance(number, slice):
+            return [self[i] for i in range(len(self))[number]]
+        number = range(len(self))[number]
+        return self._kept[number] if number < len(self._kept) else self._loaded(number)
+
+    def _loaded(self, number: int) -> Photograph:
+        view, look = self._views[number], self._look
+        found = load_photograph(self._folder, view, look.camera(view.camera))
+        return found.in_median_light(view.light if look.light else None).over(look.background)
+
+
+def load_photographs(folder: Path, views: Iterable[View], look: Look) -> Sequence[Photograph]:
+    """The views' photographs at the size of `look`, over its background and in its light; in memory
+    as far as `IN_MEMORY_MIB` goes. Raises SplatError, now or when they are used."""
+    return _Photographs(folder, views, look)
 
 
 def load_photograph(folder: Path, view: View, camera: Camera) -> Photograph:

@@ -27,6 +27,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "twin": (str,),
     "mask": (str,),
     "outside": (str,),
+    "gps": (list, type(None)),
 }
 
 
@@ -77,7 +78,10 @@ def _photo(path: Path, number: int, row: Any) -> Photo:
         outside = inside.is_absolute() or ".." in inside.parts
         if outside or (not (path.parent / inside).is_file() and (file or what == "picture")):
             raise _damaged(path, f"the {what} of {where}, {file}, is not there")
-    return Photo(**row)
+    gps = row.pop("gps")
+    if gps is not None and not (len(gps) == 2 and all(isinstance(v, float) for v in gps)):
+        raise _damaged(path, f"gps of {where} is {gps!r}")
+    return Photo(**row, gps=None if gps is None else (gps[0], gps[1]))
 
 
 def _damaged(path: Path, why: str) -> SplatError:

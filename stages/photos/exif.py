@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 FULL_FRAME_WIDTH_MM = 36.0
-_EXIF_IFD, _INTEROPERABILITY_IFD = 0x8769, 0xA005
+_EXIF_IFD, _INTEROPERABILITY_IFD, _GPS_IFD = 0x8769, 0xA005, 0x8825
 _PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _SENSOR_WIDTHS_MM = (2.0, 70.0)  # smallest phone cameras to medium format
 _FOCAL_OVER_LONG_SIDE = (0.2, 30.0)  # from fisheye to long telephoto
@@ -19,7 +19,8 @@ class Exif:
 
     orientation: 1 to 8. focal_35mm: 35 mm equivalent. pixels: (width, height) that the camera
     wrote. plane_px_per_mm: sensor pixels per millimetre along x. adobe_rgb: whether the colours are
-    declared as Adobe RGB without a profile, as cameras do (DCF "R03").
+    declared as Adobe RGB without a profile, as cameras do (DCF "R03"). gps: latitude and longitude
+    in degrees, north and east.
     """
 
     make: str = ""
@@ -34,6 +35,7 @@ class Exif:
     pixels: tuple[float, float] | None = None
     plane_px_per_mm: float | None = None
     adobe_rgb: bool = False
+    gps: tuple[float, float] | None = None
 
     @property
     def exposure_ev(self) -> float | None:
@@ -96,6 +98,10 @@ def read_exif(image: Any) -> Exif:
         interoperability = main.get_ifd(_INTEROPERABILITY_IFD)
     except Exception:  # before Pillow 13 also where there is none
         interoperability = {}
+    try:
+        place = dict(main.get_ifd(_GPS_IFD))
+    except Exception:
+        place = {}
     orientation = _number(tags.get(0x0112))
     width, height = _number(tags.get(0xA002)), _number(tags.get(0xA003))
     return Exif(
@@ -111,7 +117,24 @@ def read_exif(image: Any) -> Exif:
         pixels=(width, height) if width and height else None,
         plane_px_per_mm=_plane_px_per_mm(tags),
         adobe_rgb=_text(interoperability.get(1)) == "R03",
+        gps=_place(place),
     )
+
+
+def _place(tags: dict[int, Any]) -> tuple[float, float] | None:
+    """Latitude and longitude in degrees. None also at 0, 0, where receivers without a fix are."""
+    found = []
+    for reference, number, most in ((1, 2, 90.0), (3, 4, 180.0)):
+        sign = {"N": 1, "E": 1, "S": -1, "W": -1}.get(_text(tags.get(reference)).upper()[:1])
+        try:
+            degrees, minutes, seconds = (float(part) for part in tags[number])
+        except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+            return None
+        value = degrees + minutes / 60 + seconds / 3600
+        if sign is None or not 0 <= value <= most:
+            return None
+        found.append(round(sign * value, 8))
+    return (found[0], found[1]) if any(found) else None
 
 
 def _iso(tags: dict[int, Any]) -> float | None:

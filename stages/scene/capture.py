@@ -31,6 +31,7 @@ class Photo:
     mask: a grey picture of the same size, relative to the capture's folder; "" for none. 0 is
         outside. outside: what that means: IGNORE (nobody knows what is there) or TRANSPARENT
         (nothing is there; `image` is over black, and the mask says how much of it is solid).
+    gps: latitude and longitude in degrees from EXIF, or None.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Photo:
     twin: str = ""
     mask: str = ""
     outside: str = ""
+    gps: tuple[float, float] | None = None
 
     @property
     def picture(self) -> str:
@@ -85,7 +87,7 @@ class Reconstruction:
     points [P, 3] float64, colours [P, 3] uint8, errors_px [P] mean reprojection error, tracks [P]
     number of photographs that see the point.
     origin [3]: what to add to be back in the coordinates that `units` speaks of (float64).
-    units: "arbitrary": nothing yet finds out how large a scene is.
+    units: "metres", or "arbitrary" where nothing says how large the scene is.
     levelled: whether up = -Y was found from the cameras.
     """
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +16,7 @@ from stages.base.stage import Report
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
 from stages.structure.levelling import upright
+from stages.structure.metric import find_metric
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px
 
@@ -27,9 +30,15 @@ _JPEG = (
 )
 
 
-def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -> Reconstruction:
-    """Level and recentre `model`, write undistorted pictures and a COLMAP model of them, and
-    return the reconstruction (not stored yet: see `reconstruction_files`).
+def finish(
+    model: SparseModel,
+    capture: Capture,
+    folder: Path,
+    report: Report,
+    scale: Sequence[str] = (),
+) -> Reconstruction:
+    """Level, recentre and measure `model`, write undistorted pictures and a COLMAP model of them,
+    and return the reconstruction (not stored yet: see `reconstruction_files`). scale: see `metric`.
 
     Raises Interrupted, and SplatError "sfm-photo-unreadable" if a photograph has gone.
     """
@@ -37,6 +46,14 @@ def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -
     model, levelled = upright(model)
     photos = {photo.image: photo for photo in capture.photos}
     ordered = [photos[name] for name in model.names]
+    names = [photo.name for photo in ordered]
+    metric = find_metric(scale, capture, names, model.world_to_camera, levelled, report)
+    if metric is not None:
+        model = replace(
+            model,
+            world_to_camera=metric.poses(model.world_to_camera),
+            points=metric.points(model.points),
+        )
     pinholes = [
         pinhole_for(size, params)
         for size, params in zip(model.camera_sizes, model.camera_params, strict=True)
@@ -67,6 +84,7 @@ def finish(model: SparseModel, capture: Capture, folder: Path, report: Report) -
         errors_px=errors,
         tracks=model.tracks,
         levelled=levelled,
+        units="arbitrary" if metric is None else "metres",
     )
 
 

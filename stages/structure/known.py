@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,6 +40,7 @@ from stages.structure.finish import (
 from stages.structure.job import CameraGuess, Job, known_path
 from stages.structure.lenses import maps, straightened
 from stages.structure.levelling import levelling_rotation, up_direction
+from stages.structure.metric import find_metric
 from stages.structure.named import Posed, posed_photographs
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
 
@@ -64,6 +65,7 @@ def reconstruct(
     allow_partial: bool,
     seed: int,
     max_features: int,
+    scale: Sequence[str],
     seconds_left: Callable[[], float],
 ) -> Reconstruction:
     """The capture with the cameras in `path`. Leaves what `finish` leaves, but reconstruction.json.
@@ -92,7 +94,7 @@ def reconstruct(
         if len(cloud.points) < POINTS_PER_VIEW * len(training):
             cloud, source = _with_random(cloud, seen, outside, seed, report), "chance"
     report.metric("points_from", source)
-    return _finished(posed, cameras, cloud, observed, folder, report)
+    return _finished(posed, cameras, cloud, observed, folder, report, scale, capture)
 
 
 def _undistorted(posed: list[Posed], source: Path, folder: Path, report: Report) -> list[Camera]:
@@ -361,8 +363,10 @@ def _finished(
     observed: _Observed,
     folder: Path,
     report: Report,
+    scale: Sequence[str],
+    capture: Capture,
 ) -> Reconstruction:
-    """Levelled and recentred; the COLMAP model is written."""
+    """Levelled, recentred and measured; the COLMAP model is written."""
     rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
     up = up_direction(rotations)
     turn = np.eye(3) if up is None else levelling_rotation(up, rotations[0, 2], rotations[0, 0])
@@ -371,6 +375,16 @@ def _finished(
     world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
     cameras = [camera.moved(world_from_new) for camera in cameras]
     points = (cloud.points - middle) @ turn.T
+    names = [one.photo.name for one in posed]
+    poses = np.array([camera.world_to_camera for camera in cameras])
+    metric = find_metric(scale, capture, names, poses, up is not None, report)
+    if metric is not None:
+        points, poses = metric.points(points), metric.poses(poses)
+        cameras = [
+            replace(camera, world_to_camera=pose)
+            for camera, pose in zip(cameras, poses, strict=True)
+        ]
+        world_from_new[:3, :3] = world_from_new[:3, :3] @ metric.turn.T / metric.metres
     pictures = [one.photo.picture for one in posed]
     write_colmap_model(
         folder / SPARSE,
@@ -405,6 +419,7 @@ def _finished(
         errors_px=cloud.errors_px,
         tracks=cloud.tracks,
         levelled=up is not None,
+        units="arbitrary" if metric is None else "metres",
     )
 
 

@@ -34,7 +34,8 @@ class Side:
     def photographs(self, names: Sequence[str], side_px: int) -> tuple[Photograph, ...]:
         """Each from where this run saw it. Raises SplatError."""
         views, look = self.held_out, replace(self.splats.look, side=side_px)
-        return load_photographs(self.reconstruction.folder, [views[n] for n in names], look)
+        chosen = [views[n] for n in names]
+        return tuple(load_photographs(self.reconstruction.folder, chosen, look))
 
 
 @dataclass(frozen=True)

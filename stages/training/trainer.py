@@ -145,6 +145,8 @@ class Trainer:
             self._smooth_anew(self.model)
         view = self.train[self._row(step)]
         level = view.levels[self.schedule.level(step)]
+        if step + 1 < self.schedule.steps:
+            self.train[self._row(step + 1)].expect(self.schedule.level(step + 1))
         settings = self.settings(self.schedule.active_sh_degree(step))
         if self.cut_out:
             settings = replace(settings, background=self.schedule.background(step))

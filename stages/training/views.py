@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.measure.judge import load_photograph
+from stages.photos.album import Album
 from stages.scene import Camera, View
 from stages.scene.light import Light
 from stages.training.loss import channel_means
@@ -40,23 +42,63 @@ class TrainingView:
     """One photograph, at each of RESOLUTIONS."""
 
     name: str
-    levels: tuple[Level, ...]
+    levels: Sequence[Level]
+
+    def expect(self, level: int) -> None:
+        """That level is wanted soon."""
+        if isinstance(self.levels, _Stored):
+            self.levels.expect(level)
+
+
+class _Stored(Sequence[Level]):
+    """Levels whose pixels and masks lie in an album, in the order in which they were added."""
+
+    def __init__(self, album: Album) -> None:
+        self._album = album
+        self._known: list[tuple[Level, int, int | None]] = []
+
+    def add(self, level: Level) -> None:
+        mask = None if level.mask is None else self._album.add(level.mask)
+        bare = replace(level, pixels=np.zeros((3, 0, 0), np.uint8), mask=None)
+        self._known.append((bare, self._album.add(level.pixels), mask))
+
+    def expect(self, level: int) -> None:
+        self._album.expect(self._known[level][1])
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    @overload
+    def __getitem__(self, level: int) -> Level: ...
+    @overload
+    def __getitem__(self, level: slice) -> Sequence[Level]: ...
+    def __getitem__(self, level: int | slice) -> Level | Sequence[Level]:
+        if isinstance(level, slice):
+            return [self[i] for i in range(len(self))[level]]
+        bare, number, masked = self._known[level]
+        mask = None if masked is None else self._album.picture(masked)
+        return replace(bare, pixels=self._album.picture(number), mask=mask)
 
 
 def load_views(
-    folder: Path, views: Iterable[View], train_side: int, light: bool = False
+    folder: Path, views: Iterable[View], train_side: int, work: Path, light: bool = False
 ) -> list[TrainingView]:
     """Photographs scaled so that their longer side is at most `train_side` pixels, and smaller.
-    light: whether to be brought to their median light."""
+    light: whether to be brought to their median light.
+
+    Their bytes lie in a file in the folder `work`, mapped into memory. Raises SplatError, and
+    OSError where the disk is full.
+    """
     loaded = []
-    for view in views:
-        levels = []
-        for _, scale in RESOLUTIONS:
-            camera = view.camera.fitted(max(16, round(train_side * scale)))
-            photograph = load_photograph(folder, view, camera)
-            planar = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
-            means = channel_means(planar)
-            masked = photograph.mask, view.outside
-            levels.append(Level(camera, planar, means, *masked, view.light if light else None))
-        loaded.append(TrainingView(view.name, tuple(levels)))
+    with Album(work) as album:
+        for view in views:
+            levels = _Stored(album)
+            for _, scale in RESOLUTIONS:
+                camera = view.camera.fitted(max(16, round(train_side * scale)))
+                photograph = load_photograph(folder, view, camera)
+                planar = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
+                means = channel_means(planar)
+                masked = photograph.mask, view.outside
+                levels.add(Level(camera, planar, means, *masked, view.light if light else None))
+            loaded.append(TrainingView(view.name, levels))
     return loaded

@@ -65,7 +65,7 @@ class Capture:
     def _judges(self, out: Path, side: int) -> tuple[Photograph, ...]:
         look = Look(near_plane(self.reconstruction.views), side)
         _, held = split_held_out(self.reconstruction.views)
-        found = load_photographs(self.reconstruction.folder, held, look)
+        found = tuple(load_photographs(self.reconstruction.folder, held, look))
         if self.name != SAMPLE:
             return found
         render_judges(out / "judges")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.measure import judge
 from stages.measure.images import flip
 from stages.measure.judge import CAP_DB, decibels, drawing_of, load_photographs, scores
 from stages.raster.draw import settings_of
@@ -140,3 +141,18 @@ def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScen
     assert settings_of(replace(scene.splats, look=look)).background == (1.0, 1.0, 1.0)
     (score,) = scores(lambda _: photograph.image * (np.arange(72) < 36)[:, None], [photograph])
     assert score.psnr_db < 4
+
+
+def test_photographs_that_do_not_fit_into_memory_are_judged_alike(
+    scene: SmallScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, views = scene.reconstruction.folder, scene.reconstruction.views
+    figures = []
+    for most in (judge.IN_MEMORY_MIB, 0.01, 0.0):
+        monkeypatch.setattr(judge, "IN_MEMORY_MIB", most)
+        photographs = load_photographs(folder, views, scene.splats.look)
+        assert len(photographs) == len(views)
+        assert [p.name for p in photographs] == [view.name for view in views]
+        assert (photographs[-1].pixels == list(photographs)[-1].pixels).all()
+        figures.append(scores(drawing_of(scene.splats, "cpu"), photographs))
+    assert figures[0] == figures[1] == figures[2]

@@ -24,7 +24,7 @@ from stages.training.loss import channel_means, image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from stages.training.schedule import RESOLUTIONS, Schedule
 from stages.training.trainer import EVALUATIONS, Trainer
-from stages.training.views import Level, TrainingView
+from stages.training.views import Level, TrainingView, load_views
 from tests.scenes import camera, cloud, splats
 from tests.small_scene import small_scene
 
@@ -373,3 +373,22 @@ def test_a_damaged_note_of_the_cap_is_written_anew(tmp_path, monkeypatch):
         (tmp_path / cap.FILE_NAME).write_text(text)
         assert cap.cap_for(tmp_path, 0).free_mib == 4096
         assert cap.cap_for(tmp_path, 0) == cap._read(tmp_path / cap.FILE_NAME)
+
+
+def test_pictures_on_disk_train_to_the_same_bytes_as_pictures_in_memory(tmp_path):
+    scene = small_scene(tmp_path)
+    folder, views = scene.reconstruction.folder, scene.reconstruction.views
+    stored = load_views(folder, views, 48, tmp_path / "work")
+    held = [
+        TrainingView(
+            view.name,
+            tuple(Level(one.camera, one.pixels.copy(), one.means) for one in view.levels),
+        )
+        for view in stored
+    ]
+    models = [
+        trainer(chosen, scene.splats, 12, tmp_path / name).run(scene.splats)
+        for name, chosen in (("a", stored), ("b", held))
+    ]
+    for one, other in zip(models[0].arrays, models[1].arrays, strict=True):
+        assert one.tobytes() == other.tobytes()
