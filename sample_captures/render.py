@@ -26,7 +26,8 @@ class Shape:
     """kind: "box", "cylinder" (along y, capped) or "ellipsoid"; half [3]: half sizes in metres.
 
     faces: textures [H, W, 3] in 0..1 (sRGB). box: -x +x -y +y -z +z; cylinder: side, top, bottom;
-    ellipsoid: one. inside: seen from within (the room). gloss: strength of the highlight.
+    ellipsoid: one. inside: seen from within (the room). upside_down: turned by half a turn about
+    the world's x. gloss: strength of the highlight.
     """
 
     kind: str
@@ -37,12 +38,15 @@ class Shape:
     gloss: float = 0.0
     shininess: float = 80.0
     inside: bool = False
+    upside_down: bool = False
 
     def to_local(self) -> Array:
         """[3, 3] from world directions to the frame in which the shape has half size 1."""
         angle = np.radians(self.yaw_degrees)
         c, s = np.cos(angle), np.sin(angle)
         rotation = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+        if self.upside_down:  # after the yaw
+            rotation = rotation @ np.diag([1, -1, -1])
         return (rotation / np.array(self.half)[:, None]).astype(np.float32)
 
 

@@ -107,6 +107,7 @@ def run(
     work = folder / _WORK
     if settings.cameras is not None:
         return _with_known_cameras(capture, settings, settings.cameras, folder, report)
+    _check_different(capture)
     base = _base_job(capture, settings, work)
     _reuse_or_clear(work, base)
     bench = attempts.Workbench(
@@ -190,6 +191,23 @@ def _check(capture: Capture) -> None:
             wanted=f"At least {_FEWEST_PHOTOGRAPHS}; 20 to 50 do an object or a room well.",
             hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
             family=Family.INPUT,
+        )
+
+
+def _check_different(capture: Capture) -> None:
+    """Near-duplicates would be searched for minutes before the same is said."""
+    from stages.structure.gates import MOVE
+
+    different = len({photo.twin or photo.name for photo in capture.photos})
+    if different < _FEWEST_PHOTOGRAPHS:
+        raise SplatError(
+            "sfm-no-parallax",
+            given=f"The {len(capture.photos)} photographs show only "
+            f"{counted(different, 'picture')} that {'are' if different > 1 else 'is'} not nearly "
+            "the same as another.",
+            wanted="Depth shows only when the camera moves sideways.",
+            hint=MOVE,
+            family=Family.RECONSTRUCTION,
         )
 
 
@@ -290,8 +308,19 @@ def _tell(best: Attempt, climbed: Climb, capture: Capture, report: Report) -> No
             f"The usual way did not work ({climbed.attempts[0].failures[0].given}) but "
             f"another did: {best.rung.name}. Look at the result with care.",
         )
+    _tell_doubts(best, report)
     for failure in best.failures:
         report.warn(failure.code, f"Accepted all the same: {failure.given} {failure.wanted}")
+
+
+def _tell_doubts(best: Attempt, report: Report) -> None:
+    """What would be a failure if there were more of it."""
+    from stages.structure.gates import doubts
+
+    failed = {failure.code for failure in best.failures}
+    for doubt in doubts(best.figures):
+        if doubt.code not in failed:
+            report.warn(doubt.code, f"{doubt.given} {doubt.wanted} {doubt.hint}")
 
 
 def _listed(names: list[str], most: int = _NAMED) -> str:

@@ -7,6 +7,8 @@ import json
 import os
 import subprocess
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -20,7 +22,7 @@ from stages.base.stage import Report
 from stages.scene import Capture, Reconstruction
 from stages.structure import ladder
 from tests import processes
-from tests.structure import bad_captures
+from tests.structure import bad_captures, rooms
 from tests.structure.truth import TRUTH, centres, similarity
 
 FEW = sfm.SfmSettings(max_features=2000)  # enough for the sample, and quick
@@ -179,6 +181,52 @@ def test_the_same_photograph_many_times_has_no_parallax(tmp_path: Path) -> None:
     error = failure(bad_captures.duplicates(tmp_path / "in", 5), tmp_path, max_features=1500)
     assert error.code == "sfm-no-parallax"
     assert "Walk around" in error.hint
+
+
+def test_near_duplicates_are_refused_before_anything_is_searched(tmp_path: Path) -> None:
+    capture = bad_captures.sample(6)
+    photos = [
+        replace(photo, twin=capture.photos[i // 3].name) for i, photo in enumerate(capture.photos)
+    ]
+    error = failure(replace(capture, photos=tuple(photos)), tmp_path)
+    assert error.code == "sfm-no-parallax"
+    assert "only 2 pictures" in error.given
+    assert not (tmp_path / "work").exists()
+
+
+@pytest.mark.slow
+def test_every_photograph_there_twice_does_no_harm(tmp_path: Path) -> None:
+    pictures = enumerate(bad_captures.pictures(7))
+    twice = {f"{copy}{i}.png": picture for i, picture in pictures for copy in "ab"}
+    capture = bad_captures.capture_of(tmp_path / "in", twice)
+    found = sfm.run({"ingest": capture}, FEW, tmp_path, Report())
+    assert len(found.views) == 14
+    truth = json.loads(TRUTH.read_text())["photos"][:7]
+    have = np.array([view.camera.world_to_camera for view in found.views])
+    wanted = np.array([photo["world_to_camera"] for photo in truth + truth])
+    turn, scale, shift = similarity(centres(have), centres(wanted))
+    away = scale * centres(have) @ turn.T + shift - centres(wanted)
+    assert np.linalg.norm(away, axis=1).max() < 0.01  # metres
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("make", "code"),
+    [
+        (rooms.turned_over, "sfm-contradictions"),
+        (rooms.same_poster_twice, "sfm-contradictions"),
+        (rooms.weakly_linked, "sfm-separate-groups"),
+    ],
+)
+def test_a_plausible_model_that_is_wrong_is_refused(
+    make: Callable[[Path], tuple[Capture, object]],
+    code: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ladder, "LADDER", (ladder.LADDER[0], ladder.LADDER[-1]))
+    error = failure(make(tmp_path / "in")[0], tmp_path, max_features=1500)
+    assert error.code == code
 
 
 @pytest.mark.slow

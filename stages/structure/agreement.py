@@ -20,24 +20,36 @@ def agreement(
     world_to_camera: NDArray[np.float64],
     side: float,
 ) -> float | None:
-    """Share of matches within `NEAR` x `side` of where the poses want them, the median over pairs;
-    None without pairs.
+    """The median over pairs of `fitting_shares`; None without pairs, and where all are seen from
+    one place."""
+    shares = fitting_shares(pairs, intrinsics, world_to_camera, side)
+    told = shares[~np.isnan(shares)]
+    return float(np.median(told)) if len(told) else None
+
+
+def fitting_shares(
+    pairs: Sequence[MatchedPair],
+    intrinsics: NDArray[np.float64],
+    world_to_camera: NDArray[np.float64],
+    side: float,
+) -> NDArray[np.float64]:
+    """[Q] share of each pair's matches within `NEAR` x `side` of where the poses want them; NaN for
+    a pair seen from one place, which says nothing.
 
     pairs: (first, second, pixels in the first [N, 2], in the second) by position. intrinsics
-    [V, 4] fx, fy, cx, cy; world_to_camera [V, 4, 4]. A pair seen from one place says nothing, and
-    does not count.
+    [V, 4] fx, fy, cx, cy; world_to_camera [V, 4, 4].
     """
-    shares = []
-    for first, second, a, b in pairs:
+    shares = np.full(len(pairs), np.nan)
+    nowhere = _ROUNDING * np.abs(world_to_camera[:, :3, 3]).max(initial=0.0)
+    for number, (first, second, a, b) in enumerate(pairs):
         relative = world_to_camera[second] @ np.linalg.inv(world_to_camera[first])
         shift = relative[:3, 3]
-        if np.linalg.norm(shift) <= _ROUNDING * np.abs(world_to_camera[:, :3, 3]).max():
+        if np.linalg.norm(shift) <= nowhere:
             continue
         essential = _cross(shift) @ relative[:3, :3]
         left, right = _pixel_matrix(intrinsics[second]), _pixel_matrix(intrinsics[first])
-        distances = _sampson(left.T @ essential @ right, a, b)
-        shares.append(float((distances < NEAR * side).mean()))
-    return float(np.median(shares)) if shares else None
+        shares[number] = (_sampson(left.T @ essential @ right, a, b) < NEAR * side).mean()
+    return shares
 
 
 def alternatives(poses: NDArray[np.float64]) -> Iterator[tuple[str, NDArray[np.float64]]]:

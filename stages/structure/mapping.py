@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import time
 from pathlib import Path
@@ -11,15 +12,16 @@ import numpy as np
 import pycolmap
 
 from stages.structure import database as sqlite
+from stages.structure.agreement import fitting_shares
 from stages.structure.job import Job
 from stages.structure.sparse_model import SparseModel, save_model
 from stages.structure.ticks import Ticks
 
+CREDIBLE_POINTS = 20  # a photograph, of a model that may contradict a larger one
 SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without a word
 MOST_MODELS = 8
 LOOSE_INLIERS = 15
-PAIR_INLIERS = 50  # a relative rotation from fewer matches is too rough to check another by
-CHECKED_PAIRS = 3  # a photograph
+PAIR_INLIERS = 30  # fewer may be chance, and say nothing against a model
 
 
 def map_photographs(job: Job) -> None:
@@ -39,7 +41,7 @@ def map_photographs(job: Job) -> None:
         key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
     )
     groups = [sorted(m.images[i].name for i in m.reg_image_ids()) for m in ordered]
-    model = _plain(ordered[0], job) if ordered else None
+    model = _plain(ordered[0], ordered[1:], job) if ordered else None
     save_model(out, model, groups=groups, timed_out=timed_out)
     shutil.rmtree(scratch, ignore_errors=True)
 
@@ -125,14 +127,17 @@ class _Counter:
         self._ticks.write("placing photographs", min(self._count, self._total), self._total)
 
 
-def _plain(model: pycolmap.Reconstruction, job: Job) -> SparseModel:
-    """COLMAP's model as arrays, everything in order of ids."""
+def _plain(
+    model: pycolmap.Reconstruction, others: list[pycolmap.Reconstruction], job: Job
+) -> SparseModel:
+    """COLMAP's model as arrays, everything in order of ids. others: smaller models."""
     image_ids = sorted(model.reg_image_ids())
     position = {image_id: i for i, image_id in enumerate(image_ids)}
     point_ids = sorted(model.point3D_ids())
     points = [model.points3D[point_id] for point_id in point_ids]
     seen = observations(model, points, position)
-    rotations = _two_view_rotations(Path(job.database), model, position)
+    pairs = _pairs(Path(job.database), model, position)
+    turns = [_turn_between(model, other) for other in others if _credible(other)]
     cameras = [
         model.cameras[camera_id + 1]
         for camera_id in range(len(job.cameras))
@@ -153,8 +158,27 @@ def _plain(model: pycolmap.Reconstruction, job: Job) -> SparseModel:
         points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
         colours=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
         **seen,
-        **rotations,
+        **pairs,
+        turns_of_others=np.array([turn for turn in turns if turn is not None], np.float64),
     )
+
+
+def _credible(model: pycolmap.Reconstruction) -> bool:
+    """Whether a smaller model is more than a few photographs that happened to fit."""
+    return model.num_points3D() >= CREDIBLE_POINTS * model.num_reg_images() >= 4 * CREDIBLE_POINTS
+
+
+def _turn_between(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> float | None:
+    """Degrees between what the two say of the directions of photographs that both placed, the
+    largest over pairs of them; None with fewer than two."""
+    both = sorted(set(model.reg_image_ids()) & set(other.reg_image_ids()))
+    ours, theirs = (
+        [m.images[image].cam_from_world().rotation.matrix() for image in both]
+        for m in (model, other)
+    )
+    worlds = [a.T @ b for a, b in zip(ours, theirs, strict=True)]  # the same, if both are right
+    cosines = [(np.trace(a.T @ b) - 1.0) / 2.0 for a, b in itertools.combinations(worlds, 2)]
+    return float(np.degrees(np.arccos(np.clip(min(cosines), -1.0, 1.0)))) if cosines else None
 
 
 def _matrix(pose: Any) -> np.ndarray:
@@ -181,42 +205,34 @@ def observations(
     }
 
 
-def _two_view_rotations(
+def _pairs(
     path: Path, model: pycolmap.Reconstruction, position: dict[int, int]
 ) -> dict[str, np.ndarray]:
-    """Relative rotations that the matches of two photographs alone give, for checking.
-
-    Estimated anew with the cameras that the model found: with the focal length guessed before,
-    rotations are wrong by ten degrees and more. Strongest pairs only, evenly many a photograph.
-    """
-    database = pycolmap.Database.open(path)
-    pair_ids, geometries = database.read_two_view_geometries()
-    found = []
-    for pair_id, geometry in zip(pair_ids, geometries, strict=True):
-        first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        inliers = len(geometry.inlier_matches)
-        if first in position and second in position and inliers >= PAIR_INLIERS:
-            found.append((-inliers, first, second, geometry))
-    found.sort(key=lambda pair: pair[:3])
-    pairs, rotations, inliers_of = [], [], []
-    for inliers, first, second, geometry in found[: CHECKED_PAIRS * len(position)]:
-        camera1, camera2 = (model.cameras[model.images[i].camera_id] for i in (first, second))
-        points1 = database.read_keypoints(first)[:, :2].astype(np.float64)
-        points2 = database.read_keypoints(second)[:, :2].astype(np.float64)
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = 0
-        options.compute_relative_pose = True
-        again = pycolmap.estimate_calibrated_two_view_geometry(
-            camera1, points1, camera2, points2, geometry.inlier_matches, options
-        )
-        if again.cam2_from_cam1 is None:
-            continue
-        pairs.append((position[first], position[second]))
-        rotations.append(again.cam2_from_cam1.rotation.matrix())
-        inliers_of.append(-inliers)
-    database.close()
+    """How many of the matches that two photographs alone agree on fit the model."""
+    straight: dict[int, np.ndarray] = {}  # pixels of a pinhole without a principal point
+    focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
+    pairs = []
+    with pycolmap.Database.open(path) as database:
+        ids, geometries = database.read_two_view_geometries()
+        for pair_id, geometry in zip(ids, geometries, strict=True):
+            both = pycolmap.pair_id_to_image_pair(pair_id)
+            matches = np.asarray(geometry.inlier_matches)
+            if len(matches) < PAIR_INLIERS or any(image not in position for image in both):
+                continue
+            for image in both:
+                if image not in straight:
+                    camera = model.cameras[model.images[image].camera_id]
+                    pixels = database.read_keypoints(image)[:, :2].astype(np.float64)
+                    straight[image] = focal[image] * np.asarray(camera.cam_from_img(pixels))
+            a, b = (straight[image][matches[:, k]] for k, image in enumerate(both))
+            pairs.append((position[both[0]], position[both[1]], a, b))
+    shares = fitting_shares(
+        pairs,
+        np.array([(focal[i], focal[i], 0.0, 0.0) for i in position]),
+        np.array([_matrix(model.images[i].cam_from_world()) for i in position]),
+        max(max(c.width, c.height) for c in model.cameras.values()),
+    )
     return {
-        "pairs": np.array(pairs, np.int32).reshape(-1, 2),
-        "pair_rotations": np.array(rotations, np.float64).reshape(-1, 3, 3),
-        "pair_inliers": np.array(inliers_of, np.int32),
+        "pairs": np.array([pair[:2] for pair in pairs], np.int32).reshape(-1, 2),
+        "pair_fits": np.nan_to_num(shares, nan=1.0),
     }

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.structure.gates import Figures, Limits
+from stages.structure.links import loosest_link
 
 _SAMPLED_POINTS = 4000  # angles need every pair of rays of a point: a sample is enough
 _SAMPLED_RAYS = 24
 FEWEST_OBSERVATIONS = 15
 ODD_SHARE = 0.1  # of the photographs
 _WEAK_OBSERVATIONS = 30
+FITS = 0.25  # of a pair's matches; pairs of a good model have 0.9 and more, false ones 0.05
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,10 @@ class SparseModel:
     focal_priors_px [C], NaN where EXIF said nothing.
     points [P, 3], colours [P, 3] uint8.
     observed_points [O], observing_views [O], observed_px [O, 2]; sorted by point, then view.
-    pairs [Q, 2] positions of photographs, pair_rotations [Q, 3, 3] second from first, from the
-    matches of the two alone, pair_inliers [Q].
+    pairs [Q, 2] positions of photographs that share many matches; pair_fits [Q] share of those
+    matches that fit the model.
+    turns_of_others [M] of each smaller model with photographs in common: degrees between what the
+    two say of those photographs' directions.
     """
 
     names: tuple[str, ...]
@@ -46,8 +50,8 @@ class SparseModel:
     observing_views: NDArray[np.int32]
     observed_px: NDArray[np.float64]
     pairs: NDArray[np.int32]
-    pair_rotations: NDArray[np.float64]
-    pair_inliers: NDArray[np.int32]
+    pair_fits: NDArray[np.float64]
+    turns_of_others: NDArray[np.float64]
 
     @property
     def centres(self) -> NDArray[np.float64]:
@@ -156,8 +160,7 @@ def _with_views(model: SparseModel, keep_view: NDArray[np.bool_]) -> SparseModel
         observing_views=new_view[model.observing_views[kept]].astype(np.int32),
         observed_px=model.observed_px[kept],
         pairs=new_view[model.pairs[pairs]].astype(np.int32),
-        pair_rotations=model.pair_rotations[pairs],
-        pair_inliers=model.pair_inliers[pairs],
+        pair_fits=model.pair_fits[pairs],
     )
 
 
@@ -200,16 +203,6 @@ def triangulation_angles(model: SparseModel, index: NDArray[np.integer]) -> NDAr
     return angles
 
 
-def rotation_disagreements(model: SparseModel) -> NDArray[np.float64]:
-    """Angles in degrees between the model's relative rotations and those of well-matched pairs."""
-    first, second = model.pairs.T
-    rotations = model.world_to_camera[:, :3, :3]
-    relative = rotations[second] @ np.swapaxes(rotations[first], 1, 2)
-    cosine = (np.einsum("qij,qij->q", relative, model.pair_rotations) - 1.0) / 2.0
-    found: NDArray[np.float64] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return found
-
-
 def baseline_over_depth(model: SparseModel) -> float:
     """How far the cameras are spread (90th percentile of distances from their median position,
     doubled) over the median distance from them to the points that they see."""
@@ -234,7 +227,8 @@ def measure(result: MappingResult, photographs: int, mapper: str) -> Figures:
     angles = triangulation_angles(model, sample)
     errors = point_errors(model)
     seen = np.bincount(model.observing_views, minlength=len(model.names))
-    turned = rotation_disagreements(model)
+    against = np.flatnonzero(model.pair_fits < FITS)
+    link = loosest_link(model.observed_points, model.observing_views, len(model.names))
     return Figures(
         photographs=photographs,
         registered=len(model.names),
@@ -250,8 +244,17 @@ def measure(result: MappingResult, photographs: int, mapper: str) -> Figures:
         weak_photographs=int(np.sum(seen < _WEAK_OBSERVATIONS)),
         distortion=_largest(model.camera_params[:, 3]),
         focal_over_prior=_focal_over_prior(model),
-        rotation_disagreement_deg=float(np.percentile(turned, 80)) if len(turned) else None,
+        pairs_checked=len(model.pairs),
+        pairs_contradicting=len(against),
+        contradicting=_names(model, model.pairs[against[0]]) if len(against) else (),
+        turn_of_other_deg=float(model.turns_of_others.max(initial=0.0)),
+        link_points=link.points,
+        link_views=len(link.views),
     )
+
+
+def _names(model: SparseModel, views: NDArray[np.integer]) -> tuple[str, ...]:
+    return tuple(Path(model.names[view]).name for view in views)
 
 
 def _largest(values: NDArray[np.float64]) -> float:

@@ -34,7 +34,6 @@ def orbit_model(views: int, points: int, seed: int = 0, radius: float = 4.0) -> 
     uv = camera_points[..., :2] / camera_points[..., 2:]
     px = FOCAL * distort(uv, K) + np.array(SIZE) / 2
     pairs = np.array([(i, i + 1) for i in range(views - 1)], np.int32)
-    relative = poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)
     return SparseModel(
         names=tuple(f"{i:02d}.jpg" for i in range(views)),
         view_cameras=np.zeros(views, np.int32),
@@ -48,6 +47,6 @@ def orbit_model(views: int, points: int, seed: int = 0, radius: float = 4.0) -> 
         observing_views=np.tile(np.arange(views), points).astype(np.int32),
         observed_px=px.reshape(-1, 2),
         pairs=pairs,
-        pair_rotations=relative,
-        pair_inliers=np.full(len(pairs), 100, np.int32),
+        pair_fits=np.ones(len(pairs)),
+        turns_of_others=np.empty(0),
     )

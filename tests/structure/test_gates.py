@@ -30,7 +30,9 @@ BANANA = Figures(
     baseline_over_depth=1.63,
     distortion=0.0098,
     focal_over_prior=1.04,
-    rotation_disagreement_deg=0.4,
+    pairs_checked=40,
+    link_points=500,
+    link_views=3,
 )
 PLUSH = replace(
     BANANA,
@@ -97,9 +99,17 @@ def test_good_captures_pass(figures: Figures) -> None:
             {"photographs": 29, "registered": 2, "models": (2,), "distortion": 5.8, "points": 90},
             "sfm-no-model",
         ),
-        # the global mapper, 36 to 113 degrees off, everything else plausible
-        ({"mapper": "global", "rotation_disagreement_deg": 36.0}, "sfm-rotations-disagree"),
-        ({"mapper": "global", "rotation_disagreement_deg": None}, "sfm-rotations-disagree"),
+        # an object turned over half-way: 36 of 193 pairs, everything else plausible
+        (
+            {"pairs_checked": 193, "pairs_contradicting": 36, "contradicting": ("a", "b")},
+            "sfm-contradictions",
+        ),
+        # the same poster on opposite walls: walls put into one, but not by those between them
+        ({"turn_of_other_deg": 175.0}, "sfm-contradictions"),
+        # two halves that one pair links, put beside each other by the global mapper
+        ({"mapper": "global", "link_points": 1, "link_views": 8}, "sfm-weak-link"),
+        ({"mapper": "global", "link_points": 60, "link_views": 8}, "sfm-weak-link"),
+        ({"link_points": 20, "link_views": 8}, "sfm-weak-link"),
         ({"mean_reprojection_error_px": 2.6}, "sfm-high-error"),
         ({"mean_reprojection_error_px": float("nan")}, "sfm-high-error"),
         ({"mean_track_length": 2.1}, "sfm-short-tracks"),
@@ -113,6 +123,11 @@ def test_measured_bad_captures_are_caught(changes: dict[str, object], code: str)
 def test_one_photograph_of_sixteen_may_be_left_out_but_not_four() -> None:
     assert codes(BANANA) == []
     assert codes(replace(BANANA, registered=12)) == ["sfm-too-few-registered"]
+
+
+def test_a_few_contradicting_pairs_are_chance() -> None:
+    assert codes(replace(BANANA, pairs_checked=8, pairs_contradicting=2)) == []
+    assert codes(replace(PLUSH, pairs_checked=1200, pairs_contradicting=60)) == []
 
 
 def test_error_limit_grows_with_the_photographs() -> None:

@@ -79,7 +79,7 @@ def test_when_time_is_up_the_first_attempt_has_still_been_made() -> None:
 def test_among_failures_the_global_mapper_counts_least() -> None:
     few = Attempt(LADDER[0], failing("sfm-too-few-registered"), Figures(10, registered=5))
     all_of_them = Attempt(
-        LADDER[-1], failing("sfm-rotations-disagree"), Figures(10, registered=10, mapper="global")
+        LADDER[-1], failing("sfm-weak-link"), Figures(10, registered=10, mapper="global")
     )
     assert Climb([few, all_of_them]).best is few
 

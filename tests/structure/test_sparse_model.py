@@ -18,7 +18,7 @@ from stages.structure.sparse_model import (
     triangulation_angles,
     without_odd_views,
 )
-from tests.structure.synthetic import orbit_model, random_rotation
+from tests.structure.synthetic import orbit_model
 
 
 def test_exact_observations_have_no_error_and_a_shift_is_measured_in_pixels() -> None:
@@ -45,18 +45,17 @@ def test_figures_of_a_half_circle() -> None:
     assert figures.focal_over_prior == pytest.approx(1.05)
     assert figures.distortion == -0.05
     assert figures.weak_photographs == 0
-    assert figures.rotation_disagreement_deg == pytest.approx(0.0, abs=1e-5)
+    assert (figures.pairs_checked, figures.pairs_contradicting) == (6, 0)
+    assert (figures.link_points, figures.link_views) == (200, 3)
 
 
-def test_a_wrong_rotation_shows_against_the_pairs() -> None:
+def test_pairs_that_the_model_contradicts_are_counted_and_one_is_named() -> None:
     model = orbit_model(views=6, points=40)
-    poses = model.world_to_camera.copy()
-    for i in range(1, 6):
-        poses[i, :3, :3] = random_rotation(i) @ poses[i, :3, :3]
-    wrong = MappingResult(replace(model, world_to_camera=poses), (model.names,), timed_out=False)
-    found = measure(wrong, 6, "global").rotation_disagreement_deg
-    assert found is not None
-    assert found > 30
+    fits = np.array([0.9, 0.5, 0.1, 1.0, 0.0])
+    result = MappingResult(replace(model, pair_fits=fits), (model.names,), timed_out=False)
+    figures = measure(result, 6, "incremental")
+    assert figures.pairs_contradicting == 2
+    assert figures.contradicting == ("02.jpg", "03.jpg")
 
 
 def test_cameras_in_one_place_have_no_baseline_and_no_angle() -> None:
