@@ -8,7 +8,6 @@ user is told what to photograph differently.
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import time
 from collections.abc import Mapping
@@ -129,8 +128,7 @@ def run(
     reconstruction = light.with_light(finish.finish(model, capture, folder, report), report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
     _model_metrics(best, model, reconstruction, capture, report)
-    looked_at = base.matching == "chosen"
-    report.metric("pairs_looked_at", math.comb(len(base.names), 2) if looked_at else 0)
+    report.metric("pairs_looked_at", bench.pairs_looked_at())
     report.metric("pairs_matched", best.pairs_matched)
     report.metric("pairs_verified", best.pairs_verified)
     _write_finished(folder, report)

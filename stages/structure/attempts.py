@@ -21,7 +21,7 @@ from stages.base.stage import Report
 from stages.structure import database as sqlite
 from stages.structure import ticks
 from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
-from stages.structure.job import Job
+from stages.structure.job import Job, looked_path
 from stages.structure.ladder import LADDER, Attempt, Rung
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
 from stages.structure.sparse_model import load_result, measure, without_odd_views
@@ -175,6 +175,11 @@ class Workbench:
             return dict(json.loads((self.folder / _SECONDS).read_text()))
         except (OSError, ValueError):
             return {}
+
+    def pairs_looked_at(self) -> int:
+        """By the first looks, each pair counted once."""
+        path = looked_path(self._job(LADDER[0]))
+        return int(path.read_text()) if path.exists() else 0
 
     def _tick(self, job: Job, unit: str, more: str = "") -> None:
         """Pass on how far the worker says it is."""

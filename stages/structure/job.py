@@ -73,3 +73,8 @@ def known_path(job: Job) -> Path:
     """Of the steps "neighbours" and "triangulation": what is known of the cameras of `job.names`.
     intrinsics [V, 4] fx, fy, cx, cy; sizes [V, 2]; world_to_camera [V, 4, 4]; pairs [Q, 2]."""
     return Path(job.database).with_suffix(".known.npz")
+
+
+def looked_path(job: Job) -> Path:
+    """Where matching says how many pairs it looked at before it chose some."""
+    return Path(job.database).with_suffix(".looked")

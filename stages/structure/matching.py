@@ -12,11 +12,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from stages.structure import database as sqlite
-from stages.structure import nearest, pairs
-from stages.structure.job import Job
+from stages.structure import nearest, pairs, retrieval
+from stages.structure.job import Job, looked_path
 from stages.structure.pairs import Pair
 from stages.structure.ticks import Ticks
-from stages.structure.words import SAMPLE, Sorted, sort_by_word, vocabulary
+from stages.structure.words import SAMPLE, Sorted, sort_by_word, two_words, vocabulary
 
 FIRST_LOOK = 1000  # features: the largest, which are seen from farthest
 FIRST_COMPARED = 64  # see `words.COMPARED`; a first look need not be right about single features
@@ -71,9 +71,10 @@ class _Album:
         with self.lock:
             return self._database.read_keypoints(position + 1)[:, :2].astype(np.float64)
 
-    def largest(self, position: int) -> Sorted:
-        """For a first look."""
-        return sort_by_word(self.descriptors(position)[:FIRST_LOOK], self._words, FIRST_COMPARED)
+    def largest(self, position: int) -> tuple[Sorted, NDArray[np.int64]]:
+        """For a first look: the largest features, and what words they are."""
+        first = self.descriptors(position)[:FIRST_LOOK]
+        return sort_by_word(first, self._words, FIRST_COMPARED), two_words(first, self._words)
 
     def _sorted(self, position: int) -> Sorted:
         return sort_by_word(self.descriptors(position), self._words)
@@ -135,19 +136,26 @@ class _Matcher:
 
 
 def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
-    """[P, P] matches among the largest features of each two photographs."""
+    """[P, P] matches among the largest features of each two photographs that may look alike; none
+    of others. How many were looked at is left for the parent."""
     photographs = len(job.names)
     ticks = Ticks(Path(job.progress))
     alike = np.zeros((photographs, photographs), np.int32)
+    sorted_, held = [], []
     with ThreadPoolExecutor(job.threads) as pool:
-        largest = list(pool.map(album.largest, range(photographs)))
+        for done, (largest, words) in enumerate(pool.map(album.largest, range(photographs)), 1):
+            sorted_.append(largest)
+            held.append(words)
+            ticks.write("reading features", done, photographs)
+        wanted = retrieval.candidates(held)
 
-        def row(i: int) -> list[int]:
-            return [len(nearest.matches(largest[i], other)) for other in largest[i + 1 :]]
+        def look(pair: Pair) -> int:
+            return len(nearest.matches(sorted_[pair[0]], sorted_[pair[1]]))
 
-        for i, counts in enumerate(pool.map(row, range(photographs))):
-            alike[i, i + 1 :] = counts
-            ticks.write("looking for pairs", i + 1, photographs)
+        for done, (pair, count) in enumerate(zip(wanted, pool.map(look, wanted), strict=True), 1):
+            alike[pair] = count
+            ticks.write("looking for pairs", done, len(wanted))
+    looked_path(job).write_text(str(len(wanted)))
     return alike + alike.T
 
 

@@ -74,6 +74,16 @@ def sort_by_word(
     return Sorted(order.astype(np.int32), descriptors[order], near[order], starts)
 
 
+def two_words(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.int64]:
+    """[N] the two nearest words of each descriptor [N, 128] as one number: of W words they make
+    W (W - 1) / 2, fine enough to tell places apart."""
+    if len(words) < 2:
+        return np.zeros(len(descriptors), np.int64)
+    likeness = _likeness(descriptors.astype(np.float32), words)
+    two = np.sort(np.argpartition(-likeness, 1, axis=1)[:, :2], axis=1)
+    return two[:, 0] * len(words) + two[:, 1]
+
+
 def _likeness(points: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
     """[N, W] the larger, the nearer."""
     likeness: NDArray[np.float32] = points @ words.T - 0.5 * np.sum(words**2, axis=1)

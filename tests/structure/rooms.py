@@ -54,10 +54,10 @@ def photographs(
 def turned_over(folder: Path, each: int = 8) -> tuple[Capture, NDArray[np.float64]]:
     """Twice around an object in a room full of texture; before the second time the object is
     turned over, and the room stays."""
-    room = Shape("box", (0.0, 0.0, 0.0), (3.0, 1.4, 3.0), _prints(1, 600), inside=True)
+    room = Shape("box", (0.0, 0.0, 0.0), (3.0, 1.4, 3.0), prints(1, 600), inside=True)
     upright = [
-        Shape("box", (0.0, 0.0, 0.0), (0.5, 0.38, 0.42), _prints(5, 350), 20),
-        Shape("box", (0.62, 0.1, 0.1), (0.2, 0.28, 0.2), _prints(6, 250), -15),
+        Shape("box", (0.0, 0.0, 0.0), (0.5, 0.38, 0.42), prints(5, 350), 20),
+        Shape("box", (0.62, 0.1, 0.1), (0.2, 0.28, 0.2), prints(6, 250), -15),
     ]
     over = [
         replace(shape, centre=(x, -y, -z), upside_down=True)
@@ -76,8 +76,8 @@ def weakly_linked(folder: Path, each: int = 7) -> tuple[Capture, NDArray[np.floa
         _bare((4.0, 1.4, 3.0)),
         _poster(11, (-2.6, 0.0, 2.5), (1.2, 0.9, 0.05)),
         _poster(12, (2.6, 0.0, 2.5), (1.2, 0.9, 0.05)),
-        Shape("box", (-2.3, 0.3, 1.9), (0.25, 0.3, 0.2), _prints(21, 250), 20),
-        Shape("box", (2.3, 0.3, 1.9), (0.25, 0.3, 0.2), _prints(22, 250), -30),
+        Shape("box", (-2.3, 0.3, 1.9), (0.25, 0.3, 0.2), prints(21, 250), 20),
+        Shape("box", (2.3, 0.3, 1.9), (0.25, 0.3, 0.2), prints(22, 250), -30),
         _poster(13, (0.0, -0.1, 2.6), (0.16, 0.16, 0.05)),
     ]
     taken = []
@@ -134,10 +134,11 @@ def _bare(half: tuple[float, float, float]) -> Shape:
 def _poster(
     seed: int, centre: tuple[float, float, float], half: tuple[float, float, float]
 ) -> Shape:
-    return Shape("box", centre, half, _prints(seed, 400, faces=1) * 6)
+    return Shape("box", centre, half, prints(seed, 400, faces=1) * 6)
 
 
-def _prints(seed: int, size: int, faces: int = 6) -> tuple[NDArray[np.float32], ...]:
+def prints(seed: int, size: int, faces: int = 6) -> tuple[NDArray[np.float32], ...]:
+    """Textures of a shape's faces, [size, size, 3] each."""
     random = np.random.default_rng(seed)
     return tuple(
         textures.printed(random, size, size, _PAINTS[face % 3], shapes=90) for face in range(faces)

@@ -1,0 +1,50 @@
+"""Which photographs may show the same thing, from the words that both hold.
+
+Costs next to nothing a pair, so that a first look need not be at every two of many photographs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+CANDIDATES = 48  # of each photograph; up to so many others, all are
+NEIGHBOURS = 4  # in order of the capture, either way
+
+
+def candidates(held: Sequence[NDArray[np.int64]]) -> list[tuple[int, int]]:
+    """Pairs (first, second) to look at: the most alike of each photograph, and neighbours.
+
+    held: the words of each photograph's features. Alike are those that share many rare words
+    (Sivic and Zisserman 2003).
+    """
+    photographs = len(held)
+    alike = _likeness(held)
+    index = np.arange(photographs)
+    pairs = set()
+    for i, row in enumerate(alike):
+        row[i] = -1.0
+        best = np.lexsort((np.abs(index - i), -row))[:CANDIDATES].tolist()
+        near = range(max(0, i - NEIGHBOURS), min(photographs, i + NEIGHBOURS + 1))
+        pairs |= {(min(i, j), max(i, j)) for j in (*best, *near) if j != i}
+    return sorted(pairs)
+
+
+def _likeness(held: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
+    """[P, P] cosines between photographs as vectors of words; the rarer a word, the more it
+    counts. Rounded, so that no machine's last digit decides."""
+    photographs = len(held)
+    rows = np.repeat(np.arange(photographs), [len(words) for words in held])
+    words, columns = np.unique(np.concatenate(held), return_inverse=True)
+    table = sparse.csr_matrix(
+        (np.ones(len(rows)), (rows, columns)), shape=(photographs, max(1, len(words)))
+    )
+    table.data = np.sqrt(table.data)
+    holders = np.bincount(table.indices, minlength=table.shape[1])
+    table.data *= np.log(photographs / np.maximum(holders, 1))[table.indices]
+    lengths = np.sqrt(np.asarray(table.multiply(table).sum(axis=1)).ravel())
+    scaled = sparse.diags(1.0 / np.maximum(lengths, 1e-12)) @ table
+    return np.round((scaled @ scaled.T).toarray(), 9)
