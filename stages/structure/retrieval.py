@@ -47,4 +47,5 @@ def _likeness(held: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
     table.data *= np.log(photographs / np.maximum(holders, 1))[table.indices]
     lengths = np.sqrt(np.asarray(table.multiply(table).sum(axis=1)).ravel())
     scaled = sparse.diags(1.0 / np.maximum(lengths, 1e-12)) @ table
-    return np.round((scaled @ scaled.T).toarray(), 9)
+    likeness: NDArray[np.float64] = np.round((scaled @ scaled.T).toarray(), 9)
+    return likeness

@@ -61,7 +61,7 @@ def walk(photographs: int) -> NDArray[np.float64]:
 
 def hall(photographs: int) -> list[tuple[Shape, ...]]:
     """What stands at each pillar: its trunk, a box, and its part of the floor."""
-    found = []
+    found: list[tuple[Shape, ...]] = []
     for number, (x, z) in enumerate(places(photographs)):
         found.append(
             (
