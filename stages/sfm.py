@@ -361,5 +361,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=5, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=6, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )
