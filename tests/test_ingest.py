@@ -88,7 +88,7 @@ def test_a_photograph_that_may_not_be_read_is_left_out_and_named(
     capture, warnings, _ = ingested(photos)
     assert len(capture.photos) == 3
     assert "locked.jpg is left out" in warnings["ingest-left-out"]
-    assert "Permission denied" in warnings["ingest-left-out"]
+    assert "Change them" in warnings["ingest-left-out"]
 
 
 def test_load_returns_what_run_returned(photos: Path) -> None:

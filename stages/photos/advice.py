@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from stages.base.words import counted
+from stages.photos.decode import DENIED
 from stages.photos.find import RAW_ADVICE, Findings
 from stages.scene import TRANSPARENT, Photo
 
@@ -44,7 +45,8 @@ def about_files(found: Findings, warn: Warn) -> None:
 def about_left_out(reasons: Sequence[tuple[str, str]], warn: Warn) -> None:
     """reasons: (name, why) of photographs that could not be used."""
     for name, why in reasons[:_NAMED]:
-        warn("ingest-left-out", f"{name} is left out: {why}. Copy it from the camera again.")
+        next_step = "Change them" if why == DENIED else "Copy it from the camera again"
+        warn("ingest-left-out", f"{name} is left out: {why}. {next_step}.")
     rest = [name for name, _ in reasons[_NAMED:]]
     if rest:
         warn("ingest-left-out", f"Left out too, for like reasons: {listed(rest)}.")

@@ -25,6 +25,7 @@ from stages.scene import fitted_size
 
 MAX_MEGAPIXELS = 200
 MAX_FILE_BYTES = 2**31
+DENIED = "its permissions forbid to read it"
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP")  # MPO opens as JPEG
 _SMALLEST_SIDE_PX = 16
 UPRIGHT = {
@@ -129,6 +130,8 @@ def _read(path: Path) -> bytes:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise Unusable("the file is larger than 2 GiB")
         data = path.read_bytes()
+    except PermissionError as error:
+        raise Unusable(DENIED) from error
     except OSError as error:
         raise Unusable(f"it cannot be opened ({error.strerror or error})") from error
     if not data:

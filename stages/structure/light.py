@@ -25,18 +25,28 @@ from stages.structure.finish import SPARSE
 
 SMALLER = 4  # times: sides of the pictures that are looked at; averages out their noise
 DARKEST, LIGHTEST = 0.06, 0.94  # sRGB values between which light can be told
+HOLD = 1e-6  # of the best-known view: holds each towards 0, where nothing else does
+ALIKE = 0.5  # of the spread: by more, halves of the spots do not tell the same light
 LEAST = 30  # spots of a photograph to tell its light by
 TURNS = 8  # of weighing spots that do not agree (they shine, or are hidden) ever less
 
 
 def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction:
-    """The reconstruction with `View.light`, from the COLMAP model that lies in its folder."""
+    """The reconstruction with `View.light`, from the COLMAP model that lies in its folder; as it is
+    where its spots tell different things: then a surface shines, and the light did not change."""
     model = read_model(reconstruction.folder / SPARSE)[1]
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
     observed = model.observed_points, model.observing_views, model.observed_px
-    found = measured_light(pictures, *observed).round(4).tolist()
-    lights = [None if math.isnan(red) else (red, green, blue) for red, green, blue in found]
-    report.metric("light_spread_ev", round(spread_ev(lights), 4))
+    found, differ = measured_light(pictures, *observed)
+    lights = [
+        None if math.isnan(red) else (red, green, blue)
+        for red, green, blue in found.round(4).tolist()
+    ]
+    spread = spread_ev(lights)
+    report.metric("light_spread_ev", round(spread, 4))
+    report.metric("light_told_otherwise_ev", round(differ, 4))
+    if differ > ALIKE * spread:
+        return reconstruction
     views = (replace(v, light=light) for v, light in zip(reconstruction.views, lights, strict=True))
     return replace(reconstruction, views=tuple(views))
 
@@ -46,8 +56,10 @@ def measured_light(
     points: NDArray[np.int32],
     views: NDArray[np.int32],
     px: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """[V, 3] EV by which each photograph is lighter than the median one, for red, green and blue.
+) -> tuple[NDArray[np.float64], float]:
+    """([V, 3] EV by which each photograph is lighter than the median one, for red, green and blue;
+    by how many EV, root mean square, halves of the spots differ in that: the greyer and the more
+    tinted, the darker and the lighter).
 
     pictures [V]: files. points, views [O], px [O, 2]: where each view sees which spot, in pixels of
     its picture. NaN for a view with too few usable spots.
@@ -57,14 +69,27 @@ def measured_light(
     counts = np.bincount(views[usable], minlength=len(pictures))
     usable &= counts[views] >= LEAST
     points, views, spots = points[usable], views[usable], spots[usable]
-    light = np.full((len(pictures), 3), np.nan)
-    if len(points):
-        ev = POWER * np.log2(spots.astype(np.float64) + OFFSET)
-        for channel in range(3):
-            light[:, channel] = _offsets(points, views, ev[:, channel], len(pictures))
-        light[np.bincount(views, minlength=len(pictures)) == 0] = np.nan
-        light -= np.nanmedian(light, axis=0)
-    return light
+    if not len(points):
+        return np.full((len(pictures), 3), np.nan), 0.0
+    ev = POWER * np.log2(spots.astype(np.float64) + OFFSET)
+    tint = (spots.max(axis=1) - spots.min(axis=1)) / spots.max(axis=1)
+    halves = [np.ones(len(points), np.bool_)]
+    for kind in (tint, spots.mean(axis=1)):
+        _, spot = np.unique(points, return_inverse=True)
+        of_spot = (np.bincount(spot, kind) / np.bincount(spot))[spot]
+        halves += [of_spot < np.median(of_spot), of_spot >= np.median(of_spot)]
+    light, *told = (_even(points[h], views[h], ev[h], len(pictures)) for h in halves)
+    differ = np.array([told[0] - told[1], told[2] - told[3]])
+    return light, float(np.sqrt(np.nanmean(differ**2))) if np.isfinite(differ).any() else 0.0
+
+
+def _even(
+    points: NDArray[np.int32], views: NDArray[np.int32], ev: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """[count, 3] of each view, its channels' medians 0; NaN for views without spots."""
+    found = np.stack([_offsets(points, views, ev[:, c], count) for c in range(3)], axis=1)
+    found[np.bincount(views, minlength=count) == 0] = np.nan
+    return np.asarray(found - np.nanmedian(found, axis=0))
 
 
 def _values(
@@ -101,7 +126,8 @@ def _offsets(
             (table.T @ (table / total[:, None])).todense()
         )
         right = np.bincount(views, weight * (ev - mean[spot]), count)
-        offsets = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+        normal[np.diag_indices(count)] += HOLD * normal.diagonal().max()
+        offsets = np.linalg.solve(normal, right)
         left = ev - offsets[views]
         left -= (np.bincount(spot, weight * left) / total)[spot]
         noise = max(1.4826 * float(np.median(np.abs(left))), 1e-6)

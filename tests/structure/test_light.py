@@ -11,7 +11,7 @@ from PIL import Image
 from stages.measure.judge import Photograph
 from stages.scene import Camera
 from stages.scene.light import NOISE_EV, spread_ev
-from stages.structure.light import measured_light
+from stages.structure.light import ALIKE, measured_light
 
 SPOTS, VIEWS, CELL = 300, 6, 8
 COLUMNS = 20
@@ -23,7 +23,7 @@ def seen(light: np.ndarray) -> np.ndarray:
     return np.asarray(np.rint(bent.clip(0, 1) * 255) / 255)
 
 
-def photographs(folder: Path, ev: np.ndarray, hidden: float = 0.1) -> tuple:
+def photographs(folder: Path, ev: np.ndarray, hidden: float = 0.1, shiny: bool = False) -> tuple:
     """Six photographs of cells of one colour each, [V, 3] EV lighter or darker; some cells show
     something else. Each spot is seen by half of them."""
     rng = np.random.default_rng(4)
@@ -31,6 +31,8 @@ def photographs(folder: Path, ev: np.ndarray, hidden: float = 0.1) -> tuple:
     files, points, views, px = [], [], [], []
     for view in range(VIEWS):
         mine = truth * 2.0 ** ev[view]
+        if shiny:
+            mine[truth.mean(axis=1) > 0.3] *= 1.0 + 0.15 * view
         other = rng.random(SPOTS) < hidden
         mine[other] = rng.uniform(0, 1, (int(other.sum()), 3))
         cells = seen(mine).reshape(-1, COLUMNS, 3)
@@ -47,19 +49,27 @@ def photographs(folder: Path, ev: np.ndarray, hidden: float = 0.1) -> tuple:
 
 def test_a_stop_and_a_tint_are_told_though_some_spots_disagree(tmp_path: Path) -> None:
     ev = np.array([[1, 1, 1], [-1, -1, -1], [0, 0, 0], [0.3, 0, -0.4], [0, 0, 0], [0.5, 0.5, 0.5]])
-    found = measured_light(*photographs(tmp_path, ev))
+    found, _ = measured_light(*photographs(tmp_path, ev))
     np.testing.assert_allclose(found, ev - np.median(ev, axis=0), atol=0.06)
 
 
+def test_spots_of_all_kinds_tell_the_same_light_but_not_the_same_shine(tmp_path: Path) -> None:
+    ev = np.linspace(-0.5, 0.5, VIEWS)[:, None] * np.ones(3)
+    found, differ = measured_light(*photographs(tmp_path, ev, hidden=0.0))
+    assert differ < 0.2 * spread_ev([tuple(row) for row in found.tolist()])
+    found, differ = measured_light(*photographs(tmp_path, 0 * ev, hidden=0.0, shiny=True))
+    assert differ > ALIKE * spread_ev([tuple(row) for row in found.tolist()])
+
+
 def test_even_light_is_within_a_cameras_noise(tmp_path: Path) -> None:
-    found = measured_light(*photographs(tmp_path, np.zeros((VIEWS, 3))))
+    found, _ = measured_light(*photographs(tmp_path, np.zeros((VIEWS, 3))))
     assert spread_ev([tuple(row) for row in found.tolist()]) < NOISE_EV
 
 
 def test_a_photograph_that_shares_no_spot_is_not_known(tmp_path: Path) -> None:
     files, points, views, px = photographs(tmp_path, np.zeros((VIEWS, 3)))
     alone = views != 2
-    found = measured_light(files, points[alone], views[alone], px[alone])
+    found, _ = measured_light(files, points[alone], views[alone], px[alone])
     assert np.isnan(found[2]).all()
     assert np.isfinite(np.delete(found, 2, 0)).all()
 
