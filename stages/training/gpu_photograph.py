@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import RasterSettings
@@ -64,7 +63,7 @@ class Resident:
 def resident(level: Level, device: torch.device) -> Resident:
     """The photograph, on the device."""
 
-    def sent(array: NDArray[Any]) -> Tensor:
+    def sent(array: Any) -> Tensor:
         return torch.tensor(array, device=device)
 
     if level.plain:

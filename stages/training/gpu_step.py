@@ -50,8 +50,7 @@ class Arrivals:
         slot = self.sent % (self.lag + 1)
         self._landing[slot].copy_(pair, non_blocking=True)
         if self.on_device:
-            self._events[slot] = torch.cuda.Event()
-            self._events[slot].record()
+            self._events[slot] = torch.cuda.current_stream().record_event()
         self.sent += 1
 
     def read(self) -> tuple[float, float]:
@@ -68,7 +67,7 @@ class GpuStep:
 
     def __init__(self, rasteriser: GpuRasteriser, lag: int | None = None) -> None:
         self.rasteriser, self.device = rasteriser, rasteriser.device
-        self.skipped, self._room = 0, 0
+        self.skipped, self._room, self._splats = 0, 0, 0
         self._arrivals = Arrivals(
             self.device, (0 if interpreted() else LAG) if lag is None else lag
         )
@@ -79,12 +78,12 @@ class GpuStep:
         self.load(empty_model())
 
     def __len__(self) -> int:
-        return len(self._scene)
+        return self._splats
 
     def load(self, model: Model) -> None:
         """See `step.TrainingStep`."""
-        if len(model) and hasattr(self, "_scene"):
-            self._room = int(self._room * max(1.0, len(model) / max(1, len(self._scene))))
+        self._room = int(self._room * max(1.0, len(model) / max(1, self._splats)))
+        self._splats = len(model)
         with failures_told(len(model)):
             self._scene = self.rasteriser.scene(model.arrays)
             self._smoothing = self._on_device(model.smoothing)

@@ -84,9 +84,9 @@ def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
     photograph = level(size)
     image = np.random.default_rng(1).random((4, size[1], size[0])).astype(np.float32)
     target, means = torch.from_numpy(photograph.pixels), torch.from_numpy(photograph.means)
-    device = GpuRasteriser().device
-    on_device = (torch.from_numpy(image), target, means)
-    found, gradient = image_loss(*(t.to(device) for t in on_device))
+    where = GpuRasteriser().device
+    drawn = torch.from_numpy(image).to(where)
+    found, gradient = image_loss(drawn, target.to(where), means.to(where))
     exact = torch.tensor(image[:3], dtype=torch.float64, requires_grad=True)
     wanted = photograph_loss(exact, target.double() / 255)
     torch.autograd.backward(size[0] * size[1] * wanted)

@@ -179,7 +179,8 @@ class GpuRasteriser:
     ) -> Drawn:
         """A picture. capacity: how many entries of the lists there is room for; asked of the
         device, which is waited for, if not told."""
-        n, like = len(scene), {"device": self.device}
+        n = len(scene)
+        like: dict[str, Any] = {"device": self.device}
         records = torch.empty(n, project.RECORD.value, **like)
         shapes = torch.empty(n, project.SHAPE.value, **like)
         keys = torch.empty(n, **like)
@@ -217,7 +218,8 @@ class GpuRasteriser:
     ) -> tuple[Tensor, Tensor]:
         """([N, gradient_columns], [N, 2]) of parameters and of means on the picture, of the visible
         splats; zeros elsewhere. v_image [3, H, W]."""
-        n, bands, like = len(scene), view.bands(scene), {"device": self.device}
+        n, bands = len(scene), view.bands(scene)
+        like: dict[str, Any] = {"device": self.device}
         raw = torch.zeros(len(drawn.lists.members), blend.SUMS.value, **like)
         self._over_tiles(blend.blend_gradient_kernel, view, drawn, v_image, raw)
         sums = self._summed(raw, drawn.lists, self.real)
@@ -248,7 +250,8 @@ class GpuRasteriser:
     def _lists(
         self, scene: Scene, view: View, shapes: Tensor, keys: Tensor, capacity: int | None
     ) -> Lists:
-        n, (across, _, tiles), like = len(scene), self._tiles(view), {"device": self.device}
+        n, (across, _, tiles) = len(scene), self._tiles(view)
+        like: dict[str, Any] = {"device": self.device}
         counts = torch.zeros(n, dtype=torch.int32, **like)
         by_depth, order = torch.sort(keys, stable=True)
         settled = torch.empty_like(order)
