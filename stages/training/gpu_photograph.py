@@ -24,7 +24,7 @@ class Resident:
     ignored [H, W], bright [3, H, W]: where nothing is asked, and where no less than the value is.
     """
 
-    level: Level  # kept, so that its identity stays its own
+    level: Level  # kept: `gpu_step` knows photographs by its means
     pixels: Tensor
     means: Tensor
     uncovered: Tensor | None = None

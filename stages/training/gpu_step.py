@@ -111,7 +111,7 @@ class GpuStep:
     ) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
         with failures_told(len(self)):
-            known = id(level) in self._photographs
+            known = id(level.means) in self._photographs
             photograph = self._resident(level)
             view = photograph.view(self.rasteriser, settings)
             scene, room = self._drawn_scene(smooth), self._room if known else None
@@ -143,9 +143,10 @@ class GpuStep:
         return Scene(self._scene.rows, self._scene.bands, widths)
 
     def _resident(self, level: Level) -> Resident:
-        if id(level) not in self._photographs:
-            self._photographs[id(level)] = resident(level, self.device)
-        return self._photographs[id(level)]
+        key = id(level.means)  # which stay the same object, however often a level is read
+        if key not in self._photographs:
+            self._photographs[key] = resident(level, self.device)
+        return self._photographs[key]
 
     def _adam(
         self,

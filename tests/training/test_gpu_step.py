@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.scene import IGNORE, TRANSPARENT
+from stages.training import gpu_step
 from stages.training.gpu_step import GpuStep, image_loss
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
@@ -122,6 +124,15 @@ def test_a_steady_step_never_waits_for_the_device(monkeypatch):
     assert not waits
     made.model()
     assert waits["cpu"] > 0  # the counter counts
+
+
+def test_a_photograph_that_is_read_anew_is_sent_once(monkeypatch):
+    made, seen = stepper(), level()
+    made.step(seen, SETTINGS, RATES, smooth=False)
+    sent = []
+    monkeypatch.setattr(gpu_step, "resident", lambda *given: sent.append(given))
+    made.step(replace(seen, pixels=seen.pixels.copy()), SETTINGS, RATES, smooth=False)
+    assert not sent
 
 
 def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
