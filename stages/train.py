@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.words import counted
-from stages.raster.backends import backend_of, backend_setting
+from stages.raster.backends import backend_of, backend_setting, passed_over
 
 if TYPE_CHECKING:
     from stages.scene import Look, Reconstruction, Splats
@@ -108,6 +108,8 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     if settings.seconds:
         trainer.seconds = max(settings.seconds - (time.monotonic() - started), 1.0)
     report.metric("backend", backend_of(settings.backend).name)
+    report.metric("device", backend_of(settings.backend).where())
+    report.metric("passed_over", passed_over(settings.backend))
     report.metric("train_photographs", len(trainer.train))
     report.metric("held_out_photographs", len(trainer.held_out))
     model = trainer.run(start)

@@ -31,6 +31,9 @@ sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != RO
 os.environ["PYTHONSAFEPATH"] = "1"
 os.environ.pop("PYTHONPATH", None)
 os.environ.setdefault("SPLAT_THREADS", "2")
+# Where there is no GPU its kernels are interpreted.
+if not any(Path(device).exists() for device in ("/dev/nvidia0", "/dev/kfd")):
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 # A job in the background is born deaf to Ctrl-C, and so would be all that it starts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

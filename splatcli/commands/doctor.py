@@ -17,10 +17,11 @@ from stages.base.lazy import named
 from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
 from stages.base.words import counted
-from stages.raster.backends import BACKENDS, Backend
+from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
 
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
+_BACKEND_ADVICE = "docs/gpu.md says what it takes."
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,10 @@ def checks() -> Iterator[Check]:
     yield _memory()
     yield _disk()
     yield _kernel_cache()
+    yield _gpu()
     for backend in BACKENDS:
         yield _backend(backend)
+    yield Check("--backend auto", backend_of(AUTO).name)
 
 
 def _library(distribution: str) -> Check:
@@ -108,7 +111,19 @@ def _kernel_cache() -> Check:
 def _backend(backend: Backend) -> Check:
     label = f"backend {backend.name}"
     try:
+        if why_not := backend.why_not():
+            return Check(label, f"not chosen: {why_not}", advice=_BACKEND_ADVICE)
         named(backend.rasteriser)
     except Exception as error:
         return Check(label, f"not present ({_said(error)})", ok=False)
     return Check(label, "present")
+
+
+def _gpu() -> Check:
+    """What GPU there is, also to a torch that cannot use it."""
+    try:
+        from stages.raster.gpu import device
+
+        return Check("GPU", device.missing() or device.told())
+    except Exception as error:  # a broken driver may raise anything
+        return Check("GPU", _said(error))

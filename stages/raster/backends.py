@@ -21,16 +21,37 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class Backend:
-    """rasteriser, step: "module:Class". what: for help, a few words."""
+    """rasteriser, step: "module:Class". what: for help, a few words. obstacle: "module:function"
+    that says why "auto" passes it over here, "" where it does not; none for one that always runs.
+    device: "module:function" that says what it runs on; none for the processor.
+    """
 
     name: str
     rasteriser: str
     what: str
     step: str = "stages.training.plain_step:PlainStep"
+    obstacle: str = ""
+    device: str = ""
+
+    def where(self) -> str:
+        """What it runs on, for a manifest."""
+        return str(named(self.device)()) if self.device else "processor"
+
+    def why_not(self) -> str:
+        """Why "auto" passes it over here; "" where it does not."""
+        return str(named(self.obstacle)()) if self.obstacle else ""
 
 
-# The first one is what "auto" takes.
+# "auto" takes the first that nothing stands against.
 BACKENDS = (
+    Backend(
+        "gpu",
+        "stages.raster.gpu.rasteriser:GpuRasteriser",
+        "Triton kernels",
+        step="stages.training.gpu_step:GpuStep",
+        obstacle="stages.raster.gpu.device:obstacle",
+        device="stages.raster.gpu.device:told",
+    ),
     Backend(
         "cpu",
         "stages.raster.cpu.rasteriser:CpuRasteriser",
@@ -44,12 +65,16 @@ CHOICES = (AUTO, *(backend.name for backend in BACKENDS))
 
 def backend_of(name: str) -> Backend:
     """The backend of that name, or the one that "auto" takes. Raises ValueError for another."""
-    if name == AUTO:
-        return BACKENDS[0]
     for backend in BACKENDS:
-        if backend.name == name:
+        if backend.name == name or (name == AUTO and not backend.why_not()):
             return backend
     raise ValueError(f"backend {name!r}, wanted one of {', '.join(CHOICES)}")
+
+
+def passed_over(name: str) -> dict[str, str]:
+    """Why "auto" did not take the backends before the one that it takes; {} for another name."""
+    chosen = BACKENDS.index(backend_of(name)) if name == AUTO else 0
+    return {backend.name: backend.why_not() for backend in BACKENDS[:chosen]}
 
 
 def rasteriser_of(name: str) -> Rasteriser:

@@ -17,6 +17,9 @@ class HostStep:
         self.rasteriser = rasteriser
         self._model = empty_model()
 
+    def __len__(self) -> int:
+        return len(self._model)
+
     def load(self, model: Model) -> None:
         self._model = model
 

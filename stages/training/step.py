@@ -20,6 +20,9 @@ class TrainingStep(Protocol):
 
     def __init__(self, rasteriser: Rasteriser) -> None: ...
 
+    def __len__(self) -> int:
+        """How many splats it holds; asks no device."""
+
     def load(self, model: Model) -> None:
         """Take a model over, moments and all: at the start, and after it grew or shrank."""
 
@@ -29,9 +32,9 @@ class TrainingStep(Protocol):
     def step(
         self, level: Level, settings: RasterSettings, rates: LearningRates, smooth: bool
     ) -> float:
-        """Draw, compare with one photograph, move the splats; the loss before that. The bands of
-        SH up to `settings.sh_degree` take part. smooth: under the model's smoothing widths. What a
-        masked photograph asks: `training.target`."""
+        """Draw, compare with one photograph, move the splats; the loss before that (a device's may
+        be that of a few steps ago). The bands of SH up to `settings.sh_degree` take part. smooth:
+        under the model's smoothing widths. What a masked photograph asks: `training.target`."""
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         """[H, W, 3] of the model as it is; the caller's own."""

@@ -202,7 +202,10 @@ class Trainer:
         self.stepper.load(self._strategy.reset(self.model))
 
     def _tick(self, step: int, loss: float) -> None:
-        numbers: dict[str, float | int | str] = {"splats": len(self.model), "loss": round(loss, 4)}
+        numbers: dict[str, float | int | str] = {
+            "splats": len(self.stepper),
+            "loss": round(loss, 4),
+        }
         if self.history and "psnr_db" in self.history[-1]:
             numbers["held_out_psnr_db"] = round(self.history[-1]["psnr_db"], 2)
         self.report.progress(step, self.schedule.steps, "training", **numbers)

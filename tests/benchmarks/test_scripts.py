@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 
 import pytest
@@ -37,3 +38,14 @@ def test_the_format_benchmark_passes_its_gate_and_prints_each_format():
     assert "hold what was written" in printed
     for name in names:
         assert name in printed
+
+
+def test_the_gpu_benchmark_passes_its_gate_and_writes_its_figures(tmp_path):
+    pytest.importorskip("triton")
+    out = tmp_path / "gpu.json"
+    printed = run("tests.benchmarks.gpu", "--toy", "--out", str(out))
+    assert "gate: gradients agree with the reference" in printed
+    (line,) = json.loads(out.read_text())["lines"]
+    assert line["splats"] == 12
+    assert line["entries"] > 0
+    assert min(line[name] for name in ("draw_ms", "both_ms", "step_ms")) > 0

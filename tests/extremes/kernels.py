@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from stages.raster.camera_row import camera_row
 from stages.raster.cpu.projection import (
     AXES,
     COMPENSATION,
-    camera_row,
     footprint_values,
 )
 from stages.raster.definition import splat_arrays

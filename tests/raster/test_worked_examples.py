@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from stages.raster.camera_row import camera_row
 from stages.raster.cpu.projection import (
     A,
     B,
     C,
-    camera_row,
     footprint_values,
 )
 from stages.raster.cpu.rasteriser import CpuRasteriser

@@ -31,6 +31,23 @@ from stages.kernels.simd64 import (
     scatter8,
     spread8,
 )
+from stages.raster.camera_row import (
+    ANTIALIAS,
+    CX,
+    CY,
+    DILATION,
+    FX,
+    FY,
+    HEIGHT,
+    HIGH_X,
+    HIGH_Y,
+    LOW_X,
+    LOW_Y,
+    NEAR,
+    WIDTH,
+    R,
+    T,
+)
 from stages.raster.definition import (
     ALPHA_MIN,
     LOG_SCALE,
@@ -41,18 +58,7 @@ from stages.raster.definition import (
     ROTATION,
     SCALE_MAX,
     SH,
-    RasterSettings,
 )
-from stages.scene import Camera
-
-# Camera row: rotation (row by row) and translation from the world to the camera, then what the
-# names say, and where the camera stands in the world.
-R, T = 0, 9
-FX, FY, CX, CY = 12, 13, 14, 15
-LOW_X, HIGH_X, LOW_Y, HIGH_Y = 16, 17, 18, 19  # of the slopes x/z and y/z, beyond which J is frozen
-NEAR, DILATION, ANTIALIAS = 20, 21, 22
-STAND = 23  # 23:26
-WIDTH, HEIGHT = 26, 27
 
 # Work of eight splats (float64[WORK_ROW x 8], one a thread): entry k of all lanes lies at 8 k.
 # Filled by `footprint`, read by `footprint_gradient`.
@@ -81,28 +87,6 @@ GRADIENTS = SH
 _LOG2E = 1.0 / math.log(2.0)
 _SQRT_LOG2E = math.sqrt(_LOG2E)
 _FAINTEST = math.log(ALPHA_MIN)
-
-
-def camera_row(camera: Camera, settings: RasterSettings) -> NDArray[np.float64]:
-    """The camera and the settings as the numbers that kernels read."""
-    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
-    limits = (
-        -camera.cx / camera.fx - margin_x,
-        (camera.width - camera.cx) / camera.fx + margin_x,
-        -camera.cy / camera.fy - margin_y,
-        (camera.height - camera.cy) / camera.fy + margin_y,
-    )
-    return np.concatenate(
-        [
-            camera.world_to_camera[:3, :3].ravel(),
-            camera.world_to_camera[:3, 3],
-            (camera.fx, camera.fy, camera.cx, camera.cy),
-            limits,
-            (settings.near, settings.dilation_px2, float(settings.antialias)),
-            camera.centre,
-            (camera.width, camera.height),
-        ]
-    )
 
 
 @kernel

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.kernels.pool import Pool, default_pool
+from stages.raster.camera_row import camera_row
 from stages.raster.cpu import binning, blend, contributions
-from stages.raster.cpu.projection import GEOMETRY_ROW, camera_row
+from stages.raster.cpu.projection import GEOMETRY_ROW
 from stages.raster.cpu.splat_kernels import (
     CULLED,
     VISIBLE,

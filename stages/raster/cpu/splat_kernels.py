@@ -27,12 +27,10 @@ from stages.kernels.simd64 import (
     scatter8,
     spread8,
 )
+from stages.raster.camera_row import CX, CY, DILATION, HEIGHT, STAND, WIDTH, R, T
 from stages.raster.cpu.binning import COUNT, SLOT
 from stages.raster.cpu.blend import S_1, S_RED, S_T, S_TT, S_U, S_UT, S_UU, SUMS
 from stages.raster.cpu.projection import (
-    CX,
-    CY,
-    DILATION,
     GA,
     GB,
     GEOMETRY_ROW,
@@ -42,14 +40,9 @@ from stages.raster.cpu.projection import (
     GVY,
     GX,
     GY,
-    HEIGHT,
-    STAND,
-    WIDTH,
     WORK_ROW,
     A,
     C,
-    R,
-    T,
     at,
     drawable,
     footprint,

@@ -1,0 +1,119 @@
+"""Where the kernels run: a GPU, or Triton's interpreter on the CPU (TRITON_INTERPRET=1), for tests.
+
+This module imports neither torch nor Triton before it is asked.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from stages.base.errors import Family, SplatError
+
+INSTALL = "docs/gpu.md says which build of torch brings what is missing."
+_OLDEST = (7, 0)  # compute capability that Triton compiles for
+_COMPILERS = ("cc", "gcc", "clang")
+
+
+def interpreted() -> bool:
+    """Whether Triton's kernels are interpreted: thousands of times slower."""
+    return os.environ.get("TRITON_INTERPRET") == "1"
+
+
+def obstacle() -> str:
+    """Why the backend "gpu" is not to be chosen here by itself; "" where it is."""
+    return "Triton's interpreter is on, for tests" if interpreted() else missing()
+
+
+def missing() -> str:
+    """What keeps the kernels from a GPU; "" for nothing."""
+    if importlib.util.find_spec("triton") is None:
+        return "Triton is not installed"
+    import torch
+
+    if torch.version.cuda is None and torch.version.hip is None:
+        return f"torch {torch.__version__} is built for the CPU alone"
+    if not torch.cuda.is_available():
+        return "no GPU found that this build of torch can use (no card, or its driver is too old)"
+    if torch.version.cuda and torch.cuda.get_device_capability() < _OLDEST:
+        return f"{torch.cuda.get_device_name()} is too old for Triton"
+    if not os.environ.get("CC") and not any(map(shutil.which, _COMPILERS)):
+        return "no C compiler found, which Triton needs once to launch its kernels"
+    return ""
+
+
+def require() -> Any:
+    """The torch device to run on. Raises SplatError where there is none."""
+    fault = missing() if not interpreted() else _no_triton()
+    if fault:
+        raise SplatError(
+            "raster-no-gpu",
+            given=f"The backend gpu cannot run here: {fault}.",
+            wanted="It takes Linux, an NVIDIA or AMD card, and a torch built for it.",
+            hint=f"Choose --backend cpu. {INSTALL}",
+            family=Family.RESOURCES,
+        )
+    import torch
+
+    return torch.device("cpu" if interpreted() else "cuda")
+
+
+def _no_triton() -> str:
+    return "" if importlib.util.find_spec("triton") else "Triton is not installed"
+
+
+def told() -> str:
+    """Card, memory, driver's runtime, torch and Triton, in one line; of the interpreter as well."""
+    import torch
+    import triton
+
+    built = f"torch {torch.__version__}, Triton {triton.__version__}"
+    if interpreted():
+        return f"Triton's interpreter on the CPU, {built}"
+    properties = torch.cuda.get_device_properties(0)
+    runtime = torch.version.hip or torch.version.cuda
+    kind = "ROCm" if torch.version.hip else "CUDA"
+    gib = properties.total_memory / 2**30
+    return f"{properties.name}, {gib:.0f} GiB, {kind} {runtime}, {built}"
+
+
+@contextmanager
+def failures_told(splats: int) -> Iterator[None]:
+    """What a device refuses while it works on so many splats, as SplatError."""
+    import torch
+
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        free, total = torch.cuda.mem_get_info() if torch.cuda.is_available() else (0, 0)
+        held = torch.cuda.memory_allocated() if torch.cuda.is_available() else 0
+        raise out_of_memory(splats, free, held, total) from error
+    except RuntimeError as error:
+        if "CUDA error" not in str(error) and "HIP error" not in str(error):
+            raise
+        raise SplatError(
+            "raster-gpu-failed",
+            given=f"The GPU stopped: {str(error).splitlines()[0]}.",
+            wanted="It must answer; another program may hold it for itself.",
+            hint="Run `splat doctor`, see nvidia-smi or rocm-smi, or choose --backend cpu.",
+            family=Family.RESOURCES,
+        ) from error
+
+
+def out_of_memory(splats: int, free: int, held: int, total: int) -> SplatError:
+    """The error for `splats` splats that did not fit; bytes free, held by us, and on the card."""
+    fits = int(splats * 0.8 * (free + held) / max(total, 1)) if total else splats // 2
+    gib = 2**30
+    return SplatError(
+        "raster-gpu-memory",
+        given=f"{splats:,} splats do not fit into the GPU's memory "
+        f"({free / gib:.1f} of {total / gib:.1f} GiB free, {held / gib:.1f} GiB held by this run).",
+        wanted=f"About {fits:,} would fit.",
+        hint=f"Go on with --max-splats {fits}, or close what else uses the card. "
+        "The last checkpoint is kept.",
+        family=Family.RESOURCES,
+    )

@@ -1,0 +1,281 @@
+"""From what blending leaves of each (splat, tile) to the gradients of the splats' parameters.
+
+The same chain rule as in `cpu.projection` and `cpu.splat_kernels`, where it is explained.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from stages.raster.gpu.blend import S_1, S_RED, S_T, S_TT, S_U, S_UT, S_UU, SUMS
+from stages.raster.gpu.geometry import (
+    CX,
+    CY,
+    DILATION,
+    FX,
+    FY,
+    LOG_SCALE,
+    MEAN,
+    OPACITY,
+    ROTATION,
+    SH,
+    axis_x,
+    axis_y,
+    axis_z,
+    basis,
+    basis_slope,
+    column,
+    cross,
+    direction,
+    number,
+    scale,
+    slopes,
+    turned_back,
+    unit_quaternion,
+)
+from stages.raster.gpu.inner import inner, sum_of, top_of
+from stages.raster.gpu.project import (
+    COLOUR,
+    ORIGIN,
+    ORIGIN_CUT,
+    RECORD,
+    covariance,
+    footprint_rows,
+    held,
+    opacity_of,
+)
+
+LARGEST_KEPT = tl.constexpr(3.4e38)  # no gradient is handed on as infinite
+BRIGHTEST = tl.constexpr(1.0000000200408773e20)  # COLOUR_MAX as a record keeps it
+
+
+@triton.jit
+def sum_kernel(
+    raw,
+    firsts,
+    counts,
+    sums,
+    n,
+    entries,
+    WIDTH: tl.constexpr,
+    REAL: tl.constexpr,
+    BLOCK: tl.constexpr,
+    LANES: tl.constexpr,
+):
+    """sums [n, WIDTH] REAL: each splat's rows of raw [entries, WIDTH], added up in a fixed order.
+
+    firsts [n]: where they begin; counts [n]: how many they are. entries: for how many there was
+    room.
+    """
+    i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    first = tl.load(firsts + i, mask=i < n, other=0)
+    count = tl.load(counts + i, mask=i < n, other=0)
+    most = top_of(count, 0)
+    lane = tl.arange(0, LANES)
+    for k in tl.static_range(WIDTH):
+        total = tl.zeros([BLOCK, LANES], REAL)
+        for step in range(0, most, LANES):
+            slot = first[:, None] + step + lane[None, :]
+            there = ((step + lane)[None, :] < count[:, None]) & (slot < entries)
+            total += tl.load(raw + slot * WIDTH + k, mask=there, other=0.0).to(REAL)
+        tl.store(sums + i * WIDTH + k, sum_of(total, 1), mask=i < n)
+
+
+@inner
+def give(out, k, mask, value):
+    value = tl.minimum(tl.maximum(value, -LARGEST_KEPT), LARGEST_KEPT)
+    tl.store(out + k, value.to(tl.float32), mask=mask)
+
+
+@inner
+def axis_gradient(v0, v1, d0, d1, g_var_x, g_var_y, g_cov, g_minors):
+    """(gradients of an entry of V0 and of V1) from those of the covariance and its determinant."""
+    g_v0 = 2.0 * g_var_x * v0 + g_cov * v1 + 2.0 * g_minors * d0
+    g_v1 = 2.0 * g_var_y * v1 + g_cov * v0 + 2.0 * g_minors * d1
+    return g_v0, g_v1
+
+
+@inner
+def scale_gradient(out, k, mask, by_size, by_opacity, ratio):
+    kept = ratio * ratio
+    give(out, LOG_SCALE + k, mask, by_size * kept + by_opacity * (1.0 - kept))
+
+
+@inner
+def rotation_gradient(out, mask, q0, q1, q2, q3, norm, r00, r10, r20, r01, r11, r21, r02, r12, r22):
+    """Gradient of the quaternion from that of its matrix."""
+    n0 = 2.0 * (q1 * (r21 - r12) + q2 * (r02 - r20) + q3 * (r10 - r01))
+    n1 = 2.0 * (q2 * (r01 + r10) + q3 * (r02 + r20) + q0 * (r21 - r12)) - 4.0 * q1 * (r11 + r22)
+    n2 = 2.0 * (q1 * (r01 + r10) + q3 * (r12 + r21) + q0 * (r02 - r20)) - 4.0 * q2 * (r00 + r22)
+    n3 = 2.0 * (q1 * (r02 + r20) + q2 * (r12 + r21) + q0 * (r10 - r01)) - 4.0 * q3 * (r00 + r11)
+    along = n0 * q0 + n1 * q1 + n2 * q2 + n3 * q3
+    give(out, ROTATION, mask, (n0 - along * q0) / norm)
+    give(out, ROTATION + 1, mask, (n1 - along * q1) / norm)
+    give(out, ROTATION + 2, mask, (n2 - along * q2) / norm)
+    give(out, ROTATION + 3, mask, (n3 - along * q3) / norm)
+
+
+@inner
+def colour_gradient(
+    cam, rows, at, mask, record, sums, out, BANDS: tl.constexpr, REAL: tl.constexpr
+):
+    """SH gradients into `out`; (x, y, z) what the directions add to the means'."""
+    x, y, z, distance = direction(cam, rows, at, mask, REAL)
+    g_r = shown_colour(record, sums, 0, mask)
+    g_g = shown_colour(record, sums, 1, mask)
+    g_b = shown_colour(record, sums, 2, mask)
+    gx, gy, gz = x * 0.0, x * 0.0, x * 0.0
+    for k in tl.static_range(BANDS):
+        value = basis(k, x, y, z)
+        give(out, SH + 3 * k, mask, g_r * value)
+        give(out, SH + 3 * k + 1, mask, g_g * value)
+        give(out, SH + 3 * k + 2, mask, g_b * value)
+        if k > 0:
+            weight = g_r * column(rows, at, mask, SH + 3 * k, REAL)
+            weight += g_g * column(rows, at, mask, SH + 3 * k + 1, REAL)
+            weight += g_b * column(rows, at, mask, SH + 3 * k + 2, REAL)
+            by_x, by_y, by_z = basis_slope(k, x, y, z)
+            gx += weight * by_x
+            gy += weight * by_y
+            gz += weight * by_z
+    along = gx * x + gy * y + gz * z
+    return (gx - along * x) / distance, (gy - along * y) / distance, (gz - along * z) / distance
+
+
+@inner
+def shown_colour(record, sums, channel, mask):
+    """The gradient of a colour; one that is clamped passes nothing on."""
+    value = tl.load(record + COLOUR + channel, mask=mask, other=0.0)
+    g = tl.load(sums + S_RED + channel, mask=mask, other=0.0)
+    return tl.where((value > 0.0) & (value < BRIGHTEST), g, 0.0)
+
+
+@inner
+def exponent_gradient(cam, record, sums, mask, x, y, a, b, c, det, REAL: tl.constexpr):
+    """(gradients of mean x, mean y, of A, B, K and of ln(1 / z) through the exponent
+    A u^2 + B (v - K u)^2, the sum over pixels of the exponent's own)."""
+    tall = c > a
+    major_variance = tl.maximum(a, c)
+    k = b / major_variance
+    by_a, by_b = 0.5 / major_variance, 0.5 * major_variance / det
+    cx, cy = number(cam, CX, REAL), number(cam, CY, REAL)
+    major, minor = tl.where(tall, y, x), tl.where(tall, x, y)
+    c_major, c_minor = tl.where(tall, cy, cx), tl.where(tall, cx, cy)
+    o = tl.load(record + ORIGIN, mask=mask, other=0.0).to(REAL)
+    cut = tl.load(record + ORIGIN_CUT, mask=mask, other=0.0).to(REAL)
+    du, dt = o - major, cut - (minor - k * major)
+    s_1 = tl.load(sums + S_1, mask=mask, other=0.0)
+    near_u = tl.load(sums + S_U, mask=mask, other=0.0)
+    near_t = tl.load(sums + S_T, mask=mask, other=0.0)
+    s_u, s_t = near_u + du * s_1, near_t + dt * s_1
+    by_u = tl.load(sums + S_UU, mask=mask, other=0.0) + du * near_u
+    by_t = tl.load(sums + S_TT, mask=mask, other=0.0) + dt * near_t
+    s_uu, s_tt = by_u + du * s_u, by_t + dt * s_t
+    s_ut = tl.load(sums + S_UT, mask=mask, other=0.0) + du * near_t + dt * s_u
+    along, across = 2.0 * (by_b * k * s_t - by_a * s_u), -2.0 * by_b * s_t
+    q_p = by_a * (by_u + (o - c_major) * s_u)
+    q_p += by_b * (by_t + (cut - (c_minor - k * c_major)) * s_t)
+    q_q = by_a * by_a * s_uu - 2.0 * by_a * by_b * k * s_ut
+    q_q += by_b * by_b * (1.0 + k * k) * s_tt
+    g_near = 4.0 * number(cam, DILATION, REAL) * q_q - 2.0 * q_p
+    g_x, g_y = tl.where(tall, across, along), tl.where(tall, along, across)
+    return g_x, g_y, s_uu, s_tt, -2.0 * by_b * s_ut, g_near, s_1
+
+
+@triton.jit
+def splat_gradient_kernel(
+    cam,
+    rows,
+    smoothing,
+    keys,
+    records,
+    sums,
+    n,
+    out,
+    means2d,
+    COLUMNS: tl.constexpr,
+    OUT_COLUMNS: tl.constexpr,
+    BANDS: tl.constexpr,
+    SMOOTH: tl.constexpr,
+    ANTIALIAS: tl.constexpr,
+    REAL: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """out [n, OUT_COLUMNS], means2d [n, 2]: gradients of the visible rows; others are not touched,
+    nor are columns beyond those in use."""
+    i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    mask = i < n
+    mask = mask & (tl.load(keys + i, mask=mask, other=float("inf")) < float("inf"))
+    at = i * COLUMNS
+    record, sums, out = records + i * RECORD, sums + i * SUMS, out + i * OUT_COLUMNS
+    width = (i * 0).to(REAL)
+    if SMOOTH:
+        width = tl.load(smoothing + i, mask=mask, other=0.0).to(REAL)
+    x0, x1, x2, y0, y1, y2, _, x, y, z = footprint_rows(cam, rows, at, mask, width, SMOOTH, REAL)
+    a, b, c, det, minors, kept = covariance(cam, x0, x1, x2, y0, y1, y2, ANTIALIAS, REAL)
+    fx, fy, e = number(cam, FX, REAL), number(cam, FY, REAL), number(cam, DILATION, REAL)
+    px, py = held(fx * x / z + number(cam, CX, REAL)), held(fy * y / z + number(cam, CY, REAL))
+    g_x, g_y, g_a, g_b, g_k, g_near, s_1 = exponent_gradient(
+        cam, record, sums, mask, px, py, a, b, c, det, REAL
+    )
+    tl.store(means2d + i * 2, g_x.to(tl.float32), mask=mask)
+    tl.store(means2d + i * 2 + 1, g_y.to(tl.float32), mask=mask)
+    # from the exponent to the covariance
+    major = tl.maximum(a, c)
+    g_major = 0.5 * g_b / det - (0.5 * g_a + g_k * b) / (major * major)
+    g_cov, g_det = g_k / major, -0.5 * g_b * major / (det * det)
+    wide = a >= c
+    g_var_x, g_var_y = tl.where(wide, g_major, 0.0), tl.where(wide, 0.0, g_major)
+    opacity = opacity_of(rows, at, mask, REAL)
+    g_drawn = -s_1  # by the logarithm of the opacity drawn
+    g_minors = det * 0.0
+    if ANTIALIAS:
+        g_det -= 0.5 * g_drawn / det
+        thick = minors > 1e-60
+        g_minors = tl.where(thick, 0.5 * g_drawn / (kept * kept * det), 0.0)
+        growth = tl.where(thick, e * (a + c), e * (a + c) - 2.0 * det)
+        g_near += g_drawn * growth / det
+    give(out, OPACITY, mask, g_drawn * (1.0 - opacity))
+    g_minors += g_det
+    g_var_x += e * g_det
+    g_var_y += e * g_det
+    # from the covariance to scales, rotation and mean
+    m0, m1, m2 = cross(x0, x1, x2, y0, y1, y2)
+    d0, d1, d2 = cross(y0, y1, y2, m0, m1, m2)
+    e0, e1, e2 = cross(m0, m1, m2, x0, x1, x2)
+    u, v, in_u, in_v = slopes(cam, x, y, z, REAL)
+    j00, j02, j11, j12 = fx / z, -fx * u / z, fy / z, -fy * v / z
+    w0, w1, w2, w3, norm = unit_quaternion(rows, at, mask, REAL)
+    g0, g1 = axis_gradient(x0, y0, d0, e0, g_var_x, g_var_y, g_cov, g_minors)
+    s, ratio = scale(rows, at, mask, width, 0, SMOOTH, REAL)
+    scale_gradient(out, 0, mask, g0 * x0 + g1 * y0, g_drawn, ratio)
+    _, _, deep = axis_x(cam, w0, w1, w2, w3, REAL)
+    g0, g1 = g0 * s, g1 * s
+    g02, g12 = g0 * deep, g1 * deep
+    r00, r10, r20 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
+    g0, g1 = axis_gradient(x1, y1, d1, e1, g_var_x, g_var_y, g_cov, g_minors)
+    s, ratio = scale(rows, at, mask, width, 1, SMOOTH, REAL)
+    scale_gradient(out, 1, mask, g0 * x1 + g1 * y1, g_drawn, ratio)
+    _, _, deep = axis_y(cam, w0, w1, w2, w3, REAL)
+    g0, g1 = g0 * s, g1 * s
+    g02 += g0 * deep
+    g12 += g1 * deep
+    r01, r11, r21 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
+    g0, g1 = axis_gradient(x2, y2, d2, e2, g_var_x, g_var_y, g_cov, g_minors)
+    s, ratio = scale(rows, at, mask, width, 2, SMOOTH, REAL)
+    scale_gradient(out, 2, mask, g0 * x2 + g1 * y2, g_drawn, ratio)
+    _, _, deep = axis_z(cam, w0, w1, w2, w3, REAL)
+    g0, g1 = g0 * s, g1 * s
+    g02 += g0 * deep
+    g12 += g1 * deep
+    r02, r12, r22 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
+    rotation_gradient(out, mask, w0, w1, w2, w3, norm, r00, r10, r20, r01, r11, r21, r02, r12, r22)
+    # a slope inside its limits moves with the mean; a clamped one does not
+    g_u, g_v = tl.where(in_u, -g02 * fx / z, 0.0), tl.where(in_v, -g12 * fy / z, 0.0)
+    by_x, by_y = (g_x * fx + g_u) / z, (g_y * fy + g_v) / z
+    mx, my, mz = turned_back(cam, by_x, by_y, -(g_near + g_u * u + g_v * v) / z, REAL)
+    tx, ty, tz = colour_gradient(cam, rows, at, mask, record, sums, out, BANDS, REAL)
+    give(out, MEAN, mask, mx + tx)
+    give(out, MEAN + 1, mask, my + ty)
+    give(out, MEAN + 2, mask, mz + tz)

@@ -1,0 +1,319 @@
+"""The GPU backend: Triton's kernels, torch's sorts, tensors that stay on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import triton.language as tl
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.raster.camera_row import camera_row
+from stages.raster.definition import (
+    NO_SMOOTHING,
+    SH,
+    Arrays,
+    Backward,
+    RasterSettings,
+    gradient_columns,
+)
+from stages.raster.gpu import blend, gradients, lists, project
+from stages.raster.gpu.device import failures_told, interpreted, require
+from stages.scene import Camera
+
+VISIBLE, CULLED = 1, 2  # as `project_kernel` says them
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Splats on the device. rows [N, columns]: parameters, in the columns of a gradient row; bands:
+    of SH that they hold. smoothing [N], or [0] for none."""
+
+    rows: Tensor
+    bands: int
+    smoothing: Tensor
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera on the device, and how it draws. cam: see `camera_row`."""
+
+    cam: Tensor
+    width: int
+    height: int
+    settings: RasterSettings
+
+    def bands(self, scene: Scene) -> int:
+        """How many bands of SH take part."""
+        return min((self.settings.sh_degree + 1) ** 2, scene.bands)
+
+
+@dataclass(frozen=True)
+class Lists:
+    """What each tile draws. members [capacity]: rows, tile by tile, nearest first, from
+    starts[tile]; slots: where each entry's gradient goes, those of a splat one after the other.
+    firsts, counts [N]: a splat's slots. total: entries wanted, a tensor; at most as many as there
+    is room for are drawn."""
+
+    members: Tensor
+    slots: Tensor
+    starts: Tensor
+    firsts: Tensor
+    counts: Tensor
+    total: Tensor
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A forward pass on the device. image [4 or 6, H, W]; light, last [H, W]: see `blend_kernel`;
+    records, keys, status [N]: see `project_kernel`."""
+
+    image: Tensor
+    light: Tensor
+    last: Tensor
+    records: Tensor
+    keys: Tensor
+    status: Tensor
+    lists: Lists
+
+
+@dataclass(frozen=True)
+class Forward:
+    """As `definition.Forward`; and what the way back needs."""
+
+    image: NDArray[np.float32]
+    visible: NDArray[np.int32]
+    culled: int
+    scene: Scene
+    view: View
+    drawn: Drawn
+
+
+class GpuRasteriser:
+    """Draws and differentiates. tile: pixels across and down, a power of two. real: what footprints
+    are computed in."""
+
+    def __init__(self, tile: int | None = None, real: Any = tl.float64) -> None:
+        self.device: torch.device = require()
+        emulated = interpreted()
+        # an interpreter pays by the operation, whatever its width
+        self.tile = tile or (32 if emulated else 16)
+        self.block = 4096 if emulated else 128
+        self.real = real
+
+    def forward(
+        self,
+        arrays: Arrays,
+        camera: Camera,
+        settings: RasterSettings,
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
+        depths: bool = False,
+    ) -> Forward:
+        """See `definition.Rasteriser`."""
+        with failures_told(len(arrays[0])):
+            scene, view = self.scene(arrays, smoothing), self.view(camera, settings)
+            drawn = self.draw(scene, view, depths)
+            status, image = drawn.status.cpu().numpy(), drawn.image.cpu().numpy()
+        return Forward(
+            image,
+            np.flatnonzero(status == VISIBLE).astype(np.int32),
+            int(np.count_nonzero(status == CULLED)),
+            scene,
+            view,
+            drawn,
+        )
+
+    def backward(
+        self,
+        arrays: Arrays,
+        forward: Forward,
+        v_image: NDArray[np.float32],
+        smoothing: NDArray[np.float32] = NO_SMOOTHING,
+    ) -> Backward:
+        """See `definition.Rasteriser`."""
+        v = torch.from_numpy(np.ascontiguousarray(v_image)).to(self.device)
+        parameters, means2d = self.gradients(forward.scene, forward.view, forward.drawn, v)
+        rows = torch.from_numpy(forward.visible).to(self.device).long()
+        return Backward(
+            forward.visible, parameters[rows].cpu().numpy(), means2d[rows].cpu().numpy()
+        )
+
+    def contributions(self, forward: Forward, residual: NDArray[np.float32]) -> NDArray[np.float64]:
+        """See `definition.Rasteriser`."""
+        drawn, made = forward.drawn, forward.drawn.lists
+        planes = torch.from_numpy(np.ascontiguousarray(residual)).to(self.device)
+        raw = torch.zeros(len(made.members), 3, device=self.device)
+        self._over_tiles(blend.contribution_kernel, forward.view, drawn, planes, raw)
+        sums = self._summed(raw, made, tl.float64)
+        found = sums.cpu().numpy()[forward.visible]
+        entries = raw[:, 2].cpu().numpy()
+        firsts, counts = (t.cpu().numpy()[forward.visible] for t in (made.firsts, made.counts))
+        for place in range(len(found)):
+            own = entries[firsts[place] : firsts[place] + counts[place]]
+            found[place, 2] = own.max(initial=0.0)
+        return found
+
+    def scene(self, arrays: Arrays, smoothing: NDArray[np.float32] = NO_SMOOTHING) -> Scene:
+        """Arrays of the host, as rows on the device."""
+        means, quaternions, log_scales, opacity_logits, sh = arrays
+        n, bands = len(means), sh.shape[1]
+        parts = (means, quaternions, log_scales, opacity_logits[:, None], sh.reshape(n, 3 * bands))
+        rows = np.zeros((n, gradient_columns(bands)), np.float32)
+        np.concatenate(parts, 1, out=rows[:, : SH + 3 * bands])
+        widths = torch.tensor(smoothing, device=self.device)
+        return Scene(torch.from_numpy(rows).to(self.device), bands, widths)
+
+    def view(self, camera: Camera, settings: RasterSettings) -> View:
+        """A camera and settings, on the device."""
+        cam = torch.from_numpy(camera_row(camera, settings)).to(self.device)
+        return View(cam, camera.width, camera.height, settings)
+
+    def draw(
+        self, scene: Scene, view: View, depths: bool = False, capacity: int | None = None
+    ) -> Drawn:
+        """A picture. capacity: how many entries of the lists there is room for; asked of the
+        device, which is waited for, if not told."""
+        n = len(scene)
+        like: dict[str, Any] = {"device": self.device}
+        records = torch.empty(n, project.RECORD.value, **like)
+        shapes = torch.empty(n, project.SHAPE.value, **like)
+        keys = torch.empty(n, **like)
+        status = torch.empty(n, dtype=torch.int8, **like)
+        if n:
+            project.project_kernel[self._grid(n)](
+                *(view.cam, scene.rows, scene.smoothing, n, view.width, view.height),
+                *(records, shapes, keys, status),
+                COLUMNS=scene.rows.shape[1],
+                STORED=scene.bands,
+                BANDS=view.bands(scene),
+                SMOOTH=len(scene.smoothing) > 0,
+                ANTIALIAS=view.settings.antialias,
+                TILE=self.tile,
+                REAL=self.real,
+                BLOCK=self.block,
+            )
+        made = self._lists(scene, view, shapes, keys, capacity)
+        planes = 6 if depths else 4
+        image = torch.empty(planes, view.height, view.width, **like)
+        light = torch.empty(view.height, view.width, **like)
+        last = torch.empty(view.height, view.width, dtype=torch.int32, **like)
+        blend.blend_kernel[(self._tiles(view)[2],)](
+            *(records, made.members, made.starts, image, light, last),
+            *view.settings.background,
+            *(view.width, view.height, self._tiles(view)[0]),
+            DEPTHS=depths,
+            TILE=self.tile,
+            num_warps=1,
+        )
+        return Drawn(image, light, last, records, keys, status, made)
+
+    def gradients(
+        self, scene: Scene, view: View, drawn: Drawn, v_image: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """([N, gradient_columns], [N, 2]) of parameters and of means on the picture, of the visible
+        splats; zeros elsewhere. v_image [3, H, W]."""
+        n, bands = len(scene), view.bands(scene)
+        like: dict[str, Any] = {"device": self.device}
+        raw = torch.zeros(len(drawn.lists.members), blend.SUMS.value, **like)
+        self._over_tiles(blend.blend_gradient_kernel, view, drawn, v_image, raw)
+        sums = self._summed(raw, drawn.lists, self.real)
+        out = torch.zeros(n, gradient_columns(bands), **like)
+        means2d = torch.zeros(n, 2, **like)
+        if n:
+            gradients.splat_gradient_kernel[self._grid(n)](
+                *(view.cam, scene.rows, scene.smoothing, drawn.keys, drawn.records, sums, n),
+                *(out, means2d),
+                COLUMNS=scene.rows.shape[1],
+                OUT_COLUMNS=out.shape[1],
+                BANDS=bands,
+                SMOOTH=len(scene.smoothing) > 0,
+                ANTIALIAS=view.settings.antialias,
+                REAL=self.real,
+                BLOCK=self.block,
+            )
+        return out, means2d
+
+    def _grid(self, n: int) -> tuple[int]:
+        return (-(-n // self.block),)
+
+    def _tiles(self, view: View) -> tuple[int, int, int]:
+        """(tiles across, down, all)."""
+        across, down = -(-view.width // self.tile), -(-view.height // self.tile)
+        return across, down, across * down
+
+    def _lists(
+        self, scene: Scene, view: View, shapes: Tensor, keys: Tensor, capacity: int | None
+    ) -> Lists:
+        n, (across, _, tiles) = len(scene), self._tiles(view)
+        like: dict[str, Any] = {"device": self.device}
+        counts = torch.zeros(n, dtype=torch.int32, **like)
+        by_depth, order = torch.sort(keys, stable=True)
+        settled = torch.empty_like(order)
+        if n:
+            plain: dict[str, Any] = {"enable_fp_fusion": False}
+            lists.count_kernel[self._grid(n)](
+                *(shapes, keys, counts, n, view.width), TILE=self.tile, BLOCK=self.block, **plain
+            )
+            lists.ties_kernel[self._grid(n)](
+                *(by_depth, order, settled, scene.rows, n),
+                COLUMNS=scene.rows.shape[1],
+                STORED=scene.bands,
+                BLOCK=self.block,
+            )
+        ends = torch.cumsum(counts[settled], 0)
+        total = ends[-1:] if n else torch.zeros(1, dtype=torch.int64, **like)
+        room = int(total.item()) if capacity is None else capacity
+        # radix sorts go by the byte: 16 bits are enough for pictures of 8 million pixels
+        keyed = torch.int16 if tiles < 2**15 else torch.int32
+        tile_of = torch.empty(room, dtype=keyed, **like)
+        row_of = torch.empty(room, dtype=torch.int32, **like)
+        if room and n:
+            lists.entries_kernel[self._grid(room)](
+                *(shapes, settled, ends, n, across, tiles, view.width, room, tile_of, row_of),
+                BITS=n.bit_length(),
+                TILE=self.tile,
+                BLOCK=self.block,
+                **plain,
+            )
+        sorted_tiles, slots = torch.sort(tile_of, stable=True)
+        bounds = torch.arange(tiles + 1, dtype=keyed, **like)
+        starts = torch.searchsorted(sorted_tiles, bounds)
+        firsts = torch.empty(n, dtype=torch.int64, **like)
+        firsts[settled] = ends - counts[settled]
+        return Lists(row_of[slots], slots, starts, firsts, counts, total)
+
+    def _over_tiles(
+        self, kernel: Any, view: View, drawn: Drawn, planes: Tensor, out: Tensor
+    ) -> None:
+        """A pass from far to near over every tile's list; one row of `out` for each entry."""
+        made = drawn.lists
+        kernel[(self._tiles(view)[2],)](
+            *(drawn.records, made.members, made.slots, made.starts, drawn.light, drawn.last),
+            *(planes, out, *view.settings.background),
+            *(view.width, view.height, self._tiles(view)[0]),
+            TILE=self.tile,
+            num_warps=1,
+        )
+
+    def _summed(self, raw: Tensor, made: Lists, real: Any) -> Tensor:
+        """[N, columns of raw]: each splat's rows of `raw`, added up in a fixed order."""
+        n, width = len(made.counts), raw.shape[1]
+        dtype = torch.float64 if real == tl.float64 else torch.float32
+        sums = torch.zeros(n, width, dtype=dtype, device=self.device)
+        if n:
+            splats, lanes = (1024, 8) if interpreted() else (4, 8)
+            gradients.sum_kernel[(-(-n // splats),)](
+                *(raw, made.firsts, made.counts, sums, n, len(raw)),
+                WIDTH=width,
+                REAL=real,
+                BLOCK=splats,
+                LANES=lanes,
+                num_warps=1,
+            )
+        return sums

@@ -1,0 +1,209 @@
+"""A training step on the GPU: model, moments, photographs and statistics stay there.
+
+A steady step never waits for the device. What the host must know of a step (its loss, whether its
+lists had room) arrives LAG steps later; lists without room leave the model as it was, and get more
+room once that is known.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import triton
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.raster.definition import SH, RasterSettings
+from stages.raster.gpu.device import failures_told, interpreted
+from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
+from stages.scene import Camera
+from stages.training import gpu_kernels
+from stages.training.gpu_photograph import Resident, resident
+from stages.training.loss import SSIM_WEIGHT
+from stages.training.optimiser import (
+    LearningRates,
+    Model,
+    active_counts,
+    bias_corrections,
+    empty_model,
+)
+from stages.training.views import Level
+
+LAG = 8  # steps after which the host reads what a step said
+SPARE = 1.5  # room for the lists, of what the fullest view so far took
+
+
+class Arrivals:
+    """Pairs of numbers on their way from the device to the host, read `lag` steps late."""
+
+    def __init__(self, device: torch.device, lag: int) -> None:
+        self.lag, self.sent = lag, 0
+        self.on_device = device.type == "cuda"
+        self._landing = torch.zeros(lag + 1, 2, dtype=torch.float64, pin_memory=self.on_device)
+        self._numbers = self._landing.numpy()
+        self._events: list[Any] = [None] * (lag + 1)
+
+    def send(self, pair: Tensor) -> None:
+        """Start a copy of a pair [2]."""
+        slot = self.sent % (self.lag + 1)
+        self._landing[slot].copy_(pair, non_blocking=True)
+        if self.on_device:
+            self._events[slot] = torch.cuda.current_stream().record_event()
+        self.sent += 1
+
+    def read(self) -> tuple[float, float]:
+        """The pair sent `lag` steps ago; the newest, waited for, while there were not as many."""
+        late = self.lag if self.sent > self.lag else 0
+        slot = (self.sent - 1 - late) % (self.lag + 1)
+        if self.on_device:
+            self._events[slot].synchronize()
+        return float(self._numbers[slot, 0]), float(self._numbers[slot, 1])
+
+
+class GpuStep:
+    """See `step.TrainingStep`. skipped: steps that had no room for their lists."""
+
+    def __init__(self, rasteriser: GpuRasteriser, lag: int | None = None) -> None:
+        self.rasteriser, self.device = rasteriser, rasteriser.device
+        self.skipped, self._room, self._splats = 0, 0, 0
+        self._arrivals = Arrivals(
+            self.device, (0 if interpreted() else LAG) if lag is None else lag
+        )
+        self._photographs: dict[int, Resident] = {}
+        self._corrections = self._on_device(bias_corrections())
+        self._unsmoothed = torch.zeros(0, device=self.device)
+        self._on_host: Model | None = None
+        self.load(empty_model())
+
+    def __len__(self) -> int:
+        return self._splats
+
+    def load(self, model: Model) -> None:
+        """See `step.TrainingStep`."""
+        self._room = int(self._room * max(1.0, len(model) / max(1, self._splats)))
+        self._splats = len(model)
+        with failures_told(len(model)):
+            self._scene = self.rasteriser.scene(model.arrays)
+            self._smoothing = self._on_device(model.smoothing)
+            self._moment1, self._moment2 = map(self._on_device, (model.moment1, model.moment2))
+            self._steps = self._on_device(model.steps)
+            self._gradient_sum = self._on_device(model.gradient_sum)
+            self._gradient_count = self._on_device(model.gradient_count)
+        self._on_host = model
+
+    def model(self) -> Model:
+        """See `step.TrainingStep`."""
+        if self._on_host is None:
+            rows, bands = _host(self._scene.rows), self._scene.bands
+            means, quaternions, log_scales = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
+            sh = rows[:, SH : SH + 3 * bands].reshape(len(rows), bands, 3)
+            self._on_host = Model(
+                *map(np.ascontiguousarray, (means, quaternions, log_scales, rows[:, 10], sh)),
+                *map(_host, (self._moment1, self._moment2, self._steps)),
+                *map(_host, (self._gradient_sum, self._gradient_count, self._smoothing)),
+            )
+        return self._on_host
+
+    def step(
+        self, level: Level, settings: RasterSettings, rates: LearningRates, smooth: bool
+    ) -> float:
+        """See `step.TrainingStep`; the loss is that of LAG steps ago."""
+        with failures_told(len(self)):
+            known = id(level.means) in self._photographs
+            photograph = self._resident(level)
+            view = photograph.view(self.rasteriser, settings)
+            scene, room = self._drawn_scene(smooth), self._room if known else None
+            drawn = self.rasteriser.draw(scene, view, capacity=room)
+            if room is None:  # nothing of this photograph is known yet: it was waited for
+                room = len(drawn.lists.members)
+                self._room = max(self._room, int(SPARE * room))
+            target, means = photograph.target(drawn.image, settings.background)
+            loss, v_image = image_loss(drawn.image, target, means)
+            photograph.forget_ignored(v_image)
+            parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
+            self._adam(drawn, view, parameters, means2d, rates, room)
+            self._on_host = None
+            self._arrivals.send(torch.stack([loss.double(), drawn.lists.total[0].double()]))
+            value, wanted = self._arrivals.read()
+        if wanted > self._room:
+            self.skipped += 1
+            self._room = int(SPARE * wanted)
+        return value
+
+    def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
+        """See `step.TrainingStep`."""
+        view = self.rasteriser.view(camera, settings)
+        image = self.rasteriser.draw(self._drawn_scene(smooth), view).image
+        return np.ascontiguousarray(_host(image[:3]).transpose(1, 2, 0))
+
+    def _drawn_scene(self, smooth: bool) -> Scene:
+        widths = self._smoothing if smooth else self._unsmoothed
+        return Scene(self._scene.rows, self._scene.bands, widths)
+
+    def _resident(self, level: Level) -> Resident:
+        key = id(level.means)  # which stay the same object, however often a level is read
+        if key not in self._photographs:
+            self._photographs[key] = resident(level, self.device)
+        return self._photographs[key]
+
+    def _adam(
+        self,
+        drawn: Drawn,
+        view: View,
+        parameters: Tensor,
+        means2d: Tensor,
+        rates: LearningRates,
+        room: int,
+    ) -> None:
+        n, columns, out_columns = len(self), self._scene.rows.shape[1], parameters.shape[1]
+        if n == 0:
+            return
+        block = 4096 if interpreted() else 16
+        pixels = view.width * view.height
+        gpu_kernels.adam_kernel[(triton.cdiv(n, block),)](
+            *(self._scene.rows, self._moment1, self._moment2, self._steps, parameters, means2d),
+            *(drawn.keys, self._gradient_sum, self._gradient_count, self._corrections),
+            *(drawn.lists.total, room, n, rates.means, rates.quaternions, rates.log_scales),
+            *(rates.opacity_logits, rates.sh_dc, rates.sh_rest),
+            *(0.5 * view.width / pixels, 0.5 * view.height / pixels),
+            COLUMNS=columns,
+            OUT_COLUMNS=out_columns,
+            ACTIVE=active_counts(view.bands(self._scene)),
+            WIDTH=triton.next_power_of_2(out_columns),
+            BLOCK=block,
+        )
+
+    def _on_device(self, array: NDArray[Any]) -> Tensor:
+        return torch.tensor(array, device=self.device)
+
+
+def image_loss(
+    image: Tensor, target: Tensor, means: Tensor, ssim_weight: float = SSIM_WEIGHT
+) -> tuple[Tensor, Tensor]:
+    """(loss, a tensor of one number; gradient of H x W x loss [3, H, W]): see `loss.image_loss`.
+    target: bytes, or float32 in 0..1; all on one device."""
+    _, height, width = target.shape
+    like: dict[str, Any] = {"device": image.device}
+    block = 4096 if interpreted() else 256
+    grid = (triton.cdiv(3 * height * width, block),)
+    maps, slopes = (torch.empty(k, 3, height, width, **like) for k in (4, 3))
+    filtered, v_image = torch.empty_like(slopes), torch.empty(3, height, width, **like)
+    ssim, l1 = torch.empty(grid[0], **like), torch.empty(grid[0], **like)
+    size: tuple[Any, ...] = (width, height)
+    unit = 1 / 255 if target.dtype == torch.uint8 else 1.0
+    gpu_kernels.rows_kernel[grid](image, target, means, unit, maps, *size, BLOCK=block)
+    gpu_kernels.similarity_kernel[grid](maps, means, slopes, ssim, *size, BLOCK=block)
+    gpu_kernels.slope_rows_kernel[grid](slopes, filtered, *size, BLOCK=block)
+    gpu_kernels.loss_gradient_kernel[grid](
+        *(image, target, means, unit, filtered, v_image, l1, ssim_weight, *size), BLOCK=block
+    )
+    count = 3 * height * width
+    alike, apart = ssim.double().sum() / count, l1.double().sum() / count
+    return (1 - ssim_weight) * apart + ssim_weight * (1 - alike), v_image
+
+
+def _host(tensor: Tensor) -> NDArray[Any]:
+    found: NDArray[Any] = tensor.detach().cpu().numpy().copy()
+    return found

@@ -1,0 +1,120 @@
+"""Compiles every kernel for a GPU that is not here, and reads from the object what it would take.
+
+`python -m tests.raster.gpu_compile cuda:90` prints {kernel: {registers, spills, shared}} as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import triton
+import triton.language as tl
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from stages.raster.gpu import blend, gradients, lists, project
+from stages.training import gpu_kernels
+
+FLOATS, DOUBLES, INTS, LONGS, BYTES, SHORTS = "*fp32", "*fp64", "*i32", "*i64", "*i8", "*i16"
+POINTERS = {
+    **dict.fromkeys(("cam", "sums"), DOUBLES),
+    **dict.fromkeys(("members", "last", "counts", "row_of", "steps", "gradient_count"), INTS),
+    **dict.fromkeys(("starts", "slots", "firsts", "order", "settled", "ends", "total"), LONGS),
+    **dict.fromkeys(("status",), BYTES),
+    **dict.fromkeys(("target",), "*u8"),
+    **dict.fromkeys(("tile_of",), SHORTS),
+}
+WHOLE = ("n", "width", "height", "tiles_x", "tiles", "capacity", "entries", "room")
+REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y")
+SCENE = {"COLUMNS": 64, "STORED": 16, "BANDS": 16, "SMOOTH": False, "ANTIALIAS": False}
+SIZES = {"TILE": 16, "BLOCK": 128, "REAL": tl.float64, "OUT_COLUMNS": 64, "BITS": 20}
+KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
+    (project.project_kernel, {}, {}),
+    (lists.count_kernel, {}, {"enable_fp_fusion": False}),
+    (lists.entries_kernel, {}, {"enable_fp_fusion": False}),
+    (lists.ties_kernel, {}, {}),
+    (blend.blend_kernel, {"DEPTHS": False}, {"num_warps": 1}),
+    (blend.blend_gradient_kernel, {}, {"num_warps": 1}),
+    (blend.contribution_kernel, {}, {"num_warps": 1}),
+    (gradients.sum_kernel, {"WIDTH": 9, "BLOCK": 4, "LANES": 8}, {"num_warps": 1}),
+    (gradients.splat_gradient_kernel, {}, {}),
+    (gpu_kernels.rows_kernel, {"BLOCK": 256}, {}),
+    (gpu_kernels.similarity_kernel, {"BLOCK": 256}, {}),
+    (gpu_kernels.slope_rows_kernel, {"BLOCK": 256}, {}),
+    (gpu_kernels.loss_gradient_kernel, {"BLOCK": 256}, {}),
+    (gpu_kernels.adam_kernel, {"BLOCK": 16, "ACTIVE": 5, "WIDTH": 64}, {}),
+)
+
+
+def target_of(name: str) -> GPUTarget:
+    """ "cuda:90" or "hip:gfx942"."""
+    backend, arch = name.split(":")
+    return GPUTarget(
+        backend, int(arch) if backend == "cuda" else arch, 32 if arch != "gfx942" else 64
+    )
+
+
+def compiled(kernel: Any, constants: dict[str, Any], options: dict[str, Any], target: str) -> Any:
+    """The kernel as a device of this kind would get it; pointers aligned, as torch's are."""
+    known = {**SCENE, **SIZES, **constants}
+    signature, values, attributes = {}, {}, {}
+    for at, parameter in enumerate(kernel.params):
+        name = parameter.name
+        if parameter.is_constexpr:
+            signature[name], values[(at,)] = "constexpr", known[name]
+        elif name in WHOLE:
+            signature[name] = "i32"
+        elif name in REALS or name.startswith("rate_"):
+            signature[name] = "fp32"
+        else:
+            signature[name] = POINTERS.get(name, FLOATS)
+            attributes[(at,)] = [["tt.divisibility", 16]]
+    source = ASTSource(kernel, signature, values, attributes)
+    return triton.compile(source, target=target_of(target), options=options)
+
+
+def resources(made: Any) -> dict[str, int]:
+    """{registers, spills (bytes of local memory), shared (bytes)} of a compiled kernel."""
+    if "cubin" in made.asm:
+        return {**_of_cubin(made.asm["cubin"]), "shared": int(made.metadata.shared)}
+    text = made.asm["amdgcn"]
+
+    def entry(name: str) -> int:
+        found = re.search(rf"\.{name}:\s+(\d+)", text)
+        return int(found[1]) if found else -1
+
+    return {
+        "registers": entry("vgpr_count"),
+        "spills": entry("vgpr_spill_count"),
+        "shared": entry("group_segment_fixed_size"),
+    }
+
+
+def _of_cubin(cubin: bytes) -> dict[str, int]:
+    tool = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(cubin)
+        file.flush()
+        told = subprocess.run(
+            [str(tool), "-res-usage", file.name], capture_output=True, text=True, check=True
+        )
+    text = told.stdout + told.stderr
+    numbers = {name: int(value) for name, value in re.findall(r"(REG|STACK|LOCAL):(\d+)", text)}
+    return {"registers": numbers["REG"], "spills": numbers["STACK"] + numbers["LOCAL"]}
+
+
+def main(target: str) -> None:
+    found = {}
+    for kernel, constants, options in KERNELS:
+        found[kernel.__name__] = resources(compiled(kernel, constants, options, target))
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,242 @@
+"""The GPU's kernels against the definition: on a GPU where there is one, else interpreted, on
+scenes small enough for that."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("triton")
+
+from stages.base.errors import SplatError
+from stages.raster import backends
+from stages.raster.backends import backend_of, rasteriser_of
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.gpu import device
+from stages.raster.gpu.rasteriser import GpuRasteriser
+from stages.raster.reference_rasteriser import ReferenceRasteriser
+from tests import processes
+from tests.extremes.table import ROWS, measured
+from tests.raster import test_contributions, test_reference_laws, test_smoothing
+from tests.raster import test_worked_examples as worked
+from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
+from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
+
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
+TARGETS = ("cuda:80", "cuda:90", "cuda:100", "hip:gfx942")
+# Rows of the extremes table that the interpreter does in seconds. On a GPU all are done.
+LIGHT_ROWS = (1, 2, 5, 6, 7, 9, 10, 13, 14, 15)
+LIGHT_LAWS = (
+    test_reference_laws.test_hidden_splats_do_not_change_the_picture,
+    test_reference_laws.test_two_halves_of_a_picture_are_the_picture,
+    test_smoothing.test_splats_of_no_size_under_the_filter_leave_all_finite,
+    test_contributions.test_against_its_own_picture_no_splat_is_better_gone,
+    test_contributions.test_a_worked_pixel,
+    worked.test_twice_the_depth_halves_the_footprint,
+    worked.test_three_sigma_is_drawn_and_worth_its_gaussian,
+    worked.test_median_depth_is_where_half_of_the_light_is_gone,
+)
+
+
+@pytest.fixture(autouse=True)
+def poisoned_memory() -> Iterator[None]:
+    """What memory held before must not matter: torch hands it out full of NaN."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("tile", [16, 32])
+@pytest.mark.parametrize(("size", "antialias"), [((1, 1), False), ((47, 33), True)])
+def test_pictures_and_every_gradient_agree(size, antialias, tile):
+    scene, view = cloud(60, size[0], size[1], 3), camera(*size)
+    settings = RasterSettings(background=(0.2, 0.5, 0.9), antialias=antialias)
+    arrays = splat_arrays(scene)
+    found, wanted = GpuRasteriser(tile), ReferenceRasteriser()
+    a = found.forward(arrays, view, settings, depths=True)
+    b = wanted.forward(arrays, view, settings, depths=True)
+    np.testing.assert_allclose(a.image[:4], b.image[:4], atol=FLOAT32_IMAGE)
+    np.testing.assert_allclose(a.image[4], b.image[4], atol=10 * FLOAT32_IMAGE)
+    assert np.isclose(a.image[5], b.image[5], atol=10 * FLOAT32_IMAGE).mean() > 0.999
+    np.testing.assert_array_equal(a.visible, b.visible)
+    v = np.random.default_rng(1).normal(size=(3, size[1], size[0])).astype(np.float32)
+    g, h = found.backward(arrays, a, v), wanted.backward(arrays, b, v)
+    np.testing.assert_array_equal(g.rows, h.rows)
+    for first, end in ((0, 3), (3, 7), (7, 10), (10, 11), (11, 59)):
+        assert relative(g.parameters[:, first:end], h.parameters[:, first:end]) < FLOAT32_GRADIENT
+    assert relative(g.means2d, h.means2d) < FLOAT32_GRADIENT
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_gradients_of_an_active_degree_leave_higher_bands_alone(degree):
+    scene, view = cloud(30, 24, 20, degree=2), camera(24, 20)
+    v = np.random.default_rng(1).normal(size=(20, 24, 3)).astype(np.float32)
+    settings = RasterSettings(sh_degree=degree)
+    found = gradients("gpu", scene, view, v, settings)
+    wanted = exact_gradients(scene, view, v, settings)
+    assert not found["sh"][:, (degree + 1) ** 2 :].any()
+    for name in PARAMETERS:
+        assert relative(found[name], wanted[name]) < FLOAT32_GRADIENT, name
+
+
+def test_contributions_agree():
+    scene, view = cloud(50, 40, 30, degree=1), camera(40, 30)
+    residual = np.random.default_rng(2).normal(size=(3, 30, 40)).astype(np.float32)
+    made = []
+    for rasteriser in (rasteriser_of("gpu"), rasteriser_of("reference")):
+        forward = rasteriser.forward(splat_arrays(scene), view, SETTINGS)
+        made.append(rasteriser.contributions(forward, residual))
+    for column in range(3):
+        assert relative(made[0][:, column], made[1][:, column]) < FLOAT32_GRADIENT
+
+
+def test_the_same_twice_is_the_same_bytes():
+    scene, view = cloud(40, 40, 30, degree=1), camera(40, 30)
+    v = np.random.default_rng(1).normal(size=(3, 30, 40)).astype(np.float32)
+    made = []
+    for _ in range(2):
+        rasteriser = GpuRasteriser(16)
+        forward = rasteriser.forward(splat_arrays(scene), view, SETTINGS)
+        backward = rasteriser.backward(splat_arrays(scene), forward, v)
+        made.append((forward.image.tobytes(), backward.parameters.tobytes()))
+    assert made[0] == made[1]
+
+
+def test_equal_depths_are_drawn_in_the_order_of_their_values():
+    scene = cloud(30, 40, 30)
+    scene.means[:, 2] = 3.0
+    scene.means[:15, :2] = scene.means[15:, :2]  # so that opacities decide
+    order = np.random.default_rng(3).permutation(30)
+    view = camera(40, 30)
+    images = [
+        GpuRasteriser(16).forward(splat_arrays(s), view, SETTINGS).image
+        for s in (scene, scene.take(order))
+    ]
+    wanted = ReferenceRasteriser().forward(splat_arrays(scene), view, SETTINGS).image
+    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_allclose(images[0], wanted, atol=FLOAT32_IMAGE)
+
+
+def test_lists_without_room_draw_what_they_hold_and_say_how_much_it_was():
+    scene, view = cloud(40, 40, 30), camera(40, 30)
+    rasteriser = GpuRasteriser(16)
+    on_device, seen = rasteriser.scene(splat_arrays(scene)), rasteriser.view(view, SETTINGS)
+    whole = rasteriser.draw(on_device, seen)
+    some = rasteriser.draw(on_device, seen, capacity=10)
+    roomy = rasteriser.draw(on_device, seen, capacity=1000)
+    assert int(whole.lists.total) == int(some.lists.total) == len(whole.lists.members) > 10
+    assert bool(some.image.isfinite().all())
+    assert torch.equal(whole.image, roomy.image)
+
+
+def parameters_of(law):
+    return set(inspect.signature(law).parameters)
+
+
+@pytest.mark.parametrize("law", LIGHT_LAWS, ids=lambda law: law.__name__[5:])
+def test_what_holds_for_every_backend(law):
+    assert parameters_of(law) == {"backend"}
+    law("gpu")
+
+
+def rows():
+    for row in ROWS:
+        if row.measure is None or row.backends == ("cpu",) or row.name == "every_format":
+            continue
+        marks = [pytest.mark.skipif(device.interpreted(), reason="minutes, interpreted")]
+        yield pytest.param(row, id=row.name, marks=[] if row.number in LIGHT_ROWS else marks)
+
+
+@pytest.mark.parametrize("row", list(rows()))
+def test_every_number_of_the_table_is_within_its_bound(row):
+    beyond = [m for m in measured(row, "gpu") if not m.accepted]
+    assert not beyond, "\n".join(f"{m.what}: {m.error:.3g} > {m.bound:.3g}" for m in beyond)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("target", TARGETS)
+def test_every_kernel_compiles_within_its_registers(target):
+    """For a GPU that is not here. A warp of blending keeps at most 128 registers a thread, so that
+    16 of them live on a multiprocessor; nothing spills anywhere."""
+    told = subprocess.run(
+        processes.module("tests.raster.gpu_compile", target),
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "TRITON_INTERPRET": "0"},
+    )
+    assert told.returncode == 0, told.stderr[-2000:]
+    found = json.loads(told.stdout)
+    assert len(found) == 14
+    for name, taken in found.items():
+        assert taken["spills"] == 0, (name, taken)
+        assert taken["shared"] <= 16 * 1024, (name, taken)
+    for name in ("blend_kernel", "blend_gradient_kernel"):
+        assert found[name]["registers"] <= 128, (name, found[name])
+
+
+def test_auto_passes_the_interpreter_over_and_says_why(monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert backend_of("auto").name == "cpu"
+    assert "interpreter" in backends.BACKENDS[0].why_not()
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("no_triton", "Triton is not installed"),
+        ("cpu_build", "built for the CPU alone"),
+        ("no_card", "no GPU found"),
+        ("old_card", "too old"),
+        ("no_compiler", "no C compiler"),
+        ("", ""),
+    ],
+)
+def test_what_is_missing_is_named(fault, said, monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setenv("CC", "" if fault == "no_compiler" else "cc")
+    monkeypatch.setattr(torch.version, "cuda", None if fault == "cpu_build" else "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: fault != "no_card")
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Old Card")
+    old = (5, 2) if fault == "old_card" else (9, 0)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: old)
+    if fault == "no_triton":
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    if fault == "no_compiler":
+        monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert said in device.missing()
+    assert bool(device.missing()) == bool(said)
+    assert backend_of("auto").name == ("cpu" if said else "gpu")
+    if said:
+        with pytest.raises(SplatError, match=said) as told:
+            device.require()
+        assert told.value.code == "raster-no-gpu"
+        assert "--backend cpu" in told.value.hint
+
+
+def test_memory_that_runs_out_names_the_cap_that_would_fit():
+    with pytest.raises(SplatError) as told, device.failures_told(1_000_000):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+    assert told.value.code == "raster-gpu-memory"
+    assert "--max-splats 500000" in told.value.hint
+    full = device.out_of_memory(1_000_000, free=0, held=4 << 30, total=8 << 30)
+    assert "About 400,000 would fit" in full.wanted
+
+
+def test_a_gpu_that_is_busy_is_named():
+    said = "CUDA error: all CUDA-capable devices are busy or unavailable"
+    with pytest.raises(SplatError, match="busy or unavailable") as told, device.failures_told(1):
+        raise RuntimeError(said)
+    assert told.value.code == "raster-gpu-failed"
+    with pytest.raises(RuntimeError, match="shape"), device.failures_told(1):
+        raise RuntimeError("shape")

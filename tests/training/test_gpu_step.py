@@ -1,0 +1,166 @@
+"""A training step on the GPU (or interpreted): what it leaves, and that it does not wait."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("triton")
+
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.gpu.rasteriser import GpuRasteriser
+from stages.raster.reference_rasteriser import ReferenceRasteriser
+from stages.scene import IGNORE, TRANSPARENT
+from stages.training import gpu_step
+from stages.training.gpu_step import GpuStep, image_loss
+from stages.training.loss import channel_means
+from stages.training.optimiser import LearningRates, Model, new_model
+from stages.training.plain_step import PlainStep, photograph_loss
+from stages.training.views import Level
+from tests.scenes import camera, cloud
+from tests.tolerances import LOSS_GRADIENT
+
+RATES = LearningRates(means=1e-3)
+SETTINGS = RasterSettings(near=0.1, sh_degree=1)
+WAITS = ("item", "cpu", "numpy", "tolist", "nonzero", "__bool__", "__int__", "__float__")
+
+
+def level(size=(40, 30), seed=0) -> Level:
+    pixels = np.random.default_rng(seed).integers(0, 256, (3, size[1], size[0])).astype(np.uint8)
+    return Level(camera(*size), pixels, channel_means(pixels))
+
+
+def masked(outside: str, light: tuple[float, float, float] | None) -> Level:
+    plain = level()
+    mask = np.where(np.arange(40) < 25, 255, 0).astype(np.uint8)[None] * np.ones((30, 1), np.uint8)
+    return Level(plain.camera, plain.pixels, plain.means, mask, outside, light)
+
+
+def start(n=20) -> Model:
+    return new_model(*(a.copy() for a in splat_arrays(cloud(n, 40, 30, degree=1, seed=4))))
+
+
+def stepper(lag: int | None = None) -> GpuStep:
+    made = GpuStep(GpuRasteriser(), lag)
+    made.load(start())
+    return made
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_two_steps_leave_what_the_definition_leaves(degree):
+    settings = RasterSettings(near=0.1, sh_degree=degree)
+    plain = PlainStep(ReferenceRasteriser())
+    plain.load(start())
+    found = stepper()
+    for _ in range(2):
+        losses = [s.step(level(), settings, RATES, smooth=False) for s in (found, plain)]
+        assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    for name, wanted in vars(plain.model()).items():
+        here = getattr(found.model(), name)
+        assert here.shape == wanted.shape
+        assert here.dtype == wanted.dtype
+        np.testing.assert_allclose(here, wanted, atol=2e-5 * max(np.abs(wanted).max(), 1e-9))
+
+
+@pytest.mark.parametrize(
+    ("outside", "light"),
+    [(IGNORE, None), (TRANSPARENT, (0.3, -0.2, 0.1)), (IGNORE, (0.3, -0.2, 0.1))],
+)
+def test_masks_and_light_ask_what_the_definition_asks(outside, light):
+    settings = RasterSettings(near=0.1, sh_degree=0, background=(0.2, 0.9, 0.4))
+    plain, found = PlainStep(ReferenceRasteriser()), stepper()
+    plain.load(start())
+    photograph = masked(outside, light)
+    losses = [s.step(photograph, settings, RATES, smooth=False) for s in (found, plain)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    wanted = plain.model().moment1
+    np.testing.assert_allclose(found.model().moment1, wanted, atol=2e-5 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 3), (47, 33)])
+def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
+    photograph = level(size)
+    image = np.random.default_rng(1).random((4, size[1], size[0])).astype(np.float32)
+    target, means = torch.from_numpy(photograph.pixels), torch.from_numpy(photograph.means)
+    where = GpuRasteriser().device
+    drawn = torch.from_numpy(image).to(where)
+    found, gradient = image_loss(drawn, target.to(where), means.to(where))
+    exact = torch.tensor(image[:3], dtype=torch.float64, requires_grad=True)
+    wanted = photograph_loss(exact, target.double() / 255)
+    torch.autograd.backward(size[0] * size[1] * wanted)
+    assert exact.grad is not None
+    assert float(found) == pytest.approx(float(wanted.detach()), abs=1e-6)
+    top = float(exact.grad.abs().max())
+    apart = float((gradient.cpu() - exact.grad).abs().max())
+    assert apart <= LOSS_GRADIENT * top
+
+
+def test_a_steady_step_never_waits_for_the_device(monkeypatch):
+    made, seen = stepper(lag=2), level()
+    for _ in range(4):
+        made.step(seen, SETTINGS, RATES, smooth=False)
+    waits: Counter[str] = Counter()
+
+    def counting(name, kept):
+        def counted(self, *args, **kwargs):
+            waits[name] += 1
+            return kept(self, *args, **kwargs)
+
+        return counted
+
+    for name in WAITS:
+        monkeypatch.setattr(torch.Tensor, name, counting(name, getattr(torch.Tensor, name)))
+    if made.device.type == "cuda":
+        torch.cuda.set_sync_debug_mode("error")
+    try:
+        made.step(seen, SETTINGS, RATES, smooth=False)
+    finally:
+        if made.device.type == "cuda":
+            torch.cuda.set_sync_debug_mode("default")
+    assert not waits
+    made.model()
+    assert waits["cpu"] > 0  # the counter counts
+
+
+def test_a_photograph_that_is_read_anew_is_sent_once(monkeypatch):
+    made, seen = stepper(), level()
+    made.step(seen, SETTINGS, RATES, smooth=False)
+    sent = []
+    monkeypatch.setattr(gpu_step, "resident", lambda *given: sent.append(given))
+    made.step(replace(seen, pixels=seen.pixels.copy()), SETTINGS, RATES, smooth=False)
+    assert not sent
+
+
+def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
+    made, seen = stepper(lag=1), level()
+    for _ in range(2):
+        made.step(seen, SETTINGS, RATES, smooth=False)
+    before, made._room = made.model(), 1
+    made.step(seen, SETTINGS, RATES, smooth=False)  # has no room, which arrives one step later
+    for name, kept in vars(made.model()).items():
+        np.testing.assert_array_equal(kept, getattr(before, name))
+    made.step(seen, SETTINGS, RATES, smooth=False)
+    assert made.skipped == 1
+    assert made._room > 1
+    made.step(seen, SETTINGS, RATES, smooth=False)
+    assert (made.model().steps > before.steps).any()
+
+
+def test_a_model_moves_between_backends_whole():
+    """As a checkpoint of one backend that another goes on with."""
+    made = stepper()
+    made.step(level(), SETTINGS, RATES, smooth=False)
+    model = made.model()
+    other = GpuStep(GpuRasteriser())
+    other.load(model)
+    other._on_host = None  # so that it comes from the device
+    for name, kept in vars(model).items():
+        np.testing.assert_array_equal(getattr(other.model(), name), kept)
+    plain = PlainStep(ReferenceRasteriser())
+    plain.load(other.model())
+    losses = [s.step(level(), SETTINGS, RATES, smooth=False) for s in (made, plain)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
