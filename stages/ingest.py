@@ -310,4 +310,4 @@ def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatEr
     )
 
 
-STAGE = Stage(name="ingest", version=4, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=5, reads=(), settings_type=IngestSettings, run=run, load=load)

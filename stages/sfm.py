@@ -69,7 +69,8 @@ class SfmSettings:
         default=None,
         metadata={
             "help": "File or folder of cameras that are known already, of COLMAP, nerfstudio, a "
-            "synthetic NeRF scene, LLFF, OpenSfM, Bundler or Metashape: nothing is searched.",
+            "synthetic NeRF scene, LLFF, OpenSfM, Bundler, Metashape or RealityScan: nothing "
+            "is searched.",
             "affects_output": False,  # its content does, which is an input
         },
     )

@@ -6,7 +6,7 @@ import importlib
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
 _BACKEND_ADVICE = "docs/gpu.md says what it takes."
+_VIDEO_CODECS = ("h264", "hevc", "av1", "vp9", "vp8", "mpeg4", "prores", "mjpeg", "gif")
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ def checks() -> Iterator[Check]:
     yield _disk()
     yield _kernel_cache()
     yield _gpu()
+    yield _readable("photographs", _photograph_formats)
+    yield _readable("videos", _video_codecs)
+    yield _readable("cameras", _camera_files)
     for backend in BACKENDS:
         yield _backend(backend)
     yield Check("--backend auto", backend_of(AUTO).name)
@@ -106,6 +110,36 @@ def _kernel_cache() -> Check:
         return Check("kernel cache", value)
     except Exception as error:  # no place to write to, or no Numba
         return Check("kernel cache", _said(error), ok=False)
+
+
+def _readable(what: str, names: Callable[[], list[str]]) -> Check:
+    """What can be read on this machine: libraries are built with more or less."""
+    label = f"{what} read"
+    try:
+        return Check(label, ", ".join(names()))
+    except Exception as error:  # of a library that is missing or broken
+        return Check(label, _said(error), ok=False)
+
+
+def _photograph_formats() -> list[str]:
+    from PIL import Image
+
+    from stages.photos.decode import FORMATS, readers_set_up
+
+    with readers_set_up():
+        return [name for name in FORMATS if name in Image.OPEN]
+
+
+def _video_codecs() -> list[str]:
+    import av
+
+    return [name for name in _VIDEO_CODECS if name in av.codecs_available]
+
+
+def _camera_files() -> list[str]:
+    from stages.cameras.table import CAMERA_FILES
+
+    return [row.what for row in CAMERA_FILES]
 
 
 def _backend(backend: Backend) -> Check:

@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, FilePoints, make_views
+from stages.cameras.camera_file import (
+    CameraFile,
+    FilePoints,
+    make_views,
+    size_of_picture,
+)
 from stages.cameras.lens import Lens
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
@@ -34,7 +39,9 @@ def read(path: Path) -> CameraFile:
         placed = cameras[:, 0] != 0  # a focal length of 0 is Bundler's word for one that was not
         names = [name for name, there in zip(names, placed, strict=True) if there]
         cameras = cameras[placed]
-        sizes = np.array([_size(path.parent, name) for name in names], np.float64).reshape(-1, 2)
+        sizes = np.array(
+            [size_of_picture(path.parent, name) for name in names], np.float64
+        ).reshape(-1, 2)
         lens = np.concatenate([cameras[:, :1], cameras[:, :1], sizes / 2], axis=1)
         with np.errstate(all="ignore"):
             rotations = OPENGL_FROM_OURS @ cameras[:, 3:12].reshape(-1, 3, 3)
@@ -86,13 +93,3 @@ def _names(path: Path) -> list[str]:
         raise BadFileError(f"no list of pictures (list.txt) lies beside {path.name}")
     lines = found.read_text(encoding="utf-8").splitlines()
     return [line.split()[0] for line in lines if line.strip()]
-
-
-def _size(folder: Path, name: str) -> tuple[int, int]:
-    from PIL import Image
-
-    for place in (folder, folder / "images", folder.parent, folder.parent / "images"):
-        if (place / name).is_file():
-            with Image.open(place / name) as picture:
-                return picture.size
-    raise BadFileError(f"{name[:80]} is not there, and its size is needed")

@@ -89,6 +89,18 @@ def make_views(
     )
 
 
+def size_of_picture(folder: Path, name: str) -> tuple[int, int]:
+    """(width, height) of a picture near a file of cameras in `folder` that does not say it. Raises
+    BadFileError."""
+    from PIL import Image
+
+    for place in (folder, folder / "images", folder.parent, folder.parent / "images"):
+        if (place / name).is_file():
+            with Image.open(place / name) as picture:
+                return picture.size
+    raise BadFileError(f"{name[:80]} is not there, and its size is needed")
+
+
 def _refuse(names: Sequence[str], bad: Any, wanted: str) -> None:
     if bad.any():
         raise BadFileError(f"camera {names[int(np.argmax(bad))][:80]!r} lacks {wanted}")

@@ -32,6 +32,7 @@ CAMERA_FILES = (
     CameraFormat("llff", "LLFF's poses_bounds.npy"),
     CameraFormat("bundler", "Bundler's .out"),
     CameraFormat("metashape", "Metashape's cameras as .xml"),
+    CameraFormat("realityscan", "RealityScan's camera parameters as .csv"),
 )
 _READ_WITH_IT = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cameras
 

@@ -13,7 +13,7 @@ from stages.base.errors import Family, SplatError
 from stages.scene import Capture, Photo
 
 FILE = "capture.json"
-_SCHEMA = 3
+_SCHEMA = 4
 _TYPES: dict[str, tuple[type, ...]] = {
     "name": (str,),
     "image": (str,),

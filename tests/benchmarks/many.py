@@ -15,7 +15,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sample_captures.make import HERE
 from stages.base.memory import PeakMemory, resident_mib
@@ -43,12 +42,13 @@ def pictures(folder: Path) -> list[str]:
 
 
 @functools.cache
-def _decoded(folder: Path, image: str, width: int, height: int) -> NDArray[np.uint8]:
-    return load_photograph(folder, image, image, camera(width, height)).pixels
+def _decoded(folder: Path, image: str, width: int, height: int) -> Photograph:
+    where = camera(width, height)
+    return load_photograph(folder, View(image, image, where), where)
 
 
-def _decoded_once(folder: Path, name: str, image: str, where: Camera) -> Photograph:
-    return Photograph(name, where, _decoded(folder, image, where.width, where.height))
+def _decoded_once(folder: Path, view: View, where: Camera) -> Photograph:
+    return _decoded(folder, view.image, where.width, where.height)
 
 
 def main() -> None:

@@ -229,7 +229,34 @@ def metashape(folder: Path) -> Path:
     return folder / "cameras.xml"
 
 
+def realityscan(folder: Path) -> Path:
+    """As nerfstudio and rc2nerf read it: heading and pitch of the picture's top, clockwise from
+    north and above the horizon; roll about it; the lens in units of a 36 mm wide picture."""
+    rows, projects = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"], []
+    unit = 36 / max(WIDTH, HEIGHT)
+    for name, pose in zip(NAMES, POSES, strict=True):
+        right, down, ahead, eye = np.linalg.inv(pose)[:3].T
+        pitch, heading = np.arcsin(-down[2]), np.arctan2(-down[0], -down[1])
+        roll = np.arctan2(-right[2], -ahead[2])
+        turns = np.degrees([heading, pitch, roll])
+
+        def project(points: NDArray[np.float64], pose: NDArray = pose) -> NDArray[np.float64]:
+            at = points @ pose[:3, :3].T + pose[:3, 3]
+            x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
+            r2 = x * x + y * y
+            radial = 1 + K1 * r2 + K2 * r2 * r2
+            return np.stack([163 + FOCAL * x * radial, 117 + FOCAL * y * radial], axis=1)
+
+        projects.append(project)
+        lens = [FOCAL * unit, 3 * unit, -3 * unit, K1, K2, 0, 0, 0, 0]
+        rows.append(",".join([name, *map(repr, map(float, [*eye, *turns, *lens]))]))
+    draw(folder / "images", projects)
+    (folder / "cameras.csv").write_text("\ufeff" + "\r\n".join(rows) + "\r\n", encoding="utf-8")
+    return folder / "cameras.csv"
+
+
 MADE = {
+    "realityscan": realityscan,
     "metashape": metashape,
     "colmap": colmap,
     "nerfstudio": nerfstudio,

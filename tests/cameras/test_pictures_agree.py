@@ -102,6 +102,7 @@ def _cut(path: Path) -> None:
         ("opensfm", "reconstruction.json"),
         ("bundler", "bundle.out"),
         ("metashape", "cameras.xml"),
+        ("realityscan", "cameras.csv"),
     ],
 )
 def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:

@@ -26,6 +26,14 @@ def test_every_dependency_is_looked_at_and_the_kernel_cache_told() -> None:
     assert found["kernel cache"]["value"].startswith(f"{cache.folder()}, ")
 
 
+def test_what_can_be_read_is_told() -> None:
+    found = checks()
+    assert {"JPEG", "PNG", "HEIF"} <= set(found["photographs read"]["value"].split(", "))
+    assert {"h264", "hevc"} <= set(found["videos read"]["value"].split(", "))
+    assert "RealityScan" in found["cameras read"]["value"]
+    assert "COLMAP" in found["cameras read"]["value"]
+
+
 def test_a_library_that_is_missing_or_broken_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "needed", lambda: ("no-such-distribution", "plyfile"))
     monkeypatch.setattr(doctor, "modules_of", lambda n: ("wave_of_none",) if n == "plyfile" else ())

@@ -11,7 +11,16 @@ from types import ModuleType
 
 import numpy as np
 
-from stages.cameras import blender, bundler, colmap, llff, metashape, nerfstudio, opensfm
+from stages.cameras import (
+    blender,
+    bundler,
+    colmap,
+    llff,
+    metashape,
+    nerfstudio,
+    opensfm,
+    realityscan,
+)
 from stages.scene import Camera, View
 from tests.cameras import drawn
 from tests.cameras.models import example
@@ -110,6 +119,7 @@ LAYERS = {
     "poses_bounds.npy": _other(llff, "poses_bounds.npy", text=False),
     "OpenSfM reconstruction.json": _other(opensfm, "reconstruction.json"),
     "Metashape cameras.xml": _other(metashape, "cameras.xml"),
+    "RealityScan cameras.csv": _other(realityscan, "cameras.csv"),
     "Bundler bundle.out": _other(bundler, "bundle.out"),
     "Bundler list.txt": replace(_other(bundler, "list.txt"), read=_bundle_of_list),
     "transforms.json": Layer(

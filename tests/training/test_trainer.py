@@ -386,9 +386,9 @@ def test_pictures_on_disk_train_to_the_same_bytes_as_pictures_in_memory(tmp_path
         )
         for view in stored
     ]
-    models = [
-        trainer(chosen, scene.splats, 12, tmp_path / name).run(scene.splats)
-        for name, chosen in (("a", stored), ("b", held))
-    ]
+    models = []
+    for name, chosen in (("a", stored), ("b", held)):
+        (tmp_path / name).mkdir()
+        models.append(trainer(chosen, scene.splats, 12, tmp_path / name).run(scene.splats))
     for one, other in zip(models[0].arrays, models[1].arrays, strict=True):
         assert one.tobytes() == other.tobytes()

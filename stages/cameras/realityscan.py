@@ -1,0 +1,84 @@
+"""RealityScan's (RealityCapture's) "Internal/External camera parameters" as .csv.
+
+z is up. Heading, pitch and roll in degrees: a camera at 0, 0, 0 looks straight down, the top of its
+picture to the north (+y); heading and pitch say where that top points, clockwise from north and
+above the horizon, and roll turns the camera about it. f, px and py are of a picture whose longer
+side is 36 wide, the principal point from the middle. k1 to k4, t1 and t2 are taken as OpenCV's.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.cameras.camera_file import CameraFile, make_views, size_of_picture
+from stages.cameras.lens import Lens
+from stages.cameras.nerfstudio import OPENGL_FROM_OURS
+
+_WIDTH = 36.0  # of the longer side, in the file's own measure
+_NEEDED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
+_OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+
+
+def recognised(path: Path) -> Path | None:
+    """The path itself, if it is a .csv file."""
+    return path if path.suffix.lower() == ".csv" else None
+
+
+def read(path: Path) -> CameraFile:
+    """The cameras of all rows; their pictures lie beside the file, or in images/ there. Raises
+    SplatError "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        rows = _rows(path)
+        names = [row["name"] for row in rows]
+        found = np.array([[float(row[key]) for key in _NEEDED] for row in rows], np.float64)
+        lens = np.array([[float(row.get(key) or 0) for key in _OPTIONAL] for row in rows])
+        if not (np.isfinite(found).all() and np.isfinite(lens).all()):
+            raise BadFileError("it holds a value that is not a number")
+        sizes = np.array([size_of_picture(path.parent, name) for name in names], np.float64)
+        scale = sizes.max(axis=1, keepdims=True) / _WIDTH
+        centres = sizes / 2 + lens[:, :2] * scale
+        focal = found[:, 6:] * scale
+        rotations = np.array([_world_to_camera(*row) for row in np.radians(found[:, 3:6])])
+        with np.errstate(all="ignore"):
+            shifts = -np.einsum("vij,vj->vi", rotations, found[:, :3])
+        poses = np.concatenate([rotations, shifts[:, :, None]], axis=2)
+        views = make_views(names, sizes, np.hstack([focal, focal, centres]), poses)
+        lenses = tuple(
+            Lens(radial=tuple(row[2:6].tolist()), tangential=(float(row[6]), float(row[7])))
+            for row in lens
+        )
+        return CameraFile(views, path.parent, lenses)
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    text = path.read_bytes().decode("utf-8-sig")
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    columns = [column.strip().lstrip("#").lower() for column in reader.fieldnames or ()]
+    reader.fieldnames = columns
+    missing = [key for key in ("name", *_NEEDED) if key not in columns]
+    if missing:
+        raise BadFileError(f"it has no column {missing[0]!r}")
+    try:
+        rows = [row for row in reader if row["name"]]
+    except csv.Error as error:
+        raise BadFileError(f"it is damaged ({error})") from error
+    if any(None in row or None in row.values() for row in rows):
+        raise BadFileError("a row breaks off")
+    if not rows:
+        raise BadFileError("it holds no camera")
+    return rows
+
+
+def _world_to_camera(heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """[3, 3], with our axes of the camera."""
+    (sh, sp, sr), (ch, cp, cr) = np.sin([-heading, pitch, roll]), np.cos([-heading, pitch, roll])
+    about_z = np.array([[ch, -sh, 0], [sh, ch, 0], [0, 0, 1]])
+    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    about_y = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
+    return np.asarray(OPENGL_FROM_OURS @ (about_z @ about_x @ about_y).T)
