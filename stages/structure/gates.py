@@ -113,7 +113,8 @@ _UNIQUE = "Everything must stay where it is, and look the same nowhere else."
 _APART = (
     "If the subject was turned or moved between photographs, put those before and those after into "
     "folders of their own, or hide everything else by masks; if the same picture or pattern is "
-    "there twice, hide one of the two."
+    "there twice, hide one of the two. If the arrangement is right all the same, --allow-partial "
+    "goes on with it."
 )
 
 

@@ -17,7 +17,8 @@ from stages.structure.job import Job
 from stages.structure.sparse_model import SparseModel, save_model
 from stages.structure.ticks import Ticks
 
-CREDIBLE_POINTS = 20  # a photograph, of a model that may contradict a larger one
+# Of a smaller model that may contradict the largest.
+CREDIBLE_VIEWS, CREDIBLE_SHARE, CREDIBLE_POINTS = 4, 0.1, 20  # points: for each view
 SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without a word
 MOST_MODELS = 8
 LOOSE_INLIERS = 15
@@ -137,7 +138,7 @@ def _plain(
     points = [model.points3D[point_id] for point_id in point_ids]
     seen = observations(model, points, position)
     pairs = _pairs(Path(job.database), model, position)
-    turns = [_turn_between(model, other) for other in others if _credible(other)]
+    turns = [_turn_between(model, other) for other in others if _credible(other, model)]
     cameras = [
         model.cameras[camera_id + 1]
         for camera_id in range(len(job.cameras))
@@ -163,9 +164,11 @@ def _plain(
     )
 
 
-def _credible(model: pycolmap.Reconstruction) -> bool:
+def _credible(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> bool:
     """Whether a smaller model is more than a few photographs that happened to fit."""
-    return model.num_points3D() >= CREDIBLE_POINTS * model.num_reg_images() >= 4 * CREDIBLE_POINTS
+    views = other.num_reg_images()
+    enough = max(CREDIBLE_VIEWS, CREDIBLE_SHARE * model.num_reg_images())
+    return views >= enough and other.num_points3D() >= CREDIBLE_POINTS * views
 
 
 def _turn_between(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> float | None:
