@@ -84,7 +84,7 @@ class TrainSettings:
     backend: str = backend_setting()
 
 
-MIN_TO_LEND = 16  # photographs: of fewer, each is missed more than the advice is worth
+MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
@@ -122,7 +122,11 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     save_splats(folder, splats)
     remove_checkpoint(folder)
     forget_cap(folder)
-    report.metric("steps", settings.steps)
+    report.metric("steps", trainer.schedule.steps)
+    report.metric("photographs_lent", len(trainer.lent))
+    report.metric("learnt_by_heart", trainer.by_heart)
+    if trainer.ended:
+        report.metric("ended_early", trainer.ended)
     report.metric("splats", len(splats))
     if len(splats) >= 0.98 * trainer.cap:
         report.warn(
@@ -185,13 +189,13 @@ def make_trainer(
         report=report,
         smooth=settings.smooth,
         backend=settings.backend,
-        lent=lent_rows(len(train)) if settings.patience else (),
+        lent=lent_rows(len(train)),
         patience_db=settings.patience,
     )
 
 
 def lent_rows(n: int) -> tuple[int, ...]:
-    """Which of `n` training photographs decide when training settles: of every eight the fifth, so
+    """Which of `n` training photographs decide until training settles: of every eight the fifth, so
     that they lie between the judges; none where there are too few to lend one."""
     return tuple(range(4, n, 8)) if n >= MIN_TO_LEND else ()
 
@@ -315,5 +319,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="train", version=7, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=8, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

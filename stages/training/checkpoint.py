@@ -23,12 +23,14 @@ MAGIC = b"SPLATCP4"
 class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
     done by then), see `schedule.Schedule`. history: as logged. marks: (step, PSNR in dB) of the
-    photographs that decide. times: of each entry of the history, and, last, now."""
+    photographs that decide. by_heart: what they told. times: of each entry of the history, and,
+    last, now."""
 
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
     marks: list[tuple[int, float]]
+    by_heart: bool
     times: list[Spent]
 
 
@@ -65,6 +67,7 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         (int(steps), int(since), float(share)),
         header["history"],
         [(int(step), float(psnr_db)) for step, psnr_db in header["marks"]],
+        bool(header["by_heart"]),
         [Spent(**t) for t in header["times"]],
     )
     return model, saved

@@ -15,11 +15,13 @@ import triton
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.raster.definition import SH, RasterSettings
+from stages.raster.definition import OPACITY, SH, RasterSettings
 from stages.raster.gpu.device import failures_told, interpreted
 from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
 from stages.scene import Camera
 from stages.training import gpu_kernels
+from stages.training.dropout import INVISIBLE, Dropout
+from stages.training.gpu_dropout import resting
 from stages.training.gpu_photograph import Resident, resident
 from stages.training.loss import SSIM_WEIGHT
 from stages.training.optimiser import (
@@ -107,14 +109,19 @@ class GpuStep:
         return self._on_host
 
     def step(
-        self, level: Level, settings: RasterSettings, rates: LearningRates, smooth: bool
+        self,
+        level: Level,
+        settings: RasterSettings,
+        rates: LearningRates,
+        smooth: bool,
+        dropout: Dropout | None = None,
     ) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
         with failures_told(len(self)):
             known = id(level.means) in self._photographs
             photograph = self._resident(level)
             view = photograph.view(self.rasteriser, settings)
-            scene, room = self._drawn_scene(smooth), self._room if known else None
+            scene, room = self._drawn_scene(smooth, dropout), self._room if known else None
             drawn = self.rasteriser.draw(scene, view, capacity=room)
             if room is None:  # nothing of this photograph is known yet: it was waited for
                 room = len(drawn.lists.members)
@@ -138,9 +145,12 @@ class GpuStep:
         image = self.rasteriser.draw(self._drawn_scene(smooth), view).image
         return np.ascontiguousarray(_host(image[:3]).transpose(1, 2, 0))
 
-    def _drawn_scene(self, smooth: bool) -> Scene:
-        widths = self._smoothing if smooth else self._unsmoothed
-        return Scene(self._scene.rows, self._scene.bands, widths)
+    def _drawn_scene(self, smooth: bool, dropout: Dropout | None = None) -> Scene:
+        widths, rows = self._smoothing if smooth else self._unsmoothed, self._scene.rows
+        if dropout is not None:
+            rows = rows.clone()
+            rows[:, OPACITY].masked_fill_(resting(dropout, self._gradient_count), INVISIBLE)
+        return Scene(rows, self._scene.bands, widths)
 
     def _resident(self, level: Level) -> Resident:
         key = id(level.means)  # which stay the same object, however often a level is read

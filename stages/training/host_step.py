@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.definition import NO_SMOOTHING, Rasteriser, RasterSettings
+from stages.raster.definition import NO_SMOOTHING, Arrays, Rasteriser, RasterSettings
 from stages.scene import Camera
+from stages.training.dropout import INVISIBLE, Dropout
 from stages.training.optimiser import Model, empty_model
 
 
@@ -34,3 +35,12 @@ class HostStep:
     def widths(self, smooth: bool) -> NDArray[np.float32]:
         """[N] of the smoothing filter, or [0] for none."""
         return self._model.smoothing if smooth else NO_SMOOTHING
+
+    def arrays(self, dropout: Dropout | None) -> Arrays:
+        """The model's, with what sits this step out made invisible."""
+        arrays = self._model.arrays
+        if dropout is None:
+            return arrays
+        resting = dropout.resting(self._model.gradient_count)
+        logits = np.where(resting, np.float32(INVISIBLE), self._model.opacity_logits)
+        return (*arrays[:3], logits, arrays[4])

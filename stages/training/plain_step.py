@@ -22,6 +22,7 @@ from stages.raster.definition import (
 )
 from stages.scene import TRANSPARENT
 from stages.scene.light import BRIGHT, OFFSET, POWER
+from stages.training.dropout import Dropout
 from stages.training.host_step import HostStep
 from stages.training.loss import SSIM_WEIGHT
 from stages.training.optimiser import (
@@ -45,16 +46,22 @@ class PlainStep(HostStep):
     """See `step.TrainingStep`."""
 
     def step(
-        self, level: Level, settings: RasterSettings, rates: LearningRates, smooth: bool
+        self,
+        level: Level,
+        settings: RasterSettings,
+        rates: LearningRates,
+        smooth: bool,
+        dropout: Dropout | None = None,
     ) -> float:
         camera, model, widths = level.camera, self._model, self.widths(smooth)
-        forward = self.rasteriser.forward(model.arrays, camera, settings, widths)
+        arrays = self.arrays(dropout)
+        forward = self.rasteriser.forward(arrays, camera, settings, widths)
         image = torch.tensor(forward.image[:3], dtype=torch.float64, requires_grad=True)
         value = photograph_loss(*compared(level, image, settings.background))
         torch.autograd.backward(camera.width * camera.height * value)
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
-        backward = self.rasteriser.backward(model.arrays, forward, v_image, widths)
+        backward = self.rasteriser.backward(arrays, forward, v_image, widths)
         bands = (settings.sh_degree + 1) ** 2
         adam(model, backward, bands, rates, camera.width, camera.height)
         return float(value.detach())

@@ -123,6 +123,10 @@ class Schedule:
         red, green, blue = np.random.default_rng([self.seed, 3, step]).random(3)
         return float(red), float(green), float(blue)
 
+    def key(self, step: int) -> int:
+        """32 random bits, for numbers that a device makes by itself."""
+        return int(np.random.default_rng([self.seed, 4, step]).integers(1 << 32))
+
     def rng(self, step: int) -> np.random.Generator:
         """Random numbers of one step, whatever happened before it."""
         return np.random.default_rng([self.seed, 2, step])

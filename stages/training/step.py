@@ -11,6 +11,7 @@ from stages.base.lazy import named
 from stages.raster.backends import backend_of, rasteriser_of
 from stages.raster.definition import Rasteriser, RasterSettings
 from stages.scene import Camera
+from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model
 from stages.training.views import Level
 
@@ -30,11 +31,17 @@ class TrainingStep(Protocol):
         """What it has become, on the host; good until the next step."""
 
     def step(
-        self, level: Level, settings: RasterSettings, rates: LearningRates, smooth: bool
+        self,
+        level: Level,
+        settings: RasterSettings,
+        rates: LearningRates,
+        smooth: bool,
+        dropout: Dropout | None = None,
     ) -> float:
         """Draw, compare with one photograph, move the splats; the loss before that (a device's may
         be that of a few steps ago). The bands of SH up to `settings.sh_degree` take part. smooth:
-        under the model's smoothing widths. What a masked photograph asks: `training.target`."""
+        under the model's smoothing widths. What a masked photograph asks: `training.target`.
+        dropout: which splats sit this step out."""
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         """[H, W, 3] of the model as it is; the caller's own."""

@@ -23,9 +23,10 @@ from stages.scene import TRANSPARENT, Camera, Look, Splats, morton
 from stages.training.checkpoint import Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
 from stages.training.density import AdaptiveDensity
+from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.pace import Pace, remaining_gain_db
-from stages.training.schedule import SETTLE_FROM, Schedule
+from stages.training.schedule import GROWTH_ENDS, SETTLE_FROM, Schedule
 from stages.training.step import step_of
 from stages.training.strategy import Strategy
 from stages.training.target import target_of
@@ -35,6 +36,7 @@ CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
+BY_HEART_DB = 0.5  # if all steps to come promise the photographs lent no more, when growth ends
 MARKS = 25  # as often the photographs that were lent are looked at
 
 
@@ -65,6 +67,7 @@ class Trainer:
         self._pace = Pace(self.seconds)
         self.ended = ""  # why before all steps, if it did
         self.marks: list[tuple[int, float]] = []  # (step, PSNR in dB) of the photographs lent
+        self.by_heart = not self.lent  # so few photographs surely are
         self.cut_out = any(view.levels[0].outside == TRANSPARENT for view in self.train)
         self.history: list[dict[str, Any]] = []
         self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
@@ -108,6 +111,7 @@ class Trainer:
         if saved is not None:
             model, told = saved
             step, self.history, self.marks = told.step, told.history, told.marks
+            self.by_heart = told.by_heart
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock = Clock(spent)
@@ -120,7 +124,7 @@ class Trainer:
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        saved = Saved(step, plan, self.history, self.marks, times)
+        saved = Saved(step, plan, self.history, self.marks, self.by_heart, times)
         save_checkpoint(self.folder, self.model, saved)
 
     def _first(self, start: Splats) -> Model:
@@ -152,7 +156,14 @@ class Trainer:
             settings = replace(settings, background=self.schedule.background(step))
         factor = self.schedule.rate_factor(step)
         rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
-        return self.stepper.step(level, settings, rates, self.smooth)
+        return self.stepper.step(level, settings, rates, self.smooth, self._dropout(step))
+
+    def _dropout(self, step: int) -> Dropout | None:
+        """Once the model grows no more, if by then it is learnt by heart: before that, who sits out
+        would be pulled at less than it deserves."""
+        if not self.by_heart or self.schedule.share(step) < GROWTH_ENDS:
+            return None
+        return Dropout(len(self.train), self.schedule.key(step))
 
     def _row(self, step: int) -> int:
         """Which photograph is trained on in `step`: those that are lent not before it settles."""
@@ -170,12 +181,16 @@ class Trainer:
             self.schedule = self.schedule.replanned(step, steps)
         if not self.lent or not self.schedule.passes(step, MARKS):
             return
-        if self.schedule.share(step) < SETTLE_FROM:
-            self.marks.append((step, self._decided_db()))
-            end = round(SETTLE_FROM * self.schedule.steps)
-            if remaining_gain_db(self.marks, end) < self.patience_db:
-                self.schedule = self.schedule.settling(step)
-                self.ended = f"after {step} steps no more than {self.patience_db} dB was expected"
+        share = self.schedule.share(step)
+        if share > SETTLE_FROM:
+            return
+        self.marks.append((step, self._decided_db()))
+        if share <= GROWTH_ENDS:
+            self.by_heart = remaining_gain_db(self.marks, self.schedule.steps) < BY_HEART_DB
+        end = round(SETTLE_FROM * self.schedule.steps)
+        if step < end and remaining_gain_db(self.marks, end) < self.patience_db:
+            self.schedule = self.schedule.settling(step)
+            self.ended = f"after {step} steps no more than {self.patience_db} dB was expected"
 
     def _decided_db(self) -> float:
         """Mean PSNR of the photographs that were lent, as the model is."""

@@ -1,0 +1,78 @@
+"""Splats that sit a step out."""
+
+import numpy as np
+import pytest
+import torch
+
+from stages.raster.backends import rasteriser_of
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.scene import rgb_to_dc
+from stages.training import gpu_dropout
+from stages.training.cpu_step import CpuStep
+from stages.training.dropout import LARGEST_SHARE, Dropout, noise
+from stages.training.loss import channel_means
+from stages.training.optimiser import LearningRates, new_model
+from stages.training.plain_step import PlainStep
+from stages.training.views import Level
+from tests.scenes import camera, cloud
+
+VIEWS = 20
+
+
+def shares(seen, steps=400):
+    """How often each splat rests, seen in so many of `VIEWS` steps."""
+    seen = np.asarray(seen, np.int32)
+    return np.mean([Dropout(VIEWS, key).resting(seen) for key in range(steps)], axis=0)
+
+
+def test_what_few_photographs_see_rests_often_and_what_many_see_hardly_ever():
+    n = 500
+    seen = np.repeat([0, 1, 2, 4, 8, 20], n)
+    found = shares(seen).reshape(6, n).mean(1)
+    wanted = [LARGEST_SHARE, LARGEST_SHARE, LARGEST_SHARE, 0.25, 1 / 16, 0.01]
+    np.testing.assert_allclose(found, wanted, atol=0.004)
+
+
+def test_steps_and_splats_draw_lots_that_know_nothing_of_each_other():
+    lots = np.array([noise(5000, key) for key in range(64)]) / 2.0**32
+    assert abs(lots.mean() - 0.5) < 0.005
+    assert abs(np.corrcoef(lots[:32].ravel(), lots[32:].ravel())[0, 1]) < 0.01  # steps
+    assert abs(np.corrcoef(lots[:, :-1].ravel(), lots[:, 1:].ravel())[0, 1]) < 0.01  # neighbours
+    assert (noise(5000, 7) == noise(9000, 7)[:5000]).all()
+
+
+def test_before_anything_was_counted_and_without_splats_there_is_an_answer():
+    assert Dropout(VIEWS, 1).resting(np.zeros(0, np.int32)).shape == (0,)
+    assert Dropout(VIEWS, 1).resting(np.zeros(9, np.int32)).shape == (9,)
+
+
+def test_a_device_lets_the_same_splats_rest():
+    seen = np.random.default_rng(2).integers(0, 40, 5000).astype(np.int32)
+    for key in (0, 1, 0xFFFFFFFF):
+        wanted = Dropout(VIEWS, key).resting(seen)
+        found = gpu_dropout.resting(Dropout(VIEWS, key), torch.tensor(seen))
+        np.testing.assert_array_equal(found.numpy(), wanted)
+    assert len(gpu_dropout.resting(Dropout(VIEWS, 1), torch.zeros(0, dtype=torch.int32))) == 0
+
+
+@pytest.mark.parametrize("step_class", [CpuStep, PlainStep])
+def test_what_rests_is_not_moved_and_the_others_do_its_part(step_class):
+    scene = cloud(80, 40, 30, degree=0)
+    where = camera(40, 30)
+    pixels = np.full((3, 30, 40), 200, np.uint8)
+    level = Level(where, pixels, channel_means(pixels))
+    model = new_model(*splat_arrays(scene))
+    model.sh[:] = rgb_to_dc(np.full(3, 0.2))
+    before = model.take(np.arange(len(model)))
+    step = step_class(rasteriser_of("cpu" if step_class is CpuStep else "reference"))
+    step.load(model)
+    dropout = Dropout(3, 5)
+    resting = dropout.resting(model.gradient_count)
+    assert 10 < resting.sum() < 40
+    step.step(level, RasterSettings(sh_degree=0), LearningRates(1e-3), False, dropout)
+    moved = (step.model().sh != before.sh).any((1, 2))
+    assert not moved[resting].any()
+    assert moved[~resting].mean() > 0.5
+    np.testing.assert_array_equal(
+        step.model().opacity_logits[resting], before.opacity_logits[resting]
+    )
