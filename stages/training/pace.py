@@ -9,7 +9,7 @@ import numpy as np
 
 PLANS = 50  # times, at most, that a run with a time limit is planned anew
 PLAN_STEPS = 10  # fewer do not show a pace
-PLATEAU_POINTS = 5  # the line is laid through as many marks
+PLATEAU_POINTS = 10  # the line is laid through as many marks
 SURE = 1.0  # standard errors of its slope that are added to what is expected
 
 

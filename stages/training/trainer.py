@@ -36,8 +36,8 @@ CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
-BY_HEART_DB = 0.5  # if all steps to come promise the photographs lent no more, when growth ends
-MARKS = 25  # as often the photographs that were lent are looked at
+BY_HEART_DB = 1.0  # if all steps to come promise the photographs lent no more, when growth ends
+MARKS = 50  # as often the photographs that were lent are looked at
 
 
 @dataclass

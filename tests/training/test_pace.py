@@ -72,17 +72,17 @@ def test_a_run_that_settles_early_is_as_long_as_if_that_had_been_the_plan():
 
 
 def test_what_rises_with_every_doubling_promises_that_much_more():
-    steps = [100, 200, 400, 800, 1600]
-    marks = [(step, 20 + 0.5 * k) for k, step in enumerate(steps)]
-    assert remaining_gain_db(marks, 3200) == pytest.approx(0.5)
-    assert remaining_gain_db(marks, 6400) == pytest.approx(1.0)
+    marks = [(100 * 2**k, 20 + 0.5 * k) for k in range(PLATEAU_POINTS)]
+    last = marks[-1][0]
+    assert remaining_gain_db(marks, 2 * last) == pytest.approx(0.5)
+    assert remaining_gain_db(marks, 4 * last) == pytest.approx(1.0)
 
 
 def test_a_flat_course_promises_nothing_and_a_noisy_one_is_not_believed():
     steps = np.linspace(1000, 2000, PLATEAU_POINTS).astype(int)
     flat = [(int(step), 25.0) for step in steps]
     assert abs(remaining_gain_db(flat, 4000)) < 1e-9
-    noise = (0.4, -0.4, 0.0, 0.4, -0.4)
+    noise = [0.4 * (-1) ** k for k in range(PLATEAU_POINTS)]
     noisy = [(step, db + d) for (step, db), d in zip(flat, noise, strict=True)]
     assert remaining_gain_db(noisy, 4000) > 0.1
     falling = [(step, 25.0 - 0.1 * k) for k, (step, _) in enumerate(flat)]
