@@ -30,6 +30,7 @@ PROCESS_OPTIONS = (
     "steps",
     "max_splats",
     "light",
+    "background",
     "formats",
     "cameras",
     "split",

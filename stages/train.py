@@ -73,6 +73,14 @@ class TrainSettings:
     seed: int = field(
         default=0, metadata={"help": "Seed of all random numbers.", "min": 0, "max": 2**31 - 1}
     )
+    background: str = field(
+        default="black",
+        metadata={
+            "help": "What is behind photographs in training: black, which viewers have too, or any "
+            "colour, for scenes that will be laid over others. Objects cut out always take any.",
+            "choices": ("black", "any"),
+        },
+    )
     light: str = field(
         default="auto",
         metadata={
@@ -188,6 +196,7 @@ def make_trainer(
         folder=folder,
         report=report,
         smooth=settings.smooth,
+        over_any=settings.background == "any",
         backend=settings.backend,
         lent=lent_rows(len(train)),
         patience_db=settings.patience,

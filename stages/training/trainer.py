@@ -44,8 +44,9 @@ MARKS = 50  # as often the photographs that were lent are looked at
 class Trainer:
     """One run. schedule: as planned so far; a time limit or a plateau changes it. held_out: what
     judges it. look: how they are drawn. cap: splats at most. folder: where checkpoints go. smooth:
-    under the 3D smoothing filter. backend: what draws and steps. lent: rows of `train` that decide,
-    and are trained on only once the run settles. patience_db: what going on must promise to give.
+    under the 3D smoothing filter. over_any: over another background at each step, as cut-out
+    photographs always are. backend: what draws and steps. lent: rows of `train` that decide, and
+    are trained on only once the run settles. patience_db: what going on must promise to give.
     seconds: of wall time in all, 0 for as long as the steps take."""
 
     schedule: Schedule
@@ -56,6 +57,7 @@ class Trainer:
     folder: Path
     report: Report
     smooth: bool = False
+    over_any: bool = False
     backend: str = AUTO
     lent: tuple[int, ...] = ()
     patience_db: float = 0.0
@@ -68,7 +70,7 @@ class Trainer:
         self.ended = ""  # why before all steps, if it did
         self.marks: list[tuple[int, float]] = []  # (step, PSNR in dB) of the photographs lent
         self.by_heart = not self.lent  # so few photographs surely are
-        self.cut_out = any(view.levels[0].outside == TRANSPARENT for view in self.train)
+        self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         self.history: list[dict[str, Any]] = []
         self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
 
@@ -152,7 +154,7 @@ class Trainer:
         if step + 1 < self.schedule.steps:
             self.train[self._row(step + 1)].expect(self.schedule.level(step + 1))
         settings = self.settings(self.schedule.active_sh_degree(step))
-        if self.cut_out:
+        if self.over_any:
             settings = replace(settings, background=self.schedule.background(step))
         factor = self.schedule.rate_factor(step)
         rates = LearningRates().scaled(self.schedule.means_lr(step), factor)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,3 +84,23 @@ def test_what_is_cut_out_is_empty_in_the_end_over_any_colour(tmp_path: Path) -> 
 def test_what_is_ignored_keeps_what_stood_there(tmp_path: Path) -> None:
     alpha = render(trained(IGNORE, tmp_path), WHERE).alpha[:, 26:]
     assert alpha.mean() > 0.3
+
+
+@pytest.mark.parametrize("over_any", [False, True])
+def test_what_is_black_is_there_if_a_scene_is_for_any_background(
+    over_any: bool, tmp_path: Path
+) -> None:
+    start = splats(
+        [[x, y, 1.0] for x in (-0.2, 0.0, 0.2) for y in (-0.2, 0.0, 0.2)],
+        rgb=(0.0, 0.0, 0.0),
+        scales=0.12,
+        opacities=0.4,
+    )
+    black = replace(level(np.zeros((48, 48, 3)), ""), mask=None)
+    view = TrainingView("a", tuple(black for _ in RESOLUTIONS))
+    schedule = Schedule(steps=150, extent=10.0, sh_degree=0, n_start=9, seed=0)
+    look = Look(near=0.1)
+    made = Trainer(schedule, [view], [], look, 9, tmp_path, Report(), over_any=over_any)
+    model = made.run(start)
+    opacities = 1 / (1 + np.exp(-model.opacity_logits))
+    assert (opacities.mean() > 0.7) == over_any
