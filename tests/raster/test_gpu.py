@@ -11,6 +11,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,7 +228,7 @@ def test_what_is_missing_is_named(fault, said, monkeypatch):
 
 
 def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
-    run = SimpleNamespace(recorded_settings=lambda: {"train": SimpleNamespace(backend="gpu")})
+    run: Any = SimpleNamespace(recorded_settings=lambda: {"train": SimpleNamespace(backend="gpu")})
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     assert sources.backend_of(run) == "gpu"
     monkeypatch.delenv("TRITON_INTERPRET")
