@@ -49,8 +49,12 @@ def _as_in_its_run(file: Path, splats: Splats) -> Splats:
 
 
 def backend_of(pipeline: Pipeline | None) -> str:
-    """The backend that a run was trained with, as it was asked for; without a run "auto"."""
-    return str(pipeline.recorded_settings()["train"].backend) if pipeline is not None else "auto"
+    """The backend that a run was trained with, as it was asked for; "auto" without a run, and on a
+    machine that cannot run it."""
+    from stages.raster.backends import AUTO, runs_here
+
+    asked = AUTO if pipeline is None else str(pipeline.recorded_settings()["train"].backend)
+    return asked if runs_here(asked) else AUTO
 
 
 def newest_with_splats(pipeline: Pipeline) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from stages.base.errors import SplatError
 from stages.base.lazy import named
 
 if TYPE_CHECKING:
@@ -81,6 +82,14 @@ def rasteriser_of(name: str) -> Rasteriser:
     """A rasteriser of the backend `name` or "auto". Raises ValueError for an unknown one."""
     made: Rasteriser = named(backend_of(name).rasteriser)()
     return made
+
+
+def runs_here(name: str) -> bool:
+    """Whether the backend `name` can draw on this machine."""
+    try:
+        return not backend_of(name).obstacle or bool(rasteriser_of(name))
+    except SplatError:
+        return False
 
 
 def backend_setting() -> Any:

@@ -10,6 +10,8 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ import torch
 
 pytest.importorskip("triton")
 
+from splatcli import sources
 from stages.base.errors import SplatError
 from stages.raster import backends
 from stages.raster.backends import backend_of, rasteriser_of
@@ -222,6 +225,16 @@ def test_what_is_missing_is_named(fault, said, monkeypatch):
             device.require()
         assert told.value.code == "raster-no-gpu"
         assert "--backend cpu" in told.value.hint
+
+
+def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
+    run: Any = SimpleNamespace(recorded_settings=lambda: {"train": SimpleNamespace(backend="gpu")})
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert sources.backend_of(run) == "gpu"
+    monkeypatch.delenv("TRITON_INTERPRET")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert sources.backend_of(run) == "auto"
+    assert sources.backend_of(None) == "auto"
 
 
 def test_memory_that_runs_out_names_the_cap_that_would_fit():

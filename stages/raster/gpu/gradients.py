@@ -183,6 +183,94 @@ def exponent_gradient(cam, record, sums, mask, x, y, a, b, c, det, REAL: tl.cons
     return g_x, g_y, s_uu, s_tt, -2.0 * by_b * s_ut, g_near, s_1
 
 
+@inner
+def covariance_gradient(
+    cam,
+    a,
+    b,
+    c,
+    det,
+    minors,
+    kept,
+    g_a,
+    g_b,
+    g_k,
+    g_drawn,
+    ANTIALIAS: tl.constexpr,
+    REAL: tl.constexpr,
+):
+    """(gradients of both variances, of the covariance, of the minors, what antialiasing adds to
+    that of ln(1 / z)) from those of the exponent and of the logarithm of the opacity drawn."""
+    e, major, wide = number(cam, DILATION, REAL), tl.maximum(a, c), a >= c
+    g_major = 0.5 * g_b / det - (0.5 * g_a + g_k * b) / (major * major)
+    g_cov, g_det = g_k / major, -0.5 * g_b * major / (det * det)
+    g_minors, g_near = det * 0.0, det * 0.0
+    if ANTIALIAS:
+        g_det -= 0.5 * g_drawn / det
+        thick = minors > 1e-60
+        g_minors = tl.where(thick, 0.5 * g_drawn / (kept * kept * det), 0.0)
+        growth = tl.where(thick, e * (a + c), e * (a + c) - 2.0 * det)
+        g_near = g_drawn * growth / det
+    g_var_x = tl.where(wide, g_major, 0.0) + e * g_det
+    g_var_y = tl.where(wide, 0.0, g_major) + e * g_det
+    return g_var_x, g_var_y, g_cov, g_minors + g_det, g_near
+
+
+@inner
+def shape_gradient(
+    cam,
+    rows,
+    at,
+    mask,
+    out,
+    width,
+    x0,
+    x1,
+    x2,
+    y0,
+    y1,
+    y2,
+    g_var_x,
+    g_var_y,
+    g_cov,
+    g_minors,
+    j00,
+    j02,
+    j11,
+    j12,
+    g_drawn,
+    SMOOTH: tl.constexpr,
+    REAL: tl.constexpr,
+):
+    """Gradients of scales and rotation into `out`; (of the Jacobian's last column)."""
+    m0, m1, m2 = cross(x0, x1, x2, y0, y1, y2)
+    d0, d1, d2 = cross(y0, y1, y2, m0, m1, m2)
+    e0, e1, e2 = cross(m0, m1, m2, x0, x1, x2)
+    w0, w1, w2, w3, norm = unit_quaternion(rows, at, mask, REAL)
+    g0, g1 = axis_gradient(x0, y0, d0, e0, g_var_x, g_var_y, g_cov, g_minors)
+    s, ratio = scale(rows, at, mask, width, 0, SMOOTH, REAL)
+    scale_gradient(out, 0, mask, g0 * x0 + g1 * y0, g_drawn, ratio)
+    _, _, deep = axis_x(cam, w0, w1, w2, w3, REAL)
+    g0, g1 = g0 * s, g1 * s
+    g02, g12 = g0 * deep, g1 * deep
+    r00, r10, r20 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
+    g0, g1 = axis_gradient(x1, y1, d1, e1, g_var_x, g_var_y, g_cov, g_minors)
+    s, ratio = scale(rows, at, mask, width, 1, SMOOTH, REAL)
+    scale_gradient(out, 1, mask, g0 * x1 + g1 * y1, g_drawn, ratio)
+    _, _, deep = axis_y(cam, w0, w1, w2, w3, REAL)
+    g0, g1 = g0 * s, g1 * s
+    g02, g12 = g02 + g0 * deep, g12 + g1 * deep
+    r01, r11, r21 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
+    g0, g1 = axis_gradient(x2, y2, d2, e2, g_var_x, g_var_y, g_cov, g_minors)
+    s, ratio = scale(rows, at, mask, width, 2, SMOOTH, REAL)
+    scale_gradient(out, 2, mask, g0 * x2 + g1 * y2, g_drawn, ratio)
+    _, _, deep = axis_z(cam, w0, w1, w2, w3, REAL)
+    g0, g1 = g0 * s, g1 * s
+    r02, r12, r22 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
+    rotation_gradient(out, mask, w0, w1, w2, w3, norm, r00, r10, r20, r01, r11, r21, r02, r12, r22)
+    return g02 + g0 * deep, g12 + g1 * deep
+
+
 @triton.jit
 def splat_gradient_kernel(
     cam,
@@ -214,63 +302,45 @@ def splat_gradient_kernel(
         width = tl.load(smoothing + i, mask=mask, other=0.0).to(REAL)
     x0, x1, x2, y0, y1, y2, _, x, y, z = footprint_rows(cam, rows, at, mask, width, SMOOTH, REAL)
     a, b, c, det, minors, kept = covariance(cam, x0, x1, x2, y0, y1, y2, ANTIALIAS, REAL)
-    fx, fy, e = number(cam, FX, REAL), number(cam, FY, REAL), number(cam, DILATION, REAL)
+    fx, fy = number(cam, FX, REAL), number(cam, FY, REAL)
     px, py = held(fx * x / z + number(cam, CX, REAL)), held(fy * y / z + number(cam, CY, REAL))
     g_x, g_y, g_a, g_b, g_k, g_near, s_1 = exponent_gradient(
         cam, record, sums, mask, px, py, a, b, c, det, REAL
     )
     tl.store(means2d + i * 2, g_x.to(tl.float32), mask=mask)
     tl.store(means2d + i * 2 + 1, g_y.to(tl.float32), mask=mask)
-    # from the exponent to the covariance
-    major = tl.maximum(a, c)
-    g_major = 0.5 * g_b / det - (0.5 * g_a + g_k * b) / (major * major)
-    g_cov, g_det = g_k / major, -0.5 * g_b * major / (det * det)
-    wide = a >= c
-    g_var_x, g_var_y = tl.where(wide, g_major, 0.0), tl.where(wide, 0.0, g_major)
-    opacity = opacity_of(rows, at, mask, REAL)
     g_drawn = -s_1  # by the logarithm of the opacity drawn
-    g_minors = det * 0.0
-    if ANTIALIAS:
-        g_det -= 0.5 * g_drawn / det
-        thick = minors > 1e-60
-        g_minors = tl.where(thick, 0.5 * g_drawn / (kept * kept * det), 0.0)
-        growth = tl.where(thick, e * (a + c), e * (a + c) - 2.0 * det)
-        g_near += g_drawn * growth / det
-    give(out, OPACITY, mask, g_drawn * (1.0 - opacity))
-    g_minors += g_det
-    g_var_x += e * g_det
-    g_var_y += e * g_det
-    # from the covariance to scales, rotation and mean
-    m0, m1, m2 = cross(x0, x1, x2, y0, y1, y2)
-    d0, d1, d2 = cross(y0, y1, y2, m0, m1, m2)
-    e0, e1, e2 = cross(m0, m1, m2, x0, x1, x2)
+    give(out, OPACITY, mask, g_drawn * (1.0 - opacity_of(rows, at, mask, REAL)))
+    g_var_x, g_var_y, g_cov, g_minors, nearer = covariance_gradient(
+        cam, a, b, c, det, minors, kept, g_a, g_b, g_k, g_drawn, ANTIALIAS, REAL
+    )
+    g_near += nearer
     u, v, in_u, in_v = slopes(cam, x, y, z, REAL)
-    j00, j02, j11, j12 = fx / z, -fx * u / z, fy / z, -fy * v / z
-    w0, w1, w2, w3, norm = unit_quaternion(rows, at, mask, REAL)
-    g0, g1 = axis_gradient(x0, y0, d0, e0, g_var_x, g_var_y, g_cov, g_minors)
-    s, ratio = scale(rows, at, mask, width, 0, SMOOTH, REAL)
-    scale_gradient(out, 0, mask, g0 * x0 + g1 * y0, g_drawn, ratio)
-    _, _, deep = axis_x(cam, w0, w1, w2, w3, REAL)
-    g0, g1 = g0 * s, g1 * s
-    g02, g12 = g0 * deep, g1 * deep
-    r00, r10, r20 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
-    g0, g1 = axis_gradient(x1, y1, d1, e1, g_var_x, g_var_y, g_cov, g_minors)
-    s, ratio = scale(rows, at, mask, width, 1, SMOOTH, REAL)
-    scale_gradient(out, 1, mask, g0 * x1 + g1 * y1, g_drawn, ratio)
-    _, _, deep = axis_y(cam, w0, w1, w2, w3, REAL)
-    g0, g1 = g0 * s, g1 * s
-    g02 += g0 * deep
-    g12 += g1 * deep
-    r01, r11, r21 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
-    g0, g1 = axis_gradient(x2, y2, d2, e2, g_var_x, g_var_y, g_cov, g_minors)
-    s, ratio = scale(rows, at, mask, width, 2, SMOOTH, REAL)
-    scale_gradient(out, 2, mask, g0 * x2 + g1 * y2, g_drawn, ratio)
-    _, _, deep = axis_z(cam, w0, w1, w2, w3, REAL)
-    g0, g1 = g0 * s, g1 * s
-    g02 += g0 * deep
-    g12 += g1 * deep
-    r02, r12, r22 = turned_back(cam, j00 * g0, j11 * g1, j02 * g0 + j12 * g1, REAL)
-    rotation_gradient(out, mask, w0, w1, w2, w3, norm, r00, r10, r20, r01, r11, r21, r02, r12, r22)
+    g02, g12 = shape_gradient(
+        cam,
+        rows,
+        at,
+        mask,
+        out,
+        width,
+        x0,
+        x1,
+        x2,
+        y0,
+        y1,
+        y2,
+        g_var_x,
+        g_var_y,
+        g_cov,
+        g_minors,
+        fx / z,
+        -fx * u / z,
+        fy / z,
+        -fy * v / z,
+        g_drawn,
+        SMOOTH,
+        REAL,
+    )
     # a slope inside its limits moves with the mean; a clamped one does not
     g_u, g_v = tl.where(in_u, -g02 * fx / z, 0.0), tl.where(in_v, -g12 * fy / z, 0.0)
     by_x, by_y = (g_x * fx + g_u) / z, (g_y * fy + g_v) / z
