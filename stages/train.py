@@ -57,8 +57,8 @@ class TrainSettings:
     patience: float = field(
         default=0.05,
         metadata={
-            "help": "Training settles early once all that is left promises less than this (dB); 0 "
-            "takes every step.",
+            "help": "Training is cut short once it learns the photographs by heart, and growing on "
+            "promises others less than this (dB); 0 takes every step.",
             "min": 0,
             "max": 10,
         },
@@ -204,7 +204,7 @@ def make_trainer(
 
 
 def lent_rows(n: int) -> tuple[int, ...]:
-    """Which of `n` training photographs decide until training settles: of every eight the fifth, so
+    """Which of `n` training photographs decide while the model grows: of every eight the fifth, so
     that they lie between the judges; none where there are too few to lend one."""
     return tuple(range(4, n, 8)) if n >= MIN_TO_LEND else ()
 

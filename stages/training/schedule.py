@@ -56,13 +56,12 @@ class Schedule:
         course is gone through faster, or more slowly."""
         return replace(self, steps=max(steps, step + 1), since=(step, self.share(step)))
 
-    def settling(self, step: int) -> Schedule:
-        """A run that begins to settle now, for as long as if that had always been the plan."""
-        if self.share(step) >= SETTLE_FROM:
+    def grown(self, step: int) -> Schedule:
+        """A run that grows no more: what is left takes as long as if that had been the plan."""
+        if self.share(step) >= GROWTH_ENDS:
             return self
-        return replace(
-            self, steps=max(step + 1, round(step / SETTLE_FROM)), since=(step, SETTLE_FROM)
-        )
+        steps = max(step + 1, round(step / GROWTH_ENDS))
+        return replace(self, steps=steps, since=(step, GROWTH_ENDS))
 
     @property
     def boost(self) -> float:

@@ -26,7 +26,7 @@ from stages.training.density import AdaptiveDensity
 from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.pace import Pace, remaining_gain_db
-from stages.training.schedule import GROWTH_ENDS, SETTLE_FROM, Schedule
+from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.step import step_of
 from stages.training.strategy import Strategy
 from stages.training.target import target_of
@@ -36,7 +36,7 @@ CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
-BY_HEART_DB = 1.0  # if all steps to come promise the photographs lent no more, when growth ends
+BY_HEART_DB = 5.0  # that photographs in training come out better than those that were lent
 MARKS = 50  # as often the photographs that were lent are looked at
 
 
@@ -46,7 +46,7 @@ class Trainer:
     judges it. look: how they are drawn. cap: splats at most. folder: where checkpoints go. smooth:
     under the 3D smoothing filter. over_any: over another background at each step, as cut-out
     photographs always are. backend: what draws and steps. lent: rows of `train` that decide, and
-    are trained on only once the run settles. patience_db: what going on must promise to give.
+    are trained on only once it grows no more. patience_db: what going on must promise to give.
     seconds: of wall time in all, 0 for as long as the steps take."""
 
     schedule: Schedule
@@ -168,8 +168,8 @@ class Trainer:
         return Dropout(len(self.train), self.schedule.key(step))
 
     def _row(self, step: int) -> int:
-        """Which photograph is trained on in `step`: those that are lent not before it settles."""
-        lent = self.lent if self.schedule.share(step) < SETTLE_FROM else ()
+        """Which photograph is trained on in `step`: while the model grows, none that is lent."""
+        lent = self.lent if self.schedule.share(step) < GROWTH_ENDS else ()
         rows = [row for row in range(len(self.train)) if row not in lent]
         return rows[self.schedule.view(step, len(rows))]
 
@@ -183,21 +183,24 @@ class Trainer:
             self.schedule = self.schedule.replanned(step, steps)
         if not self.lent or not self.schedule.passes(step, MARKS):
             return
-        share = self.schedule.share(step)
-        if share > SETTLE_FROM:
+        if self.schedule.share(step) > GROWTH_ENDS:
             return
-        self.marks.append((step, self._decided_db()))
-        if share <= GROWTH_ENDS:
-            self.by_heart = remaining_gain_db(self.marks, self.schedule.steps) < BY_HEART_DB
-        end = round(SETTLE_FROM * self.schedule.steps)
-        if step < end and remaining_gain_db(self.marks, end) < self.patience_db:
-            self.schedule = self.schedule.settling(step)
-            self.ended = f"after {step} steps no more than {self.patience_db} dB was expected"
+        self.marks.append((step, self._mean_db(self.lent)))
+        self.by_heart = self._mean_db(self._told()) - self.marks[-1][1] > BY_HEART_DB
+        end = round(GROWTH_ENDS * self.schedule.steps)
+        if self.by_heart and remaining_gain_db(self.marks, end) < self.patience_db:
+            self.schedule = self.schedule.grown(step)
+            self.ended = f"after {step} steps growth promised no more than {self.patience_db} dB"
 
-    def _decided_db(self) -> float:
-        """Mean PSNR of the photographs that were lent, as the model is."""
+    def _told(self) -> list[int]:
+        """As many photographs as are lent, of those that are not, spread over the capture."""
+        others = [row for row in range(len(self.train)) if row not in self.lent]
+        return others[:: max(1, len(others) // len(self.lent))]
+
+    def _mean_db(self, rows: Sequence[int]) -> float:
+        """Mean PSNR of these photographs, as the model is."""
         values = []
-        for row in self.lent:
+        for row in rows:
             level = self.train[row].levels[-1]
             image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
             asked = target_of(level, image, (self.look.background,) * 3)

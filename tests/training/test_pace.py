@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stages.training.pace import PLATEAU_POINTS, Pace, remaining_gain_db
-from stages.training.schedule import SETTLE_FROM, SETTLE_TO, Schedule
+from stages.training.schedule import GROWTH_ENDS, SETTLE_TO, Schedule
 
 
 def schedule(steps=3000):
@@ -62,13 +62,13 @@ def test_a_changed_plan_goes_on_from_where_the_run_is_and_ends_at_its_end():
     assert again == plan
 
 
-def test_a_run_that_settles_early_is_as_long_as_if_that_had_been_the_plan():
-    plan = schedule(3000).settling(600)
-    assert plan.share(600) == SETTLE_FROM
-    assert plan.steps == round(600 / SETTLE_FROM)
+def test_a_run_that_grows_no_more_is_as_long_as_if_that_had_been_the_plan():
+    plan = schedule(3000).grown(600)
+    assert plan.share(600) == GROWTH_ENDS
+    assert plan.steps == round(600 / GROWTH_ENDS)
     assert not any(plan.densifies_after(step) for step in range(600, plan.steps))
     late = schedule(3000)
-    assert late.settling(2500) is late
+    assert late.grown(2500) is late
 
 
 def test_what_rises_with_every_doubling_promises_that_much_more():
