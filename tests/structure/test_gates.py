@@ -14,6 +14,7 @@ from stages.structure.gates import (
     check_keypoints,
     check_model,
     check_pairs,
+    doubts,
     groups_of,
 )
 
@@ -128,6 +129,17 @@ def test_one_photograph_of_sixteen_may_be_left_out_but_not_four() -> None:
 def test_a_few_contradicting_pairs_are_chance() -> None:
     assert codes(replace(BANANA, pairs_checked=8, pairs_contradicting=2)) == []
     assert codes(replace(PLUSH, pairs_checked=1200, pairs_contradicting=60)) == []
+
+
+def test_what_is_too_little_to_refuse_is_said() -> None:
+    assert doubts(PLUSH) == []
+    few = replace(PLUSH, pairs_checked=100, pairs_contradicting=5, contradicting=("a", "b"))
+    assert codes(few) == []
+    assert [failure.code for failure in doubts(few)] == ["sfm-contradictions"]
+    assert "a and b" in doubts(few)[0].given
+    loose = replace(PLUSH, link_points=60, link_views=12)
+    assert codes(loose) == []
+    assert [failure.code for failure in doubts(loose)] == ["sfm-weak-link"]
 
 
 def test_error_limit_grows_with_the_photographs() -> None:
