@@ -187,8 +187,8 @@ class Trainer:
             return
         self.marks.append((step, self._mean_db(self.lent)))
         self.by_heart = self._mean_db(self._told()) - self.marks[-1][1] > BY_HEART_DB
-        end = round(GROWTH_ENDS * self.schedule.steps)
-        if self.by_heart and remaining_gain_db(self.marks, end) < self.patience_db:
+        promised = remaining_gain_db(self.marks, round(GROWTH_ENDS * self.schedule.steps))
+        if self.by_heart and self.patience_db and promised < self.patience_db:
             self.schedule = self.schedule.grown(step)
             self.ended = f"after {step} steps growth promised no more than {self.patience_db} dB"
 
