@@ -35,6 +35,7 @@ PROCESS_OPTIONS = (
     "cameras",
     "split",
     "scale",
+    "marker",
     "allow_partial",
     "seed",
 )

@@ -85,6 +85,15 @@ class SfmSettings:
             "together": "A B METRES",
         },
     )
+    marker: float = field(
+        default=0.0,
+        metadata={
+            "help": "Side of the ArUco markers that lie in the scene, alone or on a ChArUco board "
+            "(metres); 0: there are none.",
+            "min": 0.0,
+            "max": 1000.0,
+        },
+    )
     max_minutes: float = field(
         default=120.0,
         metadata={
@@ -105,10 +114,12 @@ def run(
     pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
     SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
-    from stages.structure import attempts, finish, ladder, light, reconstruction_files
+    from stages.structure import attempts, finish, ladder, light, metric, reconstruction_files
 
     capture: Capture = inputs["ingest"]
     _check(capture)
+    if settings.scale:
+        metric.checked_distance(settings.scale, capture)  # now, not when cameras are found
     if (folder / _FINISHED).exists():
         return _again(folder, report)
     work = folder / _WORK
@@ -133,7 +144,9 @@ def run(
     report.metric("rungs", [_rung_figures(attempt) for attempt in climbed.attempts])
     model = _accepted(best, settings, capture)
     _tell(best, climbed, capture, report)
-    found = finish.finish(model, capture, folder, report, settings.scale)
+    found = finish.finish(
+        model, capture, folder, report, metric.Known(settings.scale, settings.marker)
+    )
     reconstruction = light.with_light(found, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
     _model_metrics(best, model, reconstruction, capture, report)
@@ -152,7 +165,7 @@ def _with_known_cameras(
 ) -> Reconstruction:
     import numpy as np
 
-    from stages.structure import known, light, reconstruction_files
+    from stages.structure import known, light, metric, reconstruction_files
 
     deadline = time.monotonic() + 60.0 * settings.max_minutes
     found = known.reconstruct(
@@ -165,7 +178,7 @@ def _with_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        scale=settings.scale,
+        size=metric.Known(settings.scale, settings.marker),
         seconds_left=lambda: deadline - time.monotonic(),
     )
     found = light.with_light(found, report)

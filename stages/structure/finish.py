@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from stages.base.stage import Report
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
 from stages.structure.levelling import upright
-from stages.structure.metric import find_metric
+from stages.structure.metric import NOTHING, Known, find_metric
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px
 
@@ -35,10 +34,10 @@ def finish(
     capture: Capture,
     folder: Path,
     report: Report,
-    scale: Sequence[str] = (),
+    known: Known = NOTHING,
 ) -> Reconstruction:
     """Level, recentre and measure `model`, write undistorted pictures and a COLMAP model of them,
-    and return the reconstruction (not stored yet: see `reconstruction_files`). scale: see `metric`.
+    and return the reconstruction (not stored yet: see `reconstruction_files`). known: of its size.
 
     Raises Interrupted, and SplatError "sfm-photo-unreadable" if a photograph has gone.
     """
@@ -46,24 +45,20 @@ def finish(
     model, levelled = upright(model)
     photos = {photo.image: photo for photo in capture.photos}
     ordered = [photos[name] for name in model.names]
-    names = [photo.name for photo in ordered]
-    metric = find_metric(scale, capture, names, model.world_to_camera, levelled, report)
-    if metric is not None:
-        model = replace(
-            model,
-            world_to_camera=metric.poses(model.world_to_camera),
-            points=metric.points(model.points),
-        )
     pinholes = [
         pinhole_for(size, params)
         for size, params in zip(model.camera_sizes, model.camera_params, strict=True)
     ]
     pictures = [photo.picture for photo in ordered]
     _write_pictures(model, pinholes, ordered, pictures, capture.folder, folder, report)
-    cameras = [
-        _camera(pinholes[model.view_cameras[i]], model.world_to_camera[i])
-        for i in range(len(ordered))
-    ]
+    cameras = _cameras(model, pinholes)
+    names = [photo.name for photo in ordered]
+    places = [folder / IMAGES / picture for picture in pictures]
+    metric = find_metric(known, capture, names, cameras, places, levelled, report)
+    if metric is not None:
+        poses, points = metric.poses(model.world_to_camera), metric.points(model.points)
+        model = replace(model, world_to_camera=poses, points=points)
+        cameras = _cameras(model, pinholes)
     errors = point_errors(model)
     _write_model(model, pinholes, cameras, pictures, errors, folder)
     return Reconstruction(
@@ -86,6 +81,13 @@ def finish(
         levelled=levelled,
         units="arbitrary" if metric is None else "metres",
     )
+
+
+def _cameras(model: SparseModel, pinholes: list[Pinhole]) -> list[Camera]:
+    return [
+        _camera(pinholes[number], pose)
+        for number, pose in zip(model.view_cameras, model.world_to_camera, strict=True)
+    ]
 
 
 def _camera(pinhole: Pinhole, world_to_camera: np.ndarray) -> Camera:

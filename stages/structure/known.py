@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from stages.structure.finish import (
 from stages.structure.job import CameraGuess, Job, known_path
 from stages.structure.lenses import maps, straightened
 from stages.structure.levelling import levelling_rotation, up_direction
-from stages.structure.metric import find_metric
+from stages.structure.metric import Known, find_metric
 from stages.structure.named import Posed, posed_photographs
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
 
@@ -65,7 +65,7 @@ def reconstruct(
     allow_partial: bool,
     seed: int,
     max_features: int,
-    scale: Sequence[str],
+    size: Known,
     seconds_left: Callable[[], float],
 ) -> Reconstruction:
     """The capture with the cameras in `path`. Leaves what `finish` leaves, but reconstruction.json.
@@ -94,7 +94,7 @@ def reconstruct(
         if len(cloud.points) < POINTS_PER_VIEW * len(training):
             cloud, source = _with_random(cloud, seen, outside, seed, report), "chance"
     report.metric("points_from", source)
-    return _finished(posed, cameras, cloud, observed, folder, report, scale, capture)
+    return _finished(posed, cameras, cloud, observed, folder, report, size, capture)
 
 
 def _undistorted(posed: list[Posed], source: Path, folder: Path, report: Report) -> list[Camera]:
@@ -363,7 +363,7 @@ def _finished(
     observed: _Observed,
     folder: Path,
     report: Report,
-    scale: Sequence[str],
+    size: Known,
     capture: Capture,
 ) -> Reconstruction:
     """Levelled, recentred and measured; the COLMAP model is written."""
@@ -376,9 +376,10 @@ def _finished(
     cameras = [camera.moved(world_from_new) for camera in cameras]
     points = (cloud.points - middle) @ turn.T
     names = [one.photo.name for one in posed]
-    poses = np.array([camera.world_to_camera for camera in cameras])
-    metric = find_metric(scale, capture, names, poses, up is not None, report)
+    places = [folder / IMAGES / one.photo.picture for one in posed]
+    metric = find_metric(size, capture, names, cameras, places, up is not None, report)
     if metric is not None:
+        poses = np.array([camera.world_to_camera for camera in cameras])
         points, poses = metric.points(points), metric.poses(poses)
         cameras = [
             replace(camera, world_to_camera=pose)

@@ -1,24 +1,39 @@
-"""How large the world is, and where north: from a distance that is known, or from GPS."""
+"""How large the world is, and where north: from what is known of it, or from GPS."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.scene import Capture, Photo
+from stages.scene import Camera, Capture, Photo
+from stages.structure.markers import marker_sides
 
 _FEWEST_GPS = 5
 _AGREEING_SHARE = 0.6  # of the photographs with GPS
 _WORST_RESIDUAL = 0.15  # of how far the cameras spread: beyond, GPS says nothing about the scene
+_WORST_SPREAD = 0.05  # of the sides of markers, which are all of one size
 _PAIRS = 2000  # tried, at most
 # WGS 84: half axis in metres, eccentricity squared
 _AXIS, _ECCENTRICITY2 = 6_378_137.0, 6.69437999014e-3
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the user says. distance: two photographs' names and how far apart they are, metres; or
+    nothing. marker: side of the printed markers, metres; 0 for none."""
+
+    distance: Sequence[str] = ()
+    marker: float = 0.0
+
+
+NOTHING = Known()
 
 
 @dataclass(frozen=True)
@@ -49,23 +64,25 @@ class Metric:
 
 
 def find_metric(
-    asked: Sequence[str],
+    known: Known,
     capture: Capture,
     names: Sequence[str],
-    world_to_camera: NDArray[np.float64],
+    cameras: Sequence[Camera],
+    pictures: Sequence[Path],
     levelled: bool,
     report: Report,
 ) -> Metric | None:
-    """What is known of the size of the world in which `world_to_camera` [V, 4, 4] of the capture's
-    photographs `names` [V] are given. asked: two photographs' names and their distance in metres,
-    or nothing: then GPS may say. None where nothing says.
+    """What is known of the size of the world of `cameras`, pinholes, of the capture's photographs
+    `names`, whose undistorted `pictures` lie on disk. Where the user says nothing, GPS may. None
+    where nothing says.
 
-    Raises SplatError for a distance that cannot be used.
+    Raises SplatError for a distance or a marker that cannot be used.
     """
-    centres = -np.einsum("vij,vi->vj", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
-    metric = None
-    if asked:
-        metric = _from_distance(asked, capture, names, centres)
+    centres = np.array([camera.centre for camera in cameras])
+    if known.distance:
+        metric: Metric | None = _from_distance(known.distance, capture, names, centres)
+    elif known.marker:
+        metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
     else:
         photos = {photo.name: photo for photo in capture.photos}
         metric = _from_gps([photos[name] for name in names], centres, levelled, report)
@@ -74,19 +91,27 @@ def find_metric(
     return metric
 
 
-def _from_distance(
-    asked: Sequence[str], capture: Capture, names: Sequence[str], centres: NDArray[np.float64]
-) -> Metric:
-    first, second, said = asked
+def checked_distance(asked: Sequence[str], capture: Capture) -> float:
+    """The metres of what was asked. Raises SplatError where it cannot be of this capture."""
+    *ends, said = asked
     try:
         metres = float(said)
     except ValueError:
         metres = math.nan
     if not (math.isfinite(metres) and metres > 0):
         raise _unusable(f"{said} is no distance in metres")
-    for name in (first, second):
+    for name in ends:
         if name not in {photo.name for photo in capture.photos}:
             raise _unusable(f"{name} is no photograph of the capture")
+    return metres
+
+
+def _from_distance(
+    asked: Sequence[str], capture: Capture, names: Sequence[str], centres: NDArray[np.float64]
+) -> Metric:
+    metres = checked_distance(asked, capture)
+    first, second, _ = asked
+    for name in (first, second):
         if name not in names:
             raise _unusable(f"{name} could not be placed")
     a, b = (centres[list(names).index(name)] for name in (first, second))
@@ -95,6 +120,18 @@ def _from_distance(
     if apart < 1e-3 * spread:
         raise _unusable(f"{first} and {second} were taken from the same place")
     return Metric(metres / apart, 0.0, f"{first} and {second} are {metres:g} m apart")
+
+
+def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> Metric:
+    report.metric("markers", len(sides) // 4)
+    if not len(sides):
+        raise _no_marker("no ArUco marker was found in two photographs that see it from two sides")
+    side = float(np.median(sides))
+    spread = float(np.median(np.abs(sides / side - 1.0)))
+    report.metric("marker_sides_spread", round(spread, 5))
+    if spread > _WORST_SPREAD:
+        raise _no_marker(f"the sides of {len(sides) // 4} markers differ by {spread:.0%}")
+    return Metric(metres / side, 0.0, f"{len(sides) // 4} markers of {metres:g} m")
 
 
 def _from_gps(
@@ -158,6 +195,17 @@ def east_north(places: Sequence[tuple[float, float]]) -> NDArray[np.float64]:
     north = _AXIS * (1.0 - _ECCENTRICITY2) / bend**1.5 * (latitude - middle)
     east = _AXIS / math.sqrt(bend) * np.cos(middle) * np.radians(longitude - np.median(longitude))
     return np.stack([east, north], axis=1)
+
+
+def _no_marker(why: str) -> SplatError:
+    return SplatError(
+        "sfm-marker",
+        given=f"--marker cannot be used: {why}.",
+        wanted="Printed ArUco markers of one size, flat, sharp, with their white margin; alone or "
+        "on a ChArUco board.",
+        hint="Leave --marker away, or say a distance with --scale instead.",
+        family=Family.RECONSTRUCTION,
+    )
 
 
 def _unusable(why: str) -> SplatError:

@@ -8,8 +8,8 @@ import pytest
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.photos.exif import read_exif
-from stages.scene import Capture, Photo, look_at
-from stages.structure.metric import Metric, east_north, find_metric
+from stages.scene import Camera, Capture, Photo, look_at
+from stages.structure.metric import Known, Metric, east_north, find_metric
 from tests.structure.bad_captures import SAMPLE
 
 METRES = 7.0  # of one unit of the made worlds
@@ -54,7 +54,8 @@ def on_earth(metres: np.ndarray) -> list[tuple[float, float] | None]:
 def found(capture: Capture, poses: np.ndarray, *asked: str, levelled: bool = True):
     report = Report()
     names = [photo.name for photo in capture.photos]
-    return find_metric(asked, capture, names, poses, levelled, report), report
+    posed = [Camera(640, 480, 600.0, 600.0, 320.0, 240.0, pose) for pose in poses]
+    return find_metric(Known(asked), capture, names, posed, [], levelled, report), report
 
 
 def test_a_distance_between_two_photographs_makes_the_world_metric() -> None:
