@@ -297,6 +297,13 @@ def _report_capture(
 
 
 def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatError:
+    if root.is_file() and reasons:
+        return SplatError(
+            "ingest-video-unusable",
+            given=f"{root} cannot be used: {reasons[0][1]}.",
+            wanted="A video with pictures that decode.",
+            hint="Copy it from the camera again, or export it anew as H.264 or HEVC.",
+        )
     given = f"{root} holds {counted(usable, 'usable photograph')}."
     if reasons:
         few = "; ".join(f"{name}: {why}" for name, why in reasons[:3])

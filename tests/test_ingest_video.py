@@ -170,7 +170,7 @@ def test_a_video_that_cannot_be_used_is_one_clear_error(
 ) -> None:
     with pytest.raises(SplatError) as raised:
         ingested(broken(video, kind), tmp_path / "out")
-    assert raised.value.code == "ingest-too-few-photographs"
+    assert raised.value.code == "ingest-video-unusable"
     assert "walk.mp4" in raised.value.given
     assert told in raised.value.given
 
