@@ -1,0 +1,92 @@
+"""Photographs that training lends: they tell whether it learns the others by heart."""
+
+import numpy as np
+import pytest
+
+from stages.base.errors import Interrupted
+from stages.base.stage import Report
+from stages.raster.definition import RasterSettings
+from stages.raster.draw import render
+from stages.scene import Look
+from stages.training.schedule import GROWTH_ENDS, Schedule
+from stages.training.trainer import Trainer
+from tests.scenes import camera, cloud
+from tests.training.test_trainer import view_of
+
+STEPS = 600
+LENT = 2  # the row that is lent
+
+
+def trainer(folder, contradicting, patience_db=0.05, report=None):
+    """Four photographs from one place; the one that is lent shows the same, or something else."""
+    where = camera(40, 30)
+    picture = np.clip(render(cloud(80, 40, 30, degree=0), where, RasterSettings()).image, 0, 1)
+    other = np.random.default_rng(0).random(picture.shape).astype(np.float32)
+    pictures = [picture] * 4
+    if contradicting:
+        pictures[LENT] = other
+    views = [view_of(f"{k}", p, where) for k, p in enumerate(pictures)]
+    start = cloud(60, 40, 30, degree=0, seed=4)
+    schedule = Schedule(steps=STEPS, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
+    folder.mkdir(exist_ok=True)
+    made = Trainer(
+        *(schedule, views, [], Look(near=0.1), 200, folder, report or Report()),
+        backend="cpu",
+        lent=(LENT,),
+        patience_db=patience_db,
+    )
+    return made, start
+
+
+def test_no_photograph_that_is_lent_is_trained_on_while_the_model_grows_and_all_are_afterwards(
+    tmp_path,
+):
+    made, _ = trainer(tmp_path / "a", contradicting=False)
+    growing = [made._row(step) for step in range(int(GROWTH_ENDS * STEPS))]
+    assert set(growing) == {0, 1, 3}
+    assert {made._row(step) for step in range(int(GROWTH_ENDS * STEPS), STEPS)} == {0, 1, 2, 3}
+
+
+def test_what_is_learnt_by_heart_is_cut_short_and_says_so(tmp_path):
+    made, start = trainer(tmp_path / "a", contradicting=True)
+    made.run(start)
+    assert made.by_heart
+    assert "promised no more" in made.ended
+    assert made.schedule.steps < 0.8 * STEPS
+    assert made.schedule.share(made.schedule.steps) == 1.0
+
+
+def test_what_others_gain_from_goes_its_whole_way(tmp_path):
+    made, start = trainer(tmp_path / "a", contradicting=False)
+    made.run(start)
+    assert not made.by_heart
+    assert (made.ended, made.schedule.steps) == ("", STEPS)
+
+
+def test_without_patience_nothing_is_cut_short(tmp_path):
+    made, start = trainer(tmp_path / "a", contradicting=True, patience_db=0.0)
+    made.run(start)
+    assert made.by_heart
+    assert (made.ended, made.schedule.steps) == ("", STEPS)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_a_stopped_run_keeps_its_plan_and_what_was_told(tmp_path, share):
+    whole, start = trainer(tmp_path / "whole", contradicting=True)
+    wanted = whole.run(start)
+    stop_at, report = int(share * whole.schedule.steps), Report()
+
+    def stop(label, done, total, numbers):
+        if done == stop_at:
+            report.stop_requested.set()
+
+    report.listener = stop
+    first, start = trainer(tmp_path / "parts", True, report=report)
+    with pytest.raises(Interrupted):
+        first.run(start)
+    second, start = trainer(tmp_path / "parts", contradicting=True)
+    found = second.run(start)
+    assert second.schedule == whole.schedule
+    assert (second.marks, second.by_heart) == (whole.marks, whole.by_heart)
+    for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
+        assert a.tobytes() == b.tobytes()
