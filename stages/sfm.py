@@ -411,5 +411,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=6, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=7, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )
