@@ -12,7 +12,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.words import counted
 from stages.scene import Splats
 
-WORST_VIEW = 6.0  # times the loss that is allowed on the average, in any one photograph
+WORST_VIEW_DB = 0.3  # that any one photograph may lose, at price 1
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Aim:
         """Whether photographs [P] may look like this, that looked like `best_db` before."""
         if self.min_psnr_db:
             return float(psnr_db.mean()) >= self.min_psnr_db
-        loss, allowed = best_db - psnr_db, self.price * self.max_loss_db
-        return float(loss.mean()) <= allowed and float(loss.max()) <= WORST_VIEW * allowed
+        loss = (best_db - psnr_db) / self.price
+        return float(loss.mean()) <= self.max_loss_db and float(loss.max()) <= WORST_VIEW_DB
 
     def check_start(self, psnr_db: float) -> None:
         """Raises SplatError (prune-psnr-not-reached) where even the whole model is not as good."""

@@ -80,10 +80,12 @@ class Shrinking:
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
             excess = self.aim.excess(found.splats)
-            cut = self._cut(found, worth, excess, share)
-            if cut is None:
+            cut = self._cut(found, worth, excess, share, free=number == 0)
+            if cut is None and number:
                 found.stopped_by = PRICE
                 break
+            if cut is None:
+                continue
             fewer = cut.of(found.splats)
             measured = squared_error(fewer, self.photographs, self.backend) - worth.sse
             fewer = self.tuner.tuned(fewer, self.tune_steps * self.rounds // planned)
@@ -117,9 +119,14 @@ class Shrinking:
         needed = math.log(left / len(splats)) / math.log(1 - SPLATS_A_ROUND)
         return max(self.rounds, math.ceil(needed) + 4)
 
-    def _cut(self, found: Outcome, worth: Worth, excess: int, share: float) -> Cut | None:
+    def _cut(
+        self, found: Outcome, worth: Worth, excess: int, share: float, free: bool
+    ) -> Cut | None:
+        """free: take only what harms or does nothing."""
         forced = excess > 0 or self.aim.min_psnr_db > 0
         limit = math.inf if forced else self.aim.price * found.price.sse_a_number
+        if free and not excess:
+            limit = np.finfo(np.float64).tiny
         most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
         most = min(most, excess, len(found.splats) - 1) if excess else most
         cameras = [photograph.camera for photograph in self.photographs]
