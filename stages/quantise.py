@@ -26,11 +26,11 @@ _DECISIONS, _FLAT = "decisions.json", "flat_dc.npy"
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
 # What a .sog may tell its values in, by attribute; the fewest that pass.
 _FEWER_BITS = {
-    "position": (14, 13, 12, 11),
-    "rotation": (6, 5, 4),
-    "scale": (6, 5, 4),
+    "position": (15, 14, 13, 12),
+    "rotation": (7, 6, 5, 4),
+    "scale": (7, 6, 5, 4),
     "colour": (7, 6, 5),
-    "opacity": (6, 5, 4),
+    "opacity": (7, 6, 5, 4),
 }
 
 
@@ -42,6 +42,14 @@ class QuantiseSettings:
         default=0.02,
         metadata={
             "help": "PSNR of training photographs that smaller files may cost (dB).",
+            "min": 0,
+            "max": 100,
+        },
+    )
+    sog_loss_db: float = field(
+        default=0.1,
+        metadata={
+            "help": "PSNR of training photographs that fewer bits in a .sog may cost besides (dB).",
             "min": 0,
             "max": 100,
         },
@@ -157,7 +165,7 @@ def _bits(
     if not len(drawn):
         return asdict(found), 0.0
     best = decider.psnr(of_sog(drawn, found))
-    share = settings.max_loss_db / len(asdict(found))
+    share = settings.sog_loss_db / len(asdict(found))
     for name, fewer in _FEWER_BITS.items():
         floor = best - share
         for count in fewer:

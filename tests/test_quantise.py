@@ -178,7 +178,7 @@ def test_colours_without_view_dependence_are_the_means_of_what_is_seen(
 def test_a_sog_is_told_in_no_more_bits_than_show(scene: SmallScene, tmp_path: Path) -> None:
     for name, allowed in (("a", 0.02), ("b", 2.0)):
         (tmp_path / name).mkdir()
-        _, metrics = decide(scene, tmp_path / name, max_loss_db=allowed)
+        _, metrics = decide(scene, tmp_path / name, sog_loss_db=allowed)
         kept = json.loads((tmp_path / name / "decisions.json").read_text())
         assert kept["bits"] == metrics["bits"]
     fewest = metrics["bits"]
