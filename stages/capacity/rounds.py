@@ -129,8 +129,9 @@ class Shrinking:
             limit = np.finfo(np.float64).tiny
         most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
         most = min(most, excess, len(found.splats) - 1) if excess else most
-        cameras = [photograph.camera for photograph in self.photographs]
-        return choose(found.splats, worth, cameras, limit, min(most, len(found.splats) - 1), share)
+        return choose(
+            found.splats, worth, self.tuner.cameras, limit, min(most, len(found.splats) - 1), share
+        )
 
 
 def _round(

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.judge import Photograph
-from stages.raster.definition import RasterSettings
+from stages.raster.draw import settings_of
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import Splats
+from stages.scene import IGNORE, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.step import step_of
@@ -30,8 +30,8 @@ class Tuner:
     def __init__(
         self, photographs: Sequence[Photograph], extent: float, backend: str, report: Report
     ) -> None:
-        self.extent, self.report = extent, report
-        self.levels = [_level(photograph) for photograph in photographs]
+        self.photographs, self.extent, self.report = photographs, extent, report
+        self.cameras = [photograph.camera for photograph in photographs]
         self.stepper = step_of(backend)
         self.steps = 0  # made so far
 
@@ -43,7 +43,7 @@ class Tuner:
         model = new_model(*(np.array(a, np.float32, order="C") for a in splats.arrays))
         model.sh_degrees[:] = splats.sh_degrees
         self.stepper.load(model)
-        settings = RasterSettings(near=splats.look.near, sh_degree=splats.sh_degree)
+        settings = replace(settings_of(splats), sh_degree=splats.sh_degree)
         for number in range(steps):
             if self.report.stop_requested.is_set():
                 raise Interrupted("stopped while fine-tuning")
@@ -57,16 +57,15 @@ class Tuner:
 
     def _level(self) -> Level:
         """Every photograph once in each round, in a new order each round."""
-        number, place = divmod(self.steps, len(self.levels))
+        number, place = divmod(self.steps, len(self.photographs))
         self.steps += 1
-        order = np.random.default_rng([7, number]).permutation(len(self.levels))
-        return self.levels[int(order[place])]
+        order = np.random.default_rng([7, number]).permutation(len(self.photographs))
+        return _level(self.photographs[int(order[place])])
 
     def _finished(self, model: Model, before: Splats) -> Splats:
         norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
-        cameras = [level.camera for level in self.levels]
         with np.errstate(divide="ignore"):
-            finest = np.log(smoothing_widths(before.means, cameras, before.look.near))
+            finest = np.log(smoothing_widths(before.means, self.cameras, before.look.near))
         least = np.minimum(before.log_scales, finest[:, None])
         return replace(
             before,
@@ -79,5 +78,9 @@ class Tuner:
 
 
 def _level(photograph: Photograph) -> Level:
+    """In the light and over the background that it is judged in, without what is not judged."""
     planar: NDArray[np.uint8] = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
-    return Level(photograph.camera, planar, channel_means(planar))
+    kept = photograph.kept
+    mask = None if kept is None else kept.astype(np.uint8)
+    outside = "" if mask is None else IGNORE
+    return Level(photograph.camera, planar, channel_means(planar), mask, outside)

@@ -48,7 +48,10 @@ def price_of(draw: Drawing, photographs: Iterable[Photograph]) -> Price:
     samples, sse, tiles = 0, 0.0, []
     for photograph in photographs:
         residual = np.clip(draw(photograph.camera), 0.0, 1.0) - photograph.image
-        samples += residual.size
+        kept = photograph.kept
+        if kept is not None:
+            residual *= kept[..., None]
+        samples += residual.size if kept is None else 3 * int(kept.sum())
         sse += float(np.square(residual, dtype=np.float64).sum())
         tiles.append(_tiles(residual))
     return Price(samples, samples * independent_share(np.concatenate(tiles)), sse)

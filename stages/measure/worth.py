@@ -54,9 +54,9 @@ def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: st
     settings, bands = settings_of(splats), _Bands(splats)
     for photograph in photographs:
         forward = rasteriser.forward(arrays, photograph.camera, settings, depths=True)
-        target = photograph.image.transpose(2, 0, 1)
-        psnr_db.append(decibels(forward.image[:3], target))
-        residual = np.ascontiguousarray(forward.image[:3] - target)
+        drawn, truth = forward.image[:3].transpose(1, 2, 0), photograph.image
+        psnr_db.append(decibels(drawn, truth, photograph.kept))
+        residual = np.ascontiguousarray((drawn - truth).transpose(2, 0, 1))
         if photograph.kept is not None:
             residual *= photograph.kept
         sse += float(np.sum(residual.astype(np.float64) ** 2))
@@ -131,10 +131,11 @@ def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[n
 
 def squared_error(splats: Splats, photographs: Iterable[Photograph], backend: str) -> float:
     """Summed over all photographs, as `Worth.sse`."""
-    draw = drawing_of(splats, backend)
-    return sum(
-        float(np.square(draw(p.camera) - p.image, dtype=np.float64).sum()) for p in photographs
-    )
+    draw, found = drawing_of(splats, backend), 0.0
+    for photograph in photographs:
+        squares = np.square(draw(photograph.camera) - photograph.image, dtype=np.float64)
+        found += float(squares.sum() if photograph.kept is None else squares[photograph.kept].sum())
+    return found
 
 
 def floaters(splats: Splats, worth: Worth, cameras: list[Camera]) -> NDArray[np.bool_]:
