@@ -32,6 +32,7 @@ class Tuner:
     ) -> None:
         self.photographs, self.extent, self.report = photographs, extent, report
         self.cameras = [photograph.camera for photograph in photographs]
+        self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
         self.stepper = step_of(backend)
         self.steps = 0  # made so far
 
@@ -60,7 +61,9 @@ class Tuner:
         number, place = divmod(self.steps, len(self.photographs))
         self.steps += 1
         order = np.random.default_rng([7, number]).permutation(len(self.photographs))
-        return _level(self.photographs[int(order[place])])
+        which = int(order[place])
+        level = _level(self.photographs[which])
+        return replace(level, means=self._means.setdefault(which, level.means))
 
     def _finished(self, model: Model, before: Splats) -> Splats:
         norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
