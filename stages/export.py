@@ -78,6 +78,7 @@ def run(
     file from being written.
     """
     from stages import formats
+    from stages.formats.coarse import held_by
     from stages.formats.rows import kept_rows
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
@@ -85,9 +86,10 @@ def run(
     quantised: QuantisedSplats = inputs["quantise"]
     reconstruction: Reconstruction = inputs["sfm"]
     _clear(folder)
+    if not quantised.splats.origin.any():
+        moved = replace(quantised.splats, origin=reconstruction.origin)
+        quantised = replace(quantised, splats=moved)
     splats, dropped = kept_rows(quantised.splats)
-    if not splats.origin.any():
-        splats = replace(splats, origin=reconstruction.origin)
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
@@ -96,13 +98,15 @@ def run(
     for number, name in enumerate(wanted):
         report.progress(number, len(wanted), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
-        formats.write(path, splats, units=reconstruction.units, views=reconstruction.views)
+        held = held_by(FORMATS[name], quantised)
+        formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
         size = FORMATS[name].size_bytes(path)
         files.append(ExportedFile(name, path.name, size))
         figures[name] = {
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
-            **_proven(prover, path, report),
+            # pictures of all the splats' colours, values of those that it should hold
+            **_proven(replace(prover, splats=held), path, report),
         }
         report.progress(number + 1, len(wanted), f".{name}", verify_db=figures[name]["verify_db"])
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
@@ -226,7 +230,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=4,
+    version=5,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,

@@ -1,45 +1,98 @@
-"""Stage 5: take out floaters and splats that no photograph needs; prove that it cost nothing."""
+"""Stage 5: model only what the scene requires: what no photograph needs goes, and what does not pay
+its way; the rest goes on learning a little. Prove that it cost nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.stage import Report, Stage
+from stages.formats.table import FORMATS
 from stages.raster.backends import backend_of, backend_setting
 
 if TYPE_CHECKING:
-    from stages.measure.judge import Photograph
+    from stages.capacity.aim import Aim
+    from stages.capacity.rounds import Outcome
     from stages.scene import Reconstruction, Splats
-
-SHARE_A_ROUND = 0.10  # predictions for single splats add up only while few go at once
-BACK_OFFS = 5
 
 
 @dataclass(frozen=True)
 class PruneSettings:
     rounds: int = field(
-        default=2, metadata={"help": "Rounds of pruning, 0 for none.", "min": 0, "max": 100}
-    )
-    max_loss_db: float = field(
-        default=0.05,
+        default=8,
         metadata={
-            "help": "PSNR of the training photographs that pruning may cost in all (dB).",
+            "help": "Rounds of pruning, each of a tenth of the splats at most; 0 for none.",
             "min": 0,
             "max": 100,
+        },
+    )
+    price: float = field(
+        default=1.0,
+        metadata={
+            "help": "How much a splat must be worth to stay, 1 for what the photographs ask; the "
+            "loss allowed grows with it.",
+            "min": 0.001,
+            "max": 1000,
+        },
+    )
+    max_loss_db: float = field(
+        default=0.1,
+        metadata={
+            "help": "PSNR of the training photographs that pruning may cost in all, at price 1 "
+            "(dB).",
+            "min": 0,
+            "max": 100,
+        },
+    )
+    max_splats: int = field(
+        default=0,
+        metadata={"help": "Splats at most, whatever it costs.", "min": 0, "max": 100_000_000},
+    )
+    max_mb: float = field(
+        default=0.0,
+        metadata={
+            "help": "Size at most, whatever it costs, of the file that --mb-of names; 0 for any "
+            "(megabytes).",
+            "min": 0,
+            "max": 1_000_000,
+        },
+    )
+    mb_of: str = field(
+        default="ply",
+        metadata={"help": "Format that --max-mb speaks of", "choices": tuple(FORMATS)},
+    )
+    min_psnr: float = field(
+        default=0.0,
+        metadata={
+            "help": "As small as the training photographs allow at this PSNR, instead of by price; "
+            "0 for none (dB).",
+            "min": 0,
+            "max": 99,
+        },
+    )
+    tune_steps: int = field(
+        default=90,
+        metadata={
+            "help": "Steps of fine-tuning after each round; 0 for none.",
+            "min": 0,
+            "max": 100_000,
         },
     )
     backend: str = backend_setting()
 
 
 def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report) -> Splats:
-    """Fewer splats, written to `folder`; counts and PSNR before and after into the report."""
+    """Fewer splats, written to `folder`; each round, counts and PSNR before and after into the
+    report. Raises SplatError for targets that cannot be met."""
     import numpy as np
 
+    from stages.capacity import words
+    from stages.capacity.rounds import Shrinking
+    from stages.capacity.tuning import Tuner
     from stages.measure.judge import load_photographs, mean_psnr_db
-    from stages.scene import split_held_out
+    from stages.scene import scene_extent, split_held_out
     from stages.scene.storage import save_splats
 
     reconstruction: Reconstruction = inputs["sfm"]
@@ -48,67 +101,76 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     photographs = load_photographs(reconstruction.folder, kept, splats.look)
     judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
     before = mean_psnr_db(splats, judges, settings.backend)
-    floor = mean_psnr_db(splats, photographs, settings.backend) - settings.max_loss_db
-    start, counts = len(splats), {"floaters": 0, "unneeded": 0}
-    for number in range(settings.rounds):
-        report.progress(number, settings.rounds, "pruning", splats=len(splats))
-        splats, found = _one_round(splats, photographs, settings.backend, floor)
-        for name, count in found.items():
-            counts[name] += count
-        if not sum(found.values()):
-            break
-    after = mean_psnr_db(splats, judges, settings.backend)
+    extent = scene_extent(reconstruction.views)
+    tuner = Tuner(photographs, extent, settings.backend, report)
+    aim = _aim(settings, reconstruction)
+    shrinking = Shrinking(
+        *(photographs, aim, settings.backend, tuner, settings.rounds, settings.tune_steps, report)
+    )
+    found = shrinking.run(splats)
+    after = mean_psnr_db(found.splats, judges, settings.backend)
     report.metric("backend", backend_of(settings.backend).name)
     report.metric("judged_side_px", splats.look.side)
-    report.metric("splats_before", start)
-    report.metric("splats", len(splats))
-    report.metric("floaters_removed", counts["floaters"])
-    report.metric("unneeded_removed", counts["unneeded"])
-    report.metric("floater_share", round(counts["floaters"] / max(start, 1), 5))
     report.metric("psnr_before_db", round(before, 3))
     report.metric("psnr_db", round(after, 3))
     report.metric("psnr_change_db", round(after - before, 3))
-    if counts["floaters"] > 0.05 * start:
+    report.metric("tune_steps", tuner.steps)
+    _report_cuts(splats, found, report)
+    report.metric("said", words.said(splats, found, settings.price, tuner.steps))
+    if more := words.more_would_pay(found, settings.price):
+        report.warn("prune-more-would-pay", more)
+    assert np.isfinite(found.splats.means).all()
+    save_splats(folder, found.splats)
+    return found.splats
+
+
+def _aim(settings: PruneSettings, reconstruction: Reconstruction) -> Aim:
+    """What is asked for. The size is measured on a file that is really written."""
+    import tempfile
+
+    from stages import formats
+    from stages.capacity.aim import Aim
+
+    def size_bytes(splats: Splats) -> int:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"scene.{settings.mb_of}"
+            views, units = reconstruction.views, reconstruction.units
+            formats.write(path, splats, units=units, views=views)
+            return FORMATS[settings.mb_of].size_bytes(path)
+
+    return Aim(
+        settings.price,
+        settings.max_loss_db,
+        settings.max_splats,
+        settings.max_mb * 1e6,
+        settings.min_psnr,
+        size_bytes,
+    )
+
+
+def _report_cuts(before: Splats, found: Outcome, report: Report) -> None:
+    """Counts, the price and the rounds as metrics; a warning where much was in the air."""
+    kept = [one for one in found.rounds if one.kept]
+    floaters, start = sum(one.floaters for one in kept), len(before)
+    after = found.splats
+    degrees = [int((after.sh_degrees == d).sum()) for d in range(after.sh_degree + 1)]
+    report.metric("splats_before", start)
+    report.metric("splats", len(after))
+    report.metric("floaters_removed", floaters)
+    report.metric("unneeded_removed", start - len(after) - floaters)
+    report.metric("floater_share", round(floaters / max(start, 1), 5))
+    report.metric("splats_by_sh_degree", degrees)
+    report.metric("price", asdict(found.price) | {"bits_a_number": found.price.bits_a_number})
+    report.metric("training_psnr_before_db", round(found.start_db, 3))
+    report.metric("training_psnr_db", round(found.end_db, 3))
+    report.metric("stopped_by", found.stopped_by)
+    report.metric("rounds", [asdict(one) for one in found.rounds])
+    if floaters > 0.05 * start:
         report.warn(
             "prune-many-floaters",
-            f"{counts['floaters']:,} of {start:,} splats hung in empty space near cameras. "
+            f"{floaters:,} of {start:,} splats hung in empty space near cameras. "
             "Photographs with more overlap, and a locked exposure, leave fewer.",
         )
-    assert np.isfinite(splats.means).all()
-    save_splats(folder, splats)
-    return splats
-
-
-def _one_round(
-    splats: Splats,
-    photographs: Sequence[Photograph],
-    backend: str,
-    floor_db: float,
-) -> tuple[Splats, dict[str, int]]:
-    """Remove what a round may, most harmful first; less of it while they lose too much."""
-    import numpy as np
-
-    from stages.measure.judge import mean_psnr_db
-    from stages.measure.worth import beside_pictures, floaters, measure_worth, unneeded
-
-    worth = measure_worth(splats, photographs, backend)
-    cameras = [photograph.camera for photograph in photographs]
-    floating = floaters(splats, worth, cameras)
-    useless = unneeded(worth, beside_pictures(splats, cameras))
-    candidates = np.flatnonzero(floating | useless)
-    order = np.lexsort((candidates, worth.sse_change[candidates], ~floating[candidates]))
-    chosen = candidates[order][: max(1, int(SHARE_A_ROUND * len(splats)))]
-    for _ in range(BACK_OFFS):
-        if not len(chosen) or len(chosen) == len(splats):
-            break
-        keep = np.ones(len(splats), bool)
-        keep[chosen] = False
-        fewer = splats.take(keep)
-        if mean_psnr_db(fewer, photographs, backend) >= floor_db:
-            n_floating = int(floating[chosen].sum())
-            return fewer, {"floaters": n_floating, "unneeded": len(chosen) - n_floating}
-        chosen = chosen[: len(chosen) // 2]
-    return splats, {"floaters": 0, "unneeded": 0}
 
 
 def load(folder: Path) -> Splats:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,17 @@ if TYPE_CHECKING:
     from stages.measure.judge import Photograph
     from stages.scene import Look, QuantisedSplats, Reconstruction, Splats
 
-_DECISIONS = "decisions.json"
+_DECISIONS, _FLAT = "decisions.json", "flat_dc.npy"
 # Colour that a splat may lose with its higher bands, in steps of 8 bits; the largest that passes.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
+# What a .sog may tell its values in, by attribute; the fewest that pass.
+_FEWER_BITS = {
+    "position": (15, 14, 13, 12),
+    "rotation": (7, 6, 5, 4),
+    "scale": (7, 6, 5, 4),
+    "colour": (7, 6, 5),
+    "opacity": (7, 6, 5, 4),
+}
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,14 @@ class QuantiseSettings:
         default=0.02,
         metadata={
             "help": "PSNR of training photographs that smaller files may cost (dB).",
+            "min": 0,
+            "max": 100,
+        },
+    )
+    sog_loss_db: float = field(
+        default=0.1,
+        metadata={
+            "help": "PSNR of training photographs that fewer bits in a .sog may cost besides (dB).",
             "min": 0,
             "max": 100,
         },
@@ -54,9 +70,13 @@ def run(
     those that decided where none are held out), sh_degree, splats_by_sh_degree, raw_mib, kept_mib.
     Raises SplatError if a photograph cannot be read.
     """
-    from stages.formats import splat32
-    from stages.formats.rows import kept_rows
-    from stages.scene import QuantisedSplats, save_splats
+    import numpy as np
+
+    from stages.base.atomic import replacing
+    from stages.formats import FORMATS, splat32
+    from stages.formats.coarse import held_by
+    from stages.measure.flat import flat_dc
+    from stages.scene import QuantisedSplats, save_splats, split_held_out
 
     splats: Splats = inputs["prune"]
     decider, judge = _measures(inputs["sfm"], splats.look, settings, report)
@@ -70,7 +90,11 @@ def run(
             kept = candidate
             break
     kept, threshold = _cut_each(kept, raw_db, settings, decider)
-    drawn, _ = kept_rows(kept)
+    flat = None
+    if kept.sh_degree:
+        views = split_held_out(inputs["sfm"].views)[0]
+        flat = flat_dc(kept, (kept.look.camera(v.camera) for v in views), settings.backend)
+    drawn = held_by(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
     in_32_bytes = splat32.decode(splat32.encode(drawn))
     judged = {
         "psnr_raw_db": judge.psnr(splats),
@@ -79,8 +103,11 @@ def run(
     }
 
     counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
+    bits, sog_db = _bits(kept, settings, decider)
     decisions: dict[str, object] = {
         "sh_degree": kept.sh_degree,
+        "bits": bits,
+        "psnr_sog_training_db": sog_db,
         "splats_by_sh_degree": counts,
         "max_loss_db": settings.max_loss_db,
         "colour_loss_of_255": threshold,
@@ -92,6 +119,7 @@ def run(
     for name in ("psnr_raw_db", "psnr_kept_db", "psnr_splat32_db", "sh_degree"):
         report.metric(name, decisions[name])
     report.metric("splats_by_sh_degree", counts)
+    report.metric("bits", bits)
     report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
     report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("measured_on", judge.what)
@@ -99,7 +127,10 @@ def run(
     report.metric("backend", backend_of(settings.backend).name)
     save_splats(folder, kept)
     (folder / _DECISIONS).write_text(json.dumps(decisions, indent=1) + "\n", encoding="utf-8")
-    return QuantisedSplats(kept, kept.sh_degree, decisions)
+    if flat is not None:
+        with replacing(folder / _FLAT) as path, path.open("wb") as file:
+            np.save(file, flat)
+    return QuantisedSplats(kept, kept.sh_degree, decisions, flat)
 
 
 def _cut_each(
@@ -120,6 +151,30 @@ def _cut_each(
         if raw_db - decider.psnr(candidate) < settings.max_loss_db:
             return candidate, steps
     return kept, 0.0
+
+
+def _bits(
+    kept: Splats, settings: QuantiseSettings, decider: _Measure
+) -> tuple[dict[str, int], float]:
+    """(by attribute, in how many bits a .sog tells it; PSNR of such a file): as few as cost each
+    attribute its share of what smaller files may cost."""
+    from stages.formats.coarse import Bits, of_sog
+    from stages.formats.rows import kept_rows
+
+    drawn, found = kept_rows(kept)[0], Bits()
+    if not len(drawn):
+        return asdict(found), 0.0
+    best = decider.psnr(of_sog(drawn, found))
+    share = settings.sog_loss_db / len(asdict(found))
+    for name, fewer in _FEWER_BITS.items():
+        floor = best - share
+        for count in fewer:
+            tried = replace(found, **{name: count})
+            psnr = decider.psnr(of_sog(drawn, tried))
+            if psnr < floor:
+                break
+            found, best = tried, psnr
+    return asdict(found), best
 
 
 def _bytes(splats: Splats) -> int:
@@ -172,20 +227,23 @@ class _Measure:
 
         mean = round(mean_psnr_db(splats, self.photographs, self.settings.backend), 4)
         self.done += 1
-        # At most: raw, three lower degrees, each threshold.
-        total = 4 + len(_THRESHOLDS_OF_255)
+        # At most: raw, three lower degrees, each threshold, each number of bits.
+        total = 5 + len(_THRESHOLDS_OF_255) + sum(map(len, _FEWER_BITS.values()))
         self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
         return mean
 
 
 def load(folder: Path) -> QuantisedSplats:
     """The decision in a finished folder. Raises SplatError if it is damaged."""
+    import numpy as np
+
     from stages.scene import QuantisedSplats, load_splats
 
     splats = load_splats(folder)
     try:
         decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
-        return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions)
+        flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
+        return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions, flat)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "quantise-folder-damaged",

@@ -24,6 +24,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "stages.training",
         "stages.proof",
         "stages.trade",
+        "stages.capacity",
         "stages.surface",
         "stages.film",
     ),

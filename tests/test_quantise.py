@@ -15,7 +15,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
 from stages.measure.sh import cut, degrees_at, tail_rms
 from stages.quantise import QuantiseSettings
-from stages.scene import QuantisedSplats
+from stages.scene import QuantisedSplats, dc_to_rgb
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -159,3 +159,28 @@ def test_cutting_takes_whole_bands_and_no_others() -> None:
         kept = (int(degrees[i]) + 1) ** 2
         np.testing.assert_array_equal(after.sh[i, :kept], splats.sh[i, :kept])
         assert not after.sh[i, kept:].any()
+
+
+def test_colours_without_view_dependence_are_the_means_of_what_is_seen(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    result, _ = decide(scene, tmp_path)
+    shiny = result.splats.sh_degrees > 0
+    assert result.flat_dc is not None
+    moved = np.abs(result.flat_dc - result.splats.sh[:, 0]).max(axis=1)
+    assert (moved[shiny] > 1e-3).mean() > 0.5
+    dark = dc_to_rgb(result.splats.sh[:, 0]) == 0  # a colour below 0 is drawn, and averaged, as 0
+    assert moved[~shiny & ~dark.any(axis=1)].max() < 1e-4
+    loaded = quantise.load(tmp_path)
+    np.testing.assert_array_equal(loaded.flat_dc, result.flat_dc)
+
+
+def test_a_sog_is_told_in_no_more_bits_than_show(scene: SmallScene, tmp_path: Path) -> None:
+    for name, allowed in (("a", 0.02), ("b", 2.0)):
+        (tmp_path / name).mkdir()
+        _, metrics = decide(scene, tmp_path / name, sog_loss_db=allowed)
+        kept = json.loads((tmp_path / name / "decisions.json").read_text())
+        assert kept["bits"] == metrics["bits"]
+    fewest = metrics["bits"]
+    assert fewest["position"] < 16
+    assert all(fewest[name] < 8 for name in ("rotation", "scale", "colour", "opacity"))

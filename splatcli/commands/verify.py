@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
     from stages.proof.prover import Proof
-    from stages.scene import Splats, View
+    from stages.scene import QuantisedSplats, Splats, View
 
 _ITSELF = "itself"
 _ONLY_ITSELF = (
@@ -26,7 +26,7 @@ _ONLY_ITSELF = (
 @dataclass(frozen=True)
 class _Original:
     """What files are compared with. name: in words. came_as: the format that it was read from.
-    itself: whether that was the file in question. backend: what draws."""
+    itself: whether that was the file in question. backend: what draws. quantised: of a run."""
 
     splats: Splats
     views: tuple[View, ...]
@@ -34,6 +34,14 @@ class _Original:
     came_as: str = ""
     itself: bool = False
     backend: str = "auto"
+    quantised: QuantisedSplats | None = None
+
+    def held_in(self, file: Path) -> Splats:
+        """What `file` should hold, as export decided where a run is known."""
+        from stages.formats import format_of
+        from stages.formats.coarse import held_by
+
+        return held_by(format_of(file), self.quantised) if self.quantised else self.splats
 
 
 def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool) -> None:
@@ -58,7 +66,8 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
             cameras = cameras_for(original.splats, original.views)
             prover = Prover.of(original.splats, cameras, original.backend, original.came_as)
         del read
-        proof = prover.prove(file, exact=original.itself)
+        held = replace(prover, splats=original.held_in(file))
+        proof = held.prove(file, exact=original.itself)
         found.append((file, proof))
         if as_json:
             console.emit("verified", **_facts(file, proof, original))
@@ -105,9 +114,11 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
         came_as = formats.format_of(file).ending
         return _Original(kept_rows(read)[0], (), _ITSELF, came_as, itself=True)
     seen = run.load("sfm").views
-    splats = kept_rows(run.load("quantise").splats)[0]
+    quantised = run.load("quantise")
+    splats = kept_rows(quantised.splats)[0]
     backend = sources.backend_of(run)
-    return _Original(splats, seen, f"the run {run.run_folder}", backend=backend)
+    name = f"the run {run.run_folder}"
+    return _Original(splats, seen, name, backend=backend, quantised=quantised)
 
 
 def _tell(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:

@@ -14,18 +14,18 @@ _SAMPLE = 1 << 15  # vectors that the coarse centres are found from
 _ROWS_AT_ONCE = 1 << 14
 
 
-def of_numbers(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[256] rising: near the values [M] in the least squares sense; all of them if they are few."""
+def of_numbers(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.float64]:
+    """[size] rising: near the values [M] in the least squares sense; all of them if few."""
     ordered = np.sort(values, axis=None)
     new = np.ones(len(ordered), bool)
     np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
     distinct = ordered[new].astype(np.float64)
-    if len(distinct) <= SIZE:
-        padding = np.full(SIZE - len(distinct), distinct[-1] if len(distinct) else 0.0)
+    if len(distinct) <= size:
+        padding = np.full(size - len(distinct), distinct[-1] if len(distinct) else 0.0)
         return np.concatenate([distinct, padding])
     # Half of the first centres where the values are many, half spread evenly, for the far ones.
-    ranks = np.linspace(0, len(ordered) - 1, SIZE // 2).astype(np.intp)
-    even = np.linspace(ordered[0], ordered[-1], SIZE - SIZE // 2)
+    ranks = np.linspace(0, len(ordered) - 1, size // 2).astype(np.intp)
+    even = np.linspace(ordered[0], ordered[-1], size - size // 2)
     centres = np.sort(np.concatenate([ordered[ranks], even]))
     sums, squares = _running(ordered, 1), _running(ordered, 2)
     for _ in range(_SCALAR_ROUNDS):
@@ -38,9 +38,9 @@ def of_numbers(values: NDArray[np.floating]) -> NDArray[np.float64]:
         means = np.diff(sums[ends])[used] / counts[used]
         errors = np.maximum(np.diff(squares[ends])[used] - counts[used] * means * means, 0)
         # A centre without values goes to a cell whose values are far apart, and splits it.
-        widest = np.argsort(-errors, kind="stable")[: SIZE - len(used)]
+        widest = np.argsort(-errors, kind="stable")[: size - len(used)]
         spread = np.sqrt(errors[widest] / counts[used][widest])
-        extra = np.resize(means[widest] + spread, SIZE - len(used))
+        extra = np.resize(means[widest] + spread, size - len(used))
         centres = np.sort(np.concatenate([means, extra]))
     return centres
 

@@ -27,9 +27,10 @@ from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
 from stages.scene import Splats, morton
 
 # Beyond them scales look the same, and the codebook's entries are better spent between.
-_LOG_SCALE_LIMIT = 20.0
+LOG_SCALE_LIMIT = 20.0
 _PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
 _DC_LIMIT = 1e4
+STEPS = 65535  # of a position, along each axis
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
@@ -84,24 +85,30 @@ def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _positions(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
     low, high = (np.zeros(3), np.zeros(3))
     if len(splats):  # the curve rises: the ends of the bent are the bent ends
-        low, high = (_bent(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
+        low, high = (bent(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
     span = np.where(high > low, high - low, 1.0)
     steps = np.empty((len(splats), 3), np.uint16)
     for rows in passing(len(splats)):
-        steps[rows] = np.rint((_bent(splats.means[rows]) - low) / span * 65535)
+        steps[rows] = np.rint((bent(splats.means[rows]) - low) / span * STEPS)
     files = ["means_l.webp", "means_u.webp"]
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
     halves = (steps & 255, steps >> 8)
     return {name: _picture(half.astype(np.uint8)) for name, half in zip(files, halves, strict=True)}
 
 
-def _bent(means: NDArray[np.floating]) -> NDArray[np.float64]:
+def bent(means: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Positions on the curve whose even steps are stored: finer near the centre."""
     exact = means.astype(np.float64)
     return np.sign(exact) * np.log1p(np.abs(exact))
 
 
+def unbent(curved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse of `bent`."""
+    return np.sign(curved) * np.expm1(np.abs(curved))
+
+
 def _shapes(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
-    logs = np.clip(splats.log_scales, -_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT)
+    logs = np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
     book = codebook.of_numbers(logs)
     meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
     turns = np.empty((len(splats), 4), np.uint8)

@@ -24,7 +24,8 @@ class Format:
     reader (path) -> Splats, y down; raises SplatError "splats-unreadable";
     second_reader (path) -> Splats in the file's axes, sharing no code with the writer; may raise
     anything; anatomy (path) -> Anatomy; order (splats) -> [N] the row that each row of the file
-    comes from, if it sorts them; validator (path) -> list of complaints, if another program has
+    comes from, if it sorts them; coarse (splats, bits) -> Splats in fewer bits, if the format packs
+    what repeats; validator (path) -> list of complaints, if another program has
     one.
 
     Of a mesh (no reader): writer (path, mesh, units); second_reader (path) -> (vertices [V, 3],
@@ -39,6 +40,7 @@ class Format:
     reader: str = ""
     anatomy: str = ""
     order: str = ""
+    coarse: str = ""
     validator: str = ""
     loses: str = ""
     sh_degree: int = 3
@@ -110,7 +112,7 @@ TABLE = (
     Format(
         "splat",
         opens_in="web viewers",
-        keeps="8-bit colour and rotation; no view-dependent colour",
+        keeps="8-bit colour and rotation; the mean of the colours that photographs see",
         writer="stages.formats.splat32:write",
         reader="stages.formats.splat32:read",
         second_reader="stages.proof.second_readers:splat",
@@ -164,6 +166,7 @@ TABLE = (
         second_reader="stages.proof.second_packed:sog",
         anatomy="stages.proof.anatomy:sog",
         order="stages.scene.morton:order",
+        coarse="stages.formats.coarse:of_sog",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
     ),
     Format(

@@ -1,4 +1,4 @@
-"""What each splat is worth to a set of photographs, and which splats are floaters."""
+"""What each splat and each band of its colour is worth to photographs; which are floaters."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from stages.measure.judge import Photograph
+from stages.measure.judge import Photograph, decibels, drawing_of
 from stages.raster.backends import rasteriser_of
-from stages.raster.definition import splat_arrays
+from stages.raster.definition import CHANGE, LARGEST, PULL, SQUARES, WEIGHT, splat_arrays
 from stages.raster.draw import settings_of
+from stages.raster.reference import sh_basis
 from stages.scene import Camera, Splats
 
 SEEN = 1.0 / 255.0  # a weight below it cannot change an 8-bit picture
@@ -25,7 +27,11 @@ class Worth:
     """Per splat [N]. sse_change: of the summed squared error over all photographs if it alone
     were removed (negative: they would be better without it). weight: summed blend weight;
     largest_weight: in any pixel. photographs: in how many it has a weight of 1/255 somewhere.
-    sse: summed squared error now. scene_depth [photographs]: median depth of each picture.
+    sse: summed squared error now. scene_depth, psnr_db [photographs]: median depth of each picture,
+    and how near it is.
+
+    cut_change [N, L]: of the summed squared error if its colour kept only the bands up to degree
+    0..L - 1, the mean of what is lost baked in: cut_colour [N, L, 3], what that adds to its colour.
     """
 
     sse_change: NDArray[np.float64]
@@ -34,19 +40,23 @@ class Worth:
     photographs: NDArray[np.int32]
     sse: float
     scene_depth: NDArray[np.float64]
+    cut_change: NDArray[np.float64]
+    cut_colour: NDArray[np.float64]
+    psnr_db: NDArray[np.float64]
 
 
 def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: str) -> Worth:
     """What each splat does for the photographs, drawn by its own look."""
     n = len(splats)
     change, weight, largest = np.zeros(n), np.zeros(n), np.zeros(n)
-    seen_in, sse, depths = np.zeros(n, np.int32), 0.0, []
+    seen_in, sse, depths, psnr_db = np.zeros(n, np.int32), 0.0, [], []
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
-    settings = settings_of(splats)
+    settings, bands = settings_of(splats), _Bands(splats)
     for photograph in photographs:
         forward = rasteriser.forward(arrays, photograph.camera, settings, depths=True)
-        target = photograph.image.transpose(2, 0, 1)
-        residual = np.ascontiguousarray(forward.image[:3] - target)
+        drawn, truth = forward.image[:3].transpose(1, 2, 0), photograph.image
+        psnr_db.append(decibels(drawn, truth, photograph.kept))
+        residual = np.ascontiguousarray((drawn - truth).transpose(2, 0, 1))
         if photograph.kept is not None:
             residual *= photograph.kept
         sse += float(np.sum(residual.astype(np.float64) ** 2))
@@ -54,11 +64,78 @@ def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: st
         depths.append(float(np.median(solid)) if solid.size else np.inf)
         found = rasteriser.contributions(forward, residual)
         rows = forward.visible
-        change[rows] += found[:, 0]
-        weight[rows] += found[:, 1]
-        largest[rows] = np.maximum(largest[rows], found[:, 2])
-        seen_in[rows] += found[:, 2] >= SEEN
-    return Worth(change, weight, largest, seen_in, sse, np.array(depths))
+        change[rows] += found[:, CHANGE]
+        weight[rows] += found[:, WEIGHT]
+        largest[rows] = np.maximum(largest[rows], found[:, LARGEST])
+        seen_in[rows] += found[:, LARGEST] >= SEEN
+        bands.add(photograph.camera.centre, rows, found)
+    cut_change, cut_colour = bands.cuts()
+    return Worth(
+        change,
+        weight,
+        largest,
+        seen_in,
+        sse,
+        np.array(depths),
+        cut_change,
+        cut_colour,
+        np.array(psnr_db),
+    )
+
+
+class _Bands:
+    """Sums over photographs for each degree that colours may be cut to: d the change of a splat's
+    colour there, g the pull of the residual on it, q its squared weights."""
+
+    def __init__(self, splats: Splats) -> None:
+        shape = (len(splats), splats.sh_degree, 3)
+        self.splats = splats
+        self.linear, self.square, self.shift = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        self.pull, self.squares = np.zeros((len(splats), 1, 3)), np.zeros((len(splats), 1, 1))
+
+    def add(
+        self, centre: NDArray[np.floating], rows: NDArray[np.int32], found: NDArray[np.float64]
+    ) -> None:
+        """One photograph. found [V, CONTRIBUTIONS] of the splats `rows`."""
+        if not self.splats.sh_degree:
+            return
+        every = colours_by_degree(self.splats.take(rows), centre)
+        d = every[:, :-1] - every[:, -1:]
+        g, q = found[:, None, PULL:], found[:, SQUARES, None, None]
+        self.linear[rows] += d * g
+        self.square[rows] += d * d * q
+        self.shift[rows] += d * q
+        self.pull[rows] += g
+        self.squares[rows] += q
+
+    def cuts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(cut_change, cut_colour) of `Worth`: with s added to the colour, each photograph's error
+        changes by 2 (d + s) g + (d + s)^2 q; s is what makes the mean of d, weighted by q, zero."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            s = np.where(self.squares > 0, -self.shift / self.squares, 0.0)
+        first_order = 2 * (self.linear + s * self.pull)
+        second_order = self.square + 2 * s * self.shift + s * s * self.squares
+        return (first_order + second_order).sum(2), s
+
+
+def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N, L + 1, 3] colour of each splat seen from `centre`, with the bands up to degree 0..L."""
+    offsets = splats.means - centre
+    with np.errstate(invalid="ignore", divide="ignore"):
+        directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    basis = sh_basis(torch.from_numpy(directions), splats.sh_degree).numpy()
+    terms = basis[:, :, None] * splats.sh
+    ends = np.arange(1, splats.sh_degree + 2) ** 2 - 1
+    return np.maximum(0.5 + np.cumsum(terms, axis=1)[:, ends], 0.0)
+
+
+def squared_error(splats: Splats, photographs: Iterable[Photograph], backend: str) -> float:
+    """Summed over all photographs, as `Worth.sse`."""
+    draw, found = drawing_of(splats, backend), 0.0
+    for photograph in photographs:
+        squares = np.square(draw(photograph.camera) - photograph.image, dtype=np.float64)
+        found += float(squares.sum() if photograph.kept is None else squares[photograph.kept].sum())
+    return found
 
 
 def floaters(splats: Splats, worth: Worth, cameras: list[Camera]) -> NDArray[np.bool_]:
@@ -81,11 +158,3 @@ def beside_pictures(splats: Splats, cameras: list[Camera]) -> NDArray[np.bool_]:
         margin = RIM * size.max()
         beside |= (z > 0) & ((pixels > -margin) & (pixels < size + margin)).all(1)
     return beside
-
-
-def unneeded(worth: Worth, beside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[N] splats that no photograph is better for: seen, and the error does not grow without
-    them; or never seen, and not beside any picture either (see `beside_pictures`). What continues a
-    picture beyond its rim no photograph speaks against, and views in between show it."""
-    seen = worth.photographs > 0
-    return np.asarray((seen & (worth.sse_change <= 0.0)) | (~seen & ~beside))

@@ -25,6 +25,11 @@ QUATERNION_MIN = 1e-20  # largest component; below it a rotation is lost to roun
 # A row of gradients: where each parameter's begin. SH come basis function by basis function, RGB
 # last, DC first; whole vectors of 16 columns, zero beyond the last band.
 MEAN, ROTATION, LOG_SCALE, OPACITY, SH, SH_REST = 0, 3, 7, 10, 11, 14
+# A row of contributions, of one splat to one picture w its weights, r render less photograph, sums
+# over pixels: change of the squared error without the splat, of w, the largest w, of w^2, and of
+# w r by channel (PULL to PULL + 2).
+CHANGE, WEIGHT, LARGEST, SQUARES, PULL = range(5)
+CONTRIBUTIONS = PULL + 3
 
 
 def used_columns(bands: int) -> int:
@@ -140,8 +145,6 @@ class Rasteriser(Protocol):
         """Gradients of the visible splats, from v_image [3, H, W]."""
 
     def contributions(self, forward: Any, residual: NDArray[np.float32]) -> NDArray[np.float64]:
-        """[V, 3] for the visible splats: change of the squared error against the photograph if
-        the splat alone were removed, sum of its weights, its largest weight.
-
-        residual [3, H, W]: render less photograph.
+        """[V, CONTRIBUTIONS] for the visible splats, columns as above: what each alone does for
+        the picture. residual [3, H, W]: render less photograph.
         """

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import (
+    CHANGE,
+    CONTRIBUTIONS,
+    LARGEST,
     NO_SMOOTHING,
+    PULL,
+    SQUARES,
+    WEIGHT,
     Arrays,
     Backward,
     RasterSettings,
@@ -105,7 +111,7 @@ class ReferenceRasteriser:
         changes by -w c + behind alpha / (1 - alpha), "behind" what is composited behind it."""
         camera, settings = forward.camera, forward.settings
         p = _parameters(forward.arrays)
-        found = torch.zeros(len(forward.arrays[0]), 3, dtype=torch.float64)
+        found = torch.zeros(len(forward.arrays[0]), CONTRIBUTIONS, dtype=torch.float64)
         with torch.no_grad():
             projected = project(p, camera, settings, _widths(forward.smoothing))
             centre = torch.tensor(camera.centre, dtype=torch.float64)
@@ -122,9 +128,11 @@ class ReferenceRasteriser:
                     shift = torch.where(weights > 0, shift, torch.zeros_like(shift))
                     change += shift * (shift + 2 * errors[channel])
                 index = projected.index[rows]
-                found[index, 0] += change.sum(1)
-                found[index, 1] += weights.sum(1)
-                found[index, 2] = torch.maximum(found[index, 2], weights.amax(1))
+                found[index, CHANGE] += change.sum(1)
+                found[index, WEIGHT] += weights.sum(1)
+                found[index, LARGEST] = torch.maximum(found[index, LARGEST], weights.amax(1))
+                found[index, SQUARES] += weights.square().sum(1)
+                found[index, PULL:] += weights @ errors.T
         return found.numpy()[forward.visible]
 
 

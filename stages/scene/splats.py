@@ -113,11 +113,14 @@ class QuantisedSplats:
 
     splats: the values to export, SH already cut to the degree decided for each splat.
     degree: the SH degree kept. decisions: plain data for the manifest (what was kept, its cost).
+    flat_dc [N, 3]: DC coefficients for formats without view-dependent colour; None where those of
+    the splats do.
     """
 
     splats: Splats
     degree: int
     decisions: dict[str, object]
+    flat_dc: NDArray[np.floating] | None = None
 
 
 def rgb_to_dc(rgb: NDArray[np.floating]) -> NDArray[np.floating]:

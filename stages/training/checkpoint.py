@@ -16,7 +16,7 @@ from stages.training.clock import Spent
 from stages.training.optimiser import Model
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP4"
+MAGIC = b"SPLATCP5"
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import triton
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.raster.definition import OPACITY, SH, RasterSettings
+from stages.raster.definition import OPACITY, SH, RasterSettings, gradient_columns
 from stages.raster.gpu.device import failures_told, interpreted
 from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
 from stages.scene import Camera
@@ -89,6 +89,7 @@ class GpuStep:
         with failures_told(len(model)):
             self._scene = self.rasteriser.scene(model.arrays)
             self._smoothing = self._on_device(model.smoothing)
+            self._sh_degrees, self._own = model.sh_degrees, self._own_columns(model)
             self._moment1, self._moment2 = map(self._on_device, (model.moment1, model.moment2))
             self._steps = self._on_device(model.steps)
             self._gradient_sum = self._on_device(model.gradient_sum)
@@ -103,6 +104,7 @@ class GpuStep:
             sh = rows[:, SH : SH + 3 * bands].reshape(len(rows), bands, 3)
             self._on_host = Model(
                 *map(np.ascontiguousarray, (means, quaternions, log_scales, rows[:, 10], sh)),
+                self._sh_degrees,
                 *map(_host, (self._moment1, self._moment2, self._steps)),
                 *map(_host, (self._gradient_sum, self._gradient_count, self._smoothing)),
             )
@@ -130,6 +132,8 @@ class GpuStep:
             loss, v_image = image_loss(drawn.image, target, means)
             photograph.forget_ignored(v_image)
             parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
+            if self._own is not None:
+                parameters *= self._own[:, : parameters.shape[1]]
             self._adam(drawn, view, parameters, means2d, rates, room)
             self._on_host = None
             self._arrivals.send(torch.stack([loss.double(), drawn.lists.total[0].double()]))
@@ -184,6 +188,17 @@ class GpuStep:
             WIDTH=triton.next_power_of_2(out_columns),
             BLOCK=block,
         )
+
+    def _own_columns(self, model: Model) -> Tensor | None:
+        """[N, columns] 0 where a gradient is of a band above the splat's own degree, else 1; None
+        where every splat has all bands."""
+        bands = model.sh.shape[1]
+        own = (model.sh_degrees.astype(np.int64) + 1) ** 2
+        if (own >= bands).all():
+            return None
+        kept = np.ones((len(model), gradient_columns(bands)), np.float32)
+        kept[:, SH : SH + 3 * bands] = np.repeat(np.arange(bands) < own[:, None], 3, axis=1)
+        return self._on_device(kept)
 
     def _on_device(self, array: NDArray[Any]) -> Tensor:
         return torch.tensor(array, device=self.device)

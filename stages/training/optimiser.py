@@ -139,6 +139,7 @@ def adam_step(
     log_scales,
     opacity_logits,
     sh,
+    sh_degrees,
     moment1,
     moment2,
     steps,
@@ -155,7 +156,8 @@ def adam_step(
     gradients, means2d: see `cpu.Backward`. steps [N, STEP_COUNTS], of which the first `counts` have
     a part in this step. corrections [T, 2]: 1 / (1 - beta^t) of both betas. rates [columns of
     gradients]. ndc_x, ndc_y: factors that take a gradient per pixel to the units
-    of the densification threshold. sh [N, 3 bands]: a 2-D view. A splat with a gradient beyond
+    of the densification threshold. sh [N, 3 bands]: a 2-D view; what lies above a splat's own
+    degree in sh_degrees [N] stays as it is. A splat with a gradient beyond
     LARGEST_GRADIENT, or with one that is not finite, stays as it is.
     """
     n = len(visible)
@@ -195,7 +197,8 @@ def adam_step(
             for k in range(4):
                 quaternions[i, k] -= shift[ROTATION + k]
             opacity_logits[i] -= shift[OPACITY]
-            for k in range(min(columns - SH, sh.shape[1])):
+            own = 3 * (np.int64(sh_degrees[i]) + 1) ** 2
+            for k in range(min(columns - SH, sh.shape[1], own)):
                 sh[i, k] -= shift[SH + k]
             gx, gy = means2d[rank, 0] * ndc_x, means2d[rank, 1] * ndc_y
             gradient_sum[i] += math.sqrt(gx * gx + gy * gy)
@@ -212,7 +215,8 @@ def bias_corrections() -> NDArray[np.float32]:
 class Model:
     """The splats in training and all that their optimisation remembers.
 
-    Parameters as in `Splats`, float32. moment1, moment2: columns as the gradient's, for all bands.
+    Parameters as in `Splats`, float32; sh_degrees too: what a splat has no bands for is not
+    trained. moment1, moment2: columns as the gradient's, for all bands.
     steps [N, STEP_COUNTS] int32: how often each was moved, by groups of columns. gradient_sum,
     gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D smoothing
     filter, 0 for none.
@@ -223,6 +227,7 @@ class Model:
     log_scales: NDArray[np.float32]
     opacity_logits: NDArray[np.float32]
     sh: NDArray[np.float32]
+    sh_degrees: NDArray[np.uint8]
     moment1: NDArray[np.float32]
     moment2: NDArray[np.float32]
     steps: NDArray[np.int32]
@@ -249,7 +254,9 @@ class Model:
 
     def fresh(self) -> Model:
         """The same parameters with nothing remembered."""
-        return new_model(*(array.copy() for array in self.arrays))
+        found = new_model(*(array.copy() for array in self.arrays))
+        found.sh_degrees[:] = self.sh_degrees
+        return found
 
     def forget_gradients(self) -> None:
         self.gradient_sum[:] = 0.0
@@ -263,7 +270,7 @@ def new_model(
     opacity_logits: NDArray[np.float32],
     sh: NDArray[np.float32],
 ) -> Model:
-    """A model whose optimiser has seen nothing."""
+    """A model whose optimiser has seen nothing; each splat has all the bands of `sh`."""
     n, columns = len(means), gradient_columns(sh.shape[1])
     return Model(
         means,
@@ -271,6 +278,7 @@ def new_model(
         log_scales,
         opacity_logits,
         sh,
+        np.full(n, math.isqrt(sh.shape[1]) - 1, np.uint8),
         np.zeros((n, columns), np.float32),
         np.zeros((n, columns), np.float32),
         np.zeros((n, STEP_COUNTS), np.int32),
@@ -324,6 +332,7 @@ def apply_gradients(
         model.log_scales,
         model.opacity_logits,
         model.sh.reshape(len(model), 3 * model.sh.shape[1]),
+        model.sh_degrees,
         model.moment1,
         model.moment2,
         model.steps,

@@ -127,7 +127,9 @@ def adam(
     model.quaternions[rows] -= shift[:, ROTATION:LOG_SCALE]
     model.log_scales[rows] -= shift[:, LOG_SCALE:OPACITY]
     model.opacity_logits[rows] -= shift[:, OPACITY]
-    model.sh[rows, :bands] -= shift[:, SH : used_columns(bands)].reshape(len(rows), bands, 3)
+    by_band = shift[:, SH : used_columns(bands)].reshape(len(rows), bands, 3)
+    own = np.arange(bands) < (model.sh_degrees[rows, None].astype(int) + 1) ** 2
+    model.sh[rows, :bands] -= np.where(own[:, :, None], by_band, 0.0)
     pull = backward.means2d[whole].astype(np.float64) * (0.5 * width, 0.5 * height)
     model.gradient_sum[rows] += np.hypot(*pull.T) / (width * height)
     model.gradient_count[rows] += 1

@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from stages.raster.backends import rasteriser_of
-from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.definition import (
+    CHANGE,
+    CONTRIBUTIONS,
+    LARGEST,
+    PULL,
+    SQUARES,
+    WEIGHT,
+    RasterSettings,
+    splat_arrays,
+)
 from stages.raster.reference import blend_weights, parameters_of, project, render_tensors
 from tests.scenes import BACKENDS, camera, cloud, relative, splats
 
@@ -26,11 +35,11 @@ def photograph(seed=5):
 
 
 def measured(backend, scene, picture, where, settings=SETTINGS):
-    """[N, 3] of `contributions`, zero for what is out of view."""
+    """[N, CONTRIBUTIONS] of `contributions`, zero for what is out of view."""
     rasteriser = rasteriser_of(backend)
     forward = rasteriser.forward(splat_arrays(scene), where, settings)
     residual = np.ascontiguousarray(forward.image[:3] - picture)
-    full = np.zeros((len(scene), 3))
+    full = np.zeros((len(scene), CONTRIBUTIONS))
     full[forward.visible] = rasteriser.contributions(forward, residual)
     return full
 
@@ -52,14 +61,14 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_splat(backend, s
     wanted = np.array([squared_error(scene.take(rows != i), picture, where) - now for i in rows])
     assert (wanted < 0).any()
     assert (wanted > 0).any()
-    assert relative(measured(backend, scene, picture, where)[:, 0], wanted) < 1e-3
+    assert relative(measured(backend, scene, picture, where)[:, CHANGE], wanted) < 1e-3
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_against_its_own_picture_no_splat_is_better_gone(backend):
     scene, where = faint_cloud(1), camera(40, 30)
     forward = rasteriser_of(backend).forward(splat_arrays(scene), where, SETTINGS)
-    change = measured(backend, scene, forward.image[:3].copy(), where)[:, 0]
+    change = measured(backend, scene, forward.image[:3].copy(), where)[:, CHANGE]
     assert (change >= 0).all()
 
 
@@ -77,11 +86,16 @@ def test_weights_are_those_of_the_definition(backend, opaque):
     pixels = torch.stack([xs, ys], -1).flatten(0, 1)
     with torch.no_grad():
         weights, _, _ = blend_weights(projected, torch.arange(len(projected.depths)), pixels)
-    wanted = np.zeros((len(scene), 2))
-    wanted[projected.index.numpy()] = np.stack([weights.sum(1), weights.amax(1)], 1)
-    found = measured(backend, scene, photograph(), where)[:, 1:]
-    np.testing.assert_allclose(found[:, 1], wanted[:, 1], atol=5e-3)
-    assert relative(found[:, 0], wanted[:, 0]) < 1e-3
+    image, _, _, _ = render_tensors(parameters_of(scene), where, SETTINGS)
+    residual = (image.detach() - torch.tensor(photograph().transpose(1, 2, 0))).flatten(0, 1)
+    columns = [weights.sum(1), weights.amax(1), weights.square().sum(1), *(weights @ residual).T]
+    wanted = np.zeros((len(scene), 6))
+    wanted[projected.index.numpy()] = torch.stack(columns, 1).numpy()
+    found = measured(backend, scene, photograph(), where)
+    np.testing.assert_allclose(found[:, LARGEST], wanted[:, 1], atol=5e-3)
+    assert relative(found[:, WEIGHT], wanted[:, 0]) < 1e-3
+    assert relative(found[:, SQUARES], wanted[:, 2]) < 1e-3
+    assert relative(found[:, PULL:], wanted[:, 3:]) < 1e-3
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -93,4 +107,4 @@ def test_a_worked_pixel(backend):
     found = measured(
         backend, scene, black, camera(1, 1), replace(SETTINGS, background=(0.0, 0.0, 0.0))
     )
-    np.testing.assert_allclose(found, [[-0.75, 0.5, 0.5]], rtol=1e-4)
+    np.testing.assert_allclose(found, [[-0.75, 0.5, 0.5, 0.25, 0.25, 0.25, 0.25]], rtol=1e-4)

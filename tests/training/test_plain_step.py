@@ -81,3 +81,19 @@ def test_many_steps_end_at_the_same_loss() -> None:
     _, wanted = stepped("reference", 20)
     np.testing.assert_allclose(losses, wanted, rtol=1e-3)
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_bands_above_a_splat_s_own_degree_are_not_trained(backend: str) -> None:
+    level, start = level_of(cloud(80, 40, 30, degree=1)), cloud(60, 40, 30, degree=1, seed=4)
+    model = new_model(*(array.copy() for array in splat_arrays(start)))
+    poor = np.arange(60) % 2 == 0
+    model.sh_degrees[poor] = 0
+    stepper = step_of(backend)
+    stepper.load(model)
+    for _ in range(3):
+        stepper.step(level, RasterSettings(near=0.1, sh_degree=1), RATES, smooth=False)
+    after = stepper.model().sh
+    assert np.array_equal(after[poor, 1:], start.sh[poor, 1:])
+    assert (after[~poor, 1:] != start.sh[~poor, 1:]).any()
+    assert (after[poor, 0] != start.sh[poor, 0]).any()

@@ -1,11 +1,13 @@
-"""What each splat is worth to a picture: its weights, and the exact change of the squared error if
-it were removed.
+"""What each splat is worth to a picture: its weights, the exact change of the squared error if it
+were removed, and what tells that change if its colour were another.
 
 Colour is affine in each alpha, so removing one splat changes a pixel by
     dI = -w c + behind alpha / (1 - alpha),
 w its blend weight, c its colour, "behind" what is composited behind it (background included, light
 at its place included); the squared error against a photograph changes by 2 r dI + dI^2, r the
-residual. Exact but for pixels that the stopping rule or the alpha cut-off would treat otherwise.
+residual. A colour that changes by d changes a pixel by w d, and so the error by 2 d sum(w r) + d^2
+sum(w^2), channel by channel. Exact but for pixels that the stopping rule or the alpha cut-off would
+treat otherwise.
 """
 
 from __future__ import annotations
@@ -36,9 +38,17 @@ from stages.raster.cpu.tile import (
     last_of_blocks,
     load_plane,
 )
-from stages.raster.definition import ALPHA_MAX, ALPHA_MIN
+from stages.raster.definition import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    CHANGE,
+    CONTRIBUTIONS,
+    LARGEST,
+    PULL,
+    SQUARES,
+    WEIGHT,
+)
 
-COLUMNS = 3  # change of the squared error, sum of weights, largest weight
 _F = np.float32
 _ALPHA_MIN, _ALPHA_MAX = _F(ALPHA_MIN), _F(ALPHA_MAX)
 # Planes of the work: residual, colour behind the splat, light behind it.
@@ -74,7 +84,8 @@ def contribution_tiles(
     residual,
     out,
 ):
-    """out [intersections, 3] at each entry's slot; residual [3, H, W]: render - photograph."""
+    """out [intersections, CONTRIBUTIONS] at each entry's slot; residual [3, H, W]: render less
+    photograph."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(7 * PIXELS, np.float32)
@@ -109,7 +120,8 @@ def contribution_tiles(
 @kernel
 def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, slot):
     zero, one, two = splat16(_F(0.0)), splat16(_F(1.0)), splat16(_F(2.0))
-    change, total, largest = zero, zero, zero
+    change, total, largest, squares = zero, zero, zero, zero
+    pull_r, pull_g, pull_b = zero, zero, zero
     while blocks:
         block = lowest_bit(blocks)
         blocks &= blocks - 1
@@ -123,6 +135,10 @@ def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, s
         weight = alpha * before
         total = total + weight
         largest = vmax(largest, weight)
+        squares = vfma(weight, weight, squares)
+        pull_r = vfma(weight, vload(work, RESIDUAL + at), pull_r)
+        pull_g = vfma(weight, vload(work, RESIDUAL + PIXELS + at), pull_g)
+        pull_b = vfma(weight, vload(work, RESIDUAL + 2 * PIXELS + at), pull_b)
         ratio = alpha * inverse
         for channel in range(3):
             plane = channel * PIXELS + at
@@ -131,22 +147,32 @@ def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, s
             shift = behind * ratio - painted
             change = vfma(shift, shift + two * vload(work, RESIDUAL + plane), change)
             vstore(work, BEHIND + plane, behind + painted)
-    out[slot, 0], out[slot, 1] = vsum(change), vsum(total)
+    out[slot, CHANGE], out[slot, WEIGHT], out[slot, SQUARES] = (
+        vsum(change),
+        vsum(total),
+        vsum(squares),
+    )
+    out[slot, PULL], out[slot, PULL + 1] = vsum(pull_r), vsum(pull_g)
+    out[slot, PULL + 2] = vsum(pull_b)
     vstore(lanes, 0, largest)
     top = lanes[0]
     for lane in range(1, 16):
         top = max(top, lanes[lane])
-    out[slot, 2] = top
+    out[slot, LARGEST] = top
 
 
 @kernel
 def gather_contributions(raw, places, out):
-    """out [V, 3] float64: sums (and the largest weight) over each visible splat's tiles."""
+    """out [V, CONTRIBUTIONS] float64: sums (and the largest weight) over each visible splat's
+    tiles."""
     for place in range(len(out)):
-        change, total, largest = 0.0, 0.0, 0.0
+        for column in range(CONTRIBUTIONS):
+            out[place, column] = 0.0
         first = places[place, SLOT]
         for slot in range(first, first + places[place, COUNT]):
-            change += raw[slot, 0]
-            total += raw[slot, 1]
-            largest = max(largest, np.float64(raw[slot, 2]))
-        out[place, 0], out[place, 1], out[place, 2] = change, total, largest
+            for column in range(CONTRIBUTIONS):
+                value = np.float64(raw[slot, column])
+                if column == LARGEST:
+                    out[place, column] = max(out[place, column], value)
+                else:
+                    out[place, column] += value

@@ -20,6 +20,7 @@ from stages.raster.cpu.splat_kernels import (
 )
 from stages.raster.cpu.tile import PIXELS
 from stages.raster.definition import (
+    CONTRIBUTIONS,
     NO_SMOOTHING,
     Arrays,
     Backward,
@@ -206,15 +207,11 @@ class CpuRasteriser:
         return Backward(forward.visible, out, means2d)
 
     def contributions(self, forward: Forward, residual: NDArray[np.float32]) -> NDArray[np.float64]:
-        """[V, 3] for the visible splats: change of the squared error against the photograph if
-        the splat were removed, sum of its weights, its largest weight.
-
-        residual [3, H, W]: render less photograph.
-        """
-        shape = (forward.n_intersections, contributions.COLUMNS)
+        """See `definition.Rasteriser`."""
+        shape = (forward.n_intersections, CONTRIBUTIONS)
         (raw,) = self.buffers.carve((shape, np.float32))
         self._over_tiles(contributions.contribution_tiles, forward, residual, raw)
-        out = np.empty((len(forward.visible), contributions.COLUMNS))
+        out = np.empty((len(forward.visible), CONTRIBUTIONS))
         contributions.gather_contributions(raw, forward.lists.places, out)
         return out
 

@@ -236,8 +236,8 @@ def contribution_kernel(
     tiles_x,
     TILE: tl.constexpr,
 ):
-    """out [entries, 3] at each entry's slot: change of the squared error without the splat, sum of
-    its weights, its largest weight. residual [3, H, W]: see `cpu.contributions`."""
+    """out [entries, 7] at each entry's slot: columns as in `definition.CONTRIBUTIONS`. residual
+    [3, H, W]: see `cpu.contributions`."""
     x, y, i, j, at, inside = pixels_of(tl.program_id(0), tiles_x, width, height, TILE)
     start, count, finished_at = furthest(starts, last, at, inside)
     plane = width * height
@@ -268,7 +268,11 @@ def contribution_kernel(
         shift = behind_b * ratio - painted
         change += shift * (shift + 2.0 * e_b)
         behind_b += painted
-        to = out + tl.load(slots + entry) * 3
+        to = out + tl.load(slots + entry) * 7
         tl.store(to, sum_of(change, 0))
         tl.store(to + 1, sum_of(weight, 0))
         tl.store(to + 2, top_of(weight, 0))
+        tl.store(to + 3, sum_of(weight * weight, 0))
+        tl.store(to + 4, sum_of(weight * e_r, 0))
+        tl.store(to + 5, sum_of(weight * e_g, 0))
+        tl.store(to + 6, sum_of(weight * e_b, 0))

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from stages.raster.camera_row import camera_row
 from stages.raster.definition import (
-    NO_SMOOTHING,
-    SH,
     Arrays,
     Backward,
+    CONTRIBUTIONS,
+    LARGEST,
+    NO_SMOOTHING,
     RasterSettings,
+    SH,
     gradient_columns,
 )
 from stages.raster.gpu import blend, gradients, lists, project
@@ -148,15 +150,15 @@ class GpuRasteriser:
         """See `definition.Rasteriser`."""
         drawn, made = forward.drawn, forward.drawn.lists
         planes = torch.from_numpy(np.ascontiguousarray(residual)).to(self.device)
-        raw = torch.zeros(len(made.members), 3, device=self.device)
+        raw = torch.zeros(len(made.members), CONTRIBUTIONS, device=self.device)
         self._over_tiles(blend.contribution_kernel, forward.view, drawn, planes, raw)
         sums = self._summed(raw, made, tl.float64)
         found = sums.cpu().numpy()[forward.visible]
-        entries = raw[:, 2].cpu().numpy()
+        entries = raw[:, LARGEST].cpu().numpy()
         firsts, counts = (t.cpu().numpy()[forward.visible] for t in (made.firsts, made.counts))
         for place in range(len(found)):
             own = entries[firsts[place] : firsts[place] + counts[place]]
-            found[place, 2] = own.max(initial=0.0)
+            found[place, LARGEST] = own.max(initial=0.0)
         return found
 
     def scene(self, arrays: Arrays, smoothing: NDArray[np.float32] = NO_SMOOTHING) -> Scene:

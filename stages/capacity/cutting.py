@@ -1,0 +1,112 @@
+"""What one round takes away: the splats and bands of colour that are worth least for their size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.measure.worth import Worth, beside_pictures, floaters
+from stages.scene import SH_C0, Camera, Splats, morton
+
+SPLATS_A_ROUND = 0.10  # predictions for single splats add up only while few go at once,
+NEIGHBOURS = 4  # and of so many side by side only one: they stand in for each other
+BANDS = 2.5  # times as many splats may lose bands: colours hardly depend on each other
+_SHAPE_NUMBERS = 11  # of a splat without its colour
+
+
+@dataclass(frozen=True)
+class Cut:
+    """gone [N]: which splats. degrees [N], colour [N, 3]: of each the degree that is left, and what
+    is added to its colour for the bands that go. floaters: how many of `gone`. predicted_sse: what
+    it should change the photographs' squared error by, as if each went alone."""
+
+    gone: NDArray[np.bool_]
+    degrees: NDArray[np.uint8]
+    colour: NDArray[np.float64]
+    floaters: int
+    predicted_sse: float
+
+    def of(self, splats: Splats) -> Splats:
+        """What is left of them."""
+        bands = np.floor(np.sqrt(np.arange(splats.sh.shape[1])))
+        kept = (bands <= self.degrees[:, None])[:, :, None]
+        sh = np.where(kept, splats.sh, splats.sh.dtype.type(0))
+        sh[:, 0] += (self.colour / SH_C0).astype(sh.dtype)
+        return replace(splats, sh=sh, sh_degrees=self.degrees).take(~self.gone)
+
+
+def numbers_of(degrees: NDArray[np.integer]) -> NDArray[np.int64]:
+    """[N] how many numbers a splat of each degree is."""
+    return _SHAPE_NUMBERS + 3 * (degrees.astype(np.int64) + 1) ** 2
+
+
+def choose(
+    splats: Splats,
+    worth: Worth,
+    cameras: Sequence[Camera],
+    sse_a_number: float,
+    most: int,
+    share: float = SPLATS_A_ROUND,
+) -> Cut | None:
+    """At most `most` splats, and bands of a share of the others, that save less squared error than
+    `sse_a_number` for each of their numbers; the least worth first. None if there is nothing.
+
+    Floaters and what lies where no photograph looks go whatever the price. What continues a picture
+    beyond its rim, where none speaks against it, goes last, and only at an infinite price.
+    """
+    seen, beside = worth.photographs > 0, beside_pictures(splats, list(cameras))
+    floating = floaters(splats, worth, list(cameras))
+    free = floating | (~seen & ~beside)
+    ratio = worth.sse_change / numbers_of(splats.sh_degrees)
+    ratio[~seen & beside] = np.finfo(np.float64).max
+    ratio[free] = -np.inf
+    order = np.argsort(ratio, kind="stable")
+    allowed = free | _first_of_neighbours(splats, ratio)
+    chosen = order[(allowed & (ratio < sse_a_number))[order]][:most]
+    gone = np.zeros(len(splats), bool)
+    gone[chosen] = True
+    # bands by the worth of the last splat that goes: what is worth more stays, splat or band
+    limit = float(ratio[chosen[-1]]) if 0 < len(chosen) == most else sse_a_number
+    degrees, colour, bands_sse = _cut_bands(splats, worth, gone, limit, share)
+    if not len(chosen) and np.array_equal(degrees, splats.sh_degrees):
+        return None
+    predicted = float(worth.sse_change[chosen].sum()) + bands_sse
+    return Cut(gone, degrees, colour, int(floating[chosen].sum()), predicted)
+
+
+def _first_of_neighbours(splats: Splats, ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[N] the one of each few neighbours that is worth least."""
+    place = np.empty(len(splats), np.int64)
+    place[morton.order(splats)] = np.arange(len(splats)) // NEIGHBOURS
+    order = np.lexsort((ratio, place))
+    first = np.zeros(len(splats), bool)
+    first[order[np.flatnonzero(np.diff(place[order], prepend=-1))]] = True
+    return first
+
+
+def _cut_bands(
+    splats: Splats,
+    worth: Worth,
+    gone: NDArray[np.bool_],
+    sse_a_number: float,
+    share: float,
+) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
+    """(degrees, colour, predicted change) of the splats that stay, as in `Cut`."""
+    degrees, colour = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
+    best, to = np.full(len(splats), np.inf), np.zeros(len(splats), np.int64)
+    numbers = numbers_of(degrees)
+    for degree in range(splats.sh_degree):
+        saved = numbers - numbers_of(np.full(1, degree))
+        ratio = np.where(saved > 0, worth.cut_change[:, degree] / np.maximum(saved, 1), np.inf)
+        better = (ratio < best) & ~gone
+        best[better], to[better] = ratio[better], degree
+    order = np.argsort(best, kind="stable")[: max(1, int(BANDS * share * len(splats)))]
+    rows = order[best[order] < sse_a_number]
+    degrees[rows] = to[rows]
+    if not len(rows):
+        return degrees, colour, 0.0
+    colour[rows] = worth.cut_colour[rows, to[rows]]
+    return degrees, colour, float(worth.cut_change[rows, to[rows]].sum())

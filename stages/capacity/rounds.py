@@ -1,0 +1,155 @@
+"""Round by round: cut what is worth least, fine-tune, measure, and take back what cost too much."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stages.base.stage import Report
+from stages.capacity.aim import Aim
+from stages.capacity.cutting import SPLATS_A_ROUND, Cut, choose
+from stages.capacity.tuning import Tuner
+from stages.measure.judge import Photograph, drawing_of
+from stages.measure.price import Price, price_of
+from stages.measure.worth import Worth, measure_worth, squared_error
+from stages.scene import Splats
+
+BACK_OFFS = 3  # times that a round may ask for half as much
+# Splats that go together cost more than the sum of each alone, since they stood in for each other:
+# this much at first, then what the last round told that cost enough to tell.
+OVERLAP, TELLING = 1.3, 0.01  # TELLING: of the squared error
+PRICE, LOSS, ROUNDS = "price", "loss", "rounds"  # why it stopped
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round as it was tried. splats: before. predicted_sse, measured_sse: change of the squared
+    error by the cut alone, foretold and drawn. psnr_db: mean over the photographs, fine-tuned.
+    kept: or taken back."""
+
+    splats: int
+    removed: int
+    floaters: int
+    bands_cut: int
+    predicted_sse: float
+    measured_sse: float
+    psnr_db: float
+    kept: bool
+
+
+@dataclass
+class Outcome:
+    """What came of it. start_db, end_db: mean over the photographs that decide. stopped_by: PRICE
+    (what is left pays), LOSS or ROUNDS. least_tenth_db: what the tenth of the splats that is worth
+    least was worth at the start."""
+
+    splats: Splats
+    price: Price
+    start_db: float
+    end_db: float
+    least_tenth_db: float
+    stopped_by: str = ROUNDS
+    rounds: list[Round] = field(default_factory=list)
+
+
+@dataclass
+class Shrinking:
+    """One model on its way down. rounds: at most, unless targets want more. tune_steps: after each
+    of as many; where targets want more rounds, they share the steps."""
+
+    photographs: Sequence[Photograph]
+    aim: Aim
+    backend: str
+    tuner: Tuner
+    rounds: int
+    tune_steps: int
+    report: Report
+
+    def run(self, splats: Splats) -> Outcome:
+        """The smaller model. Raises SplatError for targets that cannot be met, and Interrupted."""
+        worth = self._worth(splats)
+        best = worth.psnr_db
+        mean_db = float(best.mean())
+        self.aim.check_start(mean_db)
+        price = price_of(drawing_of(splats, self.backend), self.photographs)
+        found = Outcome(splats, price, mean_db, mean_db, _least_tenth_db(worth))
+        planned, share, overlap = self._planned(splats), SPLATS_A_ROUND, OVERLAP
+        for number in range(planned):
+            self.report.progress(number, planned, "pruning", splats=len(found.splats))
+            excess = self.aim.excess(found.splats)
+            cut = self._cut(found, worth, excess, share, free=number == 0)
+            if cut is None and number:
+                found.stopped_by = PRICE
+                break
+            if cut is None:
+                continue
+            fewer = cut.of(found.splats)
+            measured = squared_error(fewer, self.photographs, self.backend) - worth.sse
+            fewer = self.tuner.tuned(fewer, self.tune_steps * self.rounds // planned)
+            after = self._worth(fewer)
+            kept = excess > 0 or self.aim.holds(after.psnr_db, best)
+            predicted = cut.predicted_sse * (overlap if cut.predicted_sse > 0 else 1)
+            told = (predicted, measured, float(after.psnr_db.mean()), kept)
+            found.rounds.append(_round(found.splats, cut, *told))
+            if cut.predicted_sse > TELLING * worth.sse:
+                overlap = max(1.0, measured / cut.predicted_sse)
+            if kept:
+                found.splats, worth = fewer, after
+                # what removing harm and learning on win is not there to be spent
+                best = max(best, after.psnr_db, key=np.mean)
+                continue
+            share, found.stopped_by = share / 2, LOSS
+            if share < SPLATS_A_ROUND / 2**BACK_OFFS:
+                break
+        found.end_db = float(worth.psnr_db.mean())
+        self.aim.check_end(found.splats, found.end_db)
+        return found
+
+    def _worth(self, splats: Splats) -> Worth:
+        return measure_worth(splats, self.photographs, self.backend)
+
+    def _planned(self, splats: Splats) -> int:
+        """As many rounds as targets need, and a few for what they leave over."""
+        left = len(splats) - self.aim.excess(splats)
+        if left == len(splats):
+            return self.rounds
+        needed = math.log(left / len(splats)) / math.log(1 - SPLATS_A_ROUND)
+        return max(self.rounds, math.ceil(needed) + 4)
+
+    def _cut(
+        self, found: Outcome, worth: Worth, excess: int, share: float, free: bool
+    ) -> Cut | None:
+        """free: take only what harms or does nothing."""
+        forced = excess > 0 or self.aim.min_psnr_db > 0
+        limit = math.inf if forced else self.aim.price * found.price.sse_a_number
+        if free and not excess:
+            limit = np.finfo(np.float64).tiny
+        most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
+        most = min(most, excess, len(found.splats) - 1) if excess else most
+        return choose(
+            found.splats, worth, self.tuner.cameras, limit, min(most, len(found.splats) - 1), share
+        )
+
+
+def _round(
+    before: Splats, cut: Cut, predicted: float, measured: float, psnr_db: float, kept: bool
+) -> Round:
+    return Round(
+        splats=len(before),
+        removed=int(cut.gone.sum()),
+        floaters=cut.floaters,
+        bands_cut=int(((cut.degrees < before.sh_degrees) & ~cut.gone).sum()),
+        predicted_sse=round(predicted, 3),
+        measured_sse=round(measured, 3),
+        psnr_db=round(psnr_db, 4),
+        kept=kept,
+    )
+
+
+def _least_tenth_db(worth: Worth) -> float:
+    """By the worth of each alone."""
+    change = np.sort(worth.sse_change)[: max(1, len(worth.sse_change) // 10)].sum()
+    return 10 * math.log10(max(1e-12, 1 + float(change) / worth.sse)) if worth.sse else 0.0

@@ -1,0 +1,89 @@
+"""Splats that go on learning after a cut, a little and carefully."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import Interrupted
+from stages.base.stage import Report
+from stages.measure.judge import Photograph
+from stages.raster.draw import settings_of
+from stages.raster.smoothing import smoothing_widths
+from stages.scene import IGNORE, Splats
+from stages.training.loss import channel_means
+from stages.training.optimiser import LearningRates, Model, new_model
+from stages.training.step import step_of
+from stages.training.views import Level
+
+# Of the rates that the recipe begins with: a round starts at the first and ends at the second.
+RATE, RATE_END = 1.2, 0.6
+MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
+
+
+class Tuner:
+    """Goes on with splats where training left them. extent: of the scene, world units."""
+
+    def __init__(
+        self, photographs: Sequence[Photograph], extent: float, backend: str, report: Report
+    ) -> None:
+        self.photographs, self.extent, self.report = photographs, extent, report
+        self.cameras = [photograph.camera for photograph in photographs]
+        self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
+        self.stepper = step_of(backend)
+        self.steps = 0  # made so far
+
+    def tuned(self, splats: Splats, steps: int) -> Splats:
+        """After `steps` more. No splat gets smaller than what the photographs show, unless it was;
+        bands above a splat's own degree stay empty. Raises Interrupted."""
+        if not steps or not len(splats):
+            return splats
+        model = new_model(*(np.array(a, np.float32, order="C") for a in splats.arrays))
+        model.sh_degrees[:] = splats.sh_degrees
+        self.stepper.load(model)
+        settings = replace(settings_of(splats), sh_degree=splats.sh_degree)
+        for number in range(steps):
+            if self.report.stop_requested.is_set():
+                raise Interrupted("stopped while fine-tuning")
+            share = number / steps
+            rates = LearningRates().scaled(
+                MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** share,
+                RATE * (RATE_END / RATE) ** share,
+            )
+            self.stepper.step(self._level(), settings, rates, False)
+        return self._finished(self.stepper.model(), splats)
+
+    def _level(self) -> Level:
+        """Every photograph once in each round, in a new order each round."""
+        number, place = divmod(self.steps, len(self.photographs))
+        self.steps += 1
+        order = np.random.default_rng([7, number]).permutation(len(self.photographs))
+        which = int(order[place])
+        level = _level(self.photographs[which])
+        return replace(level, means=self._means.setdefault(which, level.means))
+
+    def _finished(self, model: Model, before: Splats) -> Splats:
+        norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
+        with np.errstate(divide="ignore"):
+            finest = np.log(smoothing_widths(before.means, self.cameras, before.look.near))
+        least = np.minimum(before.log_scales, finest[:, None])
+        return replace(
+            before,
+            means=model.means.copy(),
+            quaternions=(model.quaternions / norms).astype(np.float32),
+            log_scales=np.maximum(model.log_scales, least).astype(np.float32),
+            opacity_logits=model.opacity_logits.copy(),
+            sh=model.sh.copy(),
+        )
+
+
+def _level(photograph: Photograph) -> Level:
+    """In the light and over the background that it is judged in, without what is not judged."""
+    planar: NDArray[np.uint8] = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
+    kept = photograph.kept
+    mask = None if kept is None else kept.astype(np.uint8)
+    outside = "" if mask is None else IGNORE
+    return Level(photograph.camera, planar, channel_means(planar), mask, outside)

@@ -1,0 +1,52 @@
+"""What bands of colour are worth, against drawing without them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.capacity.cutting import Cut
+from stages.measure.judge import load_photographs
+from stages.measure.worth import colours_by_degree, measure_worth, squared_error
+from stages.scene import Splats
+from tests.formats.truth import colour, many_splats
+from tests.small_scene import small_scene
+
+
+def without(splats: Splats, row: int, degree: int, added: np.ndarray) -> Splats:
+    """One splat cut to a degree, its colour moved."""
+    degrees, shift = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
+    degrees[row], shift[row] = degree, added
+    return Cut(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).of(splats)
+
+
+def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) -> None:
+    scene = small_scene(tmp_path, views=4, n=60)
+    # no colour at its end, where it is not linear any more
+    splats = replace(scene.splats, sh=scene.splats.sh * np.float32(0.3))
+    photographs = load_photographs(
+        scene.reconstruction.folder, scene.reconstruction.views, splats.look
+    )
+    worth = measure_worth(splats, photographs, "cpu")
+    assert worth.sse == pytest.approx(squared_error(splats, photographs, "cpu"), rel=1e-5)
+    for row in (0, 10, 20):
+        for degree in (0, 1):
+            cut = without(splats, row, degree, worth.cut_colour[row, degree])
+            change = squared_error(cut, photographs, "cpu") - worth.sse
+            assert worth.cut_change[row, degree] == pytest.approx(change, rel=2e-3, abs=1e-5)
+            plain = without(splats, row, degree, np.zeros(3))
+            assert not np.array_equal(plain.sh[row, 0], cut.sh[row, 0])
+
+
+def test_colours_by_degree_are_the_definition_s() -> None:
+    splats, centre = many_splats(6), np.array([0.3, -4.0, 1.0])
+    found = colours_by_degree(splats, centre)
+    for i in range(0, len(splats), 5):
+        direction = splats.means[i] - centre
+        for degree in range(splats.sh_degree + 1):
+            sh = splats.sh[i].astype(float).copy()
+            sh[(degree + 1) ** 2 :] = 0
+            wanted = np.maximum(colour(sh, direction), 0)
+            np.testing.assert_allclose(found[i, degree], wanted, atol=1e-6)
