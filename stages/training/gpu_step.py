@@ -102,12 +102,13 @@ class GpuStep:
             rows, bands = _host(self._scene.rows), self._scene.bands
             means, quaternions, log_scales = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
             sh = rows[:, SH : SH + 3 * bands].reshape(len(rows), bands, 3)
-            self._on_host = Model(
+            arrays: list[Any] = [
                 *map(np.ascontiguousarray, (means, quaternions, log_scales, rows[:, 10], sh)),
                 self._sh_degrees,
                 *map(_host, (self._moment1, self._moment2, self._steps)),
                 *map(_host, (self._gradient_sum, self._gradient_count, self._smoothing)),
-            )
+            ]
+            self._on_host = Model(*arrays)
         return self._on_host
 
     def step(
