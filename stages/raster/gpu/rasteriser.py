@@ -13,13 +13,13 @@ from torch import Tensor
 
 from stages.raster.camera_row import camera_row
 from stages.raster.definition import (
-    Arrays,
-    Backward,
     CONTRIBUTIONS,
     LARGEST,
     NO_SMOOTHING,
-    RasterSettings,
     SH,
+    Arrays,
+    Backward,
+    RasterSettings,
     gradient_columns,
 )
 from stages.raster.gpu import blend, gradients, lists, project
