@@ -81,18 +81,20 @@ def compiled(kernel: Any, constants: dict[str, Any], options: dict[str, Any], ta
 
 def resources(made: Any) -> dict[str, int]:
     """{registers, spills (bytes of local memory), shared (bytes)} of a compiled kernel."""
+    shared = int(made.metadata.shared)
     if "cubin" in made.asm:
-        return {**_of_cubin(made.asm["cubin"]), "shared": int(made.metadata.shared)}
+        return {**_of_cubin(made.asm["cubin"]), "shared": shared}
     text = made.asm["amdgcn"]
 
     def entry(name: str) -> int:
         found = re.search(rf"\.{name}:\s+(\d+)", text)
-        return int(found[1]) if found else -1
+        assert found, name
+        return int(found[1])
 
     return {
         "registers": entry("vgpr_count"),
         "spills": entry("vgpr_spill_count"),
-        "shared": entry("group_segment_fixed_size"),
+        "shared": shared,
     }
 
 
