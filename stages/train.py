@@ -92,6 +92,7 @@ class TrainSettings:
     backend: str = backend_setting()
 
 
+MOST_LENT = 4  # photographs: what more of them would tell is not worth what each is missed
 MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
 
 PRESETS: dict[str, TrainSettings] = {
@@ -204,9 +205,10 @@ def make_trainer(
 
 
 def lent_rows(n: int) -> tuple[int, ...]:
-    """Which of `n` training photographs decide while the model grows: of every eight the fifth, so
-    that they lie between the judges; none where there are too few to lend one."""
-    return tuple(range(4, n, 8)) if n >= MIN_TO_LEND else ()
+    """Which of `n` training photographs decide while the model grows: the fifth of every eight, so
+    that they lie between the judges, or of more where that would be more than four; none where
+    there are too few to lend one."""
+    return tuple(range(4, n, max(8, -(-n // MOST_LENT)))) if n >= MIN_TO_LEND else ()
 
 
 def light_wanted(reconstruction: Reconstruction, wanted: str, report: Report) -> bool:

@@ -8,6 +8,7 @@ from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Look
+from stages.train import lent_rows
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.trainer import Trainer
 from tests.scenes import camera, cloud
@@ -45,6 +46,13 @@ def test_no_photograph_that_is_lent_is_trained_on_while_the_model_grows_and_all_
     growing = [made._row(step) for step in range(int(GROWTH_ENDS * STEPS))]
     assert set(growing) == {0, 1, 3}
     assert {made._row(step) for step in range(int(GROWTH_ENDS * STEPS), STEPS)} == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize(("n", "wanted"), [(0, 0), (7, 0), (8, 1), (12, 1), (21, 3), (300, 4)])
+def test_few_are_lent_and_of_too_few_none(n, wanted):
+    rows = lent_rows(n)
+    assert len(rows) == len(set(rows)) == wanted
+    assert all(0 <= row < n for row in rows)
 
 
 def test_what_is_learnt_by_heart_is_cut_short_and_says_so(tmp_path):
