@@ -92,7 +92,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     from stages.capacity.rounds import Shrinking
     from stages.capacity.tuning import Tuner
     from stages.measure.judge import load_photographs, mean_psnr_db
-    from stages.scene import scene_extent, split_held_out
+    from stages.scene import seen_extent, split_held_out
     from stages.scene.storage import save_splats
 
     reconstruction: Reconstruction = inputs["sfm"]
@@ -101,8 +101,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     photographs = load_photographs(reconstruction.folder, kept, splats.look)
     judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
     before = mean_psnr_db(splats, judges, settings.backend)
-    extent = scene_extent(reconstruction.views)
-    tuner = Tuner(photographs, extent, settings.backend, report)
+    tuner = Tuner(photographs, seen_extent(reconstruction), settings.backend, report)
     aim = _aim(settings, reconstruction)
     shrinking = Shrinking(
         *(photographs, aim, settings.backend, tuner, settings.rounds, settings.tune_steps, report)

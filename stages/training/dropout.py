@@ -31,8 +31,8 @@ class Dropout:
 
     def resting(self, seen: NDArray[np.int32]) -> NDArray[np.bool_]:
         """[N] which splats sit out. seen [N]: in how many steps each was in the picture, since they
-        were last counted together."""
-        photographs = self.views * (seen / max(1, int(seen.max(initial=0))))
+        were last counted together; before anything was counted, all are taken to be seen by all."""
+        photographs = self.views * ((seen + 1.0) / (int(seen.max(initial=0)) + 1.0))
         share = np.minimum(LARGEST_SHARE, np.square(FEW / np.maximum(photographs, 1.0)))
         return np.asarray(noise(len(seen), self.key) < share * _UINT32)
 

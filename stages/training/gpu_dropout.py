@@ -15,7 +15,7 @@ def resting(dropout: Dropout, seen: Tensor) -> Tensor:
     n = len(seen)
     if n == 0:
         return torch.zeros(0, dtype=torch.bool, device=seen.device)
-    photographs = dropout.views * (seen.double() / seen.max().clamp(min=1))
+    photographs = dropout.views * ((seen.double() + 1.0) / (seen.max() + 1.0))
     share = torch.square(FEW / photographs.clamp(min=1.0)).clamp(max=LARGEST_SHARE)
     return _noise(n, dropout.key, seen.device) < share * 2.0**32
 
