@@ -55,10 +55,10 @@ class TrainSettings:
         },
     )
     patience: float = field(
-        default=0.05,
+        default=0.0,
         metadata={
-            "help": "Training is cut short once it learns the photographs by heart, and growing on "
-            "promises others less than this (dB); 0 takes every step.",
+            "help": "Cut training short once it learns its photographs by heart, and growing on "
+            "promises those that it lends less than this (dB); 0: never.",
             "min": 0,
             "max": 10,
         },
