@@ -78,6 +78,13 @@ class SfmSettings:
         default=False,
         metadata={"help": "Keep the training and test photographs that --cameras tells apart."},
     )
+    refine_cameras: bool = field(
+        default=False,
+        metadata={
+            "help": "Move the cameras of --cameras to where the photographs' matches want them; "
+            "their lenses stay as they are."
+        },
+    )
     scale: tuple[str, ...] = field(
         default=(),
         metadata={
@@ -175,6 +182,7 @@ def _with_known_cameras(
         folder / _WORK,
         report,
         split=settings.split,
+        refine=settings.refine_cameras,
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,

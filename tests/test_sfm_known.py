@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -65,6 +66,69 @@ def test_given_cameras_are_kept_and_points_are_triangulated(tmp_path: Path) -> N
     assert not (tmp_path / "sfm" / "work").exists()
 
 
+def split_file(path: Path) -> list[str]:
+    """transforms.json of six photographs: four to train on, one to judge; their names."""
+    frames = []
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    names = list(POSES)[:6]
+    for name in names:
+        matrix = np.linalg.inv(flip @ POSES[name])
+        frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
+    data = {
+        "w": 640,
+        "h": 480,
+        "fl_x": 600,
+        "k1": -0.045,
+        "frames": frames,
+        "train_filenames": names[:4],
+        "test_filenames": names[4:5],
+    }
+    path.write_text(json.dumps(data))
+    return names
+
+
+def off_by(pose: np.ndarray, degrees: float, metres: float, r: np.random.Generator) -> np.ndarray:
+    """A camera turned and moved by about as much, at random."""
+    turn, _ = cv2.Rodrigues(np.radians(degrees) * r.normal(size=3) / np.sqrt(3))
+    found = pose.copy()
+    found[:3, :3] = turn @ pose[:3, :3]
+    centre = -pose[:3, :3].T @ pose[:3, 3] + metres * r.normal(size=3) / np.sqrt(3)
+    found[:3, 3] = -found[:3, :3] @ centre
+    return found
+
+
+def test_rough_cameras_are_moved_to_where_the_matches_want_them(tmp_path: Path) -> None:
+    """Half a degree and a centimetre off at 1.3 m, as of a phone's own tracking."""
+    r = np.random.default_rng(1)
+    rough = {name: off_by(pose, 0.5, 0.01, r) for name, pose in list(POSES.items())[:8]}
+    given = iter(rough.values())
+    cameras = model(tmp_path / "cameras", lambda pose: next(given), 8)
+    errors = {}
+    for name, refine in (("as given", False), ("refined", True)):
+        folder = tmp_path / name
+        found, report = reconstructed(folder, cameras, 8, refine_cameras=refine)
+        wanted = np.array([POSES[view.name] for view in found.views])
+        have = np.array([view.camera.world_to_camera for view in found.views])
+        turn, scale, shift = similarity(centres(have), centres(wanted))
+        off = scale * centres(have) @ turn.T + shift - centres(wanted)
+        errors[name] = np.linalg.norm(off, axis=1)
+    assert errors["refined"].mean() < 0.2 * errors["as given"].mean()
+    assert report.metrics["matches_that_fit"] > 0.9 > report.metrics["matches_that_fitted_before"]
+    assert 0.001 < report.metrics["cameras_moved"]["centre"] < 0.03
+    back = np.array(report.metrics["file_from_world"])  # the file's world is kept
+    file_centres = np.array([-p[:3, :3].T @ p[:3, 3] for p in rough.values()])
+    ours = centres(have @ np.linalg.inv(back))
+    assert np.linalg.norm(ours.mean(0) - file_centres.mean(0)) < 0.01
+
+
+def test_cameras_of_a_split_are_not_refined(tmp_path: Path) -> None:
+    path = tmp_path / "transforms.json"
+    split_file(path)
+    with pytest.raises(SplatError) as error:
+        reconstructed(tmp_path / "sfm", path, 6, split=True, refine_cameras=True)
+    assert error.value.code == "cameras-split-and-refined"
+
+
 def test_opengl_axes_are_refused_by_their_name(tmp_path: Path) -> None:
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
     cameras = model(tmp_path / "cameras", lambda pose: turn @ pose, 5)
@@ -75,24 +139,9 @@ def test_opengl_axes_are_refused_by_their_name(tmp_path: Path) -> None:
 
 
 def test_a_splits_test_photographs_judge_and_lend_no_points(tmp_path: Path) -> None:
-    frames = []
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    for name in list(POSES)[:6]:
-        matrix = np.linalg.inv(flip @ POSES[name])
-        frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
-    data = {
-        "w": 640,
-        "h": 480,
-        "fl_x": 600,
-        "k1": -0.045,
-        "frames": frames,
-        "train_filenames": [frame["file_path"] for frame in frames[:4]],
-        "test_filenames": [frames[4]["file_path"]],
-    }
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(data))
+    names = split_file(path)
     found, _ = reconstructed(tmp_path / "sfm", path, 6, split=True)
-    names = [Path(frame["file_path"]).name for frame in frames]
     training, judges = split_held_out(sfm.load(tmp_path / "sfm").views)
     assert [view.name for view in training] == names[:4]
     assert [view.name for view in judges] == names[4:5]

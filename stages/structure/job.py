@@ -32,7 +32,8 @@ class Job:
     look, "exhaustive" or "sequential".
     drop_stationary: leave out matches that stay in place in the picture (a date stamp).
     mapper: "incremental" or "global". loose: register photographs with fewer matches.
-    other_pair: start from another pair of photographs than COLMAP would. max_seconds: of mapping.
+    other_pair: start from another pair of photographs than COLMAP would. refine: move the known
+    cameras to where the matches want them. max_seconds: of mapping.
     """
 
     step: str
@@ -53,6 +54,7 @@ class Job:
     mapper: str = "incremental"
     loose: bool = False
     other_pair: bool = False
+    refine: bool = False
     max_seconds: int = 3600
 
     def write(self, path: Path) -> Path:

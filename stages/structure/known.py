@@ -62,6 +62,7 @@ def reconstruct(
     report: Report,
     *,
     split: bool,
+    refine: bool,
     allow_partial: bool,
     seed: int,
     max_features: int,
@@ -70,7 +71,8 @@ def reconstruct(
 ) -> Reconstruction:
     """The capture with the cameras in `path`. Leaves what `finish` leaves, but reconstruction.json.
 
-    split: see `posed_photographs`. Raises SplatError, and Interrupted.
+    split: see `posed_photographs`. refine: let the matches move the cameras. Raises SplatError, and
+    Interrupted.
     """
     found = read_cameras(path)
     from_file = read_points(path)
@@ -80,9 +82,13 @@ def reconstruct(
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
     cameras = _undistorted(posed, capture.folder, folder, report)
     training = [i for i, one in enumerate(posed) if one.role != "test"]
-    job = _job(posed, cameras, training, folder, work, seed, max_features)
+    if refine and len(training) < len(posed):
+        raise _judges_cannot_follow()
+    job = _job(posed, cameras, training, folder, work, seed, max_features, refine)
     _match(job, work, report, seconds_left)
     _judge(Path(job.out), report, allow_partial)
+    if refine:
+        cameras = _moved(cameras, Path(job.out) / "points.npz", report)
     seen = [cameras[i] for i in training]
     cloud = _file_points(from_file, seen, report)
     source = "the cameras' file"
@@ -147,6 +153,7 @@ def _job(
     work: Path,
     seed: int,
     max_features: int,
+    refine: bool,
 ) -> Job:
     """Of the training photographs alone, undistorted, each with a camera of its own. What an
     interrupted run left is kept if it was about the same."""
@@ -170,9 +177,10 @@ def _job(
         seed=seed,
         threads=threads.count(),
         max_features=max_features,
+        refine=refine,
     )
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(v).tobytes() for v in known.values()))
-    about = json.dumps([job.names, seed, max_features, digest.hexdigest()])
+    about = json.dumps([job.names, seed, max_features, refine, digest.hexdigest()])
     described = work / "known.json"
     if not described.is_file() or described.read_text(encoding="utf-8") != about:
         shutil.rmtree(work, ignore_errors=True)
@@ -240,10 +248,28 @@ def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], floa
         raise crash_error(crash, work) from crash
 
 
+def _moved(cameras: list[Camera], path: Path, report: Report) -> list[Camera]:
+    """The cameras where the matches want them; how far that is into the report."""
+    poses = np.load(path)["world_to_camera"]
+    moved = [replace(c, world_to_camera=p) for c, p in zip(cameras, poses, strict=True)]
+    away = [float(np.linalg.norm(a.centre - b.centre)) for a, b in zip(moved, cameras, strict=True)]
+    before = np.array([camera.world_to_camera for camera in cameras])
+    cosines = np.einsum("vij,vij->v", poses[:, :3, :3], before[:, :3, :3]) / 2 - 0.5
+    turns = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    report.metric("cameras_moved", {"centre": float(np.median(away)), "most": max(away)})
+    report.metric(
+        "cameras_turned_deg", {"median": float(np.median(turns)), "most": float(turns.max())}
+    )
+    return moved
+
+
 def _judge(out: Path, report: Report, allow_partial: bool) -> None:
     """Refuse poses that do not fit the matches, with the likely cause."""
     found = json.loads((out / "agreement.json").read_text(encoding="utf-8"))
     given, roughly = found["given"], found["roughly"]
+    if "refined" in found:
+        report.metric("matches_that_fitted_before", None if given is None else round(given, 4))
+        given = found["refined"]
     report.metric("matched_pairs", found["pairs"])
     report.metric("matches_that_fit", None if given is None else round(given, 4))
     if given is None or found["pairs"] < FEWEST_PAIRS:
@@ -261,7 +287,7 @@ def _judge(out: Path, report: Report, allow_partial: bool) -> None:
             "cameras-rough",
             f"Only {given:.0%} of what photographs have in common lies where the cameras want it "
             "to within 4 px of 1600, but most of it nearby: the cameras are rough, and the result "
-            "will be blurred. Leave --cameras away to find better ones.",
+            "will be blurred. --refine-cameras moves them to where the matches want them.",
         )
         return
     likely = (
@@ -353,6 +379,17 @@ def _with_random(
         np.concatenate([cloud.colours, grey]),
         np.concatenate([cloud.errors_px, np.zeros(len(points))]),
         np.concatenate([cloud.tracks, seen_by(cameras, points)]),
+    )
+
+
+def _judges_cannot_follow() -> SplatError:
+    return SplatError(
+        "cameras-split-and-refined",
+        given="--refine-cameras with --split: test photographs have no part in refinement, and "
+        "would judge from where their cameras no longer are.",
+        wanted="One of the two.",
+        hint="Leave --split away, and every eighth photograph judges.",
+        family=Family.USAGE,
     )
 
 

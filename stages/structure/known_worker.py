@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,15 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from stages.scene.similarity import similarity
 from stages.structure.agreement import agreement, alternatives
 from stages.structure.job import Job, known_path
 from stages.structure.mapping import observations
 from stages.structure.matching import match_pairs
 
+# Of each round of refinement: points may lie so many times as far off as usual. Rough poses give no
+# points to begin with otherwise.
+REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
 FEWEST_MATCHES = 30  # of a pair that is asked whether poses are right
 
 
@@ -47,8 +52,12 @@ def triangulate(job: Job) -> None:
             name: agreement(pairs, lens, turned, side) for name, turned in alternatives(poses)
         },
     }
+    if job.refine:
+        poses = _refined(job, known, out / "colmap")
+        found["refined"] = agreement(pairs, lens, poses, side)
+        known = {**known, "world_to_camera": poses}
     (out / "agreement.json").write_text(json.dumps(found), encoding="utf-8")
-    _save_points(_triangulated(job, known, out / "colmap"), out / "points.npz")
+    _save_points(_triangulated(job, known, out / "colmap"), poses, out / "points.npz")
 
 
 def _camera(number: int, lens: NDArray[np.float64], size: NDArray[np.int32]) -> pycolmap.Camera:
@@ -80,7 +89,39 @@ def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDA
     return found
 
 
-def _triangulated(job: Job, known: dict[str, Any], scratch: Path) -> pycolmap.Reconstruction:
+def _refined(job: Job, known: Mapping[str, Any], scratch: Path) -> NDArray[np.float64]:
+    """[V, 4, 4] the poses, moved to where the matches want them; the lenses stay as they are. What
+    the first rounds believe may lie far off, since the poses do. The world stays the given one: the
+    similarity that brings the new centres nearest the old ones is taken out."""
+    given = np.asarray(known["world_to_camera"], np.float64)
+    poses = given
+    for slack in REFINEMENTS:
+        model = _triangulated(job, {**known, "world_to_camera": poses}, scratch, slack)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_focal_length = options.refine_extra_params = False
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+        options.ceres.solver_options.num_threads = 1
+        options.print_summary = False
+        pycolmap.bundle_adjustment(model, options)
+        poses = given.copy()
+        for number in sorted(model.reg_image_ids()):
+            poses[number - 1, :3] = model.images[number].cam_from_world().matrix()
+    scale, turn, shift = similarity(_centres(poses), _centres(given))
+    rotations = poses[:, :3, :3] @ turn.T
+    centres = scale * _centres(poses) @ turn.T + shift
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centres)
+    return poses
+
+
+def _centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(-np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]))
+
+
+def _triangulated(
+    job: Job, known: Mapping[str, Any], scratch: Path, slack: float = 1.0
+) -> pycolmap.Reconstruction:
+    """Points of the matches, the poses held. slack: times as far off as usual that they may lie."""
     scratch.mkdir()
     model = pycolmap.Reconstruction()
     for number, (name, lens, size, pose) in enumerate(
@@ -93,7 +134,13 @@ def _triangulated(job: Job, known: dict[str, Any], scratch: Path) -> pycolmap.Re
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = job.seed
-    options.triangulation.random_seed = job.seed
+    triangulation = options.triangulation
+    triangulation.random_seed = job.seed
+    triangulation.create_max_angle_error *= slack
+    triangulation.continue_max_angle_error *= slack
+    triangulation.merge_max_reproj_error *= slack
+    triangulation.complete_max_reproj_error *= slack
+    options.mapper.filter_max_reproj_error *= slack
     model = pycolmap.triangulate_points(
         model, job.database, job.images_root, scratch, options=options
     )
@@ -103,7 +150,7 @@ def _triangulated(job: Job, known: dict[str, Any], scratch: Path) -> pycolmap.Re
     return model
 
 
-def _save_points(model: pycolmap.Reconstruction, path: Path) -> None:
+def _save_points(model: pycolmap.Reconstruction, poses: NDArray[np.float64], path: Path) -> None:
     ids = sorted(model.point3D_ids())
     points = [model.points3D[i] for i in ids]
     position = {image_id: image_id - 1 for image_id in sorted(model.reg_image_ids())}
@@ -112,5 +159,6 @@ def _save_points(model: pycolmap.Reconstruction, path: Path) -> None:
         points=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
         colours=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         errors_px=np.array([point.error for point in points], np.float64),
+        world_to_camera=poses,
         **observations(model, points, position),  # type: ignore[arg-type]
     )

@@ -17,6 +17,7 @@ from PIL import Image
 from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
 from stages.scene import Camera, Reconstruction, View
+from stages.scene.similarity import similarity
 
 TRUTH = Path(make.__file__).parent / "still_life" / "truth.json"
 PINHOLE = Lens(width=640, height=480, focal_px=600.0, k=0.0)
@@ -74,15 +75,3 @@ def judges_in(reconstruction: Reconstruction) -> tuple[View, ...]:
 
 def _centre(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(-world_to_camera[:3, :3].T @ world_to_camera[:3, 3])
-
-
-def similarity(
-    a: NDArray[np.float64], b: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """(scale, rotation [3, 3], offset [3]) that take points a [N, 3] nearest b (Umeyama 1991)."""
-    mean_a, mean_b = a.mean(0), b.mean(0)
-    u, sizes, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(signs) @ vt
-    scale = float((sizes * signs).sum() / np.square(a - mean_a).sum(1).mean())
-    return scale, rotation, mean_b - scale * rotation @ mean_a
