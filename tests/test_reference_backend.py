@@ -26,7 +26,10 @@ from stages.training.optimiser import adam_step
 called = [k.__name__ for k in (loss_bands, adam_step) if k.signatures]
 print(json.dumps({"event": "kernels", "loaded": loaded, "called": called}))
 """
-_TINY = ("--train-side", "48", "--steps", "6", "--max-splats", "400", "--preset", "preview")
+_TINY = (
+    *("--train-side", "48", "--steps", "6", "--max-splats", "400", "--preset", "preview"),
+    *("--tune-steps", "1"),
+)
 
 
 def test_the_whole_sample_runs_on_the_reference_without_one_cpu_kernel(tmp_path: Path) -> None:
