@@ -14,6 +14,7 @@ from numpy.lib import format as npy
 
 from stages.training.clock import Spent
 from stages.training.optimiser import Model
+from stages.training.pace import Mark
 
 FILE_NAME = "checkpoint.bin"
 MAGIC = b"SPLATCP5"
@@ -22,14 +23,14 @@ MAGIC = b"SPLATCP5"
 @dataclass(frozen=True)
 class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
-    done by then), see `schedule.Schedule`. history: as logged. marks: (step, PSNR in dB) of the
+    done by then), see `schedule.Schedule`. history: as logged. marks: of the
     photographs that decide. by_heart: what they told. times: of each entry of the history, and,
     last, now."""
 
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
-    marks: list[tuple[int, float]]
+    marks: list[Mark]
     by_heart: bool
     times: list[Spent]
 
@@ -66,7 +67,7 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         int(header["step"]),
         (int(steps), int(since), float(share)),
         header["history"],
-        [(int(step), float(psnr_db)) for step, psnr_db in header["marks"]],
+        [Mark(**mark) for mark in header["marks"]],
         bool(header["by_heart"]),
         [Spent(**t) for t in header["times"]],
     )

@@ -10,6 +10,9 @@ import numpy as np
 PLANS = 50  # times, at most, that a run with a time limit is planned anew
 PLAN_STEPS = 10  # fewer do not show a pace
 PLATEAU_POINTS = 10  # the line is laid through as many marks
+# Of what photographs in training gain. Measured where growth ends: 0.0 to 0.1 on a carpet that is
+# learnt by heart, 0.5 on a scene that is not.
+PASSED_ON = 0.25
 SURE = 1.0  # standard errors of its slope that are added to what is expected
 
 
@@ -37,9 +40,30 @@ class Pace:
         return step + max(1, int(left * since / lasted))
 
 
-def remaining_gain_db(marks: Sequence[tuple[int, float]], end: int) -> float:
-    """What going on to step `end` may still give, at most: by a line through the last of `marks`,
-    (step, PSNR in dB), over the logarithm of the steps, with the slope's standard error added.
+@dataclass(frozen=True)
+class Mark:
+    """What photographs came out as after `step` steps: mean PSNR in dB of those that are lent, and
+    of as many that are not."""
+
+    step: int
+    lent_db: float
+    told_db: float
+
+
+def learnt_by_heart(marks: Sequence[Mark]) -> bool:
+    """Whether, over the last marks, of each dB that photographs in training gained those lent
+    gained less than `PASSED_ON`. Not while there are too few marks to tell."""
+    if len(marks) < PLATEAU_POINTS:
+        return False
+    last = marks[-PLATEAU_POINTS:]
+    lent, _ = _slope(last, [mark.lent_db for mark in last])
+    told, _ = _slope(last, [mark.told_db for mark in last])
+    return told > 0 and lent < PASSED_ON * told
+
+
+def remaining_gain_db(marks: Sequence[Mark], end: int) -> float:
+    """What going on to step `end` may still give to the photographs lent, at most: by a line
+    through their last marks over the logarithm of the steps, with the slope's standard error added.
     Infinite while there are too few.
 
     Quality in training rises by about as much with each doubling, or less; a straight line is the
@@ -47,10 +71,15 @@ def remaining_gain_db(marks: Sequence[tuple[int, float]], end: int) -> float:
     """
     if len(marks) < PLATEAU_POINTS:
         return float("inf")
-    steps, y = np.array(marks[-PLATEAU_POINTS:], float).T
-    x = np.log(steps)
+    last = marks[-PLATEAU_POINTS:]
+    slope, error = _slope(last, [mark.lent_db for mark in last])
+    return (slope + SURE * error) * float(np.log(end / last[-1].step))
+
+
+def _slope(marks: Sequence[Mark], values_db: Sequence[float]) -> tuple[float, float]:
+    """(dB for each e-fold of the steps, its standard error) of the line through the values."""
+    x, y = np.log([mark.step for mark in marks]), np.asarray(values_db)
     x0 = x - x.mean()
     slope = float(x0 @ y / (x0 @ x0))
     residual = y - y.mean() - slope * x0
-    error = float(np.sqrt(residual @ residual / (PLATEAU_POINTS - 2) / (x0 @ x0)))
-    return (slope + SURE * error) * float(np.log(end / steps[-1]))
+    return slope, float(np.sqrt(residual @ residual / (len(x) - 2) / (x0 @ x0)))

@@ -25,7 +25,7 @@ from stages.training.clock import Clock, Spent
 from stages.training.density import AdaptiveDensity
 from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.pace import Pace, remaining_gain_db
+from stages.training.pace import Mark, Pace, learnt_by_heart, remaining_gain_db
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.step import step_of
 from stages.training.strategy import Strategy
@@ -36,7 +36,6 @@ CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
-BY_HEART_DB = 5.0  # that photographs in training come out better than those that were lent
 MARKS = 50  # as often the photographs that were lent are looked at
 
 
@@ -68,7 +67,7 @@ class Trainer:
         self._strategy: Strategy = AdaptiveDensity(self.schedule.extent)
         self._pace = Pace(self.seconds)
         self.ended = ""  # why before all steps, if it did
-        self.marks: list[tuple[int, float]] = []  # (step, PSNR in dB) of the photographs lent
+        self.marks: list[Mark] = []  # of the photographs lent
         self.by_heart = not self.lent  # so few photographs surely are
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         self.history: list[dict[str, Any]] = []
@@ -185,8 +184,8 @@ class Trainer:
             return
         if self.schedule.share(step) > GROWTH_ENDS:
             return
-        self.marks.append((step, self._mean_db(self.lent)))
-        self.by_heart = self._mean_db(self._told()) - self.marks[-1][1] > BY_HEART_DB
+        self.marks.append(Mark(step, self._mean_db(self.lent), self._mean_db(self._told())))
+        self.by_heart = learnt_by_heart(self.marks)
         promised = remaining_gain_db(self.marks, round(GROWTH_ENDS * self.schedule.steps))
         if self.by_heart and self.patience_db and promised < self.patience_db:
             self.schedule = self.schedule.grown(step)

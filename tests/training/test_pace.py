@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.training.pace import PLATEAU_POINTS, Pace, remaining_gain_db
+from stages.training.pace import PLATEAU_POINTS, Mark, Pace, learnt_by_heart, remaining_gain_db
 from stages.training.schedule import GROWTH_ENDS, SETTLE_TO, Schedule
 
 
@@ -71,23 +71,39 @@ def test_a_run_that_grows_no_more_is_as_long_as_if_that_had_been_the_plan():
     assert late.grown(2500) is late
 
 
+def marks(steps, lent_db, told_db=None):
+    told_db = lent_db if told_db is None else told_db
+    return [Mark(int(s), a, b) for s, a, b in zip(steps, lent_db, told_db, strict=True)]
+
+
+STEPS = np.linspace(1000, 2000, PLATEAU_POINTS)
+LINE = np.linspace(0.0, 1.0, PLATEAU_POINTS)
+
+
 def test_what_rises_with_every_doubling_promises_that_much_more():
-    marks = [(100 * 2**k, 20 + 0.5 * k) for k in range(PLATEAU_POINTS)]
-    last = marks[-1][0]
-    assert remaining_gain_db(marks, 2 * last) == pytest.approx(0.5)
-    assert remaining_gain_db(marks, 4 * last) == pytest.approx(1.0)
+    steps = 100 * 2 ** np.arange(PLATEAU_POINTS)
+    found = marks(steps, 20 + 0.5 * np.arange(PLATEAU_POINTS))
+    assert remaining_gain_db(found, 2 * steps[-1]) == pytest.approx(0.5)
+    assert remaining_gain_db(found, 4 * steps[-1]) == pytest.approx(1.0)
 
 
 def test_a_flat_course_promises_nothing_and_a_noisy_one_is_not_believed():
-    steps = np.linspace(1000, 2000, PLATEAU_POINTS).astype(int)
-    flat = [(int(step), 25.0) for step in steps]
-    assert abs(remaining_gain_db(flat, 4000)) < 1e-9
-    noise = [0.4 * (-1) ** k for k in range(PLATEAU_POINTS)]
-    noisy = [(step, db + d) for (step, db), d in zip(flat, noise, strict=True)]
-    assert remaining_gain_db(noisy, 4000) > 0.1
-    falling = [(step, 25.0 - 0.1 * k) for k, (step, _) in enumerate(flat)]
-    assert remaining_gain_db(falling, 4000) < 0
+    assert abs(remaining_gain_db(marks(STEPS, 25 + 0 * LINE), 4000)) < 1e-9
+    noise = 0.4 * (-1.0) ** np.arange(PLATEAU_POINTS)
+    assert remaining_gain_db(marks(STEPS, 25 + noise), 4000) > 0.1
+    assert remaining_gain_db(marks(STEPS, 25 - LINE), 4000) < 0
 
 
-def test_too_few_marks_promise_everything():
-    assert remaining_gain_db([(100, 20.0)] * (PLATEAU_POINTS - 1), 1000) == float("inf")
+def test_too_few_marks_promise_everything_and_tell_nothing():
+    few = marks(STEPS[1:], 20 + 0 * LINE[1:], 20 + LINE[1:])
+    assert remaining_gain_db(few, 4000) == float("inf")
+    assert not learnt_by_heart(few)
+
+
+@pytest.mark.parametrize(
+    ("lent", "told", "wanted"),
+    [(0.0, 1.0, True), (-0.5, 1.0, True), (0.1, 1.0, True), (0.5, 1.0, False), (0.0, 0.0, False)],
+)
+def test_by_heart_is_what_helps_those_in_training_alone(lent, told, wanted):
+    for level in (20.0, 30.0):  # how hard the photographs lent are tells nothing
+        assert learnt_by_heart(marks(STEPS, level + lent * LINE, 25 + told * LINE)) is wanted
