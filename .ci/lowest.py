@@ -13,7 +13,7 @@ from pathlib import Path
 def main() -> None:
     project = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))["project"]
     for wanted in (*project["dependencies"], *project["optional-dependencies"]["test"]):
-        name, floor = re.fullmatch(r"([\w.-]+)>=([\w.]+)(?:,<[\w.]+)?", wanted).groups()
+        name, floor = re.match(r"([\w.-]+)[>=]=([\w.]+)(?:,<[\w.]+)?(?:;|$)", wanted).groups()
         print(f"{name}=={floor}")
 
 
