@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,9 @@ from stages.scene import Camera, Splats, logit, rgb_to_dc
 
 # Those that run everywhere. What they are held to, tests/raster/test_gpu.py holds the GPU's to.
 BACKENDS = tuple(backend.name for backend in backends.BACKENDS if not backend.obstacle)
+# Of laws small enough for Triton's interpreter, which takes the GPU's part where there is none.
+_INTERPRETED = "gpu" not in BACKENDS and importlib.util.find_spec("triton") is not None
+LIGHT_BACKENDS = (*BACKENDS, "gpu") if _INTERPRETED else BACKENDS
 
 
 def camera(width=64, height=48, focal=60.0, cx=None, cy=None, matrix=None):

@@ -18,7 +18,7 @@ from stages.raster.definition import (
     splat_arrays,
 )
 from stages.raster.reference import blend_weights, parameters_of, project, render_tensors
-from tests.scenes import BACKENDS, camera, cloud, relative, splats
+from tests.scenes import BACKENDS, LIGHT_BACKENDS, camera, cloud, relative, splats
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9), sh_degree=2)
 
@@ -64,7 +64,7 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_splat(backend, s
     assert relative(measured(backend, scene, picture, where)[:, CHANGE], wanted) < 1e-3
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_against_its_own_picture_no_splat_is_better_gone(backend):
     scene, where = faint_cloud(1), camera(40, 30)
     forward = rasteriser_of(backend).forward(splat_arrays(scene), where, SETTINGS)
@@ -98,7 +98,7 @@ def test_weights_are_those_of_the_definition(backend, opaque):
     assert relative(found[:, PULL:], wanted[:, 3:]) < 1e-3
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_a_worked_pixel(backend):
     """A wide splat of opacity 1/2 and colour 1 on black, the photograph black as well: at its
     centre the picture is 1/2, and taking it out takes (1/2)^2 a channel away."""

@@ -4,7 +4,6 @@ scenes small enough for that."""
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import json
 import os
 import shutil
@@ -29,8 +28,6 @@ from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from tests import processes
 from tests.extremes.table import ROWS, measured
-from tests.raster import test_contributions, test_reference_laws, test_smoothing
-from tests.raster import test_worked_examples as worked
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 
@@ -38,16 +35,6 @@ SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 TARGETS = ("cuda:80", "cuda:90", "cuda:100", "hip:gfx942")
 # Rows of the extremes table that the interpreter does in seconds. On a GPU all are done.
 LIGHT_ROWS = (1, 2, 5, 6, 7, 9, 10, 13, 14, 15)
-LIGHT_LAWS = (
-    test_reference_laws.test_hidden_splats_do_not_change_the_picture,
-    test_reference_laws.test_two_halves_of_a_picture_are_the_picture,
-    test_smoothing.test_splats_of_no_size_under_the_filter_leave_all_finite,
-    test_contributions.test_against_its_own_picture_no_splat_is_better_gone,
-    test_contributions.test_a_worked_pixel,
-    worked.test_twice_the_depth_halves_the_footprint,
-    worked.test_three_sigma_is_drawn_and_worth_its_gaussian,
-    worked.test_median_depth_is_where_half_of_the_light_is_gone,
-)
 
 
 @pytest.fixture(autouse=True)
@@ -139,16 +126,6 @@ def test_lists_without_room_draw_what_they_hold_and_say_how_much_it_was():
     assert int(whole.lists.total) == int(some.lists.total) == len(whole.lists.members) > 10
     assert bool(some.image.isfinite().all())
     assert torch.equal(whole.image, roomy.image)
-
-
-def parameters_of(law):
-    return set(inspect.signature(law).parameters)
-
-
-@pytest.mark.parametrize("law", LIGHT_LAWS, ids=lambda law: law.__name__[5:])
-def test_what_holds_for_every_backend(law):
-    assert parameters_of(law) == {"backend"}
-    law("gpu")
 
 
 def rows():

@@ -10,7 +10,7 @@ from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.raster.reference import Parameters, parameters_of, render_tensors
 from stages.scene import Camera, Splats
-from tests.scenes import BACKENDS, PARAMETERS, camera, cloud, join, splats
+from tests.scenes import BACKENDS, LIGHT_BACKENDS, PARAMETERS, camera, cloud, join, splats
 from tests.tolerances import FINITE_DIFFERENCE, FLOAT32_SHIFT
 
 SETTINGS = RasterSettings(background=(0.2, 0.4, 0.6))
@@ -20,7 +20,7 @@ def image(backend, scene, view, settings=SETTINGS):
     return render(scene, view, settings, backend).image
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_hidden_splats_do_not_change_the_picture(backend):
     wall = splats([(0, 0, 1)] * 4 + [(0, 0, 1.1)], scales=5.0, opacities=0.9999)
     places = np.random.default_rng(0).uniform((-1, -1, 4), (1, 1, 6), (20, 3))
@@ -64,7 +64,7 @@ def test_scaling_world_and_camera_together_changes_nothing(backend):
     )
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_two_halves_of_a_picture_are_the_picture(backend):
     scene, view = cloud(150), camera(64, 48)
     whole = image(backend, scene, view)

@@ -9,6 +9,7 @@ from stages.raster.smoothing import VARIANCE, smoothed, smoothing_widths
 from stages.scene import Camera, look_at
 from tests.scenes import (
     BACKENDS,
+    LIGHT_BACKENDS,
     PARAMETERS,
     camera,
     cloud,
@@ -93,7 +94,7 @@ def test_the_definition_of_the_filter_has_the_gradient_of_its_finite_differences
         )
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_splats_of_no_size_under_the_filter_leave_all_finite(backend):
     """A ratio of volumes would be 0 / 0 here; a product of ratios per axis is 0."""
     dust = splats([(0, 0, 2)] * 3, scales=0.1)

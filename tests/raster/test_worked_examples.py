@@ -17,7 +17,7 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.reference import parameters_of, project, sh_basis
 from stages.scene import Camera
-from tests.scenes import BACKENDS, camera, splats
+from tests.scenes import BACKENDS, LIGHT_BACKENDS, camera, splats
 from tests.tolerances import WORKED
 
 VIEW = Camera(1600, 1200, 800.0, 800.0, 800.0, 600.0, np.eye(4))
@@ -62,7 +62,7 @@ def test_footprint_worked_by_hand(backend, quaternion, depth_scale, wanted, sigm
     assert np.pi * np.sqrt(np.linalg.det(cov)) == pytest.approx(area, abs=0.6)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_twice_the_depth_halves_the_footprint(backend):
     scene = splats((1.0, 0.5, 8.0), scales=(0.4, 0.15, 0.05))
     assert np.sqrt(covariance(backend, scene)[0, 0]) == pytest.approx(40.0, abs=0.01)
@@ -97,7 +97,7 @@ def test_layers_blend_front_to_back(backend, alphas, weights, residual):
     assert drawn.depth[0, 0] == pytest.approx(depth, rel=1e-5)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_three_sigma_is_drawn_and_worth_its_gaussian(backend):
     """exp(-4.5) = 0.0111 at 3 sigma: a cut there would be visible for an opaque splat."""
     view = camera(101, 1, focal=100.0)
@@ -133,7 +133,7 @@ def test_spherical_harmonics_are_orthonormal_and_alike_in_both_backends():
     np.testing.assert_allclose(kernel_basis(3, directions[:20]), basis[:20], atol=1e-14)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_median_depth_is_where_half_of_the_light_is_gone(backend):
     """Light after each of three splats: 0.7, 0.42, 0.21; and 0.7 after one alone."""
     depths = [1.0, 2.0, 3.0]

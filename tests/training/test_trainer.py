@@ -20,20 +20,14 @@ from stages.training import cap
 from stages.training.checkpoint import MAGIC
 from stages.training.clock import Clock, Spent
 from stages.training.density import AdaptiveDensity
-from stages.training.loss import channel_means, image_loss
+from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
-from stages.training.schedule import RESOLUTIONS, Schedule
+from stages.training.schedule import Schedule
 from stages.training.trainer import EVALUATIONS, Trainer
 from stages.training.views import Level, TrainingView, load_views
 from tests.scenes import camera, cloud, splats
 from tests.small_scene import small_scene
-
-
-def view_of(name, picture, where):
-    """A training view of one picture [H, W, 3] at all levels (the same size)."""
-    pixels = np.ascontiguousarray((picture * 255).round().astype(np.uint8).transpose(2, 0, 1))
-    level = Level(where, pixels, channel_means(pixels))
-    return TrainingView(name, tuple(level for _ in RESOLUTIONS))
+from tests.training.pictures import view_of
 
 
 def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, backend="cpu"):
