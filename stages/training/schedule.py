@@ -109,7 +109,7 @@ class Schedule:
     def level(self, step: int) -> int:
         """Index into RESOLUTIONS."""
         share = self.share(step)
-        return next(i for i, (end, _) in enumerate(RESOLUTIONS) if share < end)
+        return sum(share >= end for end, _ in RESOLUTIONS[:-1])
 
     def view(self, step: int, n_views: int) -> int:
         """Every one of `n_views` photographs once in each round, in a new order each round."""

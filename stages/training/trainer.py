@@ -65,7 +65,6 @@ class Trainer:
     def __post_init__(self) -> None:
         self.stepper = step_of(self.backend)
         self._strategy: Strategy = AdaptiveDensity(self.schedule.extent)
-        self._pace = Pace(self.seconds)
         self.ended = ""  # why before all steps, if it did
         self.marks: list[Mark] = []  # of the photographs lent
         self.by_heart = not self.lent  # so few photographs surely are
@@ -79,7 +78,7 @@ class Trainer:
         Raises Interrupted at a step boundary, checkpoint written, when the report asks to stop.
         """
         self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
-        self.clock = Clock()
+        self.clock, self._pace = Clock(), Pace(self.seconds)
         step = self._begin(start)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
@@ -178,6 +177,8 @@ class Trainer:
 
     def _replan(self, step: int) -> None:
         """Change the plan after `step` steps, if time or a plateau asks for it."""
+        if step == self.schedule.steps:
+            return  # its course is run, whatever time is left
         if self.seconds and (steps := self._pace.steps(step, self.clock.spent().seconds)):
             self.schedule = self.schedule.replanned(step, steps)
         if not self.lent or not self.schedule.passes(step, MARKS):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stages.training.pace import PLATEAU_POINTS, Mark, Pace, learnt_by_heart, remaining_gain_db
-from stages.training.schedule import GROWTH_ENDS, SETTLE_TO, Schedule
+from stages.training.schedule import GROWTH_ENDS, RESOLUTIONS, SETTLE_TO, Schedule
 
 
 def schedule(steps=3000):
@@ -18,7 +18,7 @@ def simulated(seconds, cost, steps=100_000):
     while step < plan.steps:
         spent += cost(plan.share(step))
         step += 1
-        if new := pace.steps(step, spent):
+        if step < plan.steps and (new := pace.steps(step, spent)):
             plan = plan.replanned(step, new)
     return spent + 1.0, plan
 
@@ -60,6 +60,13 @@ def test_a_changed_plan_goes_on_from_where_the_run_is_and_ends_at_its_end():
     assert plan.share(600) == 1.0
     again = schedule(1000).as_planned(plan.steps, *plan.since)
     assert again == plan
+
+
+def test_pictures_are_whole_to_the_very_end_of_any_plan():
+    plan = schedule(1000)
+    for step in range(10, 990, 7):
+        plan = plan.replanned(step, 1000)
+    assert {plan.level(step) for step in range(990, 1001)} == {len(RESOLUTIONS) - 1}
 
 
 def test_a_run_that_grows_no_more_is_as_long_as_if_that_had_been_the_plan():

@@ -162,6 +162,17 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, stop_at):
     assert second.history == whole.history
 
 
+def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path):
+    t, start = small_problem(tmp_path, "timed", steps=60)
+    t.run(start)  # kernels are compiled by now
+    timed, start = small_problem(tmp_path, "limited", steps=60)
+    timed.seconds = 3.0
+    timed.run(start)
+    assert timed.schedule.steps > 60
+    assert 1.5 < timed.clock.spent().seconds < 6.0  # other programs may be running
+    assert timed.schedule.share(timed.schedule.steps) == pytest.approx(1.0)
+
+
 def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its_own(tmp_path):
     report = Report()
     t, start = small_problem(tmp_path, "parts", report, steps=40)
