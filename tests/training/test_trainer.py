@@ -162,14 +162,29 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(tmp_path, stop_at):
     assert second.history == whole.history
 
 
-def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path):
-    t, start = small_problem(tmp_path, "timed", steps=60)
-    t.run(start)  # kernels are compiled by now
+def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path, monkeypatch):
+    """By a clock of its own, on which each step takes 10 ms."""
+
+    class StepClock:
+        def __init__(self, before=None):
+            self.steps = 0
+
+        def spent(self):
+            return Spent(0.01 * self.steps)
+
+    monkeypatch.setattr("stages.training.trainer.Clock", StepClock)
     timed, start = small_problem(tmp_path, "limited", steps=60)
-    timed.seconds = 3.0
+    timed.seconds = 1.2
+    step = timed.step
+
+    def counted(number):
+        timed.clock.steps += 1
+        return step(number)
+
+    timed.step = counted
     timed.run(start)
-    assert timed.schedule.steps > 60
-    assert 1.5 < timed.clock.spent().seconds < 6.0  # other programs may be running
+    assert timed.schedule.steps == pytest.approx(120, abs=6)
+    assert timed.clock.steps == timed.schedule.steps
     assert timed.schedule.share(timed.schedule.steps) == pytest.approx(1.0)
 
 
