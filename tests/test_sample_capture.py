@@ -18,6 +18,7 @@ from sample_captures.render import Lens, Light, photograph
 from stages import sfm
 from stages.run.manifest import plain
 from stages.scene import Reconstruction
+from stages.scene.similarity import similarity
 
 CAPTURE = Path(__file__).parents[1] / "sample_captures" / "still_life"
 IMAGES = sorted((CAPTURE / "images").iterdir())
@@ -74,16 +75,6 @@ def test_a_rendering_from_the_truth_looks_like_the_photograph() -> None:
         photo = cv2.resize(np.asarray(image), (160, 120), interpolation=cv2.INTER_AREA)
     difference = np.abs(picture.astype(float) - photo)
     assert 0.1 < difference.mean() < 6
-
-
-def similarity(source: NDArray, target: NDArray) -> tuple[float, NDArray, NDArray]:
-    """(scale, rotation, translation) that best takes source [N, 3] to target (Umeyama 1991)."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ sign @ vt
-    scale = float((s * np.diag(sign)).sum() / (a**2).sum())
-    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
 
 
 @pytest.fixture
