@@ -37,7 +37,7 @@ def splats_of(target: Path | None, strict: bool = True) -> tuple[Splats, Pipelin
     pipeline = Pipeline(find_run_folder(target))
     name = newest_with_splats(pipeline)
     output = pipeline.load(name)
-    return (output.splats if name == "quantise" else output), pipeline
+    return (output.splats if name in ("train", "quantise") else output), pipeline
 
 
 def _as_in_its_run(file: Path, splats: Splats) -> Splats:

@@ -15,7 +15,7 @@ from stages.raster.backends import backend_of, backend_setting
 if TYPE_CHECKING:
     from stages.capacity.aim import Aim
     from stages.capacity.rounds import Outcome
-    from stages.scene import Reconstruction, Splats
+    from stages.scene import Reconstruction, Splats, TrainedSplats
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class PruneSettings:
     max_loss_db: float = field(
         default=0.1,
         metadata={
-            "help": "PSNR of the training photographs that pruning may cost in all, at price 1 "
-            "(dB).",
+            "help": "PSNR that pruning may cost views that were not trained on, as far as training "
+            "can tell, at price 1 (dB).",
             "min": 0,
             "max": 100,
         },
@@ -96,13 +96,15 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     from stages.scene.storage import save_splats
 
     reconstruction: Reconstruction = inputs["sfm"]
-    splats: Splats = inputs["train"]
+    trained: TrainedSplats = inputs["train"]
+    splats = trained.splats
     kept, held = split_held_out(reconstruction.views)
     photographs = load_photographs(reconstruction.folder, kept, splats.look)
     judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
     before = mean_psnr_db(splats, judges, settings.backend)
-    tuner = Tuner(photographs, seen_extent(reconstruction), settings.backend, report)
-    aim = _aim(settings, reconstruction)
+    extent = seen_extent(reconstruction)
+    tuner = Tuner(photographs, extent, settings.backend, report, trained.by_heart)
+    aim = _aim(settings, trained.passed_on, reconstruction)
     shrinking = Shrinking(
         *(photographs, aim, settings.backend, tuner, settings.rounds, settings.tune_steps, report)
     )
@@ -115,7 +117,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report.metric("psnr_change_db", round(after - before, 3))
     report.metric("tune_steps", tuner.steps)
     _report_cuts(splats, found, report)
-    report.metric("said", words.said(splats, found, settings.price, tuner.steps))
+    report.metric("said", words.said(trained, found, settings.price, tuner.steps))
     if more := words.more_would_pay(found, settings.price):
         report.warn("prune-more-would-pay", more)
     assert np.isfinite(found.splats.means).all()
@@ -123,7 +125,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     return found.splats
 
 
-def _aim(settings: PruneSettings, reconstruction: Reconstruction) -> Aim:
+def _aim(settings: PruneSettings, passed_on: float, reconstruction: Reconstruction) -> Aim:
     """What is asked for. The size is measured on a file that is really written."""
     import tempfile
 
@@ -140,6 +142,7 @@ def _aim(settings: PruneSettings, reconstruction: Reconstruction) -> Aim:
     return Aim(
         settings.price,
         settings.max_loss_db,
+        passed_on,
         settings.max_splats,
         settings.max_mb * 1e6,
         settings.min_psnr,
@@ -180,5 +183,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=5, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=6, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

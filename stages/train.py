@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -14,7 +15,7 @@ from stages.base.words import counted
 from stages.raster.backends import backend_of, backend_setting, passed_over
 
 if TYPE_CHECKING:
-    from stages.scene import Look, Reconstruction, Splats
+    from stages.scene import Look, Reconstruction, Splats, TrainedSplats
     from stages.training.optimiser import Model
     from stages.training.trainer import Trainer
 
@@ -92,6 +93,7 @@ class TrainSettings:
     backend: str = backend_setting()
 
 
+_LEARNT = "learnt.json"
 MOST_LENT = 4  # photographs: what more of them would tell is not worth what each is missed
 MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
 
@@ -102,10 +104,14 @@ PRESETS: dict[str, TrainSettings] = {
 }
 
 
-def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report: Report) -> Splats:
+def run(
+    inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report: Report
+) -> TrainedSplats:
     """Train; write splats.bin, history.csv, a plot, and held-out photographs as a contact sheet
     with a legend."""
+    from stages.base.atomic import replacing
     from stages.raster.smoothing import smoothed
+    from stages.scene import TrainedSplats
     from stages.scene.storage import save_splats
     from stages.training.cap import forget_cap
     from stages.training.checkpoint import remove_checkpoint
@@ -128,12 +134,16 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
+    trained = TrainedSplats(splats, trainer.passed_on)
     save_splats(folder, splats)
+    with replacing(folder / _LEARNT) as temporary:
+        temporary.write_text(json.dumps({"passed_on": trained.passed_on}) + "\n", encoding="utf-8")
     remove_checkpoint(folder)
     forget_cap(folder)
     report.metric("steps", trainer.schedule.steps)
     report.metric("photographs_lent", len(trainer.lent))
     report.metric("learnt_by_heart", trainer.by_heart)
+    report.metric("passed_on", round(trainer.passed_on, 3))
     if trainer.ended:
         report.metric("ended_early", trainer.ended)
     report.metric("splats", len(splats))
@@ -144,7 +154,7 @@ def run(inputs: Mapping[str, Any], settings: TrainSettings, folder: Path, report
             "--max-splats, may add detail.",
         )
     report.metric("train_seconds", round(time.monotonic() - started, 1))
-    return splats
+    return trained
 
 
 def make_trainer(
@@ -322,13 +332,25 @@ def _nothing_left() -> SplatError:
     )
 
 
-def load(folder: Path) -> Splats:
-    """The trained splats."""
+def load(folder: Path) -> TrainedSplats:
+    """The result of a finished folder. Raises SplatError if it is damaged."""
+    from stages.scene import TrainedSplats
     from stages.scene.storage import load_splats
 
-    return load_splats(folder)
+    splats = load_splats(folder)
+    try:
+        learnt = json.loads((folder / _LEARNT).read_text(encoding="utf-8"))
+        return TrainedSplats(splats, float(learnt["passed_on"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SplatError(
+            "train-folder-damaged",
+            given=f"{folder / _LEARNT} cannot be read: {error}.",
+            wanted="The file that the stage wrote.",
+            hint="Delete the stage's folder and run the command again.",
+            family=Family.RUN_FOLDER,
+        ) from error
 
 
 STAGE = Stage(
-    name="train", version=8, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=9, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -11,7 +11,7 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.measure.judge import load_photographs, mean_psnr_db
 from stages.measure.worth import Worth, beside_pictures, floaters
-from stages.scene import Splats, split_held_out
+from stages.scene import Splats, TrainedSplats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -31,7 +31,7 @@ def unseen(n: int) -> Splats:
 def run(scene: SmallScene, trained: Splats, folder: Path, **settings) -> tuple[Splats, Report]:
     """Without fine-tuning unless it is asked for: splats that stay are then the same."""
     report = Report()
-    inputs = {"sfm": scene.reconstruction, "train": trained}
+    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained)}
     wanted = prune.PruneSettings(**{"tune_steps": 0, **settings})
     return prune.run(inputs, wanted, folder, report), report
 

@@ -10,20 +10,22 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
 from stages.base.words import counted
-from stages.scene import Splats
+from stages.scene import LEAST_PASSED_ON, Splats
 
-WORST_VIEW_DB = 0.3  # that any one photograph may lose, at price 1
+WORST_VIEW_DB = 0.3  # that any one view may lose, at price 1
 
 
 @dataclass(frozen=True)
 class Aim:
     """price: what a number must be worth, in units of what the photographs ask; the loss allowed
-    grows with it. max_loss_db: at price 1, mean over the photographs that decide. max_splats,
-    max_bytes, min_psnr_db: targets that override it; 0 for none. size_bytes: of the file that
-    max_bytes speaks of."""
+    grows with it. max_loss_db: at price 1, mean over views that were not trained on. passed_on: how
+    much of a loss that training photographs show reaches those, see `TrainedSplats`. max_splats,
+    max_bytes, min_psnr_db: targets that override the price; 0 for none. size_bytes: of the file
+    that max_bytes speaks of."""
 
     price: float
     max_loss_db: float
+    passed_on: float
     max_splats: int
     max_bytes: float
     min_psnr_db: float
@@ -40,10 +42,10 @@ class Aim:
         return count - max(1, min(allowed, count))
 
     def holds(self, psnr_db: NDArray[np.float64], best_db: NDArray[np.float64]) -> bool:
-        """Whether photographs [P] may look like this, that looked like `best_db` before."""
+        """Whether photographs [P] of training may look like this, and `best_db` before."""
         if self.min_psnr_db:
             return float(psnr_db.mean()) >= self.min_psnr_db
-        loss = (best_db - psnr_db) / self.price
+        loss = (best_db - psnr_db) * max(self.passed_on, LEAST_PASSED_ON) / self.price
         return float(loss.mean()) <= self.max_loss_db and float(loss.max()) <= WORST_VIEW_DB
 
     def check_start(self, psnr_db: float) -> None:

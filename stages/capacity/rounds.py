@@ -86,9 +86,9 @@ class Shrinking:
                 break
             if cut is None:
                 continue
-            fewer = cut.of(found.splats)
+            fewer, seen = cut.of(found.splats), worth.photographs[~cut.gone]
             measured = squared_error(fewer, self.photographs, self.backend) - worth.sse
-            fewer = self.tuner.tuned(fewer, self.tune_steps * self.rounds // planned)
+            fewer = self.tuner.tuned(fewer, self.tune_steps * self.rounds // planned, seen)
             after = self._worth(fewer)
             kept = excess > 0 or self.aim.holds(after.psnr_db, best)
             predicted = cut.predicted_sse * (overlap if cut.predicted_sse > 0 else 1)

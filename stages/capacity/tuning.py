@@ -14,6 +14,7 @@ from stages.measure.judge import Photograph
 from stages.raster.draw import settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
+from stages.training.dropout import Dropout
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.step import step_of
@@ -25,24 +26,32 @@ MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 
 
 class Tuner:
-    """Goes on with splats where training left them. extent: of the scene, world units."""
+    """Goes on with splats where training left them. extent: of the scene, world units. by_heart:
+    whether the photographs are learnt by heart, so that splats sit steps out here too."""
 
     def __init__(
-        self, photographs: Sequence[Photograph], extent: float, backend: str, report: Report
+        self,
+        photographs: Sequence[Photograph],
+        extent: float,
+        backend: str,
+        report: Report,
+        by_heart: bool = False,
     ) -> None:
         self.photographs, self.extent, self.report = photographs, extent, report
+        self.by_heart = by_heart
         self.cameras = [photograph.camera for photograph in photographs]
         self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
         self.stepper = step_of(backend)
         self.steps = 0  # made so far
 
-    def tuned(self, splats: Splats, steps: int) -> Splats:
-        """After `steps` more. No splat gets smaller than what the photographs show, unless it was;
-        bands above a splat's own degree stay empty. Raises Interrupted."""
+    def tuned(self, splats: Splats, steps: int, seen: NDArray[np.int32]) -> Splats:
+        """After `steps` more. seen [N]: how many photographs show each splat. No splat gets smaller
+        than what they show, unless it was; bands above a splat's own degree stay empty. Raises
+        Interrupted."""
         if not steps or not len(splats):
             return splats
         model = new_model(*(np.array(a, np.float32, order="C") for a in splats.arrays))
-        model.sh_degrees[:] = splats.sh_degrees
+        model.sh_degrees[:], model.gradient_count[:] = splats.sh_degrees, seen
         self.stepper.load(model)
         settings = replace(settings_of(splats), sh_degree=splats.sh_degree)
         for number in range(steps):
@@ -53,8 +62,14 @@ class Tuner:
                 MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** share,
                 RATE * (RATE_END / RATE) ** share,
             )
-            self.stepper.step(self._level(), settings, rates, False)
+            self.stepper.step(self._level(), settings, rates, False, self._dropout())
         return self._finished(self.stepper.model(), splats)
+
+    def _dropout(self) -> Dropout | None:
+        if not self.by_heart:
+            return None
+        key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
+        return Dropout(len(self.photographs), key)
 
     def _level(self) -> Level:
         """Every photograph once in each round, in a new order each round."""

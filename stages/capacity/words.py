@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stages.base.words import counted
 from stages.capacity.rounds import LOSS, PRICE, Outcome
-from stages.scene import Splats
+from stages.scene import LEAST_PASSED_ON, TrainedSplats
 
 _WHY = {
     PRICE: "what is left is worth its bits",
@@ -12,9 +12,10 @@ _WHY = {
 }
 
 
-def said(before: Splats, found: Outcome, dial: float, tune_steps: int) -> list[str]:
+def said(before: TrainedSplats, found: Outcome, dial: float, tune_steps: int) -> list[str]:
     """dial: the price that was asked for."""
-    price, after = found.price, found.splats
+    price, after, start = found.price, found.splats, before.splats
+    felt = max(before.passed_on, LEAST_PASSED_ON)
     told = [
         f"Price: the photographs of training hold {price.samples:,} colour values, worth "
         f"{price.independent:,.0f} independent ones; so a number costs "
@@ -25,13 +26,14 @@ def said(before: Splats, found: Outcome, dial: float, tune_steps: int) -> list[s
     if not kept:
         return [*told, "Nothing was cut."]
     floaters = sum(one.floaters for one in kept)
-    poorer = int((after.sh_degrees < before.sh_degree).sum())
+    poorer = int((after.sh_degrees < start.sh_degree).sum())
     told.append(
-        f"Cut: {counted(len(before) - len(after), 'splat')} of {len(before):,}"
+        f"Cut: {counted(len(start) - len(after), 'splat')} of {len(start):,}"
         f"{f' ({floaters:,} of them floaters)' if floaters else ''}; of the {len(after):,} left, "
-        f"{poorer:,} have fewer bands of colour than {before.sh_degree}. "
+        f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
         f"{counted(len(kept), 'round')} with {counted(tune_steps, 'step')} of fine-tuning in all: "
-        f"{found.end_db - found.start_db:+.2f} dB on the photographs of training."
+        f"{found.end_db - found.start_db:+.2f} dB on the photographs of training; other views feel "
+        f"{felt:.0%} of that, as training has told."
     )
     why = _WHY.get(found.stopped_by, "the rounds that were asked for were done")
     return [*told, f"It stopped since {why}."]

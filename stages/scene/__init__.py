@@ -19,11 +19,21 @@ from stages.scene.capture import (
     split_held_out,
 )
 from stages.scene.look import Look, look_of, near_plane
-from stages.scene.splats import SH_C0, QuantisedSplats, Splats, dc_to_rgb, logit, rgb_to_dc
+from stages.scene.splats import (
+    LEAST_PASSED_ON,
+    SH_C0,
+    QuantisedSplats,
+    Splats,
+    TrainedSplats,
+    dc_to_rgb,
+    logit,
+    rgb_to_dc,
+)
 from stages.scene.storage import load_splats, save_splats
 
 __all__ = [
     "IGNORE",
+    "LEAST_PASSED_ON",
     "SH_C0",
     "TRANSPARENT",
     "Camera",
@@ -35,6 +45,7 @@ __all__ = [
     "QuantisedSplats",
     "Reconstruction",
     "Splats",
+    "TrainedSplats",
     "View",
     "dc_to_rgb",
     "fitted_size",

@@ -17,21 +17,21 @@ from stages.training.optimiser import Model
 from stages.training.pace import Mark
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP5"
+MAGIC = b"SPLATCP6"
 
 
 @dataclass(frozen=True)
 class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
     done by then), see `schedule.Schedule`. history: as logged. marks: of the
-    photographs that decide. by_heart: what they told. times: of each entry of the history, and,
+    photographs that decide. passed_on: what they told. times: of each entry of the history, and,
     last, now."""
 
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
     marks: list[Mark]
-    by_heart: bool
+    passed_on: float
     times: list[Spent]
 
 
@@ -68,7 +68,7 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         (int(steps), int(since), float(share)),
         header["history"],
         [Mark(**mark) for mark in header["marks"]],
-        bool(header["by_heart"]),
+        float(header["passed_on"]),
         [Spent(**t) for t in header["times"]],
     )
     return model, saved

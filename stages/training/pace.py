@@ -10,9 +10,6 @@ import numpy as np
 PLANS = 50  # times, at most, that a run with a time limit is planned anew
 PLAN_STEPS = 10  # fewer do not show a pace
 PLATEAU_POINTS = 10  # the line is laid through as many marks
-# Of what photographs in training gain. Measured where growth ends: 0.0 to 0.1 on a carpet that is
-# learnt by heart, 0.2 to 0.5 on a scene that is not.
-PASSED_ON = 0.2
 SURE = 1.0  # standard errors of its slope that are added to what is expected
 
 
@@ -50,15 +47,15 @@ class Mark:
     told_db: float
 
 
-def learnt_by_heart(marks: Sequence[Mark]) -> bool:
-    """Whether, over the last marks, of each dB that photographs in training gained those lent
-    gained less than `PASSED_ON`. Not while there are too few marks to tell."""
+def share_passed_on(marks: Sequence[Mark]) -> float:
+    """Of each dB that photographs in training gained over the last marks, what those lent gained,
+    0 to 1. 1 while there are too few marks to tell, and where training gains nothing."""
     if len(marks) < PLATEAU_POINTS:
-        return False
+        return 1.0
     last = marks[-PLATEAU_POINTS:]
     lent, _ = _slope(last, [mark.lent_db for mark in last])
     told, _ = _slope(last, [mark.told_db for mark in last])
-    return told > 0 and lent < PASSED_ON * told
+    return float(np.clip(lent / told, 0.0, 1.0)) if told > 0 else 1.0
 
 
 def remaining_gain_db(marks: Sequence[Mark], end: int) -> float:

@@ -19,13 +19,13 @@ from stages.measure.judge import Photograph, scores
 from stages.raster.backends import AUTO
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import TRANSPARENT, Camera, Look, Splats, morton
+from stages.scene import LEAST_PASSED_ON, TRANSPARENT, Camera, Look, Splats, morton
 from stages.training.checkpoint import Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
 from stages.training.density import AdaptiveDensity
 from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.pace import Mark, Pace, learnt_by_heart, remaining_gain_db
+from stages.training.pace import Mark, Pace, remaining_gain_db, share_passed_on
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.step import step_of
 from stages.training.strategy import Strategy
@@ -67,7 +67,7 @@ class Trainer:
         self._strategy: Strategy = AdaptiveDensity(self.schedule.extent)
         self.ended = ""  # why before all steps, if it did
         self.marks: list[Mark] = []  # of the photographs lent
-        self.by_heart = not self.lent  # so few photographs surely are
+        self.passed_on = 1.0 if self.lent else 0.0  # so few photographs are learnt by heart
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         self.history: list[dict[str, Any]] = []
         self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
@@ -101,6 +101,11 @@ class Trainer:
         return self.model
 
     @property
+    def by_heart(self) -> bool:
+        """See `TrainedSplats`."""
+        return self.passed_on < LEAST_PASSED_ON
+
+    @property
     def model(self) -> Model:
         """As it is now, on the host."""
         return self.stepper.model()
@@ -111,7 +116,7 @@ class Trainer:
         if saved is not None:
             model, told = saved
             step, self.history, self.marks = told.step, told.history, told.marks
-            self.by_heart = told.by_heart
+            self.passed_on = told.passed_on
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock = Clock(spent)
@@ -124,7 +129,7 @@ class Trainer:
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        saved = Saved(step, plan, self.history, self.marks, self.by_heart, times)
+        saved = Saved(step, plan, self.history, self.marks, self.passed_on, times)
         save_checkpoint(self.folder, self.model, saved)
 
     def _first(self, start: Splats) -> Model:
@@ -186,7 +191,7 @@ class Trainer:
         if self.schedule.share(step) > GROWTH_ENDS:
             return
         self.marks.append(Mark(step, self._mean_db(self.lent), self._mean_db(self._told())))
-        self.by_heart = learnt_by_heart(self.marks)
+        self.passed_on = share_passed_on(self.marks)
         promised = remaining_gain_db(self.marks, round(GROWTH_ENDS * self.schedule.steps))
         if self.by_heart and self.patience_db and promised < self.patience_db:
             self.schedule = self.schedule.grown(step)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.training.pace import PLATEAU_POINTS, Mark, Pace, learnt_by_heart, remaining_gain_db
+from stages.training.pace import PLATEAU_POINTS, Mark, Pace, remaining_gain_db, share_passed_on
 from stages.training.schedule import GROWTH_ENDS, RESOLUTIONS, SETTLE_TO, Schedule
 
 
@@ -104,13 +104,14 @@ def test_a_flat_course_promises_nothing_and_a_noisy_one_is_not_believed():
 def test_too_few_marks_promise_everything_and_tell_nothing():
     few = marks(STEPS[1:], 20 + 0 * LINE[1:], 20 + LINE[1:])
     assert remaining_gain_db(few, 4000) == float("inf")
-    assert not learnt_by_heart(few)
+    assert share_passed_on(few) == 1.0
 
 
 @pytest.mark.parametrize(
     ("lent", "told", "wanted"),
-    [(0.0, 1.0, True), (-0.5, 1.0, True), (0.1, 1.0, True), (0.5, 1.0, False), (0.0, 0.0, False)],
+    [(0.0, 1.0, 0.0), (-0.5, 1.0, 0.0), (0.1, 1.0, 0.1), (2.0, 1.0, 1.0), (0.0, 0.0, 1.0)],
 )
-def test_by_heart_is_what_helps_those_in_training_alone(lent, told, wanted):
+def test_what_is_passed_on_is_a_share_of_what_training_gains(lent, told, wanted):
     for level in (20.0, 30.0):  # how hard the photographs lent are tells nothing
-        assert learnt_by_heart(marks(STEPS, level + lent * LINE, 25 + told * LINE)) is wanted
+        found = share_passed_on(marks(STEPS, level + lent * LINE, 25 + told * LINE))
+        assert found == pytest.approx(wanted)

@@ -334,7 +334,7 @@ def test_under_the_smoothing_filter_no_trained_splat_is_finer_than_its_photograp
     folder = tmp_path / "train"
     folder.mkdir()
     report = Report()
-    found = train.run({"sfm": scene.reconstruction, "seed": start}, settings, folder, report)
+    found = train.run({"sfm": scene.reconstruction, "seed": start}, settings, folder, report).splats
     kept, _ = split_held_out(scene.reconstruction.views)
     widths = smoothing_widths(found.means, [v.camera.fitted(72) for v in kept], near=0.01)
     assert (np.exp(found.log_scales).min(1) >= 0.999 * widths).all()

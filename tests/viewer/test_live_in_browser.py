@@ -252,7 +252,7 @@ def test_a_training_is_watched_stopped_and_watched_to_its_end(
         assert process.returncode == 0
     until(browser, "splatLive.picture && splatLive.picture.step === 1500")
     assert browser.run("splatLive.state.end") == "finished"
-    right = ours(run.load("train"), view.camera)
+    right = ours(run.load("train").splats, view.camera)
     assert psnr(browser.picture(), right) > LIVE_PICTURE_DB
     manifest = run.manifest("train")
     assert manifest is not None
