@@ -48,6 +48,9 @@ PROCESS_OPTIONS = (
     "seed",
 )
 
+# What speaks of one capture and no other: a batch gives the same options to all of its runs.
+_OF_ONE_CAPTURE = ("masks", "cameras", "split", "refine_cameras", "scale", "view")
+
 
 def preset_parameter(shown: str) -> Parameter:
     """`--preset`, with the names that training defines. shown: the default."""
@@ -85,6 +88,11 @@ def process_parameters() -> list[Parameter]:
     chosen = (found[name] for name in PROCESS_OPTIONS if name in found)
     shown = f"{DEFAULT_PRESET}; as before where a run goes on"
     return [preset_parameter(shown), *chosen, view_parameter()]
+
+
+def batch_parameters() -> list[Parameter]:
+    """Those of `process` that can be asked of many captures at once."""
+    return [p for p in process_parameters() if p.name not in _OF_ONE_CAPTURE]
 
 
 def stage_parameters(name: str) -> list[Parameter]:
@@ -138,6 +146,13 @@ def defaults() -> dict[str, Any]:
     """Settings by stage name, with the default preset."""
     fresh = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
     return {**fresh, "train": presets()[DEFAULT_PRESET]}
+
+
+def fresh_settings(typed: Mapping[str, Any]) -> dict[str, Any]:
+    """What a new run is asked: settings by stage name, by what was typed, the preset included.
+    Raises SplatError."""
+    others = {name: value for name, value in typed.items() if name != "preset"}
+    return settings_for(defaults(), others, typed.get("preset"))
 
 
 def target_of(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]:

@@ -19,11 +19,18 @@ OPACITY_MIN = 0.005
 OPACITY_RESET = 0.01
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 
+BASE_MIB = 3072.0  # libraries, at most 1 GiB of photographs, matching them
+
 
 def splat_cap(available_mib: float | None) -> int:
     """How many splats may be trained in half of the free memory (of 4 GiB where unknown)."""
     mib = 4096.0 if available_mib is None else available_mib
     return max(10_000, int(0.5 * mib * 1024 * 1024 / BYTES_PER_SPLAT))
+
+
+def needed_mib(splats: int) -> float:
+    """Memory of one run that may train as many splats, all its stages, whatever it photographs."""
+    return BASE_MIB + splats * BYTES_PER_SPLAT / (1024 * 1024)
 
 
 @dataclass(frozen=True)
