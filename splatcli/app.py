@@ -63,8 +63,8 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Ray cluster that does the work (HOST:PORT, ray://HOST:PORT, auto), or local:N for N "
-        'workers of this machine: pip install "splat\\[cluster]".',
+        help="Ray cluster that takes runs or blocks (HOST:PORT, ray://HOST:PORT, auto), or local:N "
+        'for N workers of this machine: pip install "splat\\[cluster]".',
         show_default="this process",
     ),
 ]
@@ -96,6 +96,7 @@ def process(
     photos: Photos = None,
     *,
     out: Out = None,
+    cluster: Cluster = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
     **given: Any,
@@ -104,7 +105,7 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
-    jobs.run_all(photos, out, given, quiet, as_json)
+    jobs.run_all(photos, out, cluster, given, quiet, as_json)
 
 
 def batch(

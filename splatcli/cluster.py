@@ -17,15 +17,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from threading import Event
 from typing import Any
 
-from splatcli.tasks import Ending, Need, Task, work_on
+from splatcli.tasks import Ending, Engine, InTurn, Need, Task, work_on
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, Interrupted, SplatError
+from stages.run.pipeline import Listener
 
 LOCAL = re.compile(r"local:([1-9]\d{0,3})")
 _PLACE = re.compile(r"(?:ray://)?([^/:\s]+):(\d{1,5})")
 _ANSWER_S, _KNOCK_S = 120.0, 5.0
+_LOOK_UP_S = 1.0  # whether to stop
 _LOST_AT_MOST = 20  # times that one task may lose its worker
 _MIB = 1024 * 1024
 
@@ -55,7 +58,9 @@ class Cluster:
     ray: Any
     workers: tuple[Answer, ...]
 
-    def results(self, tasks: Sequence[Task], need: Need) -> Iterator[tuple[int, Ending]]:
+    def results(
+        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
+    ) -> Iterator[tuple[int, Ending]]:
         """See `tasks.Engine`. Raises SplatError "cluster-too-small"."""
         cpus, memory_mib = self.share(len(tasks), need)
         do = self.ray.remote(_with_threads).options(
@@ -67,7 +72,9 @@ class Cluster:
         )
         waiting = {do.remote(task, cpus): number for number, task in enumerate(tasks)}
         while waiting:
-            ready, _ = self.ray.wait(list(waiting), num_returns=1)
+            ready, _ = self.ray.wait(list(waiting), num_returns=1, timeout=_LOOK_UP_S)
+            if stop is not None and stop.is_set():
+                raise Interrupted("the cluster's workers go on from their checkpoints")
             for reference in ready:
                 yield waiting.pop(reference), self._ending(reference)
 
@@ -102,6 +109,19 @@ class Cluster:
 def _with_threads(task: Task, threads: int) -> Ending:
     os.environ["SPLAT_THREADS"] = str(threads)
     return work_on(task)
+
+
+@contextmanager
+def engine_at(
+    address: str | None, folder: Path, paths: Iterable[Path], listener: Listener | None = None
+) -> Iterator[Engine]:
+    """What does the work in `folder`: a cluster, or without an address this process, which tells
+    the listener. Raises as `opened`."""
+    if address is None:
+        yield InTurn(listener)
+        return
+    with opened(address, folder, paths) as found:
+        yield found
 
 
 @contextmanager

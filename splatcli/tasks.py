@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
 from typing import Any, Protocol
 
 from splatcli import console
@@ -44,12 +45,22 @@ class Need:
     gpus: int = 0
 
 
+def need_of(train: Any) -> Need:
+    """What a run with these settings of training takes at most."""
+    from stages.training.density import needed_mib
+
+    memory_mib = needed_mib(train.max_splats) if train.max_splats else None
+    return Need(memory_mib, gpus=int(train.backend == "gpu"))
+
+
 class Engine(Protocol):
     """Brings tasks to their ends, one or several at a time."""
 
-    def results(self, tasks: Sequence[Task], need: Need) -> Iterator[tuple[int, Ending]]:
-        """(which task, how it ended), as they end. Raises SplatError, and Interrupted once what
-        was being done is at a safe place."""
+    def results(
+        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
+    ) -> Iterator[tuple[int, Ending]]:
+        """(which task, how it ended), as they end. Raises SplatError, and Interrupted where `stop`
+        is set, or a signal stopped what was being done at a safe place."""
 
 
 def work_on(task: Task, listener: Listener | None = None) -> Ending:
@@ -79,6 +90,10 @@ class InTurn:
     def __init__(self, listener: Listener | None = None) -> None:
         self.listener = listener
 
-    def results(self, tasks: Sequence[Task], need: Need) -> Iterator[tuple[int, Ending]]:
+    def results(
+        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
+    ) -> Iterator[tuple[int, Ending]]:
         for number, task in enumerate(tasks):
+            if stop is not None and stop.is_set():
+                raise Interrupted(f"before {task.run_folder}")
             yield number, work_on(task, self.listener)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from splatcli import cluster, console, jobs, options
-from splatcli.tasks import Ending, Engine, InTurn, Need, Task
+from splatcli.tasks import Ending, Task, need_of
 from stages import STAGE_NAMES
 from stages.base.atomic import make_folder, replacing
 from stages.base.errors import Family, SplatError
@@ -58,11 +58,10 @@ def batch(
     out = out.absolute()  # workers stand elsewhere
     tasks = [Task(out / name, path, settings) for name, path in named(captures).items()]
     make_folder(out)
-    with locked(out), engine_of(address, out, captures) as engine:
+    with locked(out), cluster.engine_at(address, out, captures) as engine:
         board = Board(out, [task.run_folder.name for task in tasks])
-        need = need_of(settings)
         with board.shown(quiet, as_json):
-            for number, ending in engine.results(tasks, need):
+            for number, ending in engine.results(tasks, need_of(settings["train"])):
                 board.ended(number, ending)
                 board.tell(number, ending, quiet, as_json)
         board.write()
@@ -90,25 +89,6 @@ def named(captures: Sequence[Path]) -> dict[str, Path]:
             )
         found[name] = taken[name.casefold()] = whole
     return found
-
-
-@contextmanager
-def engine_of(address: str | None, out: Path, paths: Collection[Path]) -> Iterator[Engine]:
-    """What does the work: a cluster, or without an address this process. Raises SplatError."""
-    if address is None:
-        yield InTurn()
-        return
-    with cluster.opened(address, out, paths) as found:
-        yield found
-
-
-def need_of(settings: Mapping[str, Any]) -> Need:
-    """What the stages of one run take at most."""
-    from stages.training.density import needed_mib
-
-    train = settings["train"]
-    memory_mib = needed_mib(train.max_splats) if train.max_splats else None
-    return Need(memory_mib, gpus=int(train.backend == "gpu"))
 
 
 class Board:
