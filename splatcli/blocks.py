@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from stages.blocks.ground import Cell
     from stages.measure.judge import Photograph
-    from stages.scene import Camera, Look, Reconstruction, Splats, View
+    from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats, View
     from stages.training.clock import Spent
 
 OpenEngine = Callable[[Path, Listener], AbstractContextManager[Engine]]
@@ -90,16 +91,16 @@ class _Scene:
     engine: Engine
     report: Report
 
-    def train(self, blocks: int, seeds: Splats, folder: Path) -> Splats:
+    def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
         """The merged splats, written to `folder` as training writes them."""
         from stages.blocks import ground, sight
-        from stages.scene import look_of, save_splats, split_held_out
-        from stages.train import light_wanted, write_quality
+        from stages.scene import look_of, split_held_out
+        from stages.train import light_wanted, save, write_quality
 
         started = time.monotonic()
         light = light_wanted(self.whole, self.settings.light, self.report)
         self.settings = replace(self.settings, light="on" if light else "off")
-        coarse = self._coarse(seeds)
+        coarse = self._coarse(seeds).splats
         training, held = split_held_out(self.whole.views)
         places, weights = ground.looked_at(replace(self.whole, views=training))
         cells = ground.cut(places, weights, blocks)
@@ -109,17 +110,18 @@ class _Scene:
         look = look_of(self.whole.views, self.settings.train_side, light)
         crossed = sight.crossing(member)
         crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
-        splats = self._joined(parts, cells, [v for v in crossing if v in training], look)
-        save_splats(folder, splats)
-        judged = _judged(splats, self, held)
+        teachers = [view for view in crossing if view in training]
+        trained = self._joined(parts, cells, teachers, look)
+        save(folder, trained)
+        judged = _judged(trained.splats, self, held)
         write_quality(judged, self.whole, folder, self.report)
         self.report.metric("train_photographs", len(training))
         self.report.metric("held_out_photographs", len(held))
         self.report.metric("crossing", [view.name for view in crossing])
         self.report.metric("train_seconds", round(time.monotonic() - started, 1))
-        return splats
+        return trained
 
-    def _coarse(self, seeds: Splats) -> Splats:
+    def _coarse(self, seeds: Splats) -> TrainedSplats:
         settings = replace(
             self.settings,
             steps=max(1, self.settings.steps // COARSE_STEPS),
@@ -135,9 +137,10 @@ class _Scene:
         cells: Sequence[Cell],
         member: NDArray[np.bool_],
         margin: float,
-    ) -> list[Splats]:
-        """The splats of each block; the coarse ones of a cell that no photograph shows."""
+    ) -> list[TrainedSplats]:
+        """What each block learnt; the coarse splats of a cell that no photograph shows."""
         from stages.blocks import merge
+        from stages.scene import TrainedSplats
 
         runs = {}
         for number, (cell, chosen) in enumerate(zip(cells, member, strict=True), start=1):
@@ -161,18 +164,19 @@ class _Scene:
                 f"({', '.join(empty)}): the coarse model stands there. Ask for fewer --blocks.",
             )
         found = self._trained(runs)
-        parts = [found.get(str(number), coarse) for number in range(1, len(cells) + 1)]
+        none = TrainedSplats(coarse)
+        parts = [found.get(str(number), none) for number in range(1, len(cells) + 1)]
         self._record(cells, runs, parts)
-        return [part.with_sh_degree(self.settings.sh_degree) for part in parts]
+        return parts
 
     def _record(
-        self, cells: Sequence[Cell], runs: Mapping[str, Any], parts: Sequence[Splats]
+        self, cells: Sequence[Cell], runs: Mapping[str, Any], parts: Sequence[TrainedSplats]
     ) -> None:
-        """Which rows of the merged splats came from which block, before seams were put right."""
-        rows, told = 0, []
+        """Which block gave how many splats: they lie in this order."""
+        told = []
         for number, (cell, part) in enumerate(zip(cells, parts, strict=True), start=1):
             run = str(number) if str(number) in runs else COARSE
-            count = int(cell.holds(part.means).sum())
+            count = int(cell.holds(part.splats.means).sum())
             views = runs[run][0].views if run in runs else ()
             told.append(
                 {
@@ -181,14 +185,15 @@ class _Scene:
                     "low_x_z": cell.low,
                     "high_x_z": cell.high,
                     "photographs": len(views),
-                    "splats_trained": len(part),
+                    "splats_trained": len(part.splats),
                     "splats_given": count,
                 }
             )
-            rows += count
         self.report.metric("blocks", told)
 
-    def _trained(self, runs: Mapping[str, tuple[Reconstruction, Splats, Any]]) -> dict[str, Splats]:
+    def _trained(
+        self, runs: Mapping[str, tuple[Reconstruction, Splats, Any]]
+    ) -> dict[str, TrainedSplats]:
         """The trained splats of runs in folders of these names. Raises SplatError for one that
         failed, once the others have ended."""
         from splatcli import block_folders
@@ -217,32 +222,39 @@ class _Scene:
 
     def _joined(
         self,
-        parts: Sequence[Splats],
+        parts: Sequence[TrainedSplats],
         cells: Sequence[Cell],
         crossing: Sequence[View],
         look: Look,
-    ) -> Splats:
-        """The blocks as one, their seams put right."""
+    ) -> TrainedSplats:
+        """The blocks as one, their seams put right by the photographs that cross them. In the
+        report, how many splats each gave: they lie block after block."""
+        import numpy as np
+
         from stages.blocks import merge
         from stages.capacity.tuning import Tuner
         from stages.measure.judge import load_photographs
-        from stages.scene import seen_extent
+        from stages.scene import TrainedSplats, seen_extent
 
-        splats, counts = merge.merged(parts, cells, look)
-        self.report.metric("splats_given", counts)
-        if not crossing:
-            return splats
-        photographs = load_photographs(self.whole.folder, crossing, look)
+        degree, backend = self.settings.sh_degree, self.settings.backend
+        given = [part.splats.with_sh_degree(degree) for part in parts]
+        splats, counts = merge.merged(given, cells, look)
+        found = TrainedSplats(splats, float(np.mean([part.passed_on for part in parts])))
         seam = merge.at_seams(splats, counts, cells)
-        self.report.progress(0, 1, "seams")
-        gone = merge.harmful(splats, seam, photographs, self.settings.backend)
-        splats = splats.take(~gone)
-        tuner = Tuner(photographs, seen_extent(self.whole), self.settings.backend, self.report)
-        splats = merge.tuned(splats, photographs, tuner)
+        gone = np.zeros(len(splats), bool)
+        if crossing:
+            self.report.progress(0, 1, "seams")
+            photographs = load_photographs(self.whole.folder, crossing, look)
+            extent = seen_extent(self.whole)
+            tuner = Tuner(photographs, extent, backend, self.report, found.by_heart)
+            splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
+        ends = np.cumsum([0, *counts])
+        left = [int((~gone[i:j]).sum()) for i, j in pairwise(ends)]
+        self.report.metric("splats", len(splats))
+        self.report.metric("splats_by_block", left)
         self.report.metric("splats_at_seams", int(seam.sum()))
         self.report.metric("pruned_at_seams", int(gone.sum()))
-        self.report.metric("splats", len(splats))
-        return splats
+        return replace(found, splats=splats)
 
 
 @dataclass

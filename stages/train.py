@@ -131,10 +131,8 @@ def run(
 ) -> TrainedSplats:
     """Train; write splats.bin, history.csv, a plot, and held-out photographs as a contact sheet
     with a legend."""
-    from stages.base.atomic import replacing
     from stages.raster.smoothing import smoothed
     from stages.scene import TrainedSplats
-    from stages.scene.storage import save_splats
     from stages.training.cap import forget_cap
     from stages.training.checkpoint import remove_checkpoint
 
@@ -159,9 +157,7 @@ def run(
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
     trained = TrainedSplats(splats, trainer.passed_on)
-    save_splats(folder, splats)
-    with replacing(folder / _LEARNT) as temporary:
-        temporary.write_text(json.dumps({"passed_on": trained.passed_on}) + "\n", encoding="utf-8")
+    save(folder, trained)
     remove_checkpoint(folder)
     forget_cap(folder)
     report.metric("steps", trainer.schedule.steps)
@@ -366,6 +362,16 @@ def _nothing_left() -> SplatError:
         "another --seed.",
         family=Family.QUALITY,
     )
+
+
+def save(folder: Path, trained: TrainedSplats) -> None:
+    """What `load` reads. Raises SplatError."""
+    from stages.base.atomic import replacing
+    from stages.scene.storage import save_splats
+
+    save_splats(folder, trained.splats)
+    with replacing(folder / _LEARNT) as temporary:
+        temporary.write_text(json.dumps({"passed_on": trained.passed_on}) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:

@@ -56,18 +56,17 @@ def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> ND
     return found
 
 
-def harmful(
+def put_right(
     splats: Splats,
-    suspects: NDArray[np.bool_],
+    seam: NDArray[np.bool_],
     photographs: Sequence[Photograph],
+    tuner: Tuner,
     backend: str,
-) -> NDArray[np.bool_]:
-    """[N] which of the suspects these photographs would be better without: two blocks that each
-    stood in for the other have put there twice what is there once."""
+) -> tuple[Splats, NDArray[np.bool_]]:
+    """(the splats without those at the seam that these photographs would be better without, tuned
+    to them all for a while; [N] which went). Two blocks that each stood in for the other have put
+    there twice what is there once."""
     worth = measure_worth(splats, photographs, backend)
-    return np.asarray(suspects & (worth.sse_change < 0))
-
-
-def tuned(splats: Splats, photographs: Sequence[Photograph], tuner: Tuner) -> Splats:
-    """After each of the photographs has had its say a few times."""
-    return tuner.tuned(splats, min(MOST_STEPS, STEPS_A_PHOTOGRAPH * len(photographs)))
+    gone = np.asarray(seam & (worth.sse_change < 0))
+    steps = min(MOST_STEPS, STEPS_A_PHOTOGRAPH * len(photographs))
+    return tuner.tuned(splats.take(~gone), steps, worth.photographs[~gone]), gone

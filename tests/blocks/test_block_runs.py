@@ -74,16 +74,17 @@ def test_blocks_are_runs_of_their_own_and_one_in_the_end(tmp_path, photos) -> No
     pipeline = trained(tmp_path / "run", photos, blocks="3")
     manifest = pipeline.manifest("train")
     assert manifest is not None
-    told, splats = manifest.metrics["blocks"], pipeline.load("train")
+    told, splats = manifest.metrics["blocks"], pipeline.load("train").splats
     assert [row["run_folder"] for row in told] == ["blocks/1", "blocks/2", "blocks/3"]
     assert manifest.metrics["splats"] == len(splats)
     given = sum(row["splats_given"] for row in told)
     assert len(splats) == given - manifest.metrics["pruned_at_seams"]
+    assert len(splats) == sum(manifest.metrics["splats_by_block"])
     for row in told:
         block = Pipeline(tmp_path / "run" / row["run_folder"])
         states = {step.stage.name: step.will_run for step in block.status()}
         assert not any(states[name] for name in STAGE_NAMES[:4]), states
-        assert len(block.load("train")) == row["splats_trained"]
+        assert len(block.load("train").splats) == row["splats_trained"]
 
 
 def test_no_block_learns_from_a_photograph_that_judges(tmp_path, photos) -> None:

@@ -9,11 +9,13 @@ import importlib.metadata
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from splatcli import cluster
+from splatcli.tasks import Need
 from stages.base.errors import SplatError
 from stages.run.lock import locked
 
@@ -139,8 +141,7 @@ def test_nothing_imports_ray_unless_a_cluster_is_asked_for() -> None:
 
 
 def answer(**changes) -> cluster.Answer:
-    usual = {"host": "b7", "edition": "2", "unseen": (), "cpus": 4, "memory_mib": 9000.0}
-    return cluster.Answer(**usual | changes)
+    return replace(cluster.Answer("b7", "2", (), 4, 9000.0), **changes)
 
 
 def test_a_worker_with_another_splat_is_refused_and_both_are_named(tmp_path) -> None:
@@ -189,10 +190,10 @@ def test_tasks_share_the_processors_and_take_the_memory_they_need(
     tasks, workers, memory_mib, wanted
 ) -> None:
     found = cluster.Cluster(None, tuple(workers))
-    assert found.share(tasks, cluster.Need(memory_mib)) == wanted
+    assert found.share(tasks, Need(memory_mib)) == wanted
 
 
 def test_a_run_that_no_worker_has_the_memory_for_is_refused() -> None:
     """Ray would wait for such a worker for ever."""
     with pytest.raises(SplatError, match="20,000 MiB, and no worker has more than 9,000"):
-        cluster.Cluster(None, (answer(),)).share(1, cluster.Need(20_000.0))
+        cluster.Cluster(None, (answer(),)).share(1, Need(20_000.0))
