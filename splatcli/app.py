@@ -59,6 +59,15 @@ Backend = Annotated[
         shown=False,
     ),
 ]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Ray cluster that takes runs or blocks (HOST:PORT, ray://HOST:PORT, auto), or local:N "
+        'for N workers of this machine: pip install "splat\\[cluster]".',
+        show_default="this process",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Events and results as lines of JSON.")]
 
@@ -87,6 +96,7 @@ def process(
     photos: Photos = None,
     *,
     out: Out = None,
+    cluster: Cluster = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
     **given: Any,
@@ -95,7 +105,30 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
-    jobs.run_all(photos, out, given, quiet, as_json)
+    jobs.run_all(photos, out, cluster, given, quiet, as_json)
+
+
+def batch(
+    captures: Annotated[
+        list[Path], typer.Argument(help="Folders of photographs, or videos: one run for each.")
+    ],
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for the run folders and batch.csv.")
+    ] = Path("runs"),
+    cluster: Cluster = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    **given: Any,
+) -> None:
+    """Many captures: `splat process` for each, into a run folder of its name.
+
+    One that fails does not keep the others; the exit status is the worst. The same command again
+    goes on where it stopped: what is finished is not done twice. batch.csv says how they went.
+    """
+    from splatcli.commands import batch as work
+
+    work.batch(captures, out, cluster, given, quiet, as_json)
 
 
 def _stage_command(name: str) -> Callable[..., None]:
@@ -320,6 +353,8 @@ def _register() -> None:
     example = _example("splat process photos/ --preset preview --out run/")
     command = with_parameters(process, jobs.process_parameters())
     app.command("process", epilog=example)(guarded(command))
+    many = with_parameters(batch, jobs.batch_parameters())
+    app.command("batch", epilog=_example("splat batch captures/* --out runs/"))(guarded(many))
     for name in STAGE_NAMES:
         line = _STAGE_EXAMPLES.get(name, f"splat {name}")
         command = with_parameters(_stage_command(name), jobs.stage_parameters(name))

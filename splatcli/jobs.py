@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager
 from inspect import Parameter
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from splatcli import console, options, progress, summary
+from splatcli import blocks, cluster, console, options, progress, summary
 from splatcli import live_view as watching
 from splatcli.folders import DEFAULT, find_run_folder
+from splatcli.tasks import Engine
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
 from stages.base.settings import Setting, settings_of
 from stages.run import runfolder
-from stages.run.pipeline import Pipeline
+from stages.run.pipeline import Listener, Pipeline
 
 DEFAULT_PRESET = "standard"
 PROCESS_OPTIONS = (
@@ -31,6 +33,7 @@ PROCESS_OPTIONS = (
     "seconds",
     "patience",
     "max_splats",
+    "blocks",
     "price",
     "max_mb",
     "mb_of",
@@ -47,6 +50,9 @@ PROCESS_OPTIONS = (
     "allow_partial",
     "seed",
 )
+
+# What speaks of one capture and no other: a batch gives the same options to all of its runs.
+_OF_ONE_CAPTURE = ("masks", "cameras", "split", "refine_cameras", "scale", "blocks", "view")
 
 
 def preset_parameter(shown: str) -> Parameter:
@@ -85,6 +91,11 @@ def process_parameters() -> list[Parameter]:
     chosen = (found[name] for name in PROCESS_OPTIONS if name in found)
     shown = f"{DEFAULT_PRESET}; as before where a run goes on"
     return [preset_parameter(shown), *chosen, view_parameter()]
+
+
+def batch_parameters() -> list[Parameter]:
+    """Those of `process` that can be asked of many captures at once."""
+    return [p for p in process_parameters() if p.name not in _OF_ONE_CAPTURE]
 
 
 def stage_parameters(name: str) -> list[Parameter]:
@@ -140,6 +151,13 @@ def defaults() -> dict[str, Any]:
     return {**fresh, "train": presets()[DEFAULT_PRESET]}
 
 
+def fresh_settings(typed: Mapping[str, Any]) -> dict[str, Any]:
+    """What a new run is asked: settings by stage name, by what was typed, the preset included.
+    Raises SplatError."""
+    others = {name: value for name, value in typed.items() if name != "preset"}
+    return settings_for(defaults(), others, typed.get("preset"))
+
+
 def target_of(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]:
     """(run folder, photographs or None) that a command is about.
 
@@ -180,11 +198,17 @@ def run(
 
 
 def run_all(
-    photos: Path | None, out: Path | None, given: Mapping[str, Any], quiet: bool, as_json: bool
+    photos: Path | None,
+    out: Path | None,
+    address: str | None,
+    given: Mapping[str, Any],
+    quiet: bool,
+    as_json: bool,
 ) -> None:
-    """`splat process`. Without photographs, what was asked before counts too."""
+    """`splat process`. Without photographs, what was asked before counts too. address: of the
+    cluster that trains blocks."""
     run_folder, photos = target_of(photos, out)
-    pipeline = Pipeline(run_folder, photos)
+    pipeline = in_blocks(Pipeline(run_folder, photos), address)
     base = defaults() if photos is not None else pipeline.recorded_settings()
     typed = options.given_only(given)
     view = typed.pop("view", False)
@@ -217,8 +241,18 @@ def run_stage(
         settings = {**base, **settings}
     if name == "train" and not (quiet or as_json):
         console.note(training_in_words(settings["train"], typed, preset))
+    pipeline = in_blocks(pipeline, None)
     may_run = _may_run(name)
     run(pipeline, settings, until=name, may_run=may_run, quiet=quiet, as_json=as_json, view=view)
+
+
+def in_blocks(pipeline: Pipeline, address: str | None) -> Pipeline:
+    """The pipeline; if it has blocks, the cluster at `address` trains them, or this process."""
+
+    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Engine]:
+        return cluster.engine_at(address, folder, [pipeline.run_folder], listener)
+
+    return blocks.in_blocks(pipeline, opened)
 
 
 def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:

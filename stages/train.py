@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
@@ -15,7 +15,12 @@ from stages.base.words import counted
 from stages.raster.backends import backend_of, backend_setting, passed_over
 
 if TYPE_CHECKING:
-    from stages.scene import Look, Reconstruction, Splats, TrainedSplats
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stages.measure.judge import Photograph
+    from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats
+    from stages.training.clock import Spent
     from stages.training.optimiser import Model
     from stages.training.trainer import Trainer
 
@@ -90,6 +95,23 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
+    blocks: str = field(
+        default="1",
+        metadata={
+            "help": "Cut the scene into as many blocks, train each on the photographs that show "
+            "it, and make them one again; auto: one for about every 250 photographs.",
+            "pattern": r"auto|[1-9]\d{0,3}",
+            "wanted": "A whole number of blocks, or auto.",
+        },
+    )
+    within: tuple[float, ...] = field(
+        default=(),
+        metadata={
+            "help": "Grow only in this rectangle of the ground plane (world units); what is "
+            "outside stays as coarse as it is.",
+            "together": "X0 Z0 X1 Z1",
+        },
+    )
     backend: str = backend_setting()
 
 
@@ -109,13 +131,13 @@ def run(
 ) -> TrainedSplats:
     """Train; write splats.bin, history.csv, a plot, and held-out photographs as a contact sheet
     with a legend."""
-    from stages.base.atomic import replacing
     from stages.raster.smoothing import smoothed
     from stages.scene import TrainedSplats
-    from stages.scene.storage import save_splats
     from stages.training.cap import forget_cap
     from stages.training.checkpoint import remove_checkpoint
 
+    if settings.blocks != "1":
+        raise ValueError("blocks are runs of their own: splatcli.blocks trains them")
     started = time.monotonic()
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]
@@ -135,9 +157,7 @@ def run(
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
     trained = TrainedSplats(splats, trainer.passed_on)
-    save_splats(folder, splats)
-    with replacing(folder / _LEARNT) as temporary:
-        temporary.write_text(json.dumps({"passed_on": trained.passed_on}) + "\n", encoding="utf-8")
+    save(folder, trained)
     remove_checkpoint(folder)
     forget_cap(folder)
     report.metric("steps", trainer.schedule.steps)
@@ -209,6 +229,7 @@ def make_trainer(
         smooth=settings.smooth,
         over_any=settings.background == "any",
         backend=settings.backend,
+        within=settings.within,
         lent=lent_rows(len(train)),
         patience_db=settings.patience,
     )
@@ -262,8 +283,19 @@ def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
     )
 
 
+class Judged(Protocol):
+    """What `write_quality` asks of whoever trained; see `Trainer`."""
+
+    held_out: Sequence[Photograph]
+    look: Look
+    history: list[dict[str, Any]]
+    times: list[Spent]
+
+    def drawn(self, camera: Camera) -> NDArray[np.float32]: ...
+
+
 def write_quality(
-    trainer: Trainer, reconstruction: Reconstruction, folder: Path, report: Report
+    trainer: Judged, reconstruction: Reconstruction, folder: Path, report: Report
 ) -> None:
     """Final held-out figures into the report; table, plot and contact sheet into the folder."""
     import numpy as np
@@ -330,6 +362,16 @@ def _nothing_left() -> SplatError:
         "another --seed.",
         family=Family.QUALITY,
     )
+
+
+def save(folder: Path, trained: TrainedSplats) -> None:
+    """What `load` reads. Raises SplatError."""
+    from stages.base.atomic import replacing
+    from stages.scene.storage import save_splats
+
+    save_splats(folder, trained.splats)
+    with replacing(folder / _LEARNT) as temporary:
+        temporary.write_text(json.dumps({"passed_on": trained.passed_on}) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:

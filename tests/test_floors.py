@@ -28,6 +28,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "stages.surface",
         "stages.film",
     ),
+    ("stages.blocks",),
     ("stages", *(f"stages.{name}" for name in STAGE_FILES)),
     ("stages.run",),
     ("stages.viewer",),

@@ -10,6 +10,7 @@ from stages.raster.definition import OPACITY
 from stages.scene import logit
 from stages.scene.rotations import matrices_of
 from stages.training.optimiser import OPACITY_STEPS, Model
+from stages.training.strategy import Strategy
 
 SPLIT_FACTOR = 1.6  # children of a split are that much smaller
 LARGE = 0.01  # of the scene's extent: above it a splat is split, below it cloned
@@ -19,11 +20,18 @@ OPACITY_MIN = 0.005
 OPACITY_RESET = 0.01
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 
+BASE_MIB = 3072.0  # libraries, at most 1 GiB of photographs, matching them
+
 
 def splat_cap(available_mib: float | None) -> int:
     """How many splats may be trained in half of the free memory (of 4 GiB where unknown)."""
     mib = 4096.0 if available_mib is None else available_mib
     return max(10_000, int(0.5 * mib * 1024 * 1024 / BYTES_PER_SPLAT))
+
+
+def needed_mib(splats: int) -> float:
+    """Memory of one run that may train as many splats, all its stages, whatever it photographs."""
+    return BASE_MIB + splats * BYTES_PER_SPLAT / (1024 * 1024)
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,27 @@ class AdaptiveDensity:
         reset.moment2[:, OPACITY] = 0.0
         reset.steps[:, OPACITY_STEPS] = 0
         return reset
+
+
+@dataclass(frozen=True)
+class Within:
+    """Another strategy that grows in a rectangle of the ground plane alone: low and high x and z of
+    `bounds` (x0, z0, x1, z1)."""
+
+    rule: Strategy
+    bounds: tuple[float, ...]
+
+    def prune(self, model: Model, settled: bool) -> Model:
+        return self.rule.prune(model, settled)
+
+    def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
+        at = model.means[:, [0, 2]]
+        inside = ((at >= self.bounds[:2]) & (at < self.bounds[2:])).all(1)
+        model.gradient_sum[~inside] = 0.0
+        return self.rule.grow(model, budget, rng)
+
+    def reset(self, model: Model) -> Model:
+        return self.rule.reset(model)
 
 
 def _children(parents: Model, rng: np.random.Generator) -> Model:

@@ -22,7 +22,7 @@ from stages.raster.smoothing import smoothing_widths
 from stages.scene import LEAST_PASSED_ON, TRANSPARENT, Camera, Look, Splats, morton
 from stages.training.checkpoint import Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
-from stages.training.density import AdaptiveDensity
+from stages.training.density import AdaptiveDensity, Within
 from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.pace import Mark, Pace, remaining_gain_db, share_passed_on
@@ -46,7 +46,8 @@ class Trainer:
     under the 3D smoothing filter. over_any: over another background at each step, as cut-out
     photographs always are. backend: what draws and steps. lent: rows of `train` that decide, and
     are trained on only once it grows no more. patience_db: what going on must promise to give.
-    seconds: of wall time in all, 0 for as long as the steps take."""
+    seconds: of wall time in all, 0 for as long as the steps take. within: where it grows, see
+    `density.Within`; () for everywhere."""
 
     schedule: Schedule
     train: list[TrainingView]
@@ -61,10 +62,13 @@ class Trainer:
     lent: tuple[int, ...] = ()
     patience_db: float = 0.0
     seconds: float = 0.0
+    within: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         self.stepper = step_of(self.backend)
         self._strategy: Strategy = AdaptiveDensity(self.schedule.extent)
+        if self.within:
+            self._strategy = Within(self._strategy, self.within)
         self.ended = ""  # why before all steps, if it did
         self.marks: list[Mark] = []  # of the photographs lent
         self.passed_on = 1.0 if self.lent else 0.0  # so few photographs are learnt by heart

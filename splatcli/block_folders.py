@@ -1,0 +1,93 @@
+"""Run folders that begin with training: of a part of another run's photographs, from its splats.
+
+`splat status`, `splat view` and `splat train` take them as any other. Pictures are not copied: a
+part's cameras name those of the whole.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from stages.base.libraries import versions
+from stages.run.digests import combined_digest, record_files
+from stages.run.manifest import MANIFEST, Manifest
+from stages.run.pipeline import Pipeline
+from stages.run.runfile import RunFile
+from stages.scene import Reconstruction, Splats, save_splats
+from stages.structure.reconstruction_files import save_reconstruction
+
+_POINTS = 100_000  # of the sparse cloud, at most: it only says how large the scene is
+
+
+def begin(
+    whole: Pipeline, folder: Path, part: Reconstruction, start: Splats, settings: Any
+) -> None:
+    """Make `folder` a run folder with ingest, sfm and seed finished: `part`, whose pictures lie
+    with the whole's, and the splats to start from. settings: of training. Equal inputs make equal
+    folders, so that it may be begun again at any time. Raises SplatError, OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pipeline = Pipeline(folder)
+    ingest = _of(whole, "ingest")
+    _finish(pipeline.stage_folder("ingest"), replace(ingest, outputs={}))
+    place = pipeline.stage_folder("sfm")
+    place.mkdir(exist_ok=True)
+    save_reconstruction(place, _pointing_at(part, place))
+    sfm = _finish(place, _of(whole, "sfm"))
+    place = pipeline.stage_folder("seed")
+    place.mkdir(exist_ok=True)
+    save_splats(place, start)
+    seed = _of(whole, "seed")
+    _finish(place, replace(seed, inputs={"sfm": sfm.output_digest}))
+    recorded = whole.recorded_settings()
+    RunFile().updated({**recorded, "train": settings}).write(folder)
+
+
+def _of(whole: Pipeline, name: str) -> Manifest:
+    found = whole.manifest(name)
+    assert found is not None, f"{name} runs before training"
+    return found
+
+
+def _finish(folder: Path, like: Manifest) -> Manifest:
+    """Write a manifest that says what `like` says, of the files that lie there."""
+    folder.mkdir(exist_ok=True)
+    outputs = record_files(folder, leave_out=frozenset([MANIFEST]))
+    metrics: Mapping[str, Any] = {"made_by": "the run that this is a block of"}
+    manifest = replace(
+        like,
+        outputs=outputs,
+        output_digest=combined_digest(outputs) if outputs else like.output_digest,
+        seconds=0.0,
+        peak_memory_mib=0.0,
+        libraries=versions(),
+        metrics=dict(metrics),
+        warnings=[],
+    )
+    manifest.write(folder)
+    return manifest
+
+
+def _pointing_at(part: Reconstruction, place: Path) -> Reconstruction:
+    """With the pictures' paths as seen from `place`, and points enough to tell its size."""
+    lead = Path(os.path.relpath(part.folder, place))
+    views = tuple(
+        replace(
+            view,
+            image=(lead / view.image).as_posix(),
+            mask=(lead / view.mask).as_posix() if view.mask else "",
+        )
+        for view in part.views
+    )
+    some = slice(None, None, max(1, len(part.points) // _POINTS))
+    return replace(
+        part,
+        views=views,
+        points=part.points[some],
+        colours=part.colours[some],
+        errors_px=part.errors_px[some],
+        tracks=part.tracks[some],
+    )

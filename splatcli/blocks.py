@@ -1,0 +1,328 @@
+"""One scene in blocks: training as many runs, on whatever brings runs to their end.
+
+A coarse model of the whole is trained first. It says which photographs show which block, and
+stands for the surroundings while each block is trained, in a run folder of its own under `blocks/`.
+Then each block gives what lies in its cell, and seams are put right on the photographs that cross
+them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli.tasks import Engine, Task, need_of
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Numbers, Report, Stage
+from stages.base.words import counted
+from stages.run.pipeline import Listener, Pipeline
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from stages.blocks.ground import Cell
+    from stages.measure.judge import Photograph
+    from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats, View
+    from stages.training.clock import Spent
+
+OpenEngine = Callable[[Path, Listener], AbstractContextManager[Engine]]
+FOLDER, COARSE = "blocks", "coarse"
+PHOTOGRAPHS_A_BLOCK = 250
+COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4  # as much less than is asked of the whole
+
+
+def in_blocks(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
+    """The pipeline, training in blocks where its settings ask for it. open_engine(folder,
+    listener): what trains them there."""
+
+    def replaced(stage: Stage) -> Stage:
+        run = partial(_train, pipeline, stage, open_engine)
+        return replace(stage, run=run) if stage.name == "train" else stage
+
+    layout = pipeline.layout
+    pipeline.layout = replace(layout, stages=tuple(map(replaced, layout.stages)))
+    return pipeline
+
+
+def blocks_wanted(asked: str, photographs: int) -> int:
+    """How many blocks `TrainSettings.blocks` means for as many photographs."""
+    return max(1, round(photographs / PHOTOGRAPHS_A_BLOCK)) if asked == "auto" else int(asked)
+
+
+def _train(
+    pipeline: Pipeline,
+    plain: Stage,
+    open_engine: OpenEngine,
+    inputs: Mapping[str, Any],
+    settings: Any,
+    folder: Path,
+    report: Report,
+) -> Any:
+    """The stage `train`, for any number of blocks."""
+    single = replace(settings, blocks="1")
+    photographs = 0 if settings == single else len(inputs["sfm"].views)
+    blocks = blocks_wanted(settings.blocks, photographs)
+    if blocks == 1:
+        return plain.run(inputs, single, folder, report)
+    _check(settings)
+    root = pipeline.run_folder.absolute() / FOLDER
+    root.mkdir(exist_ok=True)
+    with open_engine(root, _Told(report)) as engine:
+        scene = _Scene(pipeline, _with_roles(inputs["sfm"]), single, root, engine, report)
+        return scene.train(blocks, inputs["seed"], folder)
+
+
+@dataclass
+class _Scene:
+    """What is trained in blocks. whole: with the judges told apart once for all blocks. settings:
+    of the whole. root: the folder of the blocks' run folders."""
+
+    pipeline: Pipeline
+    whole: Reconstruction
+    settings: Any
+    root: Path
+    engine: Engine
+    report: Report
+
+    def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
+        """The merged splats, written to `folder` as training writes them."""
+        from stages.blocks import ground, sight
+        from stages.scene import look_of, split_held_out
+        from stages.train import light_wanted, save, write_quality
+
+        started = time.monotonic()
+        light = light_wanted(self.whole, self.settings.light, self.report)
+        self.settings = replace(self.settings, light="on" if light else "off")
+        coarse = self._coarse(seeds).splats
+        training, held = split_held_out(self.whole.views)
+        places, weights = ground.looked_at(replace(self.whole, views=training))
+        cells = ground.cut(places, weights, blocks)
+        cameras = [view.camera for view in self.whole.views]
+        member = sight.members(sight.shares(coarse, cells, cameras, self.settings.backend))
+        parts = self._blocks(seeds, coarse, cells, member, ground.margin(places))
+        look = look_of(self.whole.views, self.settings.train_side, light)
+        crossed = sight.crossing(member)
+        crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
+        teachers = [view for view in crossing if view in training]
+        trained = self._joined(parts, cells, teachers, look)
+        save(folder, trained)
+        judged = _judged(trained.splats, self, held)
+        write_quality(judged, self.whole, folder, self.report)
+        self.report.metric("train_photographs", len(training))
+        self.report.metric("held_out_photographs", len(held))
+        self.report.metric("crossing", [view.name for view in crossing])
+        self.report.metric("train_seconds", round(time.monotonic() - started, 1))
+        return trained
+
+    def _coarse(self, seeds: Splats) -> TrainedSplats:
+        settings = replace(
+            self.settings,
+            steps=max(1, self.settings.steps // COARSE_STEPS),
+            train_side=max(16, self.settings.train_side // COARSE_SIDE),
+            max_splats=max(1, self.settings.max_splats // COARSE_SPLATS),
+        )
+        return self._trained({COARSE: (self.whole, seeds, settings)})[COARSE]
+
+    def _blocks(
+        self,
+        seeds: Splats,
+        coarse: Splats,
+        cells: Sequence[Cell],
+        member: NDArray[np.bool_],
+        margin: float,
+    ) -> list[TrainedSplats]:
+        """What each block learnt; the coarse splats of a cell that no photograph shows."""
+        from stages.blocks import merge
+        from stages.scene import TrainedSplats
+
+        runs = {}
+        for number, (cell, chosen) in enumerate(zip(cells, member, strict=True), start=1):
+            views = tuple(v for v, own in zip(self.whole.views, chosen, strict=True) if own)
+            if any(view.role != "test" for view in views):
+                wide = cell.widened(margin)
+                inside = int(wide.holds(coarse.means).sum())
+                own = max(1, round(self.settings.max_splats * inside / len(coarse)))
+                start = merge.surrounded(seeds, coarse, wide, own)
+                settings = replace(
+                    self.settings,
+                    max_splats=max(len(start), len(coarse) - inside + own),
+                    within=(*wide.low, *wide.high),
+                )
+                runs[str(number)] = (replace(self.whole, views=views), start, settings)
+        empty = [str(n) for n in range(1, len(cells) + 1) if str(n) not in runs]
+        if empty:
+            self.report.warn(
+                "train-blocks-unseen",
+                f"No photograph shows {counted(len(empty), 'block')} of {len(cells)} "
+                f"({', '.join(empty)}): the coarse model stands there. Ask for fewer --blocks.",
+            )
+        found = self._trained(runs)
+        none = TrainedSplats(coarse)
+        parts = [found.get(str(number), none) for number in range(1, len(cells) + 1)]
+        self._record(cells, runs, parts)
+        return parts
+
+    def _record(
+        self, cells: Sequence[Cell], runs: Mapping[str, Any], parts: Sequence[TrainedSplats]
+    ) -> None:
+        """Which block gave how many splats: they lie in this order."""
+        told = []
+        for number, (cell, part) in enumerate(zip(cells, parts, strict=True), start=1):
+            run = str(number) if str(number) in runs else COARSE
+            count = int(cell.holds(part.splats.means).sum())
+            views = runs[run][0].views if run in runs else ()
+            told.append(
+                {
+                    "block": number,
+                    "run_folder": f"{FOLDER}/{run}",
+                    "low_x_z": cell.low,
+                    "high_x_z": cell.high,
+                    "photographs": len(views),
+                    "splats_trained": len(part.splats),
+                    "splats_given": count,
+                }
+            )
+        self.report.metric("blocks", told)
+
+    def _trained(
+        self, runs: Mapping[str, tuple[Reconstruction, Splats, Any]]
+    ) -> dict[str, TrainedSplats]:
+        """The trained splats of runs in folders of these names. Raises SplatError for one that
+        failed, once the others have ended."""
+        from splatcli import block_folders
+
+        names = list(runs)
+        for name, (part, start, settings) in runs.items():
+            block_folders.begin(self.pipeline, self.root / name, part, start, settings)
+        tasks = [Task(self.root / name, until="train") for name in names]
+        largest = max(settings.max_splats for _, _, settings in runs.values())
+        need = need_of(replace(self.settings, max_splats=largest))
+        failed = None
+        ended = self.engine.results(tasks, need, self.report.stop_requested)
+        for done, (number, ending) in enumerate(ended, start=1):
+            self.report.progress(done, len(names), "blocks")
+            if ending.status and failed is None:
+                failed = SplatError(
+                    ending.code,
+                    given=f"In {tasks[number].run_folder}: {ending.said}",
+                    wanted="Every block trained.",
+                    hint="Give the same command again: blocks that are finished are kept.",
+                    family=Family(max(ending.status, Family.USAGE)),
+                )
+        if failed is not None:
+            raise failed
+        return {name: Pipeline(self.root / name).load("train") for name in names}
+
+    def _joined(
+        self,
+        parts: Sequence[TrainedSplats],
+        cells: Sequence[Cell],
+        crossing: Sequence[View],
+        look: Look,
+    ) -> TrainedSplats:
+        """The blocks as one, their seams put right by the photographs that cross them. In the
+        report, how many splats each gave: they lie block after block."""
+        import numpy as np
+
+        from stages.blocks import merge
+        from stages.capacity.tuning import Tuner
+        from stages.measure.judge import load_photographs
+        from stages.scene import TrainedSplats, seen_extent
+
+        degree, backend = self.settings.sh_degree, self.settings.backend
+        given = [part.splats.with_sh_degree(degree) for part in parts]
+        splats, counts = merge.merged(given, cells, look)
+        found = TrainedSplats(splats, float(np.mean([part.passed_on for part in parts])))
+        seam = merge.at_seams(splats, counts, cells)
+        gone = np.zeros(len(splats), bool)
+        if crossing:
+            self.report.progress(0, 1, "seams")
+            photographs = load_photographs(self.whole.folder, crossing, look)
+            extent = seen_extent(self.whole)
+            tuner = Tuner(photographs, extent, backend, self.report, found.by_heart)
+            splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
+        ends = np.cumsum([0, *counts])
+        left = [int((~gone[i:j]).sum()) for i, j in pairwise(ends)]
+        self.report.metric("splats", len(splats))
+        self.report.metric("splats_by_block", left)
+        self.report.metric("splats_at_seams", int(seam.sum()))
+        self.report.metric("pruned_at_seams", int(gone.sum()))
+        return replace(found, splats=splats)
+
+
+@dataclass
+class _Judged:
+    """See `stages.train.Judged`."""
+
+    draw: Callable[[Camera], Any]
+    held_out: Sequence[Photograph]
+    look: Look
+    history: list[dict[str, Any]]
+    times: list[Spent]
+
+    def drawn(self, camera: Camera) -> NDArray[np.float32]:
+        image: NDArray[np.float32] = self.draw(camera)
+        return image
+
+
+def _judged(splats: Splats, scene: _Scene, held: Sequence[View]) -> _Judged:
+    from stages.measure.judge import drawing_of, load_photographs
+
+    photographs = load_photographs(scene.whole.folder, held, splats.look)
+    draw = drawing_of(splats, scene.settings.backend)
+    return _Judged(draw, photographs, splats.look, [], [])
+
+
+class _Told(Listener):
+    """What runs in this process say, told as progress of the whole."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        self._started = 0
+
+    def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
+        self._started += 1
+
+    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
+        which = "coarse model" if self._started < 2 else f"block {self._started - 1}"
+        self._report.progress(done, total, f"{which}: {label}", **numbers)
+
+
+def _with_roles(whole: Reconstruction) -> Reconstruction:
+    """With the judges of the whole named, so that no block learns from another one's."""
+    from stages.scene import split_held_out
+
+    _, held = split_held_out(whole.views)
+    judges = {view.name for view in held}
+    if not judges:
+        return whole
+    views = (replace(v, role="test" if v.name in judges else "train") for v in whole.views)
+    return replace(whole, views=tuple(views))
+
+
+def _check(settings: Any) -> None:
+    """Raises SplatError for what cannot be asked of blocks."""
+    if not settings.max_splats:
+        raise SplatError(
+            "blocks-without-cap",
+            given="--blocks was asked for, and nothing says how many splats the whole may have.",
+            wanted="A number of splats that blocks can share: what is free in memory tells only of "
+            "one of them.",
+            hint="Give --max-splats, for example 250000 for each block.",
+            family=Family.USAGE,
+        )
+    if settings.seconds or settings.within:
+        raise SplatError(
+            "blocks-without-end",
+            given="--blocks cannot be had together with --seconds or --within.",
+            wanted="Steps, which each block makes: --steps.",
+            hint="Leave --seconds and --within away.",
+            family=Family.USAGE,
+        )

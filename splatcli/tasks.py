@@ -1,0 +1,99 @@
+"""One run as a task: what is handed to whoever does it, here or elsewhere, and what comes back.
+
+Only paths and settings go out, only figures come back: everything else lies in run folders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import Any, Protocol
+
+from splatcli import console
+from stages.base.errors import Interrupted, SplatError
+from stages.run.failures import as_splat_error
+from stages.run.pipeline import Listener, Pipeline
+
+
+@dataclass(frozen=True)
+class Task:
+    """What `splat process PHOTOS --out RUN_FOLDER` does; without photos, it goes on with the run
+    folder. settings: by stage name, the recorded ones where left out. until: the last stage."""
+
+    run_folder: Path
+    photos: Path | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    until: str | None = None
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How it went. status: exit status; code, said: of the error, "" if there was none."""
+
+    status: int = 0
+    code: str = ""
+    said: str = ""
+
+
+@dataclass(frozen=True)
+class Need:
+    """What one task takes. memory_mib: None for all that one machine has."""
+
+    memory_mib: float | None
+    gpus: int = 0
+
+
+def need_of(train: Any) -> Need:
+    """What a run with these settings of training takes at most."""
+    from stages.training.density import needed_mib
+
+    memory_mib = needed_mib(train.max_splats) if train.max_splats else None
+    return Need(memory_mib, gpus=int(train.backend == "gpu"))
+
+
+class Engine(Protocol):
+    """Brings tasks to their ends, one or several at a time."""
+
+    def results(
+        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
+    ) -> Iterator[tuple[int, Ending]]:
+        """(which task, how it ended), as they end. Raises SplatError, and Interrupted where `stop`
+        is set, or a signal stopped what was being done at a safe place."""
+
+
+def work_on(task: Task, listener: Listener | None = None) -> Ending:
+    """Do it, in this process. A failure is an ending; only Interrupted is raised."""
+    try:
+        pipeline = Pipeline(task.run_folder, task.photos)
+        pipeline.run(task.settings, until=task.until, listener=listener)
+    except Interrupted:
+        raise
+    except Exception as error:
+        known = as_splat_error(error, "the run", task.run_folder)
+        return ending_of(known or error)
+    return Ending()
+
+
+def ending_of(error: Exception) -> Ending:
+    """An error as figures and words."""
+    if isinstance(error, SplatError):
+        return Ending(int(error.family), error.code, error.given)
+    said = str(error).splitlines()[0] if str(error) else "no more is known"
+    return Ending(console.CRASHED, "bug", f"{type(error).__name__}: {said}.")
+
+
+class InTurn:
+    """One task after the other, in this process."""
+
+    def __init__(self, listener: Listener | None = None) -> None:
+        self.listener = listener
+
+    def results(
+        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
+    ) -> Iterator[tuple[int, Ending]]:
+        for number, task in enumerate(tasks):
+            if stop is not None and stop.is_set():
+                raise Interrupted(f"before {task.run_folder}")
+            yield number, work_on(task, self.listener)
