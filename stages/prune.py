@@ -130,7 +130,7 @@ def _aim(settings: PruneSettings, passed_on: float, reconstruction: Reconstructi
     import tempfile
 
     from stages import formats
-    from stages.capacity.aim import Aim
+    from stages.capacity.aim import Aim, felt_share
 
     def size_bytes(splats: Splats) -> int:
         with tempfile.TemporaryDirectory() as folder:
@@ -142,7 +142,7 @@ def _aim(settings: PruneSettings, passed_on: float, reconstruction: Reconstructi
     return Aim(
         settings.price,
         settings.max_loss_db,
-        passed_on,
+        felt_share(passed_on),
         settings.max_splats,
         settings.max_mb * 1e6,
         settings.min_psnr,

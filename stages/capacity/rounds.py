@@ -109,7 +109,7 @@ class Shrinking:
         return found
 
     def _worth(self, splats: Splats) -> Worth:
-        return measure_worth(splats, self.photographs, self.backend)
+        return measure_worth(splats, self.photographs, self.backend, self.tuner.by_heart)
 
     def _planned(self, splats: Splats) -> int:
         """As many rounds as targets need, and a few for what they leave over."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from stages.base.words import counted
+from stages.capacity.aim import felt_share
 from stages.capacity.rounds import LOSS, PRICE, Outcome
-from stages.scene import LEAST_PASSED_ON, TrainedSplats
+from stages.scene import TrainedSplats
 
 _WHY = {
     PRICE: "what is left is worth its bits",
@@ -15,7 +16,6 @@ _WHY = {
 def said(before: TrainedSplats, found: Outcome, dial: float, tune_steps: int) -> list[str]:
     """dial: the price that was asked for."""
     price, after, start = found.price, found.splats, before.splats
-    felt = max(before.passed_on, LEAST_PASSED_ON)
     told = [
         f"Price: the photographs of training hold {price.samples:,} colour values, worth "
         f"{price.independent:,.0f} independent ones; so a number costs "
@@ -33,7 +33,7 @@ def said(before: TrainedSplats, found: Outcome, dial: float, tune_steps: int) ->
         f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
         f"{counted(len(kept), 'round')} with {counted(tune_steps, 'step')} of fine-tuning in all: "
         f"{found.end_db - found.start_db:+.2f} dB on the photographs of training; other views feel "
-        f"{felt:.0%} of that, as training has told."
+        f"{felt_share(before.passed_on):.0%} of that, as training has told."
     )
     why = _WHY.get(found.stopped_by, "the rounds that were asked for were done")
     return [*told, f"It stopped since {why}."]
