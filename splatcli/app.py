@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import jobs, summary
+from splatcli.chain import Chain, chain_parameters, typed_in
 from splatcli.console import guarded
 from splatcli.folders import find_run_folder
 from splatcli.options import number, option, with_parameters
@@ -297,6 +298,28 @@ def convert(
     work.convert(source, target, quiet, as_json)
 
 
+def edit(
+    ctx: typer.Context,
+    source: Annotated[Path, typer.Argument(help="Splat file, or a run folder for its splats.")],
+    target: Annotated[Path | None, typer.Argument(help=f"Splat file to write: {_ENDINGS}.")] = None,
+    *,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would become of it, and write nothing.")
+    ] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    **operations: Any,
+) -> None:
+    """Select, move, join and thin out splats: operations in the order in which they are typed.
+
+    Coordinates are those of `splat info`: y down, less the capture's origin. Where the splats are
+    a run's, or lie in its export folder, each operation is told in dB of the run's photographs.
+    """
+    from splatcli.commands import edit as work
+
+    work.edit(source, target, typed_in(ctx), dry_run, quiet, as_json)
+
+
 def verify(
     target: Annotated[
         Path | None,
@@ -359,6 +382,9 @@ def _register() -> None:
         line = _STAGE_EXAMPLES.get(name, f"splat {name}")
         command = with_parameters(_stage_command(name), jobs.stage_parameters(name))
         app.command(name, help=_STAGE_HELP[name], epilog=_example(line))(guarded(command))
+    line = "splat edit scene.ply chair.sog --crop box:-1,-1,-1,1,1,1 --decimate 50%"
+    command = with_parameters(edit, chain_parameters())
+    app.command("edit", cls=Chain, epilog=_example(line))(guarded(command))
     for extra, line in (
         (status, "splat status run/"),
         (render, "splat render run/ --path orbit --out film.mp4"),

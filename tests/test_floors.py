@@ -25,6 +25,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "stages.proof",
         "stages.trade",
         "stages.capacity",
+        "stages.editing",
         "stages.surface",
         "stages.film",
     ),

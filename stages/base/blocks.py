@@ -15,6 +15,8 @@ from contextvars import ContextVar
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.scratch import let_go
+
 ROWS = 1 << 16  # 16 MB of splats of degree 3
 Watcher = Callable[[int, int], None]  # (done, in all) of a pass: rows, mostly
 _watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
@@ -31,9 +33,10 @@ def watched(watcher: Watcher) -> Iterator[None]:
 
 
 def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
-    """0..count in slices of `rows`."""
+    """0..count in slices of `rows`. Scratch arrays stay on their disk between one and the next."""
     for start in range(0, count, rows):
         yield slice(start, min(start + rows, count))
+        let_go()
 
 
 def passing(count: int, rows: int = ROWS) -> Iterator[slice]:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.lazy import named
 from stages.formats.table import FORMATS, MESHES, TABLE, Anatomy, Format, format_of
+from stages.formats.units import units_of
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View
@@ -36,6 +37,7 @@ __all__ = [
     "Format",
     "format_of",
     "read",
+    "units_of",
     "write",
 ]
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import scratch
 from stages.base.bad_files import BadFileError
 from stages.base.blocks import blocks
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
@@ -128,7 +129,7 @@ def allocated(count: int, degree: int) -> Splats:
         quaternions=np.empty((count, 4), np.float32),
         log_scales=np.empty((count, 3), np.float32),
         opacity_logits=np.empty(count, np.float32),
-        sh=np.empty((count, (degree + 1) ** 2, 3), np.float32),
+        sh=scratch.empty((count, (degree + 1) ** 2, 3)),
         sh_degrees=np.zeros(count, np.uint8),
     )
 

@@ -1,0 +1,120 @@
+"""`splat edit`: a chain of operations on splats, and what each of them did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatcli import console
+from stages.base.errors import Family, SplatError
+
+if TYPE_CHECKING:
+    from stages.editing.operations import Done
+    from stages.editing.scene import Edited
+    from stages.editing.words import Typed
+
+
+def edit(
+    source: Path,
+    target: Path | None,
+    typed: Sequence[Typed],
+    dry_run: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Read `source`, do what was typed, write `target`. Raises SplatError; nothing is written
+    then."""
+    from stages import formats
+    from stages.base import scratch
+    from stages.editing import operations
+
+    if target is None and not dry_run:
+        raise SplatError(
+            "edit-no-target",
+            given=f"splat edit {source} says nothing of where to.",
+            wanted="A second file name, or --dry-run.",
+            hint=f"splat edit {source} edited.ply --keep 'opacity > 0.1'",
+            family=Family.USAGE,
+        )
+    target = target or Path("scene.ply")
+    row, chain = formats.format_of(target), operations.prepared(typed, target)
+    with ExitStack() as stack:
+        if target.parent.is_dir():  # `write` says so where it is not
+            stack.enter_context(scratch.scratch_in(target.parent))
+        scene = _opened(source)
+        before, start_db = len(scene.splats), scene.psnr_db()
+        facts: dict[str, Any] = {"source": str(source), "splats_before": before}
+        steps = []
+        for step in operations.done(scene, chain):
+            scene = step.scene
+            steps.append(_told(step, as_json, quiet))
+        facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
+        if start_db is not None:
+            facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
+        if not dry_run:
+            views = scene.views_there()
+            formats.write(target, scene.splats, units=scene.units, views=views)
+            facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
+    if as_json:
+        console.emit("edited", **facts)
+    else:
+        _show(facts)
+
+
+def _opened(source: Path) -> Edited:
+    """With the photographs of the run that it is of, or lies in. Raises SplatError."""
+    from splatcli.sources import backend_of, pipeline_around, splats_of
+    from stages.editing.operations import without_undrawable
+    from stages.editing.scene import Edited
+    from stages.formats import units_of
+    from stages.measure.judge import load_photographs
+    from stages.scene import split_held_out
+
+    splats, pipeline = splats_of(source)
+    pipeline = pipeline or pipeline_around(source)
+    splats = without_undrawable(splats)
+    if pipeline is None or pipeline.manifest("sfm") is None:
+        return Edited(splats, units_of(source))
+    found = pipeline.load("sfm")
+    training, held = split_held_out(found.views)
+    photographs = load_photographs(found.folder, training, splats.look)
+    judges = load_photographs(found.folder, held, splats.look) or photographs
+    return Edited(
+        *(splats, found.units, photographs, judges, found.views),
+        backend=backend_of(pipeline),
+    )
+
+
+def _db(scene: Edited) -> float | None:
+    found = scene.psnr_db()
+    return None if found is None else round(found, 3)
+
+
+def _told(step: Done, as_json: bool, quiet: bool) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "operation": str(step.typed),
+        "splats_before": step.before,
+        "splats": step.after,
+    }
+    psnr = _db(step.scene)
+    if psnr is not None:
+        facts["psnr_db"] = psnr
+    if as_json:
+        console.emit("operation", **facts)
+    elif not quiet:
+        cost = f", {console.figure('psnr_db', psnr)}" if psnr is not None else ""
+        console.note(f"{step.typed}: {step.before:,} -> {step.after:,} splats{cost}")
+    return facts
+
+
+def _show(facts: dict[str, Any]) -> None:
+    told = f"{facts['splats']:,} splats, {facts['splats_before']:,} before"
+    if "psnr_db" in facts:
+        change = facts["psnr_db"] - facts["psnr_before_db"]
+        told += f", {facts['psnr_db']:.2f} dB on photographs ({change:+.2f})"
+    if "target" in facts:
+        console.note(f"{facts['target']}: {told}, {console.size(facts['size_bytes'])}")
+    else:
+        console.note(f"Nothing was written. It would be {told}.")

@@ -1,0 +1,67 @@
+"""Arrays too large for memory, on a disk that has room for them."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+from weakref import WeakSet
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import Family, SplatError
+
+LARGE_BYTES = 1 << 28
+_folder: ContextVar[Path | None] = ContextVar("scratch", default=None)
+_maps: WeakSet[mmap.mmap] = WeakSet()
+
+
+@contextmanager
+def scratch_in(folder: Path) -> Iterator[None]:
+    """Inside, large arrays that `empty` makes are files in `folder`; nobody sees them, and they end
+    with the last look at them, or with the process, however that ends."""
+    token = _folder.set(folder)
+    try:
+        yield
+    finally:
+        _folder.reset(token)
+
+
+def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
+    """As np.empty; mapped from a file if it is large and somebody named a place for it. Raises
+    SplatError "disk-full"."""
+    folder, size = _folder.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if folder is None or size < LARGE_BYTES:
+        return np.empty(shape, dtype)
+    try:
+        with tempfile.TemporaryFile(dir=folder, prefix=".scratch-") as file:
+            # Reserved now: a disk that is full when a page is written would end the process.
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+            else:
+                file.truncate(size)
+            found = np.memmap(file, dtype, "r+", shape=shape)
+    except OSError as error:
+        raise SplatError(
+            "disk-full",
+            given=f"{folder} has no {size / 1e9:.1f} GB for splats on their way: {error.strerror}.",
+            wanted="The disk must have room for them, and for the file that comes of them.",
+            hint="Free some space, or write to a folder on another disk.",
+            family=Family.RESOURCES,
+        ) from error
+    _maps.add(found._mmap)  # type: ignore[attr-defined]
+    return found
+
+
+def let_go() -> None:
+    """Of the pages of such files that were touched: they count as memory in use until then. What
+    was written stays, and the next look finds it."""
+    for mapped in list(_maps):
+        with suppress(AttributeError, ValueError, OSError):
+            mapped.madvise(mmap.MADV_DONTNEED)

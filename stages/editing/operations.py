@@ -1,0 +1,213 @@
+"""What each word of a chain does. All are checked before the first begins."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages import formats
+from stages.base.errors import Family, SplatError
+from stages.editing import expression, floaters, regions, turning
+from stages.editing.decimate import FAR, NEAR, decimated
+from stages.editing.joining import chosen, joined
+from stages.editing.scene import Edited
+from stages.editing.turning import Similarity
+from stages.editing.words import WORDS, Typed
+from stages.formats.rows import drawable
+from stages.measure.worth import floaters as hanging
+from stages.scene import Splats
+
+Operation = Callable[[Edited], Edited]
+_AXES = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
+_TRIES = 8  # to meet a size: one or two are enough where bytes grow with splats
+_SPARE = 0.995
+
+
+@dataclass(frozen=True)
+class Done:
+    """One operation that was done. before, after: how many splats."""
+
+    typed: Typed
+    before: int
+    after: int
+    scene: Edited
+
+
+def prepared(typed: Sequence[Typed], target: Path) -> list[tuple[Typed, Operation]]:
+    """What to do; `target`: the file that comes of it. Raises SplatError for whatever of it is
+    wrong, files that are named included."""
+    return [(one, _prepared(one, target)) for one in typed]
+
+
+def done(scene: Edited, chain: Sequence[tuple[Typed, Operation]]) -> Iterator[Done]:
+    """One operation after the other. Raises SplatError "edit-nothing-left"."""
+    for typed, operation in chain:
+        before = len(scene.splats)
+        scene = operation(scene)
+        if before and not len(scene.splats):
+            raise SplatError(
+                "edit-nothing-left",
+                given=f"{typed} leaves none of {before:,} splats.",
+                wanted="At least one.",
+                hint="`splat info` tells the bounds, sizes and opacities of a file.",
+                family=Family.USAGE,
+            )
+        yield Done(typed, before, len(scene.splats), scene)
+
+
+def without_undrawable(splats: Splats) -> Splats:
+    """Those that a viewer can draw: what operations may count on."""
+    return chosen(splats, drawable(splats))
+
+
+def _prepared(typed: Typed, target: Path) -> Operation:
+    value = typed.value
+    match typed.word:
+        case "crop":
+            return _selecting(regions.parsed(value).holds)
+        case "keep":
+            return _selecting(expression.parsed(value).holds)
+        case "drop-floaters":
+            return _without_floaters
+        case "rotate":
+            return _placing(Similarity(rotation=_rotation(typed)))
+        case "scale":
+            return _placing(Similarity(scale=_number(typed, 1e-9, 1e9)))
+        case "move":
+            return _placing(Similarity(offset=_vector(typed, value)))
+        case "up":
+            return _placing(Similarity(rotation=turning.upright(_direction(typed, value))))
+        case "merge":
+            return _merging(Path(value))
+        case "degree":
+            degree = int(_number(typed, 0, 3, whole=True))
+            return lambda scene: scene.but(_of_degree(scene.splats, degree))
+        case "decimate":
+            return _decimating(typed)
+        case "max-mb":
+            return _fitting(_number(typed, 1e-6, 1e9) * 1e6, target)
+    raise AssertionError(typed.word)
+
+
+def _selecting(holds: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
+    return lambda scene: scene.but(chosen(scene.splats, holds(scene.splats)))
+
+
+def _of_degree(splats: Splats, degree: int) -> Splats:
+    return splats.with_sh_degree(min(degree, splats.sh_degree))
+
+
+def _placing(where: Similarity) -> Operation:
+    return lambda scene: scene.placed(where)
+
+
+def _without_floaters(scene: Edited) -> Edited:
+    if len(scene.photographs):
+        gone = hanging(scene.splats, scene.worth(), scene.cameras())
+    else:
+        gone = floaters.alone(scene.splats)
+    return scene.but(chosen(scene.splats, ~gone))
+
+
+def _merging(path: Path) -> Operation:
+    formats.format_of(path)
+    if not path.is_file():
+        raise SplatError(
+            "file-missing",
+            given=f"--merge {path} does not exist.",
+            wanted="A splat file.",
+            hint="Check the path.",
+        )
+    return lambda scene: scene.but(joined(scene.splats, without_undrawable(formats.read(path))))
+
+
+def fewer(scene: Edited, count: int) -> Splats:
+    """By what photographs say where they are known, else by shape and colour."""
+    if len(scene.photographs):
+        return decimated(scene.splats, count, FAR, scene.appraise)
+    return decimated(scene.splats, count, NEAR)
+
+
+def _decimating(typed: Typed) -> Operation:
+    if typed.value.endswith("%"):
+        part = _number(Typed(typed.word, typed.value[:-1]), 1e-6, 100) / 100
+        return lambda scene: scene.but(fewer(scene, round(part * len(scene.splats))))
+    count = int(_number(typed, 1, 1e9, whole=True))
+    return lambda scene: scene.but(fewer(scene, count))
+
+
+def _fitting(most: float, target: Path) -> Operation:
+    """At most so many bytes of `target`, measured on files that are really written."""
+    row = formats.format_of(target)
+
+    def size_bytes(scene: Edited) -> int:
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".size-") as folder:
+            path = Path(folder) / f"scene.{row.ending}"
+            formats.write(path, scene.splats, units=scene.units, views=scene.views_there())
+            return row.size_bytes(path)
+
+    def fitted(scene: Edited) -> Edited:
+        for _ in range(_TRIES):
+            size, count = size_bytes(scene), len(scene.splats)
+            if size <= most:
+                return scene
+            if count == 1:
+                break
+            scene = scene.but(fewer(scene, int(_SPARE * count * most / size)))
+        raise SplatError(
+            "edit-too-small",
+            given=f"--max-mb {most / 1e6:g} is less than {count:,} splats take as .{row.ending}.",
+            wanted=f"At least {np.ceil(size / 1e4) / 100:g}.",
+            hint="Ask for more megabytes, or for another format.",
+            family=Family.USAGE,
+        )
+
+    return fitted
+
+
+def _rotation(typed: Typed) -> NDArray[np.float64]:
+    axis, _, degrees = typed.value.rpartition(":")
+    angle = regions.numbers(degrees, 1)
+    if angle is None:
+        raise _wrong(typed)
+    return turning.about(_direction(typed, axis), float(angle[0]))
+
+
+def _direction(typed: Typed, text: str) -> NDArray[np.float64]:
+    """[3] of +x, -y, z, or three numbers; never of length 0."""
+    if text[-1:] in _AXES and text[:-1] in ("", "+", "-"):
+        return np.array(_AXES[text[-1]]) * (-1.0 if text[0] == "-" else 1.0)
+    found = _vector(typed, text)
+    length = np.linalg.norm(found)
+    if not 0 < length < np.inf:
+        raise _wrong(typed)
+    return np.asarray(found / length)
+
+
+def _vector(typed: Typed, text: str) -> NDArray[np.float64]:
+    found = regions.numbers(text, 3)
+    if found is None:
+        raise _wrong(typed)
+    return found
+
+
+def _number(typed: Typed, low: float, high: float, whole: bool = False) -> float:
+    found = regions.numbers(typed.value, 1)
+    if found is None or not low <= found[0] <= high or (whole and found[0] != int(found[0])):
+        raise _wrong(typed, f" from {low:g} to {high:g}")
+    return float(found[0])
+
+
+def _wrong(typed: Typed, bounds: str = "") -> SplatError:
+    return SplatError(
+        f"edit-{typed.word}",
+        given=f"{typed} is not understood.",
+        wanted=f"--{typed.word} {WORDS[typed.word].takes}{bounds}.",
+        hint=WORDS[typed.word].help,
+        family=Family.USAGE,
+    )

@@ -1,0 +1,108 @@
+"""Parts of space to keep: a box, a ball, or what lies between given points."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.bad_files import BadFileError, Kind, reading
+from stages.base.blocks import passing
+from stages.base.errors import Family, SplatError
+from stages.scene import Splats
+
+Inside = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points [M, 3] -> [M]
+_HULL = Kind(
+    "edit-hull-unreadable",
+    "the points of a hull",
+    "A .json with a list of [x, y, z], or a .ply with vertices; at least four, not in one plane.",
+    "Write the corners down, or save them as points from another program.",
+)
+_CELLS = 1 << 22  # point x face, of one block
+
+
+@dataclass(frozen=True)
+class Region:
+    """inside: which points lie in it, its rim included."""
+
+    inside: Inside
+
+    def holds(self, splats: Splats) -> NDArray[np.bool_]:
+        """[N] whose centres lie inside."""
+        found = np.empty(len(splats), bool)
+        for rows in passing(len(splats)):
+            found[rows] = self.inside(splats.means[rows].astype(np.float64))
+        return found
+
+
+def parsed(text: str) -> Region:
+    """Of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r` or `hull:FILE`. Raises SplatError "edit-crop",
+    "edit-hull-unreadable"."""
+    kind, _, rest = text.partition(":")
+    if kind == "box" and (ends := numbers(rest, 6)) is not None:
+        low, high = ends[:3], ends[3:]
+        if (low <= high).all():
+            return Region(lambda at: np.asarray(((at >= low) & (at <= high)).all(axis=1)))
+    if kind == "sphere" and (ball := numbers(rest, 4)) is not None and ball[3] > 0:
+        middle, radius = ball[:3], ball[3]
+        return Region(lambda at: np.asarray(np.linalg.norm(at - middle, axis=1) <= radius))
+    if kind == "hull" and rest:
+        return Region(_inside_hull(Path(rest)))
+    raise SplatError(
+        "edit-crop",
+        given=f"--crop {text} names no part of space.",
+        wanted="box:x0,y0,z0,x1,y1,z1 with its least corner first, sphere:x,y,z,r, or hull:FILE.",
+        hint="`splat info` tells the bounds of the scene.",
+        family=Family.USAGE,
+    )
+
+
+def numbers(text: str, count: int) -> NDArray[np.float64] | None:
+    """[count] finite numbers between commas; None for anything else."""
+    try:
+        values = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        return None
+    return values if len(values) == count and np.isfinite(values).all() else None
+
+
+def _inside_hull(path: Path) -> Inside:
+    from scipy.spatial import ConvexHull, QhullError
+
+    with reading(path, _HULL):
+        points = _points(path)
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
+            raise BadFileError("it holds no four points of three numbers")
+        if not np.isfinite(points).all():
+            raise BadFileError("not all of its numbers are finite")
+        try:
+            faces = np.unique(ConvexHull(points).equations, axis=0)
+        except QhullError as error:
+            raise BadFileError("its points lie in one plane") from error
+    slack = 1e-9 * float(np.abs(points).max())
+
+    def inside(at: NDArray[np.float64]) -> NDArray[np.bool_]:
+        found = np.empty(len(at), bool)
+        step = max(1, _CELLS // len(faces))
+        for start in range(0, len(at), step):
+            part = slice(start, start + step)
+            found[part] = (at[part] @ faces[:, :3].T + faces[:, 3] <= slack).all(axis=1)
+        return found
+
+    return inside
+
+
+def _points(path: Path) -> NDArray[np.float64]:
+    if path.suffix.lower() == ".json":
+        return np.array(json.loads(path.read_text(encoding="utf-8")), np.float64)
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        vertices = PlyData.read(str(path))["vertex"]
+    except PlyParseError as error:
+        raise BadFileError(f"it is no .ply ({error})") from error
+    return np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)

@@ -1,0 +1,91 @@
+"""What operations work on: splats, and what is known of the photographs that they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.editing.decimate import Appraisal
+from stages.editing.turning import Similarity
+from stages.measure.judge import Photograph, mean_psnr_db
+from stages.measure.worth import Worth, beside_pictures, measure_worth
+from stages.raster.backends import AUTO
+from stages.scene import Splats, View
+
+_UNSEEN = 1e-3  # weight of what no photograph shows: the first to be merged, not all at no cost
+
+
+@dataclass(frozen=True)
+class Edited:
+    """splats. units: "metres" or "arbitrary". photographs: of training, where they are known, and
+    judges: held out, or training again; views: the capture's cameras; moved: where all three are
+    now. backend: what draws."""
+
+    splats: Splats
+    units: str = "arbitrary"
+    photographs: Sequence[Photograph] = ()
+    judges: Sequence[Photograph] = ()
+    views: tuple[View, ...] = ()
+    moved: Similarity = field(default_factory=Similarity)
+    backend: str = AUTO
+
+    def but(self, splats: Splats) -> Edited:
+        """The same with other splats."""
+        return replace(self, splats=splats)
+
+    def placed(self, where: Similarity) -> Edited:
+        """All of it somewhere else. Metres times anything but 1 are no metres."""
+        there = where.of_splats(self.splats)
+        # what `of_splats` put into the origin, the cameras do not move
+        shift = there.origin - where.scale * where.rotation @ self.splats.origin
+        moved = replace(where, offset=where.offset - shift).after(self.moved)
+        units = self.units if where.scale == 1 else "arbitrary"
+        return replace(self, splats=there, moved=moved, units=units)
+
+    def psnr_db(self) -> float | None:
+        """Mean PSNR of the photographs that judge; None where none are known."""
+        if not len(self.judges):
+            return None
+        return mean_psnr_db(self.splats, _Moved(self.judges, self.moved), self.backend)
+
+    def views_there(self) -> tuple[View, ...]:
+        return tuple(replace(v, camera=self.moved.of_camera(v.camera)) for v in self.views)
+
+    def worth(self) -> Worth:
+        """Of each splat to the photographs of training; there must be some."""
+        return measure_worth(self.splats, _Moved(self.photographs, self.moved), self.backend)
+
+    def appraise(self, splats: Splats) -> Appraisal:
+        """What pruning goes by: squared error, and nothing beyond a picture's rim is left out that
+        the next view would show."""
+        worth = self.but(splats).worth()
+        unseen = (worth.photographs == 0) & beside_pictures(splats, self.cameras())
+        alone: NDArray[np.float64] = np.where(unseen, np.inf, worth.sse_change)
+        return Appraisal(worth.weight + _UNSEEN, alone)
+
+    def cameras(self) -> list:  # type: ignore[type-arg]
+        return [photograph.camera for photograph in _Moved(self.photographs, self.moved)]
+
+
+class _Moved(Sequence[Photograph]):
+    """Photographs taken elsewhere; read when they are wanted."""
+
+    def __init__(self, photographs: Sequence[Photograph], where: Similarity) -> None:
+        self._photographs, self._where = photographs, where
+
+    def __len__(self) -> int:
+        return len(self._photographs)
+
+    @overload
+    def __getitem__(self, number: int) -> Photograph: ...
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[Photograph]: ...
+    def __getitem__(self, number: int | slice) -> Photograph | Sequence[Photograph]:
+        if isinstance(number, slice):
+            return [self[i] for i in range(len(self))[number]]
+        photograph = self._photographs[number]
+        return replace(photograph, camera=self._where.of_camera(photograph.camera))

@@ -1,0 +1,78 @@
+"""A condition is read by a few rules, and nothing else is ever run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.base.errors import SplatError
+from stages.editing.expression import NAMES, parsed
+from tests import scenes
+
+SPLATS = scenes.splats(
+    [[0, 0, 0], [1, 2, 3], [-1, 0, 5]],
+    scales=[[0.1, 0.2, 0.3], [1, 1, 1], [0.01, 0.01, 2]],
+    opacities=[0.05, 0.5, 0.9],
+    rgb=[[1, 0, 0], [0, 1, 0], [0.5, 0.5, 0.5]],
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("opacity > 0.1", [False, True, True]),
+        ("opacity > 0.1 and scale < 1.5", [False, True, False]),
+        ("not opacity > 0.1 or thickness < 0.05", [True, False, True]),
+        ("-1 <= x < 1", [True, False, True]),
+        ("x * x + y * y + z * z < 4 * 4", [True, True, False]),
+        ("red > 0.9", [True, False, False]),
+        ("green - blue > 0.5", [False, True, False]),
+        ("degree == 0", [True, True, True]),
+        ("1 / 0 > x", [True, True, True]),
+        ("x / 0 == x / 0", [False, True, True]),  # 0 / 0 is no number, and equals none
+        ("True and z != 3", [True, False, True]),
+    ],
+)
+def test_a_condition_says_which_splats_stay(text: str, wanted: list[bool]) -> None:
+    assert parsed(text).holds(SPLATS).tolist() == wanted
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "opacity",
+        "x + 1",
+        "opacity >",
+        "opacity.real > 1",
+        "__import__('os').system('true')",
+        "x[0] > 1",
+        "(lambda: x)() > 1",
+        "x if y else z > 1",
+        "x > 'a'",
+        "x > 1j",
+        "size > 1",
+        "x and y > 1",
+        "not x",
+        "(x > 1) + 1 > 0",
+        "x is 1",
+        "x ** 9 > 1",
+        "x < 10 ** 400",
+        "x := 3",
+        "x > " + "1" * 500,
+        "(" * 300 + "x" + ")" * 300 + " > 1",
+        "-" * 90 + "x > 1",
+        "x > 1" + " " * 1000,
+        "x\0 > 1",
+    ],
+)
+def test_anything_else_is_refused_with_the_names_that_there_are(text: str) -> None:
+    with pytest.raises(SplatError) as refused:
+        parsed(text)
+    assert refused.value.code == "edit-keep"
+    assert all(name in refused.value.wanted for name in NAMES)
+
+
+def test_a_value_that_is_no_number_is_not_kept() -> None:
+    broken = scenes.splats([[np.nan, 0, 0], [1, 0, 0]])
+    assert parsed("x < 5").holds(broken).tolist() == [False, True]

@@ -1,0 +1,72 @@
+"""Parts of space, and files of corners."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from stages.base.errors import SplatError
+from stages.editing.regions import parsed
+from tests import scenes
+
+MEANS = np.random.default_rng(3).uniform(-2, 2, (500, 3))
+SPLATS = scenes.splats(MEANS)
+CORNERS = [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+
+
+def test_a_box_and_a_ball() -> None:
+    box = parsed("box:-1,-1,-1,1,1.5,2").holds(SPLATS)
+    means = SPLATS.means
+    assert (box == ((means >= -1) & (means <= [1, 1.5, 2])).all(1)).all()
+    ball = parsed("sphere:0.5,0,0,1.2").holds(SPLATS)
+    assert (ball == (np.linalg.norm(means - [0.5, 0, 0], axis=1) <= 1.2)).all()
+    assert 0 < ball.sum() < 500
+
+
+def test_a_hull_of_the_corners_of_a_box_is_the_box(tmp_path: Path) -> None:
+    (tmp_path / "points.json").write_text(json.dumps(CORNERS))
+    mesh = trimesh.Trimesh(CORNERS, trimesh.creation.box((2, 2, 2)).faces, process=False)
+    mesh.export(tmp_path / "points.ply")
+    wanted = parsed("box:-1,-1,-1,1,1,1").holds(SPLATS)
+    for name in ("points.json", "points.ply"):
+        assert (parsed(f"hull:{tmp_path / name}").holds(SPLATS) == wanted).all()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("box", "box:1,2,3", "box:1,1,1,0,0,0", "box:a,b,c,d,e,f"),
+        *("sphere:0,0,0,-1", "sphere:0,0,0,nan", "ball:0,0,0,1", "", "hull:"),
+    ],
+)
+def test_what_names_no_part_of_space_is_refused(text: str) -> None:
+    with pytest.raises(SplatError) as refused:
+        parsed(text)
+    assert refused.value.code == "edit-crop"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("flat.json", json.dumps([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])),
+        ("few.json", "[[1, 2, 3]]"),
+        ("words.json", '{"a": 1}'),
+        ("broken.json", "[[1, 2"),
+        ("nan.json", "[[NaN, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
+        ("text.ply", "no ply at all"),
+        ("none.ply", None),
+    ],
+)
+def test_points_that_are_no_hull_are_refused(
+    tmp_path: Path, name: str, content: str | None
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(SplatError) as refused:
+        parsed(f"hull:{tmp_path / name}")
+    assert refused.value.code == "edit-hull-unreadable"
+    assert name in refused.value.given

@@ -1,0 +1,105 @@
+"""Operations on splats whose photographs are known: what they cost is told, wherever they go."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stages.editing.operations import done, prepared
+from stages.editing.scene import Edited
+from stages.editing.words import Typed
+from stages.measure.judge import Photograph
+from stages.raster.draw import render
+from stages.scene import Camera, Look, Splats, View, look_at
+from stages.scene.far import recentred
+from tests import scenes
+
+
+def room(n: int = 1500) -> Splats:
+    r = np.random.default_rng(2)
+    means = r.normal(0, 1, (n, 3))
+    rgb = 0.5 + 0.4 * np.sin(3 * means)
+    splats = scenes.splats(means, r.uniform(0.03, 0.1, (n, 3)), r.uniform(0.2, 0.9, n), rgb)
+    sh = r.normal(0, 0.2, (n, 4, 3)).astype(np.float32)
+    sh[:, 0] = splats.sh[:, 0]
+    degrees = np.full(n, 1, np.uint8)
+    return replace(splats, sh=sh, sh_degrees=degrees, look=Look(near=0.2))
+
+
+def cameras(count: int = 6) -> list[Camera]:
+    around = 2 * np.pi * np.arange(count) / count
+    eyes = 5 * np.stack([np.sin(around), 0 * around - 0.2, -np.cos(around)], 1)
+    poses = [look_at(eye, np.zeros(3)) for eye in eyes]
+    return [Camera(96, 80, 90, 90, 48, 40, pose) for pose in poses]
+
+
+def scene(splats: Splats) -> Edited:
+    """Photographs are drawings of the splats."""
+    photographs, views = [], []
+    for number, camera in enumerate(cameras()):
+        pixels = np.rint(255 * np.clip(render(splats, camera).image, 0, 1)).astype(np.uint8)
+        photographs.append(Photograph(str(number), camera, pixels))
+        views.append(View(str(number), "", camera))
+    return Edited(splats, "metres", photographs, photographs[:2], tuple(views))
+
+
+def after(start: Edited, *words: str) -> Edited:
+    typed = [Typed(*word.split(maxsplit=1)) for word in words]
+    *_, last = done(start, prepared(typed, Path("scene.ply")))
+    return last.scene
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("rotate y:40",),
+        ("scale 3", "move 1,2,3", "up 0,-1,0.4"),
+        ("move 2000000,0,0", "rotate x:5"),
+    ],
+    ids=" ".join,
+)
+def test_a_scene_that_is_moved_as_a_whole_costs_nothing(words: tuple[str, ...]) -> None:
+    start = scene(room())
+    moved = after(start, *words)
+    assert moved.psnr_db() == pytest.approx(start.psnr_db(), abs=0.3)
+    assert (moved.psnr_db() or 0) > 45
+    view = moved.views_there()[1].camera
+    drawn = render(moved.splats, view).image
+    np.testing.assert_allclose(drawn, render(start.splats, cameras()[1]).image, atol=0.01)
+
+
+def test_photographs_say_what_may_go() -> None:
+    solid = room()  # most of it hidden behind the rest
+    start = scene(replace(solid, opacity_logits=solid.opacity_logits + 3))
+    half = f"decimate {len(start.splats) // 2}"
+    guided = after(start, half)
+    blind = after(replace(start, photographs=(), judges=()), half)
+    assert len(guided.splats) == len(blind.splats) == 750
+    assert blind.psnr_db() is None
+    judged = replace(blind, judges=start.judges)
+    assert (guided.psnr_db() or 0) > (judged.psnr_db() or 99) + 1
+
+
+def test_what_no_photograph_needs_close_before_a_camera_is_a_floater() -> None:
+    clean = room()
+    eye = cameras()[0].centre
+    floater = scenes.splats([eye * 0.9], 0.01, 0.3).with_sh_degree(1)
+    parts: dict[str, Any] = {
+        name: np.concatenate([getattr(clean, name), getattr(floater, name)])
+        for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
+    }
+    start = replace(scene(clean), splats=replace(clean, **parts))
+    found = after(start, "drop-floaters").splats
+    distances = np.linalg.norm(found.means - eye, axis=1)
+    assert distances.min() > 1
+    assert len(found) > 0.95 * len(clean)
+
+
+def test_positions_put_beside_an_origin_are_where_they_were() -> None:
+    means, origin = recentred(np.array([[5e6, 0, 0], [5e6 + 1, 0, 0]]), np.zeros(3))
+    assert origin[0] == pytest.approx(5e6, abs=2)
+    np.testing.assert_allclose(means[:, 0] + origin[0], [5e6, 5e6 + 1])
