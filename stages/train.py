@@ -162,7 +162,7 @@ def run(
     forget_cap(folder)
     report.metric("steps", trainer.schedule.steps)
     report.metric("photographs_lent", len(trainer.lent))
-    report.metric("learnt_by_heart", trainer.by_heart)
+    report.metric("learnt_by_heart", trainer.by_heart > 0)
     report.metric("passed_on", round(trainer.passed_on, 3))
     if trainer.ended:
         report.metric("ended_early", trainer.ended)

@@ -109,7 +109,8 @@ class Shrinking:
         return found
 
     def _worth(self, splats: Splats) -> Worth:
-        return measure_worth(splats, self.photographs, self.backend, self.tuner.by_heart)
+        by_heart = self.tuner.by_heart > 0
+        return measure_worth(splats, self.photographs, self.backend, by_heart)
 
     def _planned(self, splats: Splats) -> int:
         """As many rounds as targets need, and a few for what they leave over."""

@@ -26,8 +26,8 @@ MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 
 
 class Tuner:
-    """Goes on with splats where training left them. extent: of the scene, world units. by_heart:
-    whether the photographs are learnt by heart, so that splats sit steps out here too."""
+    """Goes on with splats where training left them. extent: of the scene, world units. by_heart: see
+    `scene.by_heart`; splats sit steps out here as they did in training."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class Tuner:
         extent: float,
         backend: str,
         report: Report,
-        by_heart: bool = False,
+        by_heart: float = 0.0,
     ) -> None:
         self.photographs, self.extent, self.report = photographs, extent, report
         self.by_heart = by_heart
@@ -69,7 +69,7 @@ class Tuner:
         if not self.by_heart:
             return None
         key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
-        return Dropout(len(self.photographs), key)
+        return Dropout(len(self.photographs), key, self.by_heart)
 
     def _level(self) -> Level:
         """Every photograph once in each round, in a new order each round."""

@@ -20,11 +20,11 @@ from stages.scene.capture import (
 )
 from stages.scene.look import Look, look_of, near_plane
 from stages.scene.splats import (
-    LEAST_PASSED_ON,
     SH_C0,
     QuantisedSplats,
     Splats,
     TrainedSplats,
+    by_heart,
     dc_to_rgb,
     logit,
     rgb_to_dc,
@@ -33,7 +33,6 @@ from stages.scene.storage import load_splats, save_splats
 
 __all__ = [
     "IGNORE",
-    "LEAST_PASSED_ON",
     "SH_C0",
     "TRANSPARENT",
     "Camera",
@@ -47,6 +46,7 @@ __all__ = [
     "Splats",
     "TrainedSplats",
     "View",
+    "by_heart",
     "dc_to_rgb",
     "fitted_size",
     "load_splats",

@@ -124,9 +124,14 @@ class TrainedSplats:
     passed_on: float = 1.0
 
     @property
-    def by_heart(self) -> bool:
-        """Whether what was learnt towards the end helps those photographs alone."""
-        return self.passed_on < LEAST_PASSED_ON
+    def by_heart(self) -> float:
+        """See `by_heart`."""
+        return by_heart(self.passed_on)
+
+
+def by_heart(passed_on: float) -> float:
+    """How much of what was learnt towards the end helps those photographs alone, 0 to 1."""
+    return max(0.0, 1.0 - passed_on / LEAST_PASSED_ON)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from stages.measure.judge import Photograph, scores
 from stages.raster.backends import AUTO
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import LEAST_PASSED_ON, TRANSPARENT, Camera, Look, Splats, morton
+from stages.scene import TRANSPARENT, Camera, Look, Splats, by_heart, morton
 from stages.training.checkpoint import Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
 from stages.training.density import AdaptiveDensity, Within
@@ -105,9 +105,9 @@ class Trainer:
         return self.model
 
     @property
-    def by_heart(self) -> bool:
-        """See `TrainedSplats`."""
-        return self.passed_on < LEAST_PASSED_ON
+    def by_heart(self) -> float:
+        """See `scene.by_heart`."""
+        return by_heart(self.passed_on)
 
     @property
     def model(self) -> Model:
@@ -172,7 +172,7 @@ class Trainer:
         would be pulled at less than it deserves."""
         if not self.by_heart or self.schedule.share(step) < GROWTH_ENDS:
             return None
-        return Dropout(len(self.train), self.schedule.key(step))
+        return Dropout(len(self.train), self.schedule.key(step), self.by_heart)
 
     def _row(self, step: int) -> int:
         """Which photograph is trained on in `step`: while the model grows, none that is lent."""
