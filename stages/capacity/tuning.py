@@ -26,8 +26,8 @@ MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 
 
 class Tuner:
-    """Goes on with splats where training left them. extent: of the scene, world units. by_heart: see
-    `scene.by_heart`; splats sit steps out here as they did in training."""
+    """Goes on with splats where training left them. extent: of the scene, world units. by_heart:
+    see `scene.by_heart`; splats sit steps out here as they did in training."""
 
     def __init__(
         self,
