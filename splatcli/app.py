@@ -301,7 +301,10 @@ def convert(
 def edit(
     ctx: typer.Context,
     source: Annotated[Path, typer.Argument(help="Splat file, or a run folder for its splats.")],
-    target: Annotated[Path | None, typer.Argument(help=f"Splat file to write: {_ENDINGS}.")] = None,
+    target: Annotated[
+        Path | None,
+        typer.Argument(help=f"Splat file to write: {_ENDINGS}; FOLDER/lod-meta.json to stream."),
+    ] = None,
     *,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would become of it, and write nothing.")

@@ -28,6 +28,7 @@ def edit(
     then."""
     from stages import formats
     from stages.base import scratch
+    from stages.base.atomic import make_folder
     from stages.editing import operations
 
     if target is None and not dry_run:
@@ -40,6 +41,8 @@ def edit(
         )
     target = target or Path("scene.ply")
     row, chain = formats.format_of(target), operations.prepared(typed, target)
+    if row.levels and not dry_run:
+        make_folder(target.parent)
     with ExitStack() as stack:
         if target.parent.is_dir():  # `write` says so where it is not
             stack.enter_context(scratch.scratch_in(target.parent))

@@ -147,7 +147,7 @@ def _fitting(most: float, target: Path) -> Operation:
 
     def size_bytes(scene: Edited) -> int:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".size-") as folder:
-            path = Path(folder) / f"scene.{row.ending}"
+            path = Path(folder) / row.name("scene")
             formats.write(path, scene.splats, units=scene.units, views=scene.views_there())
             return row.size_bytes(path)
 

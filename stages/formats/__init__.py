@@ -23,13 +23,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.lazy import named
-from stages.formats.table import FORMATS, MESHES, TABLE, Anatomy, Format, format_of
+from stages.formats.table import BY_ENDING, FORMATS, MESHES, TABLE, Anatomy, Format, format_of
 from stages.formats.units import units_of
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View
 
 __all__ = [
+    "BY_ENDING",
     "FORMATS",
     "MESHES",
     "TABLE",

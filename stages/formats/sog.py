@@ -40,8 +40,18 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     cannot be written.
     """
     splats, dropped = kept_rows(splats)
+    found = members(splats, morton.order(splats), units)
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
+        for name, content in found.items():
+            _add(package, name, content)
+    return dropped
+
+
+def members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, bytes]:
+    """The content of meta.json and of each picture, by name; the splats, which must be drawable,
+    in the order `places`."""
     degree = int(splats.sh_degrees.max(initial=0))
-    splats, places = splats.with_sh_degree(degree), morton.order(splats)
+    splats = splats.with_sh_degree(degree)
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": False}
     meta["asset"] = {"generator": "splat", "units": units}
     if splats.origin.any():
@@ -52,11 +62,8 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     del base
     if degree and len(splats):
         pictures |= _rest(splats, places, meta)
-    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
-        _add(package, "meta.json", json.dumps(meta, allow_nan=False).encode())
-        for name, pixels in pictures.items():
-            _add(package, name, _webp(pixels))
-    return dropped
+    told = {"meta.json": json.dumps(meta, allow_nan=False).encode()}
+    return told | {name: _webp(pixels) for name, pixels in pictures.items()}
 
 
 def _add(package: zipfile.ZipFile, name: str, content: bytes) -> None:

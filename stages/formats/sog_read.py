@@ -13,6 +13,7 @@ import struct
 import warnings
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ _META_LIMIT_BYTES = 1 << 20
 # Real files take 10 bytes a splat. What declares more splats than this is refused before memory is
 # taken for them; few splats may all be equal.
 _SPLATS_PER_BYTE, _ALWAYS_ALLOWED = 4, 1 << 16
+Member = Callable[[Any, int], bytes]  # name, most bytes -> content, perhaps a byte more
 
 
 def read(path: Path) -> Splats:
@@ -41,23 +43,57 @@ def read(path: Path) -> Splats:
     with reading(path):
         try:
             with zipfile.ZipFile(path) as package:
-                return checked(_Source(package, path.stat().st_size).splats())
+                return checked(Source(in_zip(package), path.stat().st_size).splats())
         except (zipfile.BadZipFile, zlib.error, EOFError) as error:
             raise BadFileError(f"it is no whole zip ({error})") from error
         except (NotImplementedError, RuntimeError) as error:  # encrypted, or packed in another way
             raise BadFileError(f"its zip cannot be unpacked ({error})") from error
 
 
+def in_zip(package: zipfile.ZipFile) -> Member:
+    """What reads the files of a zip."""
+
+    def member(name: Any, limit: int) -> bytes:
+        if not isinstance(name, str) or name not in package.NameToInfo:
+            raise BadFileError(f"it does not hold {str(name)[:80]!r}")
+        if package.getinfo(name).file_size > limit:
+            raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
+        with package.open(name) as file:
+            return file.read(limit + 1)
+
+    return member
+
+
+def in_folder(folder: Path) -> Member:
+    """What reads the files of a folder, and of no other."""
+
+    def member(name: Any, limit: int) -> bytes:
+        if not isinstance(name, str) or Path(name).name != name or not (folder / name).is_file():
+            raise BadFileError(f"it does not hold {str(name)[:80]!r}")
+        with (folder / name).open("rb") as file:
+            return file.read(limit + 1)
+
+    return member
+
+
 @dataclass(frozen=True)
-class _Source:
-    package: zipfile.ZipFile
+class Source:
+    """One asset. member: its files. size_bytes: of them all. Methods raise BadFileError."""
+
+    member: Member
     size_bytes: int
 
-    def splats(self) -> Splats:
+    def meta(self) -> dict[str, Any]:
+        """meta.json, of the right version, its count one that the asset can hold."""
         meta = json.loads(self._member("meta.json", _META_LIMIT_BYTES))
         if not isinstance(meta, dict) or meta.get("version") != 2:
             raise BadFileError("its meta.json is not of SOG version 2")
-        count = _whole(meta, "count", max(_ALWAYS_ALLOWED, _SPLATS_PER_BYTE * self.size_bytes))
+        _whole(meta, "count", max(_ALWAYS_ALLOWED, _SPLATS_PER_BYTE * self.size_bytes))
+        return meta
+
+    def splats(self) -> Splats:
+        meta = self.meta()
+        count = meta["count"]
         low, high = (self._pixels(meta, "means", i, count)[:, :3] for i in (0, 1))
         ends = [_numbers(meta, "means", name, 3) for name in ("mins", "maxs")]
         turns = self._pixels(meta, "quats", 0, count)
@@ -105,13 +141,8 @@ class _Source:
         return book[indices[:, :3].reshape(-1, k, 3)], labels
 
     def _member(self, name: Any, limit: int) -> bytes:
-        """A file of the zip. Raises BadFileError if it is not there or unpacks to more."""
-        if not isinstance(name, str) or name not in self.package.NameToInfo:
-            raise BadFileError(f"it does not hold {str(name)[:80]!r}")
-        if self.package.getinfo(name).file_size > limit:
-            raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
-        with self.package.open(name) as file:
-            content = file.read(limit + 1)
+        """One of its files. Raises BadFileError if it is not there or larger."""
+        content = self.member(name, limit)
         if len(content) > limit:
             raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
         return content

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +19,8 @@ class Format:
     end of "the format ..."; "" if everything comes back as float32. sh_degree: the highest kept.
     y_up: whether its axes are y up, turned 180 degrees about x from ours. sidecar: the suffix of a
     file beside it that belongs to it. wants_views: whether the writer takes cameras too.
+    levels: of detail, which streams: the name is `ending` alone, its chunks lie in folders beside
+    it, and a folder holds one such asset; `splat edit` writes it.
 
     Of splats:
     writer (path, splats, *, units, and views if it wants them) -> how many could not be drawn;
@@ -47,13 +50,25 @@ class Format:
     y_up: bool = False
     sidecar: str = ""
     wants_views: bool = False
+    levels: bool = False
 
     @property
     def is_mesh(self) -> bool:
         return not self.reader
 
+    def is_of(self, name: str) -> bool:
+        """Whether a file of this name, in small letters, is of this format."""
+        return name == self.ending if self.levels else name.endswith("." + self.ending)
+
+    def name(self, stem: str) -> str:
+        """What a file of this format is called."""
+        return self.ending if self.levels else f"{stem}.{self.ending}"
+
     def files(self, path: Path) -> list[Path]:
         """`path` and what lies beside it and belongs to it."""
+        if self.levels:
+            every = sorted(path.parent.glob("*_*/*"))
+            return [path, *(file for file in every if CHUNK.match(file.parent.name))]
         beside = path.with_suffix(self.sidecar) if self.sidecar else path
         return [path, beside] if beside != path and beside.is_file() else [path]
 
@@ -70,6 +85,8 @@ class Anatomy:
     unpacked: bool = False
     untold: str = ""
 
+
+CHUNK = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
 
 _GLB = Format(
     "glb",
@@ -170,6 +187,18 @@ TABLE = (
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
     ),
     Format(
+        "lod-meta.json",
+        opens_in="PlayCanvas, SuperSplat, which load what is near first",
+        keeps="as `sog`, in chunks and levels of detail; written by `splat edit`",
+        writer="stages.editing.levels:write",
+        reader="stages.formats.streamed_sog:read",
+        second_reader="stages.proof.second_packed:streamed_sog",
+        anatomy="stages.proof.anatomy:streamed_sog",
+        order="stages.formats.streamed_sog:order",
+        loses="has 256 sizes and colours, and a palette of view-dependent colours",
+        levels=True,
+    ),
+    Format(
         "html",
         opens_in="any browser, from disk, without a network",
         keeps="everything; the viewer and the cameras too",
@@ -188,8 +217,9 @@ TABLE = (
     ),
     _MESH,
 )
-# By ending: the formats of splats, and those of meshes.
-FORMATS = {row.ending: row for row in TABLE if not row.is_mesh}
+# By ending: all of them, the formats of one file of splats, and those of meshes.
+BY_ENDING = {row.ending: row for row in TABLE}
+FORMATS = {row.ending: row for row in TABLE if not row.is_mesh and not row.levels}
 MESHES = {row.ending: row for row in TABLE if row.is_mesh}
 
 
@@ -199,7 +229,7 @@ def format_of(path: Path) -> Format:
     Raises SplatError "format-unknown", and "format-mesh" for the name of a mesh.
     """
     name = Path(path).name.lower()
-    rows = [row for row in TABLE if name.endswith("." + row.ending)]
+    rows = [row for row in TABLE if row.is_of(name)]
     if not rows:
         raise SplatError(
             "format-unknown",

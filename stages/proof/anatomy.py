@@ -7,6 +7,7 @@ import json
 import struct
 import zipfile
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -122,10 +123,20 @@ def spz(path: Path) -> Anatomy:
 
 
 def sog(path: Path) -> Anatomy:
-    parts: Counter[str] = Counter()
     with zipfile.ZipFile(path) as package:
-        for member in package.infolist():
-            stem = member.filename.rpartition("/")[2].partition(".")[0].partition("_")[0]
-            parts[_SOG.get(stem, stem)] += member.compress_size
+        return _of_pictures((m.filename, m.compress_size) for m in package.infolist())
+
+
+def streamed_sog(path: Path) -> Anatomy:
+    chunks = format_of(path).files(path)[1:]
+    return _of_pictures((file.name, file.stat().st_size) for file in chunks)
+
+
+def _of_pictures(members: Iterable[tuple[str, int]]) -> Anatomy:
+    """Of (name, bytes) of the files of a SOG."""
+    parts: Counter[str] = Counter()
+    for name, size in members:
+        stem = name.rpartition("/")[2].partition(".")[0].partition("_")[0]
+        parts[_SOG.get(stem, stem)] += size
     parts.pop("meta", None)
     return Anatomy(dict(parts))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.lazy import named
-from stages.formats import FORMATS, Format
+from stages.formats import BY_ENDING, Format
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.proof.second_readers import FileContent
 from stages.scene import SH_C0, Splats
@@ -57,7 +57,7 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
 
     names: of the formats through which either went; some sort the rows or keep fewer bands.
     """
-    formats = [FORMATS[name] for name in names]
+    formats = [BY_ENDING[name] for name in names]
     file = content.splats
     upright = content.world_from_file[1, 1] < 0
     placed = splats

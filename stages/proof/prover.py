@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.lazy import named
-from stages.formats import FORMATS, format_of
+from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
 from stages.measure.judge import CAP_DB, decibels
 from stages.proof import diagnosis, second_readers
@@ -107,7 +107,7 @@ class Prover:
         if count != len(self.splats):
             return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
         names = tuple(filter(None, (row.ending, self.came_as)))
-        lossy = not exact and any(FORMATS[name].loses for name in names)
+        lossy = not exact and any(BY_ENDING[name].loses for name in names)
         return self._compared(content, names, lossy)
 
     def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.formats.rows import joined
 from stages.proof.content import logits, splats_by_rows
 from stages.scene import Splats
 
@@ -103,7 +105,34 @@ def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
     return _with_largest(words >> 30, np.stack(others, axis=1))
 
 
-def sog(path: Path) -> Splats:
+def streamed_sog(path: Path) -> Splats:
+    """The finest level, its leaves in the order of their chunks and rows."""
+    import io
+    import json
+    import zipfile
+
+    meta = json.loads(path.read_text("utf-8"))
+    waiting, found = [meta["tree"]], {}
+    while waiting:
+        node = waiting.pop()
+        waiting.extend(node.get("children", ()))
+        if node.get("lods"):
+            at = node["lods"][sorted(node["lods"], key=int)[0]]
+            found[at["file"], at["offset"]] = at["count"]
+    chunks: dict[int, Splats] = {}
+    parts = []
+    for (file, offset), count in sorted(found.items()):
+        if file not in chunks:
+            packed = io.BytesIO()
+            with zipfile.ZipFile(packed, "w") as package:
+                for part in (path.parent / meta["filenames"][file]).parent.iterdir():
+                    package.write(part, part.name)
+            chunks[file] = sog(packed)
+        parts.append(chunks[file].take(slice(offset, offset + count)))
+    return joined(parts)
+
+
+def sog(path: Path | BinaryIO) -> Splats:
     import json
     import zipfile
 

@@ -213,6 +213,16 @@ def test_a_file_can_be_edited_in_its_place_and_through_the_disk(
     assert source.read_bytes() == source.with_name("b.ply").read_bytes()
 
 
+def test_levels_of_detail_go_into_a_folder_that_is_made(source: Path, tmp_path: Path) -> None:
+    target = tmp_path / "new" / "lod-meta.json"
+    edited(source, target, "--scale", "2", "--dry-run")
+    assert not target.parent.exists()
+    edited(source, target, "--scale", "2")
+    assert len(result_of(target)) == 300
+    edited(target, tmp_path / "b.ply", "--decimate", "10")
+    assert len(result_of(tmp_path / "b.ply")) == 10
+
+
 def test_help_names_every_operation() -> None:
     text = help_of("edit")
     for word in (*WORDS, "ops", "dry-run"):

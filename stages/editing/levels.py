@@ -1,0 +1,31 @@
+"""Levels of detail of one scene: each a quarter of the splats of the one before it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stages.editing.decimate import FAR, decimated
+from stages.editing.joining import chosen
+from stages.formats import streamed_sog
+from stages.formats.rows import drawable
+from stages.scene import Splats
+
+# On a surface a quarter of the splats are twice as large, and look as large twice as far away.
+A_LEVEL = 4
+_FEWEST = 20_000  # a level of so few is small enough to begin with
+
+
+def levels_of(splats: Splats) -> list[Splats]:
+    """The finest first. Every splat must be drawable."""
+    found = [splats]
+    while len(found[-1]) > _FEWEST:
+        found.append(decimated(found[-1], len(found[-1]) // A_LEVEL, FAR))
+    return found
+
+
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
+    """Write `splats` and coarser levels of them as a streamed SOG; return how many could not be
+    drawn and were left out. Raises SplatError when it cannot be written."""
+    kept = chosen(splats, drawable(splats))
+    streamed_sog.write_levels(Path(path), levels_of(kept), units)
+    return len(splats) - len(kept)
