@@ -15,9 +15,10 @@ from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE
 from stages.measure.judge import load_photographs
 from stages.scene import Look, split_held_out
 from stages.trade import words
-from stages.trade.measuring import SHARES, Material, measure_trade, spread_over
+from stages.trade.measuring import SHARES, Material, measure_trade
 from stages.trade.pair import Side, pair, verdict
 from stages.trade.pair_report import write_pair
+from stages.trade.points import spread_over
 from stages.trade.report import write_report
 from tests.small_scene import small_scene
 
@@ -42,7 +43,7 @@ def material(scene):
     )
     splats = replace(scene.splats, look=look)
     return Material(
-        splats, training, held, reconstruction.views, "metres", "cpu", COURSE, ("ply", "spz")
+        splats, training, held, reconstruction.views, "metres", "cpu", True, COURSE, ("ply", "spz")
     )
 
 
@@ -87,7 +88,7 @@ def test_the_report_is_one_file_that_needs_no_other(trade, material, tmp_path) -
     files = write_report(tmp_path, "<scene>", trade, material)
     assert {file.name for file in files} == {
         *("report.html", "tradeoff.csv"),
-        *(f"{n}.png" for n in ("time", "formats", "splats", "drawing", "photographs")),
+        *(f"{n}.png" for n in ("time", "formats", "splats", "drawing", "coverage", "photographs")),
     }
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
@@ -95,6 +96,9 @@ def test_the_report_is_one_file_that_needs_no_other(trade, material, tmp_path) -
     assert "The trade of &lt;scene&gt;" in text
     assert words.NOT_FINE_TUNED in text
     assert trade.worst.name in text
+    assert text.count("shimmer") > len(trade.thin.framings)
+    assert "<h2>Coverage</h2>" in text
+    assert "Gap 1, straight above" in text  # ten cameras in a ring
 
 
 def test_the_table_holds_every_point(trade, material, tmp_path) -> None:
@@ -114,6 +118,10 @@ def test_plots_have_axes_with_units_and_legends(trade, material, tmp_path, monke
     shown = {}
     monkeypatch.setattr(plots, "write_plot", lambda path, figure: shown.update({path.stem: figure}))
     plots.write_plots(tmp_path, trade)
+    maps = shown.pop("coverage")
+    bars = [axes.get_xlabel() for axes in maps.axes if axes.get_xlabel()]
+    assert bars == ["photographs that see it", "over how many degrees"]
+    assert maps.legends
     labels = {name: figure.axes[0].get_xlabel() for name, figure in shown.items()}
     assert labels == {
         "time": "seconds",
