@@ -81,4 +81,5 @@ def material_of(pipeline: Pipeline) -> Material:
         levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
         exported=tuple(sources.exported_formats(pipeline)),
+        quantised=pipeline.load("quantise"),
     )

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from stages import formats
+from stages.formats.coarse import held_by
 from stages.formats.rows import kept_rows
 from stages.measure.judge import Photograph, Score, drawing_of, scores
 from stages.measure.speed import seconds_a_frame
 from stages.measure.worth import Worth, floaters, measure_worth
-from stages.scene import Splats, View, split_held_out
+from stages.scene import QuantisedSplats, Splats, View, split_held_out
 from stages.trade.points import Moment, Point, Trade, change_db, mean_db
 from stages.trade.thin import Thin, measure_thin
 
@@ -32,7 +33,7 @@ Tell = Callable[[str], None]
 class Material:
     """What is measured. splats: the run's last, in the frame of its cameras. training, held_out:
     photographs that decide, and that judge. levelled: whether up is -Y. history: as training logged
-    it. exported: formats."""
+    it. exported: formats. quantised: what was decided on for files; None where nothing was."""
 
     splats: Splats
     training: Sequence[Photograph]
@@ -43,6 +44,7 @@ class Material:
     levelled: bool = True
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
+    quantised: QuantisedSplats | None = None
 
 
 def measure_trade(material: Material, tell: Tell) -> Trade:
@@ -88,13 +90,14 @@ def _moments(history: Sequence[dict[str, Any]]) -> tuple[Moment, ...]:
 
 
 def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, ...]:
-    """The splats written, read back and judged, in every format, smallest file first."""
+    """The splats written as export does, read back and judged, in every format, smallest first."""
     splats, points = material.splats, []
     with tempfile.TemporaryDirectory() as folder:
         for name, row in formats.FORMATS.items():
             tell(f"writing and judging .{name}")
             path = Path(folder) / f"scene.{name}"
-            formats.write(path, splats, units=material.units, views=material.views)
+            held = held_by(row, material.quantised) if material.quantised else splats
+            formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)
             read = replace(formats.read(path), look=splats.look)
             for file in row.files(path):

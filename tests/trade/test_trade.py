@@ -13,7 +13,7 @@ from stages.base.errors import SplatError
 from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE
 from stages.measure.judge import load_photographs
-from stages.scene import Look, split_held_out
+from stages.scene import Look, QuantisedSplats, split_held_out
 from stages.trade import words
 from stages.trade.measuring import SHARES, Material, measure_trade
 from stages.trade.pair import Side, pair, verdict
@@ -60,6 +60,17 @@ def test_every_format_is_really_written_and_judged(trade) -> None:
     assert points["spz"].size_bytes < points["ply"].size_bytes / 3
     sizes = [point.size_bytes for point in trade.formats]
     assert sizes == sorted(sizes)
+
+
+def test_formats_are_told_in_as_many_bits_as_the_run_decided_on(material, tmp_path) -> None:
+    bits = {"position": 11, "rotation": 4, "scale": 4, "colour": 4, "opacity": 4, "palette": 5}
+    decided = QuantisedSplats(material.splats, 2, {"bits": bits})
+    found = [
+        next(p for p in measure_trade(m, lambda label: None).formats if p.label == ".sog")
+        for m in (material, replace(material, quantised=decided))
+    ]
+    assert found[1].size_bytes < 0.9 * found[0].size_bytes
+    assert found[1].change.mean < found[0].change.mean
 
 
 def test_splats_go_by_their_worth_to_photographs_that_do_not_judge(trade, material) -> None:
