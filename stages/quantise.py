@@ -203,7 +203,8 @@ def _saved(name: str, bits: int, splats: Splats) -> float:
         return _NUMBERS[name][0] * len(splats) / 8
     labelled = int((splats.sh_degrees > 0).sum())
     numbers = 3 * (splats.sh.shape[1] - 1)
-    return 2 ** (bits - 1) * numbers * _ENTROPY + labelled / 8
+    found: float = (1 << (bits - 1)) * numbers * _ENTROPY + labelled / 8
+    return found
 
 
 def _bytes(splats: Splats) -> int:

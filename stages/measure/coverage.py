@@ -87,11 +87,9 @@ def patches_of(splats: Splats, cameras: Sequence[Camera], backend: str) -> Patch
     which = which.ravel()
     gathered = np.zeros((len(cubes), len(small)))
     np.add.at(gathered, which, pixels[shown])
-    centres = np.stack(
-        [np.bincount(which, total[shown] * means[shown, axis]) for axis in range(3)], axis=1
-    )
-    centres /= np.bincount(which, total[shown])[:, None]
-    return _patches(centres, side, gathered, small)
+    weighted = [np.bincount(which, total[shown] * means[shown, axis]) for axis in range(3)]
+    centres = np.stack(weighted, axis=1) / np.bincount(which, total[shown])[:, None]
+    return _patches(centres.astype(np.float64), side, gathered, small)
 
 
 def _patches(
@@ -130,7 +128,7 @@ def _weighted_quantile(
 
 def _units(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(lengths, 1e-12)
+    return np.asarray(vectors / np.maximum(lengths, 1e-12))
 
 
 def _widest_deg(offsets: NDArray[np.float64]) -> float:
@@ -299,13 +297,13 @@ def _together(centres: NDArray[np.float64], side: float) -> list[NDArray[np.intp
 
 def _step(splats: Splats, place: Place, camera: Camera, backend: str) -> str:
     """The first step aside, twice the angle that is wanted, from which the place is not hidden."""
-    distance = float(np.linalg.norm(place.centre - camera.centre))
+    distance, side = float(np.linalg.norm(place.centre - camera.centre)), _PROBE_PX
     stride = distance * np.tan(np.radians(2 * SMALL_ANGLE_DEG))
     right, down = camera.world_to_camera[0, :3], camera.world_to_camera[1, :3]
     for word, way in (("left", -right), ("right", right), ("higher", -down)):
         eye = camera.centre + stride * way
         pose = look_at(eye, place.centre, up=-down)
-        probe = Camera(_PROBE_PX, _PROBE_PX, _PROBE_PX, _PROBE_PX, *[_PROBE_PX / 2] * 2, pose)
+        probe = Camera(side, side, side, side, side / 2, side / 2, pose)
         depth = float(np.median(render(splats, probe, backend=backend).depth[46:50, 46:50]))
         if depth > 0.9 * float(np.linalg.norm(place.centre - eye)):
             return word

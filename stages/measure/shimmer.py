@@ -101,8 +101,8 @@ def small_psnr_db(draw: Draw, photographs: Iterable[Photograph]) -> tuple[float,
         camera, kept = photograph.camera, photograph.kept
         truth = blocks(photograph.image)
         counts = None if kept is None else blocks(kept[..., None]) == 1
-        intrinsics = (value / FEWER for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-        small = Camera(truth.shape[1], truth.shape[0], *intrinsics, camera.world_to_camera)
+        fx, fy, cx, cy = (x / FEWER for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+        small = Camera(truth.shape[1], truth.shape[0], fx, fy, cx, cy, camera.world_to_camera)
         for drawn in (draw(small), blocks(np.clip(draw(camera), 0.0, 1.0))):
             found.append(decibels(drawn, truth, None if counts is None else counts[..., 0]))
     drawn_small, scaled_down = np.reshape(found, (-1, 2)).mean(axis=0)

@@ -102,4 +102,6 @@ def _mark(
 ) -> None:
     for number, (place, name) in enumerate(zip(places, names, strict=False)):
         axes.plot(*place, "o", ms=11, mfc="white", mec=colour, label="" if number else label)
-        axes.annotate(name, place, fontsize=8, ha="center", va="center", color="black")
+        axes.annotate(
+            name, (place[0], place[1]), fontsize=8, ha="center", va="center", color="black"
+        )

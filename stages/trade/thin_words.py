@@ -16,8 +16,11 @@ _OVERHEAD_DEG, _DOWN_DEG = 65.0, 25.0
 _SAME_HEADING_DEG = 20.0
 _SAME_HEIGHT_DEG = 10.0
 _FEW_SHARE = 0.01  # of what is seen: a smaller place is not worth a word
-_SIDE_WORDS = (("upper left", "top", "upper right"), ("left", "middle", "right"))
-_SIDE_WORDS += (("lower left", "bottom", "lower right"),)
+_SIDE_WORDS = (
+    ("upper left", "top", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "bottom", "lower right"),
+)
 _LOSS_DB = 0.5  # of pictures drawn small, against those scaled down
 
 

@@ -19,7 +19,7 @@ def surface(means: np.ndarray, scale: float = 0.08) -> Splats:
     n = len(means)
     return Splats(
         means=means.astype(np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         log_scales=np.full((n, 3), np.log(scale), np.float32),
         opacity_logits=np.full(n, 6, np.float32),
         sh=np.zeros((n, 1, 3), np.float32),

@@ -32,7 +32,7 @@ def sheet(spacing_px: float, size_px: float) -> Splats:
     rng = np.random.default_rng(2)
     return Splats(
         means=np.stack([x.ravel(), y.ravel(), np.full(n, DEPTH)], 1).astype(np.float32),
-        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
         log_scales=np.full((n, 3), np.log(size_px * pixel), np.float32),
         opacity_logits=np.full(n, 3, np.float32),
         sh=rng.uniform(-1.7, 1.7, (n, 1, 3)).astype(np.float32),
@@ -84,7 +84,7 @@ def test_a_large_picture_is_not_made_larger_than_anybody_waits_for() -> None:
 def test_fine_splats_thicken_in_small_pictures_and_not_in_pictures_scaled_down() -> None:
     splats = sheet(2, 0.3)
     draw = drawing(splats)
-    pixels = np.uint8(np.clip(draw(CAMERA), 0, 1) * 255 + 0.5)
+    pixels = (np.clip(draw(CAMERA), 0, 1) * 255 + 0.5).astype(np.uint8)
     small, scaled = small_psnr_db(draw, [Photograph("a", CAMERA, pixels)])
     assert scaled > 45
     assert small < scaled - 10
@@ -92,7 +92,7 @@ def test_fine_splats_thicken_in_small_pictures_and_not_in_pictures_scaled_down()
 
 def test_what_is_not_judged_does_not_judge_small_pictures_either() -> None:
     draw = drawing(sheet(8, 6))
-    pixels = np.uint8(np.clip(draw(CAMERA), 0, 1) * 255 + 0.5)
+    pixels = (np.clip(draw(CAMERA), 0, 1) * 255 + 0.5).astype(np.uint8)
     cut_off = np.zeros((48, 64), bool)
     cut_off[:9] = True
     pixels[:9] = 255
