@@ -230,7 +230,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=5,
+    version=6,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,

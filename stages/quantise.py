@@ -24,14 +24,18 @@ if TYPE_CHECKING:
 _DECISIONS, _FLAT = "decisions.json", "flat_dc.npy"
 # Colour that a splat may lose with its higher bands, in steps of 8 bits; the largest that passes.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
-# What a .sog may tell its values in, by attribute; the fewest that pass.
-_FEWER_BITS = {
-    "position": (15, 14, 13, 12),
-    "rotation": (7, 6, 5, 4),
-    "scale": (7, 6, 5, 4),
-    "colour": (7, 6, 5),
-    "opacity": (7, 6, 5, 4),
+# Of what a .sog tells its values in: (numbers of a splat, the fewest bits).
+_NUMBERS = {
+    "position": (3, 10),
+    "rotation": (3, 4),
+    "scale": (3, 4),
+    "colour": (3, 4),
+    "opacity": (1, 3),
+    "palette": (0, 5),
 }
+_ENTROPY = 0.9  # of the bits of a palette's numbers: about what compression leaves
+_LEAST_DB = 1e-4  # a loss below it is chance
+_BIT_TRIALS = 25  # about as many as are made
 
 
 @dataclass(frozen=True)
@@ -156,25 +160,51 @@ def _cut_each(
 def _bits(
     kept: Splats, settings: QuantiseSettings, decider: _Measure
 ) -> tuple[dict[str, int], float]:
-    """(by attribute, in how many bits a .sog tells it; PSNR of such a file): as few as cost each
-    attribute its share of what smaller files may cost."""
-    from stages.formats.coarse import Bits, of_sog
+    """(by attribute, in how many bits a .sog tells it; PSNR of such a file). The next bit goes
+    where it saves most bytes for what it costs, as long as all together cost no more than they
+    may. A step that follows is foretold to cost four times as much: half the precision."""
+    from stages.formats.axes import least_turned
+    from stages.formats.coarse import Bits, of_sog, palette_bits, told
     from stages.formats.rows import kept_rows
 
-    drawn, found = kept_rows(kept)[0], Bits()
-    if not len(drawn):
-        return asdict(found), 0.0
-    best = decider.psnr(of_sog(drawn, found))
-    share = settings.sog_loss_db / len(asdict(found))
-    for name, fewer in _FEWER_BITS.items():
-        floor = best - share
-        for count in fewer:
-            tried = replace(found, **{name: count})
-            psnr = decider.psnr(of_sog(drawn, tried))
-            if psnr < floor:
-                break
-            found, best = tried, psnr
-    return asdict(found), best
+    exact = least_turned(kept_rows(kept)[0])
+    found = asdict(Bits(palette=palette_bits(len(exact))))
+    if not len(exact):
+        return found, 0.0
+    splats = of_sog(exact, Bits(**found))
+    best = decider.psnr(splats)
+    floor, least = best - settings.sog_loss_db, {n: bits for n, (_, bits) in _NUMBERS.items()}
+    if not kept.sh_degree:
+        least["palette"] = found["palette"]
+    losses = {
+        name: best - decider.psnr(told(exact, splats, name, bits - 1))
+        for name, bits in found.items()
+        if bits > least[name]
+    }
+    while losses:
+        name = max(losses, key=lambda n: _saved(n, found[n], exact) / max(losses[n], _LEAST_DB))
+        tried = told(exact, splats, name, found[name] - 1)
+        psnr = decider.psnr(tried)
+        if psnr < floor:
+            del losses[name]
+            continue
+        losses[name] = 4 * max(best - psnr, _LEAST_DB)
+        splats, best = tried, psnr
+        found[name] -= 1
+        if found[name] == least[name]:
+            del losses[name]
+    return found, best
+
+
+def _saved(name: str, bits: int, splats: Splats) -> float:
+    """Bytes that one bit less of an attribute is worth, about: each number's, or half a palette and
+    a bit of each label."""
+    if name != "palette":
+        return _NUMBERS[name][0] * len(splats) / 8
+    labelled = int((splats.sh_degrees > 0).sum())
+    numbers = 3 * (splats.sh.shape[1] - 1)
+    found: float = (1 << (bits - 1)) * numbers * _ENTROPY + labelled / 8
+    return found
 
 
 def _bytes(splats: Splats) -> int:
@@ -227,8 +257,8 @@ class _Measure:
 
         mean = round(mean_psnr_db(splats, self.photographs, self.settings.backend), 4)
         self.done += 1
-        # At most: raw, three lower degrees, each threshold, each number of bits.
-        total = 5 + len(_THRESHOLDS_OF_255) + sum(map(len, _FEWER_BITS.values()))
+        # Raw, three lower degrees, each threshold, and about as many numbers of bits.
+        total = 5 + len(_THRESHOLDS_OF_255) + _BIT_TRIALS
         self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
         return mean
 
@@ -256,7 +286,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=4,
+    version=5,
     reads=("sfm", "prune"),
     settings_type=QuantiseSettings,
     run=run,

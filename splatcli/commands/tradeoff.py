@@ -55,7 +55,8 @@ def material_of(pipeline: Pipeline) -> Material:
     nothing-held-out)."""
     from stages.measure.judge import load_photographs
     from stages.scene import split_held_out
-    from stages.trade.measuring import DECIDING_PHOTOGRAPHS, Material, spread_over
+    from stages.trade.measuring import DECIDING_PHOTOGRAPHS, Material
+    from stages.trade.points import spread_over
 
     splats = sources.finished_splats(pipeline)
     reconstruction = pipeline.load("sfm")
@@ -77,6 +78,8 @@ def material_of(pipeline: Pipeline) -> Material:
         views=reconstruction.views,
         units=reconstruction.units,
         backend=sources.backend_of(pipeline),
+        levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
         exported=tuple(sources.exported_formats(pipeline)),
+        quantised=pipeline.load("quantise"),
     )

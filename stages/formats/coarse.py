@@ -6,45 +6,71 @@ they are compressed, and every reader reads them as it always did.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.lazy import named
 from stages.formats import codebook, smallest_three
-from stages.formats.rows import kept_rows, linear_opacities, logits_of, unit_quaternions
-from stages.formats.sog import LOG_SCALE_LIMIT, STEPS, bent, unbent
+from stages.formats.axes import least_turned
+from stages.formats.rows import (
+    degrees_in_use,
+    kept_rows,
+    linear_opacities,
+    logits_of,
+    unit_quaternions,
+)
+from stages.formats.sog import LOG_SCALE_LIMIT, STEPS, bent, palette_size, unbent
 from stages.formats.table import Format
 from stages.scene import QuantisedSplats, Splats
 
 
 @dataclass(frozen=True)
 class Bits:
-    """How many each value is told in."""
+    """How many each value is told in, and a row of the palette of view-dependent colours."""
 
     position: int = 16
     rotation: int = 8
     scale: int = 8
     colour: int = 8
     opacity: int = 8
+    palette: int = 16
 
 
 def of_sog(splats: Splats, bits: Bits) -> Splats:
     """What a .sog holds of them in so many bits, on the grids that its writer will find again."""
-    if not len(splats):
+    exact = least_turned(splats)
+    found = exact
+    for name, count in asdict(bits).items():
+        found = told(exact, found, name, count)
+    return found
+
+
+def told(exact: Splats, splats: Splats, name: str, bits: int) -> Splats:
+    """`splats` with one of the values of `Bits` told in so many, from what it is in `exact`."""
+    if not len(exact):
         return splats
-    logs = np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+    if name == "position":
+        return replace(splats, means=_positions(exact.means, bits))
+    if name == "rotation":
+        return replace(splats, quaternions=_rotations(exact.quaternions, bits))
+    if name == "scale":
+        logs = np.clip(exact.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+        return replace(splats, log_scales=_by_codebook(logs, bits))
+    if name == "opacity":
+        return replace(splats, opacity_logits=_opacities(exact, bits))
     sh = splats.sh.copy()
-    sh[:, 0] = _by_codebook(sh[:, 0], bits.colour)
-    return replace(
-        splats,
-        means=_positions(splats.means, bits.position),
-        quaternions=_rotations(splats.quaternions, bits.rotation),
-        log_scales=_by_codebook(logs, bits.scale),
-        opacity_logits=_opacities(splats, bits.opacity),
-        sh=sh,
-    )
+    if name == "colour":
+        sh[:, 0] = _by_codebook(exact.sh[:, 0], bits)
+    elif sh.shape[1] > 1:
+        sh[:, 1:] = _by_palette(exact.sh[:, 1:], bits)
+    return replace(splats, sh=sh, sh_degrees=degrees_in_use(sh))
+
+
+def palette_bits(count: int) -> int:
+    """The most that tell apart all that a palette of so many splats may hold."""
+    return (palette_size(count) - 1).bit_length()
 
 
 def held_by(row: Format, quantised: QuantisedSplats) -> Splats:
@@ -85,6 +111,12 @@ def _by_codebook(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]
     book = codebook.of_numbers(values, 1 << bits)
     found: NDArray[np.float32] = book[codebook.nearest(book, values)].astype(np.float32)
     return found
+
+
+def _by_palette(rest: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
+    vectors = rest.reshape(len(rest), -1).astype(np.float32)
+    palette, labels = codebook.of_vectors(vectors, min(palette_size(len(rest)), 1 << bits))
+    return palette[labels].reshape(rest.shape)
 
 
 def _opacities(splats: Splats, bits: int) -> NDArray[np.float32]:

@@ -12,6 +12,7 @@ _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
 _COARSE = 128
 _SAMPLE = 1 << 15  # vectors that the coarse centres are found from
 _ROWS_AT_ONCE = 1 << 14
+_LOOK = 2  # times as many vectors as a palette has rows: if they all differ, it is too small
 
 
 def of_numbers(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.float64]:
@@ -67,8 +68,14 @@ def of_vectors(
     """(palette [at most `size`, D], which of its rows stands for each of `vectors` [N, D]).
 
     In two levels, so that time grows with the square root of the palette: coarse clusters first,
-    and in each as many entries as its share of the vectors. Vectors of zeros stay zeros.
+    and in each as many entries as its share of the vectors. Vectors of zeros stay zeros. All of
+    them, exactly, if few differ.
     """
+    if len(_distinct(vectors[: _LOOK * size])[0]) <= size:  # of millions, a part tells soon
+        first, which = _distinct(vectors)
+        if len(first) <= size:
+            order = np.lexsort(vectors[first].T)
+            return vectors[first[order]], np.argsort(order)[which]
     labels = np.zeros(len(vectors), np.intp)
     palette = [np.zeros((1, vectors.shape[1]), np.float32)]
     rows = np.flatnonzero(vectors.any(axis=1))
@@ -93,6 +100,17 @@ def of_vectors(
         palette.append(fine)
         used += len(fine)
     return np.concatenate(palette), labels
+
+
+def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(row of the first of each kind, of which kind each is), told apart by 64 bits of a sum."""
+    factors = np.random.default_rng(1).integers(1, 1 << 63, vectors.shape[1], np.uint64) | 1
+    sums = np.empty(len(vectors), np.uint64)
+    for rows in passing(len(vectors)):
+        bits = np.ascontiguousarray(vectors[rows] + np.float32(0)).view(np.uint32)  # -0 is 0
+        sums[rows] = (bits * factors).sum(axis=1)
+    _, first, which = np.unique(sums, return_index=True, return_inverse=True)
+    return first, which.ravel()
 
 
 def _centres(

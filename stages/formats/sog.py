@@ -80,6 +80,11 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
     return file.getvalue()
 
 
+def _written(book: NDArray[np.float64]) -> list[float]:
+    """What is as exact as float32, in half of the letters."""
+    return [float(f"{number:.7g}") for number in book]
+
+
 def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """[H, W, channels] nearly square, its sides multiples of 4, from [N, channels]."""
     width = max(4, 4 * math.ceil(math.sqrt(len(rows)) / 4))
@@ -117,7 +122,7 @@ def unbent(curved: NDArray[np.float64]) -> NDArray[np.float64]:
 def _shapes(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
     logs = np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
     book = codebook.of_numbers(logs)
-    meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
+    meta["scales"] = {"codebook": _written(book), "files": ["scales.webp"]}
     turns = np.empty((len(splats), 4), np.uint8)
     for rows in passing(len(splats)):
         largest, others = smallest_three.split(unit_quaternions(splats.quaternions[rows]))
@@ -131,10 +136,15 @@ def _shapes(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]
 def _colours(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
     dc = np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT)
     book = codebook.of_numbers(dc)
-    meta["sh0"] = {"codebook": book.tolist(), "files": ["sh0.webp"]}
+    meta["sh0"] = {"codebook": _written(book), "files": ["sh0.webp"]}
     opacity = np.rint(255 * linear_opacities(splats)).astype(np.uint8)
     indices = codebook.nearest(book, dc)
     return {"sh0.webp": _picture(np.concatenate([indices, opacity[:, None]], axis=1))}
+
+
+def palette_size(count: int) -> int:
+    """Rows at most, for so many splats."""
+    return min(PALETTE_LIMIT, max(_PALETTE_LEAST, count // _SPLATS_PER_ENTRY))
 
 
 def _rest(
@@ -145,7 +155,7 @@ def _rest(
     vectors = np.empty((len(splats), count, 3), np.float32)
     for rows in passing(len(splats)):
         vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
-    size = min(PALETTE_LIMIT, max(_PALETTE_LEAST, len(splats) // _SPLATS_PER_ENTRY))
+    size = palette_size(len(splats))
     palette, labels = codebook.of_vectors(vectors.reshape(len(splats), -1), size)
     book = codebook.of_numbers(palette)
     book[np.abs(book).argmin()] = 0.0  # what does not change with the view stays so
@@ -157,7 +167,7 @@ def _rest(
     meta["shN"] = {
         "count": len(palette),
         "bands": splats.sh_degree,
-        "codebook": book.tolist(),
+        "codebook": _written(book),
         "files": files,
     }
     halves = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)

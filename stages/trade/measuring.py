@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from stages import formats
+from stages.formats.coarse import held_by
 from stages.formats.rows import kept_rows
 from stages.measure.judge import Photograph, Score, drawing_of, scores
 from stages.measure.speed import seconds_a_frame
-from stages.measure.worth import measure_worth
-from stages.scene import Splats, View
+from stages.measure.worth import Worth, floaters, measure_worth
+from stages.scene import QuantisedSplats, Splats, View, split_held_out
 from stages.trade.points import Moment, Point, Trade, change_db, mean_db
+from stages.trade.thin import Thin, measure_thin
 
 # Shares of the splats that are left, each taken from the one before: what single splats are worth
 # no longer adds up where many go at once.
@@ -30,7 +32,8 @@ Tell = Callable[[str], None]
 @dataclass(frozen=True)
 class Material:
     """What is measured. splats: the run's last, in the frame of its cameras. training, held_out:
-    photographs that decide, and that judge. history: as training logged it. exported: formats."""
+    photographs that decide, and that judge. levelled: whether up is -Y. history: as training logged
+    it. exported: formats. quantised: what was decided on for files; None where nothing was."""
 
     splats: Splats
     training: Sequence[Photograph]
@@ -38,8 +41,10 @@ class Material:
     views: tuple[View, ...]
     units: str
     backend: str
+    levelled: bool = True
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
+    quantised: QuantisedSplats | None = None
 
 
 def measure_trade(material: Material, tell: Tell) -> Trade:
@@ -49,13 +54,16 @@ def measure_trade(material: Material, tell: Tell) -> Trade:
     tell("judging the run's splats")
     own_scores = _scores(material, splats)
     own = _point(material, "as it is", splats, own_scores, own_scores)
+    tell("finding what each splat is worth")
+    worth = measure_worth(splats, material.training, material.backend)
     return Trade(
         own=own,
         moments=_moments(material.history),
         formats=_formats(material, own_scores, tell),
-        counts=(own, *_fewer(material, own_scores, tell)),
+        counts=(own, *_fewer(material, own_scores, worth, tell)),
         scores=tuple(own_scores),
         side_px=max(max(p.pixels.shape[:2]) for p in material.held_out),
+        thin=_thin(material, worth, tell),
         exported=material.exported,
     )
 
@@ -82,13 +90,14 @@ def _moments(history: Sequence[dict[str, Any]]) -> tuple[Moment, ...]:
 
 
 def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, ...]:
-    """The splats written, read back and judged, in every format, smallest file first."""
+    """The splats written as export does, read back and judged, in every format, smallest first."""
     splats, points = material.splats, []
     with tempfile.TemporaryDirectory() as folder:
         for name, row in formats.FORMATS.items():
             tell(f"writing and judging .{name}")
             path = Path(folder) / f"scene.{name}"
-            formats.write(path, splats, units=material.units, views=material.views)
+            held = held_by(row, material.quantised) if material.quantised else splats
+            formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)
             read = replace(formats.read(path), look=splats.look)
             for file in row.files(path):
@@ -107,22 +116,29 @@ def _same(a: Splats, b: Splats) -> bool:
     )
 
 
-def _fewer(material: Material, own: list[Score], tell: Tell) -> list[Point]:
-    """Fewer and fewer splats, the least worth to the training photographs first."""
+def _thin(material: Material, worth: Worth, tell: Tell) -> Thin:
+    tell("looking where the capture is thin")
+    cameras = [photograph.camera for photograph in material.training]
+    return measure_thin(
+        material.splats,
+        split_held_out(material.views)[0],
+        material.levelled,
+        material.held_out,
+        floaters(material.splats, worth, cameras),
+        material.backend,
+    )
+
+
+def _fewer(material: Material, own: list[Score], worth: Worth, tell: Tell) -> list[Point]:
+    """Fewer and fewer splats, the least worth to the training photographs first. worth: of all."""
     splats, points = material.splats, []
     for share in SHARES:
         count = round(share * len(material.splats))
         if not 0 < count < len(splats):
             continue
         tell(f"leaving {share:.0%} of the splats")
-        worth = measure_worth(splats, material.training, material.backend).sse_change
-        kept = np.sort(np.argsort(-worth, kind="stable")[:count])
-        splats = splats.take(kept)
+        if len(splats) < len(material.splats):
+            worth = measure_worth(splats, material.training, material.backend)
+        splats = splats.take(np.sort(np.argsort(-worth.sse_change, kind="stable")[:count]))
         points.append(_point(material, f"{share:.0%}", splats, _scores(material, splats), own))
     return points
-
-
-def spread_over(items: Sequence[Any], most: int) -> list[Any]:
-    """At most so many of them, evenly: photographs next to each other say the same."""
-    count = min(most, len(items))
-    return [items[i * len(items) // count] for i in range(count)]

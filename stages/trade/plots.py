@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.measure.plots import BLUE, GREY, ORANGE, new_plot, write_plot
+from stages.trade.plan_view import plan_view
 from stages.trade.points import Point, Trade, knee
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ def write_plots(folder: Path, trade: Trade) -> list[Path]:
         "drawing": _drawing(trade),
         "photographs": _photographs(trade),
     }
+    if trade.thin.ring is not None:
+        drawn["coverage"] = plan_view(trade.thin)
     if len(trade.moments) > 1:
         drawn = {"time": _time(trade), **drawn}
     paths = []

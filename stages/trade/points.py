@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stages.measure.bootstrap import Difference, paired_difference
 from stages.measure.judge import Score
+
+if TYPE_CHECKING:
+    from stages.trade.thin import Thin
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Trade:
     """own: the run's splats as they are. moments: the course of training, () where none was
     logged. formats: the same splats in each file format. counts: fewer of them, not fine-tuned,
     most first, `own` among them. scores: of `own`, by photograph. side_px: longer side of the
-    pictures. exported: formats that the run wrote."""
+    pictures. thin: where the capture is. exported: formats that the run wrote."""
 
     own: Point
     moments: tuple[Moment, ...]
@@ -50,6 +54,7 @@ class Trade:
     counts: tuple[Point, ...]
     scores: tuple[Score, ...]
     side_px: int
+    thin: Thin
     exported: tuple[str, ...] = ()
 
     @property
@@ -94,3 +99,9 @@ def knee(costs: Sequence[float], psnr_db: Sequence[float]) -> int:
     above = y - (y[low] + (x - x[low]) / span * (y[high] - y[low]))
     best = int(np.argmax(above))
     return best if above[best] > 1e-9 else high
+
+
+def spread_over(items: Sequence[Any], most: int) -> list[Any]:
+    """At most so many of them, evenly: photographs next to each other say the same."""
+    count = min(most, len(items))
+    return [items[i * len(items) // count] for i in range(count)]

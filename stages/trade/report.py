@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.base.atomic import replacing
 from stages.measure.judge import drawing_of
-from stages.trade import pages, words
+from stages.trade import pages, thin_words, words
 from stages.trade.measuring import Material
 from stages.trade.plots import write_plots
 from stages.trade.points import Point, Trade
@@ -25,6 +25,8 @@ _SECTIONS = {
     "formats": ("Bytes", words.about_formats),
     "splats": ("Splats", words.about_splats),
     "drawing": ("Drawing", words.about_drawing),
+    "coverage": ("Coverage", thin_words.about_coverage),
+    "framing": ("Framing", thin_words.about_framing),
     "photographs": ("Photographs", words.about_photographs),
 }
 
@@ -56,6 +58,8 @@ def write_report(folder: Path, name: str, trade: Trade, material: Material) -> l
             parts.append(pages.png(plots[stem], f"Plot: {title}"))
         if stem == "formats":
             parts.append(_formats_table(trade))
+        if stem == "framing":
+            parts.append(_framings(trade))
     parts += [_photographs_table(trade), _worst(trade, material)]
     report = folder / "report.html"
     pages.write_page(report, f"The trade of {name}", parts)
@@ -104,6 +108,15 @@ def _photographs_table(trade: Trade) -> str:
         for number, score in enumerate(trade.scores, 1)
     ]
     return pages.table(("photograph", "PSNR", "SSIM"), rows)
+
+
+def _framings(trade: Trade) -> str:
+    """The scene from elsewhere, three pictures a row."""
+    shown = [
+        (f"{framing.label}: shimmer {framing.shimmer:.1f} of 255", framing.image)
+        for framing in trade.thin.framings
+    ]
+    return "".join(pages.pictures(shown[i : i + 3]) for i in range(0, len(shown), 3))
 
 
 def _worst(trade: Trade, material: Material) -> str:

@@ -111,6 +111,16 @@ def test_a_palette_smaller_than_the_scene_stays_close_to_it() -> None:
     np.testing.assert_array_equal(again[1], labels)
 
 
+def test_a_palette_of_few_vectors_is_exact() -> None:
+    rng = np.random.default_rng(3)
+    vectors = rng.normal(size=(64, 9)).astype(np.float32)[rng.integers(0, 64, 5000)]
+    vectors[:100] = 0
+    palette, labels = codebook.of_vectors(vectors, 65)
+    np.testing.assert_array_equal(palette[labels], vectors)
+    assert len(palette) == 65
+    assert len(codebook.of_vectors(vectors, 64)[0]) <= 64
+
+
 def test_a_codebook_of_few_numbers_is_exact_and_of_many_is_close() -> None:
     few = np.array([3.0, -1.0, 3.0, 0.25])
     book = codebook.of_numbers(few)

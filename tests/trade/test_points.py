@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from stages.measure.bootstrap import paired_difference
+from stages.measure.coverage import Patches
 from stages.trade import words
 from stages.trade.points import Moment, Point, Trade, knee, time_to
+from stages.trade.thin import Thin
 
 
 def moments(*psnr):
@@ -55,8 +57,15 @@ def test_one_photograph_makes_no_interval():
     assert words.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one judge)"
 
 
+def nowhere() -> Thin:
+    """A capture that shows nothing."""
+    none = np.zeros(0)
+    patches = Patches(np.zeros((0, 3)), 1.0, none, np.zeros((0, 1), bool), none.astype(int), none)
+    return Thin((), (), patches, None, (), (), np.zeros((0, 3)), (), (0.0, 0.0))
+
+
 @pytest.mark.parametrize("logged", [0, 1])
 def test_a_run_without_a_log_says_so(logged):
     own = Point("as it is", 100, 20.0, paired_difference(np.zeros(3)))
-    trade = Trade(own, tuple(moments(20.0)[:logged]), (), (own,), (), 480)
+    trade = Trade(own, tuple(moments(20.0)[:logged]), (), (own,), (), 480, nowhere())
     assert words.about_time(trade) == [words.NO_TIMES]

@@ -13,11 +13,12 @@ from stages.base.errors import SplatError
 from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE
 from stages.measure.judge import load_photographs
-from stages.scene import Look, split_held_out
+from stages.scene import Look, QuantisedSplats, split_held_out
 from stages.trade import words
-from stages.trade.measuring import SHARES, Material, measure_trade, spread_over
+from stages.trade.measuring import SHARES, Material, measure_trade
 from stages.trade.pair import Side, pair, verdict
 from stages.trade.pair_report import write_pair
+from stages.trade.points import spread_over
 from stages.trade.report import write_report
 from tests.small_scene import small_scene
 
@@ -42,7 +43,7 @@ def material(scene):
     )
     splats = replace(scene.splats, look=look)
     return Material(
-        splats, training, held, reconstruction.views, "metres", "cpu", COURSE, ("ply", "spz")
+        splats, training, held, reconstruction.views, "metres", "cpu", True, COURSE, ("ply", "spz")
     )
 
 
@@ -59,6 +60,17 @@ def test_every_format_is_really_written_and_judged(trade) -> None:
     assert points["spz"].size_bytes < points["ply"].size_bytes / 3
     sizes = [point.size_bytes for point in trade.formats]
     assert sizes == sorted(sizes)
+
+
+def test_formats_are_told_in_as_many_bits_as_the_run_decided_on(material, tmp_path) -> None:
+    bits = {"position": 11, "rotation": 4, "scale": 4, "colour": 4, "opacity": 4, "palette": 5}
+    decided = QuantisedSplats(material.splats, 2, {"bits": bits})
+    found = [
+        next(p for p in measure_trade(m, lambda label: None).formats if p.label == ".sog")
+        for m in (material, replace(material, quantised=decided))
+    ]
+    assert (found[1].size_bytes or 0) < 0.9 * (found[0].size_bytes or 0)
+    assert found[1].change.mean < found[0].change.mean
 
 
 def test_splats_go_by_their_worth_to_photographs_that_do_not_judge(trade, material) -> None:
@@ -87,7 +99,7 @@ def test_the_report_is_one_file_that_needs_no_other(trade, material, tmp_path) -
     files = write_report(tmp_path, "<scene>", trade, material)
     assert {file.name for file in files} == {
         *("report.html", "tradeoff.csv"),
-        *(f"{n}.png" for n in ("time", "formats", "splats", "drawing", "photographs")),
+        *(f"{n}.png" for n in ("time", "formats", "splats", "drawing", "coverage", "photographs")),
     }
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
@@ -95,6 +107,9 @@ def test_the_report_is_one_file_that_needs_no_other(trade, material, tmp_path) -
     assert "The trade of &lt;scene&gt;" in text
     assert words.NOT_FINE_TUNED in text
     assert trade.worst.name in text
+    assert text.count("shimmer") > len(trade.thin.framings)
+    assert "<h2>Coverage</h2>" in text
+    assert "Gap 1, straight above" in text  # ten cameras in a ring
 
 
 def test_the_table_holds_every_point(trade, material, tmp_path) -> None:
@@ -114,6 +129,10 @@ def test_plots_have_axes_with_units_and_legends(trade, material, tmp_path, monke
     shown = {}
     monkeypatch.setattr(plots, "write_plot", lambda path, figure: shown.update({path.stem: figure}))
     plots.write_plots(tmp_path, trade)
+    maps = shown.pop("coverage")
+    bars = [axes.get_xlabel() for axes in maps.axes if axes.get_xlabel()]
+    assert bars == ["photographs that see it", "over how many degrees"]
+    assert maps.legends
     labels = {name: figure.axes[0].get_xlabel() for name, figure in shown.items()}
     assert labels == {
         "time": "seconds",
