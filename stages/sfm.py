@@ -76,13 +76,17 @@ class SfmSettings:
     )
     split: bool = field(
         default=False,
-        metadata={"help": "Keep the training and test photographs that --cameras tells apart."},
+        metadata={
+            "help": "Keep the training and test photographs that --cameras tells apart.",
+            "needs": "cameras",
+        },
     )
     refine_cameras: bool = field(
         default=False,
         metadata={
             "help": "Move the cameras of --cameras to where the photographs' matches want them; "
-            "their lenses stay as they are."
+            "their lenses stay as they are.",
+            "needs": "cameras",
         },
     )
     scale: tuple[str, ...] = field(

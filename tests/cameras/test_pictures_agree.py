@@ -69,6 +69,15 @@ def test_a_benchmarks_split_is_read(tmp_path: Path) -> None:
     assert roles == ["train", "train", "val", "test"]
 
 
+def test_a_benchmark_without_its_validation_pictures_is_read(tmp_path: Path) -> None:
+    folder = blender(tmp_path)
+    for path in (folder / "train").iterdir():
+        if path.stem not in ("p_0", "p_1", "p_2"):
+            path.unlink()
+    sizes = {(v.camera.width, v.camera.height) for v in read_cameras(folder).views}
+    assert len(sizes) == 1
+
+
 def test_nerfstudios_split_is_read(tmp_path: Path) -> None:
     path = nerfstudio(tmp_path)
     data = json.loads(path.read_text())
