@@ -89,6 +89,13 @@ class SfmSettings:
             "needs": "cameras",
         },
     )
+    metres: bool = field(
+        default=False,
+        metadata={
+            "help": "The cameras of --cameras are in metres, as those of phones' AR sessions are.",
+            "needs": "cameras",
+        },
+    )
     scale: tuple[str, ...] = field(
         default=(),
         metadata={
@@ -190,7 +197,7 @@ def _with_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        size=metric.Known(settings.scale, settings.marker),
+        size=metric.Known(settings.scale, settings.marker, float(settings.metres), "--metres"),
         seconds_left=lambda: deadline - time.monotonic(),
     )
     found = light.with_light(found, report)
@@ -423,5 +430,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=7, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=8, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

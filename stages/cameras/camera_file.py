@@ -25,6 +25,19 @@ _ROUNDED = 1e-9  # of R^T R: more than float64 leaves
 
 
 @dataclass(frozen=True)
+class Ground:
+    """What a file says of its world. metres: of one unit; 0 where it does not say. axes [3, 3]:
+    rows point east, north and up in it; None likewise. said_by: in words."""
+
+    metres: float = 0.0
+    axes: NDArray[np.float64] | None = None
+    said_by: str = ""
+
+
+UNSAID = Ground()
+
+
+@dataclass(frozen=True)
 class CameraFile:
     """views: pinhole cameras, in the file's order; their role is that in the file's own split.
     folder: where `View.image` starts. lenses [V]: what bends each picture besides."""
@@ -32,6 +45,7 @@ class CameraFile:
     views: tuple[View, ...]
     folder: Path
     lenses: tuple[Lens, ...]
+    ground: Ground = UNSAID
 
     @property
     def distorted(self) -> int:
