@@ -18,6 +18,7 @@ from stages.base.bad_files import BadFileError
 from stages.cameras.lens import Lens
 from stages.scene import Camera, View
 
+LARGEST_FILE = 1 << 30  # bytes; cameras and points of thousands of photographs have fewer
 LARGEST_SIDE = 100_000  # pixels; no lens shows more
 FARTHEST = 1e12  # world units; squares of it are still far from overflowing
 ROTATION_TOLERANCE = 1e-3  # of R^T R: three decimals of text; beyond, it is not a rotation
@@ -101,6 +102,15 @@ def make_views(
             names, images or names, sizes, intrinsics, matrices, strict=True
         )
     )
+
+
+def content_of(path: Path) -> bytes:
+    """All of a file, unless it is too large for any cameras: a parser would want many times that
+    much memory. Raises BadFileError."""
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise BadFileError(f"it has {size / 1e9:.1f} GB, and no cameras take more than 1.1")
+    return path.read_bytes()
 
 
 def size_of_picture(folder: Path, name: str) -> tuple[int, int]:

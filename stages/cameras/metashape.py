@@ -23,6 +23,7 @@ from stages.cameras.camera_file import (
     UNSAID,
     CameraFile,
     Ground,
+    content_of,
     make_views,
 )
 from stages.cameras.lens import Lens
@@ -102,7 +103,7 @@ def _east_north_up(place: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _parsed(path: Path) -> Element:
-    data = path.read_bytes()
+    data = content_of(path)
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # an entity may stand for gigabytes
         raise BadFileError("it declares entities, which Metashape does not")
     try:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, FilePoints, make_views
+from stages.cameras.camera_file import CameraFile, FilePoints, content_of, make_views
 from stages.cameras.lens import Lens
 from stages.scene import View
 
@@ -84,7 +84,7 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
     """The cameras of a file; `file_path` gives their names. size: of pictures that are not there,
     where the file does not say it either. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(content_of(path).decode("utf-8"))
         if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
             raise BadFileError("it has no list of frames")
         frames = data["frames"]
@@ -109,7 +109,7 @@ def read_points(path: Path) -> FilePoints | None:
     """The points of `ply_file_path`, if the file names one that is there. Raises SplatError
     "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(content_of(path).decode("utf-8"))
         named = data.get("ply_file_path")
         if not named or not (path.parent / str(named)).is_file():
             return None

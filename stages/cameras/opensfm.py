@@ -17,7 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import UNSAID, CameraFile, FilePoints, Ground, make_views
+from stages.cameras.camera_file import (
+    UNSAID,
+    CameraFile,
+    FilePoints,
+    Ground,
+    content_of,
+    make_views,
+)
 from stages.cameras.lens import Lens
 from stages.scene import View
 from stages.scene.rotations import matrices_of
@@ -98,7 +105,7 @@ def read_points(path: Path) -> FilePoints | None:
 
 
 def _largest(path: Path) -> dict[str, Any]:
-    data = json.loads(path.read_text(encoding="utf-8-sig"))
+    data = json.loads(content_of(path).decode("utf-8-sig"))
     if not isinstance(data, list) or not data:
         raise BadFileError("it holds no reconstruction")
     for part in data:

@@ -121,3 +121,13 @@ def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -
         read_cameras(path)
     assert caught.value.code == "cameras-unreadable"
     assert file in caught.value.given
+
+
+@pytest.mark.parametrize("name", ["cameras.json", "cameras.xml", "cameras.csv", "cameras.out"])
+def test_gigabytes_are_refused_before_they_are_read(tmp_path: Path, name: str) -> None:
+    with (tmp_path / name).open("wb") as file:
+        file.write(b'{"frames": [')
+        file.truncate(4 << 30)  # takes no room on a disk
+    with pytest.raises(SplatError, match=r"4\.3 GB") as caught:
+        read_cameras(tmp_path / name)
+    assert caught.value.code == "cameras-unreadable"
