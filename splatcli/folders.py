@@ -21,11 +21,12 @@ def find_run_folder(named: Path | None = None) -> Path:
             raise runfolder.missing(named)
         return named
     here = Path()
-    for folder in (here, DEFAULT):
-        if runfolder.is_run_folder(folder):
-            return folder
+    if runfolder.is_run_folder(here):
+        return here
     every = sorted(path for path in here.iterdir() if runfolder.is_run_folder(path))
     found = [path for path in every if runfolder.has_finished_work(path)] or every
+    if DEFAULT in found:
+        return DEFAULT
     if len(found) == 1:
         return found[0]
     if found:

@@ -45,6 +45,7 @@ PROCESS_OPTIONS = (
     "cameras",
     "split",
     "refine_cameras",
+    "metres",
     "scale",
     "marker",
     "allow_partial",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -58,7 +59,7 @@ def _explained(error: Any) -> SplatError:
     elif kind == "MissingParameter":
         given = f"{command} needs a {error.param.name}, and none is named."
     else:
-        given = error.format_message()
+        given, hint = _in_our_words(command, error.format_message(), hint)
     return SplatError(
         "command-line",
         given=given,
@@ -66,3 +67,16 @@ def _explained(error: Any) -> SplatError:
         hint=hint,
         family=Family.USAGE,
     )
+
+
+def _in_our_words(command: str, said: str, hint: str) -> tuple[str, str]:
+    """(given, hint) of what the parser tells only as a sentence; its own where that is another."""
+    if found := re.fullmatch(r"No such command '(.+?)'\.(?: Did you mean (.+)\?)?", said):
+        likely = f"Did you mean {found[2].replace(chr(39), '')}? " if found[2] else ""
+        return f"{command} has no command {found[1]}.", likely + hint
+    if found := re.fullmatch(r"Got unexpected extra argument(?:s|\(s\))? \((.+)\)", said):
+        return (
+            f"{command} has no use for {found[1]}.",
+            f"Put quotes around a path with spaces, and give each option all of its values. {hint}",
+        )
+    return said, hint

@@ -76,13 +76,24 @@ class SfmSettings:
     )
     split: bool = field(
         default=False,
-        metadata={"help": "Keep the training and test photographs that --cameras tells apart."},
+        metadata={
+            "help": "Keep the training and test photographs that --cameras tells apart.",
+            "needs": "cameras",
+        },
     )
     refine_cameras: bool = field(
         default=False,
         metadata={
             "help": "Move the cameras of --cameras to where the photographs' matches want them; "
-            "their lenses stay as they are."
+            "their lenses stay as they are.",
+            "needs": "cameras",
+        },
+    )
+    metres: bool = field(
+        default=False,
+        metadata={
+            "help": "The cameras of --cameras are in metres, as those of phones' AR sessions are.",
+            "needs": "cameras",
         },
     )
     scale: tuple[str, ...] = field(
@@ -186,7 +197,7 @@ def _with_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        size=metric.Known(settings.scale, settings.marker),
+        size=metric.Known(settings.scale, settings.marker, float(settings.metres), "--metres"),
         seconds_left=lambda: deadline - time.monotonic(),
     )
     found = light.with_light(found, report)
@@ -419,5 +430,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=7, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=8, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -301,7 +301,7 @@ def write_quality(
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.measure.judge import as_taken_db, inside_db, scores
+    from stages.measure.judge import as_taken_db, inside_db, scores, spread
     from stages.scene import split_held_out
     from stages.training.charts import contact_sheet, training_plot
 
@@ -314,7 +314,8 @@ def write_quality(
         report.metric("psnr_worst_photograph", worst.name)
         report.metric("psnr_spread_db", round(float(np.std(values)), 3))
         report.metric("ssim", round(float(np.mean([score.ssim for score in found])), 4))
-        report.metric("flip", round(float(np.mean([score.flip or 0.0 for score in found])), 4))
+        flips = [score.flip for score in found if score.flip is not None]
+        report.metric("flip", round(float(np.mean(flips)), 4))
     else:
         report.warn(
             "train-nothing-held-out",
@@ -347,9 +348,11 @@ def write_quality(
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     training_plot(folder / "training.png", trainer.history)
     rows = []
-    for photograph, score in zip(trainer.held_out, found, strict=True):
+    worst_row = min(range(len(found)), key=lambda i: found[i].psnr_db, default=0)
+    for i in sorted({*spread(len(found)), worst_row}) if found else ():
+        photograph = trainer.held_out[i]
         image = np.clip(trainer.drawn(photograph.camera), 0.0, 1.0)
-        rows.append((photograph.name, score.psnr_db, image, photograph.image))
+        rows.append((photograph.name, found[i].psnr_db, image, photograph.image))
     contact_sheet(folder / "held_out.png", rows)
 
 
@@ -394,5 +397,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=9, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=10, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

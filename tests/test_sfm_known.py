@@ -66,6 +66,44 @@ def test_given_cameras_are_kept_and_points_are_triangulated(tmp_path: Path) -> N
     assert not (tmp_path / "sfm" / "work").exists()
 
 
+def test_cameras_in_metres_stay_as_large_as_they_are(tmp_path: Path) -> None:
+    cameras = model(tmp_path / "cameras", lambda pose: pose, 5)
+    found, report = reconstructed(tmp_path / "sfm", cameras, metres=True)
+    wanted = np.array([POSES[view.name] for view in found.views])
+    have = np.array([view.camera.world_to_camera for view in found.views])
+    assert similarity(centres(have), centres(wanted))[1] == pytest.approx(1.0, abs=1e-6)
+    assert (found.units, report.metrics["metres_from"]) == ("metres", "--metres")
+
+
+def test_a_file_that_knows_north_gives_the_world_its_directions(tmp_path: Path) -> None:
+    """OpenSfM's world: x east, y north, z up; ours: x east, y down, z north."""
+    file_from_truth = np.eye(4)
+    file_from_truth[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+    shots = {}
+    for name, pose in list(POSES.items())[:5]:
+        placed = pose @ np.linalg.inv(file_from_truth)
+        turn, _ = cv2.Rodrigues(placed[:3, :3])
+        shots[name] = {
+            "rotation": turn.ravel().tolist(),
+            "translation": placed[:3, 3].tolist(),
+            "camera": "c",
+        }
+    lens = {"projection_type": "radial", "width": 640, "height": 480, "focal": 600 / 640}
+    data = {
+        "cameras": {"c": {**lens, "k1": -0.045, "k2": 0.0}},
+        "shots": shots,
+        "reference_lla": {"latitude": 48.0, "longitude": 11.0, "altitude": 500.0},
+    }
+    path = tmp_path / "reconstruction.json"
+    path.write_text(json.dumps([data]))
+    found, _ = reconstructed(tmp_path / "sfm", path)
+    assert (found.units, found.levelled) == ("metres", True)
+    wanted = [POSES[view.name][:3, :3] @ file_from_truth[:3, :3].T for view in found.views]
+    have = [view.camera.world_to_camera[:3, :3] for view in found.views]
+    ours_from_file = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    np.testing.assert_allclose(np.array(have) @ ours_from_file, wanted, atol=1e-9)
+
+
 def split_file(path: Path) -> list[str]:
     """transforms.json of six photographs: four to train on, one to judge; their names."""
     frames = []

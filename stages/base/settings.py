@@ -4,7 +4,8 @@
 list's items, of which there must then be one at least. "pattern": of a text, a regular expression
 for all of it, with "wanted", the sentence that says what it asks for. "option": the option's name
 where it is not the field's. "together": of a list, the words that one use of the option takes, as
-its help shows them. "affects_output": False where another value gives the same bytes.
+its help shows them. "needs": another field, without which a value but the default means nothing.
+"affects_output": False where another value gives the same bytes.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ class Setting:
     wanted: str = ""
     help: str = ""
     together: str = ""
+    needs: str = ""
 
     def check(self, value: Any) -> None:
         """Raises SplatError "option-value" for a value that the setting cannot have."""
@@ -120,12 +122,26 @@ def settings_of(settings_type: type) -> list[Setting]:
                 wanted=field.metadata.get("wanted", ""),
                 help=field.metadata.get("help", ""),
                 together=field.metadata.get("together", ""),
+                needs=field.metadata.get("needs", ""),
             )
         )
     return found
 
 
 def check_settings(settings: Any) -> None:
-    """Check every field of a settings dataclass. Raises SplatError "option-value"."""
-    for setting in settings_of(type(settings)):
-        setting.check(getattr(settings, setting.name))
+    """Check every field of a settings dataclass. Raises SplatError "option-value" and, where one
+    means nothing without another, "option-alone"."""
+    every = {setting.name: setting for setting in settings_of(type(settings))}
+    for name, setting in every.items():
+        setting.check(getattr(settings, name))
+        if not setting.needs or getattr(settings, name) == setting.default:
+            continue
+        other = every[setting.needs]
+        if getattr(settings, other.name) == other.default:
+            raise SplatError(
+                "option-alone",
+                given=f"{setting.flag} means nothing without {other.flag}.",
+                wanted="Both, or neither.",
+                hint=f"Add {other.flag}, or leave {setting.flag} away.",
+                family=Family.USAGE,
+            )

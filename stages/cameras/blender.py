@@ -21,10 +21,15 @@ def recognised(path: Path) -> Path | None:
 
 
 def read(folder: Path) -> CameraFile:
-    """The cameras of all files that are there; a view's role is its file's. Raises SplatError
-    "cameras-unreadable"."""
-    parts = [name for name in _SPLITS if _part(folder, name).is_file()]
-    found = [(name, nerfstudio.read(_part(folder, name))) for name in parts]
+    """The cameras of all files that are there; a view's role is its file's. Pictures that are not
+    there, as the validation part's often are not, are taken to be as large as the first for
+    training. Raises SplatError "cameras-unreadable"."""
+    first = nerfstudio.read(_part(folder, "train"))
+    size = first.views[0].camera.width, first.views[0].camera.height
+    others = [name for name in _SPLITS[1:] if _part(folder, name).is_file()]
+    found = [("train", first)] + [
+        (name, nerfstudio.read(_part(folder, name), size)) for name in others
+    ]
     return CameraFile(
         tuple(replace(view, role=name) for name, part in found for view in part.views),
         folder,

@@ -15,6 +15,7 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
+    content_of,
     make_views,
     size_of_picture,
 )
@@ -69,7 +70,7 @@ def read_points(path: Path) -> FilePoints | None:
 
 def _numbers(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Cameras [V, 15]: f, k1, k2, rotation, translation; points [P, 7]: position, colour, views."""
-    text = path.read_text(encoding="utf-8")
+    text = content_of(path).decode("utf-8")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     views, count = (int(word) for word in lines[0].split()[:2])
     if views < 0 or count < 0 or len(lines) < 1 + _LINES * views + 3 * count:

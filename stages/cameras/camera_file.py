@@ -18,10 +18,24 @@ from stages.base.bad_files import BadFileError
 from stages.cameras.lens import Lens
 from stages.scene import Camera, View
 
+LARGEST_FILE = 1 << 30  # bytes; cameras and points of thousands of photographs have fewer
 LARGEST_SIDE = 100_000  # pixels; no lens shows more
 FARTHEST = 1e12  # world units; squares of it are still far from overflowing
 ROTATION_TOLERANCE = 1e-3  # of R^T R: three decimals of text; beyond, it is not a rotation
 _ROUNDED = 1e-9  # of R^T R: more than float64 leaves
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What a file says of its world. metres: of one unit; 0 where it does not say. axes [3, 3]:
+    rows point east, north and up in it; None likewise. said_by: in words."""
+
+    metres: float = 0.0
+    axes: NDArray[np.float64] | None = None
+    said_by: str = ""
+
+
+UNSAID = Ground()
 
 
 @dataclass(frozen=True)
@@ -32,6 +46,7 @@ class CameraFile:
     views: tuple[View, ...]
     folder: Path
     lenses: tuple[Lens, ...]
+    ground: Ground = UNSAID
 
     @property
     def distorted(self) -> int:
@@ -87,6 +102,15 @@ def make_views(
             names, images or names, sizes, intrinsics, matrices, strict=True
         )
     )
+
+
+def content_of(path: Path) -> bytes:
+    """All of a file, unless it is too large for any cameras: a parser would want many times that
+    much memory. Raises BadFileError."""
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise BadFileError(f"it has {size / 1e9:.1f} GB, and no cameras take more than 1.1")
+    return path.read_bytes()
 
 
 def size_of_picture(folder: Path, name: str) -> tuple[int, int]:

@@ -25,7 +25,7 @@ class Lens:
 
     radial: factors of r^2, r^4, ... in 1 + ...; below: the same in the denominator. tangential: p1
     and p2 in OpenCV's order. prism: what r^2 and r^4 add to u, then to v. own: parameters of the
-    last three kinds.
+    last three kinds. skew: of the other kinds, how much of v is added to u at the end.
     """
 
     kind: str = "perspective"
@@ -34,11 +34,12 @@ class Lens:
     tangential: tuple[float, float] = (0.0, 0.0)
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     own: tuple[float, ...] = ()
+    skew: float = 0.0
 
     @property
     def bends(self) -> bool:
         """Whether it differs from a pinhole."""
-        terms = (*self.radial, *self.below, *self.tangential, *self.prism, *self.own)
+        terms = (*self.radial, *self.below, *self.tangential, *self.prism, *self.own, self.skew)
         return "fisheye" in self.kind or any(terms)
 
     def distort(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,7 +92,8 @@ class Lens:
             alpha, beta = self.own
             return np.asarray(uv / (alpha * np.sqrt(beta * r2 + 1.0) + 1.0 - alpha))
         scaled = uv * (_polynomial(self.radial, r2) / _polynomial(self.below, r2))
-        return scaled + self._shift(scaled if self.kind == "prism fisheye" else uv)
+        moved = scaled + self._shift(scaled if self.kind == "prism fisheye" else uv)
+        return moved + moved[..., 1:] * (self.skew, 0.0) if self.skew else moved
 
     def _shift(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of the tangential and prism terms."""

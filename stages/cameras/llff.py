@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, make_views
+from stages.cameras.camera_file import CameraFile, content_of, make_views
 from stages.cameras.lens import PINHOLE
 
 _NAME = "poses_bounds.npy"
@@ -34,7 +34,7 @@ def read(path: Path) -> CameraFile:
     """The cameras of the pictures in a folder beside the file that begins with "images" (the
     largest ones), or beside the file itself. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        rows = _rows(path.read_bytes())
+        rows = _rows(content_of(path))
         names = _names(path.parent, len(rows))
         matrices = rows[:, :15].reshape(-1, 3, 5)
         down, right, backward, centre, sizes = np.moveaxis(matrices, 2, 0)

@@ -2,20 +2,34 @@
 
 A camera's transform is camera to world with our axes; the world is the chunk's own. Principal
 points are counted from the middle of the picture; P1 and P2 are OpenCV's p2 and p1.
+
+The chunk's transform, if it has one, leads to metres from the centre of the earth, or to local
+coordinates whose unit the chunk's reference names, z up. One that changes nothing says nothing.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, make_views
+from stages.cameras.camera_file import (
+    ROTATION_TOLERANCE,
+    UNSAID,
+    CameraFile,
+    Ground,
+    content_of,
+    make_views,
+)
 from stages.cameras.lens import Lens
 
+_EARTH = (6.2e6, 6.5e6)  # metres from its centre to where people take photographs
+_SAID_BY = "the chunk's transform"
 _KINDS = {"frame": "perspective", "fisheye": "fisheye"}
 
 
@@ -50,11 +64,46 @@ def read(path: Path) -> CameraFile:
             numbers[:, 2:],
             np.concatenate([turns, shifts[:, :, None]], axis=2),
         )
-        return CameraFile(views, path.parent, tuple(lens for _, lens in mine))
+        return CameraFile(views, path.parent, tuple(lens for _, lens in mine), _ground(root))
+
+
+def _ground(root: Element) -> Ground:
+    """Of the only transform of a chunk or component; of several, none is everyone's."""
+    every = [e for e in root.iter("transform") if e.find("scale") is not None]
+    if len(every) != 1:
+        return UNSAID
+    turn = _numbers(every[0], "rotation", 9).reshape(3, 3)
+    shift, (scale,) = _numbers(every[0], "translation", 3), _numbers(every[0], "scale", 1)
+    if scale <= 0 or np.abs(turn @ turn.T - np.eye(3)).max() > ROTATION_TOLERANCE:
+        raise BadFileError("the chunk's transform is no rotation and scale")
+    if _EARTH[0] < np.linalg.norm(shift) < _EARTH[1]:
+        return Ground(float(scale), _east_north_up(shift) @ turn, _SAID_BY)
+    reference = (root.findtext(".//chunk/reference") or root.findtext("reference") or "").strip()
+    unit = re.search(r'UNIT\["[^"]*",\s*([0-9.]+)', reference)
+    changes = scale != 1.0 or shift.any() or (turn != np.eye(3)).any()
+    if not (reference.startswith("LOCAL_CS") and unit and changes):
+        return UNSAID
+    return Ground(float(scale) * float(unit[1]), turn, _SAID_BY)
+
+
+def _numbers(transform: Element, name: str, count: int) -> NDArray[np.float64]:
+    values = np.array((transform.findtext(name) or "").split(), np.float64)
+    if len(values) != count or not np.isfinite(values).all():
+        raise BadFileError(f"the {name} of its chunk has not {count} numbers")
+    return values
+
+
+def _east_north_up(place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3, 3] rows, at a place counted from the centre of the earth; up away from that centre, which
+    is a fifth of a degree off at most."""
+    up = place / np.linalg.norm(place)
+    east = np.cross([0.0, 0.0, 1.0], up)
+    east = east / max(float(np.linalg.norm(east)), 1e-9)
+    return np.stack([east, np.cross(up, east), up])
 
 
 def _parsed(path: Path) -> Element:
-    data = path.read_bytes()
+    data = content_of(path)
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # an entity may stand for gigabytes
         raise BadFileError("it declares entities, which Metashape does not")
     try:
@@ -79,10 +128,13 @@ def _optics(sensor: Element) -> tuple[list[float], Lens]:
     terms = [value(name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")]
     if not np.isfinite(terms).all():
         raise BadFileError("a lens has a parameter that is not a number")
-    if value("b2") or value("p3") or value("p4"):
-        raise BadFileError("a lens is skewed (b2) or has terms p3 and p4, which are not known here")
+    if value("p3") or value("p4"):
+        raise BadFileError("a lens has terms p3 and p4, which are not known here")
     k1, k2, k3, k4, p1, p2 = terms
     focal = value("f")
-    numbers = [width, height, focal + value("b1"), focal]
+    across = focal + value("b1")
+    numbers = [width, height, across, focal]
     centre = [width / 2 + value("cx"), height / 2 + value("cy")]
-    return numbers + centre, Lens(_KINDS[kind], (k1, k2, k3, k4), tangential=(p2, p1))
+    skew = value("b2") / across if across > 0 else 0.0
+    lens = Lens(_KINDS[kind], (k1, k2, k3, k4), tangential=(p2, p1), skew=skew)
+    return numbers + centre, lens

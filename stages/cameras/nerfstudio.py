@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, FilePoints, make_views
+from stages.cameras.camera_file import CameraFile, FilePoints, content_of, make_views
 from stages.cameras.lens import Lens
 from stages.scene import View
 
@@ -80,18 +80,19 @@ def recognised(path: Path) -> Path | None:
     return path if path.suffix.lower() == ".json" else None
 
 
-def read(path: Path) -> CameraFile:
-    """The cameras of a file; `file_path` gives their names. Raises SplatError
-    "cameras-unreadable"."""
+def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
+    """The cameras of a file; `file_path` gives their names. size: of pictures that are not there,
+    where the file does not say it either. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(content_of(path).decode("utf-8"))
         if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
             raise BadFileError("it has no list of frames")
         frames = data["frames"]
         if not all(isinstance(frame, dict) for frame in frames):
             raise BadFileError("a frame is not an object")
         numbers = np.array(
-            [_read_numbers(ChainMap(frame, data), path.parent) for frame in frames], np.float64
+            [_read_numbers(ChainMap(frame, data), path.parent, size) for frame in frames],
+            np.float64,
         ).reshape(-1, 6)
         if not np.isfinite(numbers).all():
             raise BadFileError("a size or focal length is not a number")
@@ -108,7 +109,7 @@ def read_points(path: Path) -> FilePoints | None:
     """The points of `ply_file_path`, if the file names one that is there. Raises SplatError
     "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(content_of(path).decode("utf-8"))
         named = data.get("ply_file_path")
         if not named or not (path.parent / str(named)).is_file():
             return None
@@ -164,13 +165,15 @@ def _lens(view: View) -> dict[str, float]:
     return dict(zip(_LENS, lens, strict=True))
 
 
-def _read_numbers(merged: Mapping[str, Any], folder: Path) -> list[float]:
+def _read_numbers(
+    merged: Mapping[str, Any], folder: Path, size: tuple[int, int] | None
+) -> list[float]:
     """w, h, fl_x, fl_y, cx, cy: the frame's own, or the file's. Those that may be missing have
     instant-ngp's defaults."""
     if "w" in merged and "h" in merged:
         width, height = float(merged["w"]), float(merged["h"])
     else:
-        width, height = _picture_size(folder, str(_wanted(merged, "file_path")))
+        width, height = _picture_size(folder, str(_wanted(merged, "file_path")), size)
     fx = _focal(merged, "x", width, None)
     return [
         width,
@@ -193,7 +196,7 @@ def _focal(merged: Mapping[str, Any], axis: str, side: float, otherwise: float |
     return float(_wanted(merged, f"fl_{axis}"))
 
 
-def _picture_size(folder: Path, name: str) -> tuple[int, int]:
+def _picture_size(folder: Path, name: str, otherwise: tuple[int, int] | None) -> tuple[int, int]:
     """Width and height of the picture itself, whose suffix may have been left out."""
     from PIL import Image
 
@@ -201,6 +204,8 @@ def _picture_size(folder: Path, name: str) -> tuple[int, int]:
         if path.is_file():
             with Image.open(path) as picture:
                 return picture.size
+    if otherwise is not None:
+        return otherwise
     raise BadFileError(f"a frame has no w and h, and {name[:80]} is not there to be measured")
 
 

@@ -2,7 +2,8 @@
 
 Rotations are axis and angle, world to camera, with our axes. Focal lengths and principal points
 are in units of the longer side, the latter from the picture's centre. The largest of several
-reconstructions counts.
+reconstructions counts. With a reference of latitude and longitude, its world is metres east, north
+and up of that, as far as GPS goes; without, the reference is 0, 0.
 """
 
 from __future__ import annotations
@@ -16,13 +17,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, FilePoints, make_views
+from stages.cameras.camera_file import (
+    UNSAID,
+    CameraFile,
+    FilePoints,
+    Ground,
+    content_of,
+    make_views,
+)
 from stages.cameras.lens import Lens
+from stages.scene import View
 from stages.scene.rotations import matrices_of
 
 _NAME = "reconstruction.json"
 _PERSPECTIVE = ("perspective", "simple_radial", "radial", "brown")
 _FISHEYE = ("fisheye", "fisheye_opencv")
+_WORST_DOP = 1e4  # metres; OpenSfM's word for no GPS is 999,999
+_WORST_RESIDUAL = 0.15  # of how far the cameras spread, as for GPS in photographs
+_FEWEST_GPS = 3
 
 
 def recognised(path: Path) -> Path | None:
@@ -54,7 +66,27 @@ def read(path: Path) -> CameraFile:
         poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
         views = make_views(list(shots), numbers[:, :2], numbers[:, 2:], poses)
         lenses = tuple(optics[shot["camera"]][1] for shot in shots.values())
-        return CameraFile(views, path.parent / "images", lenses)
+        return CameraFile(views, path.parent / "images", lenses, _ground(data, views))
+
+
+def _ground(data: Mapping[str, Any], views: tuple[View, ...]) -> Ground:
+    """Metres, if there is a reference and what GPS said of the shots agrees with where they are."""
+    reference = data.get("reference_lla")
+    if not isinstance(reference, dict):
+        return UNSAID
+    if not (reference.get("latitude") or reference.get("longitude")):
+        return UNSAID
+    shots = list(data["shots"].values())
+    told = [i for i, s in enumerate(shots) if float(s.get("gps_dop", 0.0)) < _WORST_DOP]
+    rows = [i for i in told if "gps_position" in shots[i]]
+    if rows:
+        there = np.array([shots[i]["gps_position"] for i in rows], np.float64).reshape(-1, 3)
+        here = np.array([views[i].camera.centre for i in rows])
+        apart = np.median(np.linalg.norm((there - here)[:, :2], axis=1))
+        spread = np.linalg.norm((there - there.mean(axis=0))[:, :2], axis=1).mean()
+        if len(rows) < _FEWEST_GPS or not apart <= _WORST_RESIDUAL * spread:
+            return UNSAID
+    return Ground(1.0, np.eye(3), "the file's GPS reference")
 
 
 def read_points(path: Path) -> FilePoints | None:
@@ -73,7 +105,7 @@ def read_points(path: Path) -> FilePoints | None:
 
 
 def _largest(path: Path) -> dict[str, Any]:
-    data = json.loads(path.read_text(encoding="utf-8-sig"))
+    data = json.loads(content_of(path).decode("utf-8-sig"))
     if not isinstance(data, list) or not data:
         raise BadFileError("it holds no reconstruction")
     for part in data:

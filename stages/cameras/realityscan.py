@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, make_views, size_of_picture
+from stages.cameras.camera_file import CameraFile, content_of, make_views, size_of_picture
 from stages.cameras.lens import Lens
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
@@ -57,7 +57,7 @@ def read(path: Path) -> CameraFile:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    text = path.read_bytes().decode("utf-8-sig")
+    text = content_of(path).decode("utf-8-sig")
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
     columns = [column.strip().lstrip("#").lower() for column in reader.fieldnames or ()]
     reader.fieldnames = columns

@@ -22,6 +22,7 @@ from stages.scene.light import BRIGHT, Light, gains_and_offsets
 
 CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
 IN_MEMORY_MIB = 512  # of photographs that judge; more of them are read anew each time
+MOST_SHOWN = 24  # of many judges, those that are worth FLIP's time, or a place where all are seen
 Drawing = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
 
 
@@ -142,15 +143,22 @@ def decibels(
     return 0.0 if np.isnan(found) else min(found, CAP_DB)
 
 
+def spread(count: int) -> range:
+    """Which of `count` judges, evenly over them, where `MOST_SHOWN` must do."""
+    return range(0, count, max(1, -(-count // MOST_SHOWN)))
+
+
 def scores(
-    draw: Drawing, photographs: Iterable[Photograph], with_flip: bool = False
+    draw: Drawing, photographs: Sequence[Photograph], with_flip: bool = False
 ) -> list[Score]:
-    """PSNR, SSIM and perhaps FLIP of each, of drawings clipped to what a screen can show."""
+    """PSNR and SSIM of each, and perhaps FLIP of as many as are `spread` over them, of drawings
+    clipped to what a screen can show."""
     found = []
-    for photograph in photographs:
+    flipped = spread(len(photographs)) if with_flip else ()
+    for number, photograph in enumerate(photographs):
         image, truth = np.clip(draw(photograph.camera), 0.0, 1.0), photograph.image
         kept = photograph.kept
-        seen = flip(image, truth, kept) if with_flip else None
+        seen = flip(image, truth, kept) if number in flipped else None
         alike = ssim(image, truth, kept)
         found.append(Score(photograph.name, decibels(image, truth, kept), alike, seen))
     return found

@@ -48,14 +48,19 @@ def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) ->
     """The folder's run file, speaking of `photos` (absolute) if they are given.
 
     A moved folder of photographs, or a copy of it, is the same one; another is an error
-    (run-folder-other-photographs). A new run folder gets an empty run file. Raises SplatError.
+    (run-folder-other-photographs) once a stage has finished. A new run folder gets an empty run
+    file. Raises SplatError.
     """
     recorded = RunFile.read(folder)
     if recorded is None:
         return RunFile(photos)
     if photos is None or recorded.photographs in (None, photos):
         return RunFile(recorded.photographs or photos, recorded.settings)
-    if recorded.photographs.exists() and not _same(photos, first_stage_folder):
+    if (
+        has_finished_work(folder)
+        and recorded.photographs.exists()
+        and not _same(photos, first_stage_folder)
+    ):
         raise _other_photographs(folder, recorded.photographs, photos)
     return RunFile(photos, recorded.settings)
 

@@ -100,7 +100,10 @@ def reconstruct(
         if len(cloud.points) < POINTS_PER_VIEW * len(training):
             cloud, source = _with_random(cloud, seen, outside, seed, report), "chance"
     report.metric("points_from", source)
-    return _finished(posed, cameras, cloud, observed, folder, report, size, capture)
+    if found.ground.metres and not size.stated:
+        size = replace(size, stated=found.ground.metres, stated_by=found.ground.said_by)
+    axes = found.ground.axes
+    return _finished(posed, cameras, cloud, observed, folder, report, size, capture, axes)
 
 
 def _undistorted(posed: list[Posed], source: Path, folder: Path, report: Report) -> list[Camera]:
@@ -402,11 +405,10 @@ def _finished(
     report: Report,
     size: Known,
     capture: Capture,
+    axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
-    """Levelled, recentred and measured; the COLMAP model is written."""
-    rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
-    up = up_direction(rotations)
-    turn = np.eye(3) if up is None else levelling_rotation(up, rotations[0, 2], rotations[0, 0])
+    """Levelled, recentred and measured; the COLMAP model is written. axes: as in `Ground`."""
+    turn, levelled = _levelling(cameras, axes)
     middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
     world_from_new = np.eye(4)
     world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
@@ -414,7 +416,7 @@ def _finished(
     points = (cloud.points - middle) @ turn.T
     names = [one.photo.name for one in posed]
     places = [folder / IMAGES / one.photo.picture for one in posed]
-    metric = find_metric(size, capture, names, cameras, places, up is not None, report)
+    metric = find_metric(size, capture, names, cameras, places, levelled, report)
     if metric is not None:
         poses = np.array([camera.world_to_camera for camera in cameras])
         points, poses = metric.points(points), metric.poses(poses)
@@ -456,9 +458,24 @@ def _finished(
         colours=cloud.colours,
         errors_px=cloud.errors_px,
         tracks=cloud.tracks,
-        levelled=up is not None,
+        levelled=levelled,
         units="arbitrary" if metric is None else "metres",
     )
+
+
+def _levelling(
+    cameras: list[Camera], axes: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], bool]:
+    """(rotation [3, 3] to a world whose y points down, whether anything says where that is): by the
+    file, then +Z is north; else by how the cameras were held."""
+    if axes is not None:
+        east, north, up = axes
+        return np.stack([east, -up, north]), True
+    rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
+    found = up_direction(rotations)
+    if found is None:
+        return np.eye(3), False
+    return levelling_rotation(found, rotations[0, 2], rotations[0, 0]), True
 
 
 def _too_few(count: int) -> SplatError:

@@ -26,11 +26,14 @@ _AXIS, _ECCENTRICITY2 = 6_378_137.0, 6.69437999014e-3
 
 @dataclass(frozen=True)
 class Known:
-    """What the user says. distance: two photographs' names and how far apart they are, metres; or
-    nothing. marker: side of the printed markers, metres; 0 for none."""
+    """What is said of the size. distance: two photographs' names and how far apart they are,
+    metres; or nothing. marker: side of the printed markers, metres; 0 for none. stated: metres of
+    one unit of a world that came with its cameras, 0 where nobody says; stated_by: who does."""
 
     distance: Sequence[str] = ()
     marker: float = 0.0
+    stated: float = 0.0
+    stated_by: str = ""
 
 
 NOTHING = Known()
@@ -73,8 +76,8 @@ def find_metric(
     report: Report,
 ) -> Metric | None:
     """What is known of the size of the world of `cameras`, pinholes, of the capture's photographs
-    `names`, whose undistorted `pictures` lie on disk. Where the user says nothing, GPS may. None
-    where nothing says.
+    `names`, whose undistorted `pictures` lie on disk. Where the user says nothing, the cameras'
+    file may, or GPS. None where nothing says.
 
     Raises SplatError for a distance or a marker that cannot be used.
     """
@@ -83,6 +86,8 @@ def find_metric(
         metric: Metric | None = _from_distance(known.distance, capture, names, centres)
     elif known.marker:
         metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
+    elif known.stated:
+        metric = Metric(known.stated, 0.0, known.stated_by)
     else:
         photos = {photo.name: photo for photo in capture.photos}
         metric = _from_gps([photos[name] for name in names], centres, levelled, report)

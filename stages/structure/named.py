@@ -38,21 +38,23 @@ def posed_photographs(
 ) -> list[Posed]:
     """The photographs that have a camera, in the capture's order.
 
-    split: whether the file's own train and test photographs are kept, and others left out.
-    Raises SplatError, also for those that lack their counterpart unless `allow_partial`.
+    split: whether the file's own train and test photographs are kept, and all others left out.
+    Raises SplatError, also for those that lack their counterpart unless `allow_partial`; a split
+    that leaves photographs out (a benchmark's maps of depth beside them) is no reason.
     """
     if split and not {view.role for view in found.views} >= {"train", "test"}:
         raise _no_split()
-    matches, missing = _matched(found.views, capture.photos)
+    wanted = [i for i, v in enumerate(found.views) if not split or v.role in ("train", "test")]
+    views = [found.views[i] for i in wanted]
+    matches, missing = _matched(views, capture.photos)
     without = [p.name for i, p in enumerate(capture.photos) if i not in matches.values()]
-    _check_missing(missing, without, len(matches), allow_partial, report)
+    allowed = allow_partial or (split and not missing)
+    _check_missing(missing, without, len(matches), allowed, report)
     posed = []
     for number, position in sorted(matches.items(), key=lambda match: match[1]):
-        view, photo = found.views[number], capture.photos[position]
-        role = view.role if split else ""
-        if split and role not in ("train", "test"):
-            continue
-        posed.append(Posed(photo, _fitted(view, photo), found.lenses[number], role))
+        view, photo = views[number], capture.photos[position]
+        lens = found.lenses[wanted[number]]
+        posed.append(Posed(photo, _fitted(view, photo), lens, view.role if split else ""))
     return posed
 
 

@@ -26,6 +26,7 @@ class Settings:
     names: tuple[str, ...] = field(default=("a",), metadata={"choices": ("a", "b")})
     title: str = field(default="x", metadata={"pattern": "[a-z]+", "wanted": "Small letters."})
     loud: bool = False
+    louder: bool = field(default=False, metadata={"needs": "loud"})
 
 
 def with_value(name: str, setting: Setting, value: Any) -> Any:
@@ -73,6 +74,13 @@ def test_error_names_the_option_what_was_given_and_what_may_be(
         check_settings(replace(Settings(), **change))
     assert caught.value.given.startswith(given)
     assert wanted in caught.value.wanted
+
+
+def test_what_means_nothing_without_another_is_refused_alone() -> None:
+    with pytest.raises(SplatError, match="--louder means nothing without --loud") as caught:
+        check_settings(Settings(louder=True))
+    assert caught.value.code == "option-alone"
+    check_settings(Settings(loud=True, louder=True))
 
 
 def test_what_may_be_none_or_whole_may() -> None:

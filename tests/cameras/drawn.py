@@ -23,6 +23,12 @@ POSES = np.array([look_at(eye, np.zeros(3), np.array([0.1, 0.2, 1.0])) for eye i
 K1, K2, P1, P2 = 0.08, -0.03, 0.004, -0.006
 NAMES = [f"p_{number}.png" for number in range(len(POSES))]
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+CHUNK = (
+    '<components><component id="0"><transform><rotation locked="true">0 -1 0 1 0 0 0 0 1</rotation>'
+    '<translation locked="true">1 2 3</translation><scale locked="true">0.5</scale></transform>'
+    '</component></components><reference>LOCAL_CS["Local Coordinates (m)",'
+    'LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]</reference>'
+)
 Project = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -195,7 +201,8 @@ def bundler(folder: Path) -> Path:
 
 def metashape(folder: Path) -> Path:
     """The manual: x' = x (1 + K1 r^2 + K2 r^4) + P1 (r^2 + 2 x^2) + 2 P2 x y, y' likewise,
-    u = w / 2 + cx + x' f + x' B1, v = h / 2 + cy + y' f; camera to world, x right, y down."""
+    u = w / 2 + cx + x' f + x' B1 + y' B2, v = h / 2 + cy + y' f; camera to world, x right, y
+    down."""
     cameras, projects = [], []
     for name, pose in zip(NAMES, POSES, strict=True):
         matrix = np.linalg.inv(pose)
@@ -207,7 +214,7 @@ def metashape(folder: Path) -> Path:
             radial = 1 + K1 * r2 + K2 * r2 * r2
             xd = x * radial + P1 * (r2 + 2 * x * x) + 2 * P2 * x * y
             yd = y * radial + P2 * (r2 + 2 * y * y) + 2 * P1 * x * y
-            u = WIDTH / 2 + 3 + xd * FOCAL + xd * 5
+            u = WIDTH / 2 + 3 + xd * FOCAL + xd * 5 + yd * 7
             return np.stack([u, HEIGHT / 2 - 4 + yd * FOCAL], axis=1)
 
         projects.append(project)
@@ -217,14 +224,14 @@ def metashape(folder: Path) -> Path:
             f'<camera id="1" sensor_id="0" label="{label}"><transform>{words}</transform></camera>'
         )
     draw(folder, projects)
-    lens = {"f": FOCAL, "cx": 3, "cy": -4, "b1": 5, "k1": K1, "k2": K2, "p1": P1, "p2": P2}
+    lens = {"f": FOCAL, "cx": 3, "cy": -4, "b1": 5, "b2": 7, "k1": K1, "k2": K2, "p1": P1, "p2": P2}
     terms = "".join(f"<{key}>{value}</{key}>" for key, value in lens.items())
     (folder / "cameras.xml").write_text(
         '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk><sensors>'
         '<sensor id="0" type="frame"><calibration type="frame" class="adjusted">'
         f'<resolution width="{WIDTH}" height="{HEIGHT}"/>{terms}</calibration></sensor></sensors>'
         f'<cameras>{"".join(cameras)}<camera id="9" sensor_id="0" label="lost"/></cameras>'
-        "</chunk></document>"
+        f"{CHUNK}</chunk></document>"
     )
     return folder / "cameras.xml"
 

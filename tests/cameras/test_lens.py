@@ -32,6 +32,16 @@ def test_a_lens_shows_directions_where_colmap_does_and_can_be_undone(model: str)
     assert optics.lens.bends == (model not in ("SIMPLE_PINHOLE", "PINHOLE"))
 
 
+def test_a_skewed_lens_can_be_undone() -> None:
+    lens = Lens(radial=(0.05,), tangential=(0.01, -0.01), skew=0.1)
+    uv = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 2))
+    seen = lens.distort(uv)
+    straight = Lens(radial=(0.05,), tangential=(0.01, -0.01)).distort(uv)
+    np.testing.assert_allclose(seen - straight, straight[:, 1:] * (0.1, 0.0), atol=1e-12)
+    np.testing.assert_allclose(lens.undistort(seen), uv, atol=1e-9)
+    assert Lens(skew=0.1).bends
+
+
 def test_what_a_lens_cannot_show_is_nowhere() -> None:
     """By hand: r (1 - r^2 / 3) is largest at r = 1, where it is 2/3."""
     lens = Lens(radial=(-1 / 3,))

@@ -69,6 +69,15 @@ def test_a_benchmarks_split_is_read(tmp_path: Path) -> None:
     assert roles == ["train", "train", "val", "test"]
 
 
+def test_a_benchmark_without_its_validation_pictures_is_read(tmp_path: Path) -> None:
+    folder = blender(tmp_path)
+    for path in (folder / "train").iterdir():
+        if path.stem not in ("p_0", "p_1", "p_2"):
+            path.unlink()
+    sizes = {(v.camera.width, v.camera.height) for v in read_cameras(folder).views}
+    assert len(sizes) == 1
+
+
 def test_nerfstudios_split_is_read(tmp_path: Path) -> None:
     path = nerfstudio(tmp_path)
     data = json.loads(path.read_text())
@@ -112,3 +121,13 @@ def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -
         read_cameras(path)
     assert caught.value.code == "cameras-unreadable"
     assert file in caught.value.given
+
+
+@pytest.mark.parametrize("name", ["cameras.json", "cameras.xml", "cameras.csv", "cameras.out"])
+def test_gigabytes_are_refused_before_they_are_read(tmp_path: Path, name: str) -> None:
+    with (tmp_path / name).open("wb") as file:
+        file.write(b'{"frames": [')
+        file.truncate(4 << 30)  # takes no room on a disk
+    with pytest.raises(SplatError, match=r"4\.3 GB") as caught:
+        read_cameras(tmp_path / name)
+    assert caught.value.code == "cameras-unreadable"

@@ -203,6 +203,9 @@ def test_run_folder_in_which_nothing_succeeded_is_not_offered(splat, pretend) ->
     del pretend["ingest"]
     splat("process", "photos", "--out", "good")
     assert states(splat)["ingest"] == "finished"
+    pretend["ingest"] = refuse
+    splat("process", "photos")  # nor is it where it is called run/
+    assert states(splat)["ingest"] == "finished"
 
 
 def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
@@ -223,7 +226,9 @@ def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
         (["process", "photos", "--steps"], "--steps needs a value"),
         (["process", "photos", "--train-side", "nan"], "--train-side nan cannot be used"),
         (["export", "--name", "a/b"], "--name a/b cannot be used"),
-        (["proces", "photos"], "process"),
+        (["proces", "photos"], "splat has no command proces."),
+        (["process", "photos", "more"], "splat process has no use for more."),
+        (["process", "photos", "--split"], "--split means nothing without --cameras."),
         (["convert", "a.ply"], "splat convert needs a target"),
         (["render", "--width", "0"], "A whole number from 1 to 16,384."),
         (["view", "--port", "x"], "--port x cannot be used"),

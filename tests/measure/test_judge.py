@@ -11,11 +11,21 @@ from PIL import Image
 
 from stages.measure import judge
 from stages.measure.images import flip
-from stages.measure.judge import CAP_DB, decibels, drawing_of, load_photographs, scores
+from stages.measure.judge import (
+    CAP_DB,
+    MOST_SHOWN,
+    Photograph,
+    decibels,
+    drawing_of,
+    load_photographs,
+    scores,
+    spread,
+)
 from stages.raster.draw import settings_of
 from stages.scene import (
     IGNORE,
     TRANSPARENT,
+    Camera,
     Look,
     Reconstruction,
     Splats,
@@ -156,3 +166,19 @@ def test_photographs_that_do_not_fit_into_memory_are_judged_alike(
         assert (photographs[-1].pixels == list(photographs)[-1].pixels).all()
         figures.append(scores(drawing_of(scene.splats, "cpu"), photographs))
     assert figures[0] == figures[1] == figures[2]
+
+
+@pytest.mark.parametrize("count", [0, 1, 24, 25, 200, 1000])
+def test_of_many_judges_a_few_evenly_spread_ones_are_shown(count: int) -> None:
+    chosen = spread(count)
+    assert min(count, MOST_SHOWN // 2) <= len(chosen) <= MOST_SHOWN
+    assert count > MOST_SHOWN or list(chosen) == list(range(count))
+    assert not count or count - chosen[-1] <= chosen.step
+
+
+def test_flip_is_told_by_those_and_psnr_by_all() -> None:
+    camera = Camera(16, 16, 20.0, 20.0, 8.0, 8.0, np.eye(4))
+    shown = Photograph("a", camera, np.full((16, 16, 3), 99, np.uint8))
+    found = scores(lambda _: shown.image, [shown] * 50, with_flip=True)
+    assert len(found) == 50
+    assert [i for i, score in enumerate(found) if score.flip is not None] == list(spread(50))

@@ -224,6 +224,15 @@ def test_other_photographs_are_refused(finished: Pipeline, run_folder: Path, tmp
     assert caught.value.code == "run-folder-other-photographs"
 
 
+def test_other_photographs_may_follow_those_of_which_nothing_came(
+    photos: Path, run_folder: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match="bug"):
+        Pipeline(run_folder, photos, fake_stages(copy=failing(ValueError("bug")))).run()
+    other = photographs(tmp_path / "other", z="zzz")
+    assert ran(Pipeline(run_folder, other, fake_stages()))
+
+
 def test_foreign_folder_is_refused_and_untouched(photos: Path, run_folder: Path) -> None:
     run_folder.mkdir()
     (run_folder / "thesis.txt").write_text("mine")

@@ -122,6 +122,19 @@ def test_the_files_own_split_is_kept_only_when_asked_for() -> None:
     assert refusal(cameras("a"), capture("a"), split=True).code == "cameras-without-split"
 
 
+def test_what_a_split_leaves_out_may_lack_its_counterpart() -> None:
+    found = cameras("train/a", "train/b", "test/c", "val/d", roles="rrtv")
+    photographs = capture("train/a.png", "train/b.png", "test/c.png", "test/c_depth.png")
+    report = Report()
+    posed = posed_photographs(found, photographs, True, False, report)
+    assert sorted(one.role for one in posed) == ["test", "train", "train"]
+    ((code, words),) = report.warnings
+    assert code == "cameras-missing"
+    assert "test/c_depth.png" in words
+    lacking = cameras("a", "b", "c", "x", roles="rrtt")
+    assert refusal(lacking, capture("a", "b", "c"), split=True).code.startswith("cameras-without")
+
+
 def test_where_photographs_have_roles_these_decide_who_judges() -> None:
     found = cameras(*"abcdefghij", roles="rrrrrrrtrt")
     training, judges = split_held_out(found.views)
