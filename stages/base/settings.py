@@ -4,7 +4,8 @@
 list's items, of which there must then be one at least. "pattern": of a text, a regular expression
 for all of it, with "wanted", the sentence that says what it asks for. "option": the option's name
 where it is not the field's. "together": of a list, the words that one use of the option takes, as
-its help shows them. "affects_output": False where another value gives the same bytes.
+its help shows them. "affects_output": False where another value gives the same bytes. "midway":
+True where half-done work goes on under another value, which the stage then says.
 """
 
 from __future__ import annotations
