@@ -82,7 +82,7 @@ def test_manifest_says_what_was_made_from_what(finished: Pipeline, run_folder: P
     assert copied
     assert counted
     assert counted.inputs == {"copy": copied.output_digest}
-    assert counted.settings == {"iterations": 7000, "seed": 0}
+    assert counted.settings == {"iterations": 7000, "seed": 0, "tool": "pen"}
     assert counted.seed == 0
     assert counted.warnings == [["count-low", "Few letters. Write more."]]
     assert set(copied.input_files["photos"]) == {"a.jpg", "b.jpg"}
@@ -527,6 +527,18 @@ def test_leftovers_of_other_settings_are_not_used(photos: Path, run_folder: Path
         pipeline.run({"count": CountSettings(seed=1)})
     pipeline.run()
     assert pipeline.load("count") == "10 from 6"  # 12 would be both attempts added up
+
+
+def test_half_done_work_goes_on_under_a_setting_that_may_change_midway(
+    photos: Path, run_folder: Path
+) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    pipeline.run({"count": CountSettings(tool="pencil")})
+    assert pipeline.load("count") == "10 from 6"
+    step = pipeline.plan({"count": CountSettings(tool="pen")})[1]
+    assert step.reason == "tool pencil -> pen"  # what is finished was made with one of them
 
 
 def test_stop_between_stages_keeps_the_finished_ones(photos: Path, run_folder: Path) -> None:
