@@ -4,6 +4,7 @@ hall of boxes in minutes instead of an hour."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +41,24 @@ class Boxes:
             ]
         )
         ways = self._into @ turn.T
-        _cast(lens.focal_px, eyes, ways, self._inside, self._texels, self._starts, self._sizes, out)
+        frames = np.array([_frame(way, eye, lens) for way, eye in zip(ways, eyes, strict=True)])
+        surfaces = self._inside, self._texels, self._starts, self._sizes
+        _cast(lens.focal_px, eyes, ways, frames, *surfaces, out)
         return out * np.float32(255 / _PARTS**2)
 
 
+def _frame(way: NDArray[np.float64], eye: NDArray[np.float64], lens: Lens) -> NDArray[np.float64]:
+    """[4] columns and rows (least, most) between which a box can be seen; see `_cast`."""
+    corners = np.linalg.solve(way, (np.array(list(product((-1, 1), repeat=3))) - eye).T)
+    if (corners[2] <= 1e-3).any():  # it reaches behind the camera
+        return np.array([-np.inf, np.inf, -np.inf, np.inf])
+    columns, rows = lens.focal_px * corners[:2] / corners[2]
+    columns, rows = columns + lens.width / 2, rows + lens.height / 2
+    return np.array([columns.min() - 1, columns.max() + 1, rows.min() - 1, rows.max() + 1])
+
+
 @kernel
-def _cast(focal, eyes, ways, inside, texels, starts, sizes, out):
+def _cast(focal, eyes, ways, frames, inside, texels, starts, sizes, out):
     """eyes [S, 3], ways [S, 3, 3]: where the camera is, and which way its rays go, in the frame of
     each box, whose half size is 1."""
     height, width = out.shape[:2]
@@ -57,6 +70,10 @@ def _cast(focal, eyes, ways, inside, texels, starts, sizes, out):
         y = (row + (part % _PARTS + 0.5) / _PARTS - height / 2) / focal
         nearest, reach = 0, np.inf
         for shape in range(len(eyes)):
+            if not frames[shape, 0] <= column <= frames[shape, 1]:
+                continue
+            if not frames[shape, 2] <= row <= frames[shape, 3]:
+                continue
             near, far = -np.inf, np.inf
             for k in range(3):
                 way = ways[shape, k, 0] * x + ways[shape, k, 1] * y + ways[shape, k, 2]

@@ -56,9 +56,11 @@ def in_hall(photographs: int, width: int) -> Walk:
     lens = Lens(width=width, height=width * 3 // 4, focal_px=0.675 * width, k=0.0)
     backdrop = Shape("box", (0.0, 0.0, 0.0), (200.0, 3.0, 200.0), prints(1, 64), inside=True)
 
+    standing = functools.lru_cache(8)(lambda number: _pillar(number, *pillars[number]))
+
     @functools.lru_cache(2)
     def around(near: tuple[int, ...]) -> Boxes:
-        return Boxes([backdrop, *(shape for n in near for shape in _pillar(n, *pillars[n]))])
+        return Boxes([backdrop, *(shape for n in near for shape in standing(n))])
 
     def draw(number: int) -> NDArray[np.uint8]:
         eye = -poses[number][:3, :3].T @ poses[number][:3, 3]
