@@ -12,6 +12,7 @@ import typer
 
 from splatcli import blocks, cluster, console, options, progress, summary
 from splatcli import live_view as watching
+from splatcli.compiling import Compiling
 from splatcli.folders import DEFAULT, find_run_folder
 from splatcli.tasks import Engine
 from stages import STAGE_NAMES, load_stage
@@ -198,6 +199,8 @@ def run(
 ) -> None:
     """Run the pipeline and show what came of it. view: on a page too, while it trains."""
     listener = progress.listener_for(quiet, as_json)
+    if until is None:
+        listener = watching.Together(Compiling(settings["train"].backend), listener)
     if view:
         listener = watching.Together(watching.Watching(pipeline, as_json), listener)
     pipeline.run(settings, until=until, may_run=may_run, listener=listener)

@@ -230,6 +230,19 @@ def test_a_plausible_model_that_is_wrong_is_refused(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_halves_that_one_weak_pair_joins_end_in_an_error_whatever_is_tried(tmp_path: Path) -> None:
+    rooms.weakly_linked(tmp_path / "photos")
+    run = str(tmp_path / "run")
+    subprocess.run(processes.splat("ingest", str(tmp_path / "photos"), "--out", run), check=True)
+    words = processes.splat("sfm", run, "--max-features", "1500")
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "sfm-separate-groups" in done.stderr
+    assert not list(tmp_path.glob("run/2-sfm/reconstruction.json"))
+
+
+@pytest.mark.slow
 def test_turning_on_the_spot_has_no_parallax(tmp_path: Path) -> None:
     capture = bad_captures.turning_on_the_spot(tmp_path / "in", 6)
     assert failure(capture, tmp_path, max_features=1500).code == "sfm-no-parallax"

@@ -97,8 +97,9 @@ def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
 
 
 def _mapped(path: Path) -> memoryview:
-    """The file's bytes, read only where they are touched."""
-    return np.memmap(path, np.uint8, "r").data
+    """The file's bytes, read only where they are touched; to change them would change no file.
+    (Kernels would be compiled anew for arrays that may not be written to.)"""
+    return np.memmap(path, np.uint8, "c").data
 
 
 class _Buffers:

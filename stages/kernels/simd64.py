@@ -129,6 +129,32 @@ def dstore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, types.intp, f64x8), codegen
 
 
+# Not plain kernels: those would be compiled anew for each number that stands in a call.
+@intrinsic
+def at(typingctx: Any, work: Any, k: Any) -> Any:
+    """Entry k of a float64 array of eights: work[8 k : 8 k + 8]; not bounds-checked."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        start = builder.mul(args[1], ir.Constant(args[1].type, LANES))
+        address = _address(context, builder, sig.args[0], args[0], start)
+        return builder.load(builder.bitcast(address, _VECTOR.as_pointer()), align=8)
+
+    return f64x8(work, types.intp), codegen
+
+
+@intrinsic
+def put(typingctx: Any, work: Any, k: Any, value: Any) -> Any:
+    """The way back of `at`."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        start = builder.mul(args[1], ir.Constant(args[1].type, LANES))
+        address = _address(context, builder, sig.args[0], args[0], start)
+        builder.store(args[2], builder.bitcast(address, _VECTOR.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.void(work, types.intp, f64x8), codegen
+
+
 @intrinsic
 def istore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     """array[index : index + 8] = value, rounded to zero, of an int64 array; not bounds-checked."""

@@ -7,8 +7,9 @@ logarithm of a value and 0.055.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ DARKEST, LIGHTEST = 0.06, 0.94  # sRGB values between which light can be told
 HOLD = 1e-6  # of the best-known view: holds each towards 0, where nothing else does
 ALIKE = 0.5  # of the spread: by more, halves of the spots do not tell the same light
 LEAST = 30  # spots of a photograph to tell its light by
+HALVES = 5  # all spots; the greyer and the more tinted; the darker and the lighter
 TURNS = 8  # of weighing spots that do not agree (they shine, or are hidden) ever less
 
 
@@ -37,7 +39,10 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
     model = read_model(reconstruction.folder / SPARSE)[1]
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
     observed = model.observed_points, model.observing_views, model.observed_px
-    found, differ = measured_light(pictures, *observed)
+    steps, total = itertools.count(1), len(pictures) + HALVES * 3
+    found, differ = measured_light(
+        pictures, *observed, tick=lambda: report.progress(next(steps), total, "measuring light")
+    )
     lights = [
         None if math.isnan(red) else (red, green, blue)
         for red, green, blue in found.round(4).tolist()
@@ -56,15 +61,17 @@ def measured_light(
     points: NDArray[np.int32],
     views: NDArray[np.int32],
     px: NDArray[np.float64],
+    tick: Callable[[], None] = lambda: None,
 ) -> tuple[NDArray[np.float64], float]:
     """([V, 3] EV by which each photograph is lighter than the median one, for red, green and blue;
     by how many EV, root mean square, halves of the spots differ in that: the greyer and the more
     tinted, the darker and the lighter).
 
     pictures [V]: files. points, views [O], px [O, 2]: where each view sees which spot, in pixels of
-    its picture. NaN for a view with too few usable spots.
+    its picture. NaN for a view with too few usable spots. tick: called after each picture, and
+    after each channel of each of `HALVES`.
     """
-    spots = _values(pictures, views, px)
+    spots = _values(pictures, views, px, tick)
     usable = ((spots > DARKEST) & (spots < LIGHTEST)).all(axis=1)
     counts = np.bincount(views[usable], minlength=len(pictures))
     usable &= counts[views] >= LEAST
@@ -78,26 +85,37 @@ def measured_light(
         _, spot = np.unique(points, return_inverse=True)
         of_spot = (np.bincount(spot, kind) / np.bincount(spot))[spot]
         halves += [of_spot < np.median(of_spot), of_spot >= np.median(of_spot)]
-    light, *told = (_even(points[h], views[h], ev[h], len(pictures)) for h in halves)
+    light, *told = (_even(points[h], views[h], ev[h], len(pictures), tick) for h in halves)
     differ = np.array([told[0] - told[1], told[2] - told[3]])
     return light, float(np.sqrt(np.nanmean(differ**2))) if np.isfinite(differ).any() else 0.0
 
 
 def _even(
-    points: NDArray[np.int32], views: NDArray[np.int32], ev: NDArray[np.float64], count: int
+    points: NDArray[np.int32],
+    views: NDArray[np.int32],
+    ev: NDArray[np.float64],
+    count: int,
+    tick: Callable[[], None],
 ) -> NDArray[np.float64]:
     """[count, 3] of each view, its channels' medians 0; NaN for views without spots."""
-    found = np.stack([_offsets(points, views, ev[:, c], count) for c in range(3)], axis=1)
+    found = np.empty((count, 3))
+    for channel in range(3):
+        found[:, channel] = _offsets(points, views, ev[:, channel], count)
+        tick()
     found[np.bincount(views, minlength=count) == 0] = np.nan
     return np.asarray(found - np.nanmedian(found, axis=0))
 
 
 def _values(
-    pictures: Sequence[Path], views: NDArray[np.int32], px: NDArray[np.float64]
+    pictures: Sequence[Path],
+    views: NDArray[np.int32],
+    px: NDArray[np.float64],
+    tick: Callable[[], None],
 ) -> NDArray[np.float32]:
     """[O, 3] sRGB values at each spot, 0 to 1; NaN beyond a picture."""
     found = np.full((len(views), 3), np.nan, np.float32)
     for number, path in enumerate(pictures):
+        tick()
         mine = np.flatnonzero(views == number)
         picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is None or not len(mine):

@@ -14,6 +14,7 @@ import pycolmap
 from stages.structure import database as sqlite
 from stages.structure.agreement import fitting_shares
 from stages.structure.job import Job
+from stages.structure.placing import Placing
 from stages.structure.sparse_model import SparseModel, save_model
 from stages.structure.ticks import Ticks
 
@@ -70,17 +71,17 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
             options.init_image_id1, options.init_image_id2 = pair
             options.multiple_models = False
             options.mapper.init_min_tri_angle = 4.0
-    counter = _Counter(job)
-    return dict(
-        pycolmap.incremental_mapping(
-            job.database,
-            job.images_root,
-            scratch,
-            options,
-            initial_image_pair_callback=counter.began,
-            next_image_callback=counter.registered,
+    with Placing(Ticks(Path(job.progress)), len(job.names)) as placing:
+        return dict(
+            pycolmap.incremental_mapping(
+                job.database,
+                job.images_root,
+                scratch,
+                options,
+                initial_image_pair_callback=placing.began,
+                next_image_callback=placing.placed,
+            )
         )
-    )
 
 
 def _global(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
@@ -113,21 +114,6 @@ def _other_pair(database: Path) -> tuple[int, int] | None:
     return first + 1, second + 1
 
 
-class _Counter:
-    """Keeps the job's progress file up to date."""
-
-    def __init__(self, job: Job) -> None:
-        self._ticks, self._total, self._count = Ticks(Path(job.progress)), len(job.names), 0
-
-    def began(self) -> None:
-        self._count = 1
-        self.registered()
-
-    def registered(self) -> None:
-        self._count += 1
-        self._ticks.write("placing photographs", min(self._count, self._total), self._total)
-
-
 def _plain(
     model: pycolmap.Reconstruction, others: list[pycolmap.Reconstruction], job: Job
 ) -> SparseModel:
@@ -137,7 +123,7 @@ def _plain(
     point_ids = sorted(model.point3D_ids())
     points = [model.points3D[point_id] for point_id in point_ids]
     seen = observations(model, points, position)
-    pairs = _pairs(Path(job.database), model, position)
+    pairs = _pairs(job, model, position)
     turns = [_turn_between(model, other) for other in others if _credible(other, model)]
     cameras = [
         model.cameras[camera_id + 1]
@@ -209,17 +195,19 @@ def observations(
 
 
 def _pairs(
-    path: Path, model: pycolmap.Reconstruction, position: dict[int, int]
+    job: Job, model: pycolmap.Reconstruction, position: dict[int, int]
 ) -> dict[str, np.ndarray]:
     """How many of the matches that two photographs alone agree on fit the model."""
+    ticks = Ticks(Path(job.progress))
     straight: dict[int, np.ndarray] = {}  # pixels of a pinhole without a principal point
     focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
     pairs = []
-    with pycolmap.Database.open(path) as database:
+    with pycolmap.Database.open(job.database) as database:
         ids, geometries = database.read_two_view_geometries()
-        for pair_id, geometry in zip(ids, geometries, strict=True):
+        for done, (pair_id, geometry) in enumerate(zip(ids, geometries, strict=True), 1):
             both = pycolmap.pair_id_to_image_pair(pair_id)
             matches = np.asarray(geometry.inlier_matches)
+            ticks.write("checking pairs", done, len(ids))
             if len(matches) < PAIR_INLIERS or any(image not in position for image in both):
                 continue
             for image in both:

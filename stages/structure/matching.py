@@ -52,11 +52,14 @@ def match_pairs(job: Job, wanted: list[Pair]) -> None:
 class _Album:
     """The features of photographs by position, sorted by word; read by several threads."""
 
-    def __init__(self, database: pycolmap.Database, photographs: int) -> None:
+    def __init__(self, database: pycolmap.Database, photographs: int, ticks: Ticks) -> None:
         self.lock = threading.Lock()  # around all use of the database
         self._database = database
         each = max(1, SAMPLE // photographs)
-        rows = [_spread(self.descriptors(i), each) for i in range(photographs)]
+        rows = []
+        for i in range(photographs):
+            rows.append(_spread(self.descriptors(i), each))
+            ticks.write("sorting features", i + 1, 2 * photographs)
         self._words = vocabulary(np.concatenate(rows))
         self.sorted = functools.lru_cache(_KEPT)(self._sorted)
         self.points = functools.lru_cache(_KEPT)(self._points)
@@ -84,9 +87,9 @@ class _Matcher:
     """Matches and verifies pairs in several threads, and writes what they find."""
 
     def __init__(self, job: Job, database: pycolmap.Database, inliers: dict[Pair, int]) -> None:
-        self.album = _Album(database, len(job.names))
-        self._job, self._database, self._inliers = job, database, inliers
         self._ticks = Ticks(Path(job.progress))
+        self.album = _Album(database, len(job.names), self._ticks)
+        self._job, self._database, self._inliers = job, database, inliers
         self._cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
 
     def run(self, wanted: list[Pair]) -> dict[Pair, int]:
@@ -146,7 +149,7 @@ def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
         for done, (largest, words) in enumerate(pool.map(album.largest, range(photographs)), 1):
             sorted_.append(largest)
             held.append(words)
-            ticks.write("reading features", done, photographs)
+            ticks.write("sorting features", photographs + done, 2 * photographs)
         wanted = retrieval.candidates(held)
 
         def look(pair: Pair) -> int:

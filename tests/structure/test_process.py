@@ -106,7 +106,7 @@ def test_photographs_beside_a_module_of_the_same_name_do_no_harm(
 def test_the_worker_ends_when_its_input_does(tmp_path: Path) -> None:
     """The portable half of dying with the parent, while COLMAP is busy."""
     code = (
-        "import time; from stages.structure import worker; worker._die_with_parent();"
+        "import time; from stages.base.parent import die_with_parent; die_with_parent();"
         "print('ready', flush=True); time.sleep(60)"
     )
     worker = subprocess.Popen(
@@ -122,7 +122,7 @@ def test_the_worker_ends_when_its_input_does(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_kill_minus_nine_of_the_parent_ends_the_worker(tmp_path: Path) -> None:
     sleeper = (
-        "from stages.structure import worker; worker._die_with_parent();"
+        "from stages.base.parent import die_with_parent; die_with_parent();"
         "import time, os; print(os.getpid(), flush=True); time.sleep(60)"
     )
     parent_code = f"""

@@ -67,7 +67,8 @@ def radix_order(keys, order, keys2, order2):
             counts[digit] = to + 1
             keys2[to] = keys[i]
             order2[to] = order[i]
-        keys[:], order[:] = keys2, order2
+        for i in range(n):  # as slices they would be checked to be of one length, by much code
+            keys[i], order[i] = keys2[i], order2[i]
 
 
 @kernel

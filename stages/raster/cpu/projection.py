@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from stages.kernels.simd import kernel
 from stages.kernels.simd64 import (
     LANES,
+    at,
     bits8,
     dand,
     deq,
     dexp,
     dge,
     dgt,
-    dload,
     dlog,
     dmax,
     dmin,
     dselect,
     dsqrt,
-    dstore,
     gather8,
+    put,
     scatter8,
     spread8,
 )
@@ -87,17 +87,6 @@ GRADIENTS = SH
 _LOG2E = 1.0 / math.log(2.0)
 _SQRT_LOG2E = math.sqrt(_LOG2E)
 _FAINTEST = math.log(ALPHA_MIN)
-
-
-@kernel
-def at(w, k):
-    """Entry k of the work of eight splats."""
-    return dload(w, LANES * k)
-
-
-@kernel
-def put(w, k, value):
-    dstore(w, LANES * k, value)
 
 
 @kernel

@@ -14,6 +14,7 @@ from stages.kernels.simd import (
 )
 from stages.kernels.simd64 import (
     LANES,
+    at,
     bits8,
     dand,
     dgt,
@@ -24,6 +25,7 @@ from stages.kernels.simd64 import (
     dsqrt,
     dstore,
     gather8,
+    put,
     scatter8,
     spread8,
 )
@@ -43,12 +45,10 @@ from stages.raster.cpu.projection import (
     WORK_ROW,
     A,
     C,
-    at,
     drawable,
     footprint,
     footprint_gradient,
     geometry_records,
-    put,
     sums_origin,
     used_opacity,
 )
@@ -160,9 +160,7 @@ def _shade(rows, cam, degree, means, sh, basis, paint):
     for channel in range(3):
         value = spread8(0.5)
         for band in range((degree + 1) * (degree + 1)):
-            value = value + dload(basis, LANES * band) * gather8(
-                sh, rows, stride, 3 * band + channel
-            )
+            value = value + at(basis, band) * gather8(sh, rows, stride, 3 * band + channel)
         scatter8(paint, rows, 4, channel, dmin(dmax(value, 0.0), COLOUR_MAX))
     mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
     depth = cam[R + 6] * mx + cam[R + 7] * my + cam[R + 8] * mz + cam[T + 2]
@@ -177,17 +175,17 @@ def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, w
     sh_basis(degree, x, y, z, basis)
     stride, columns = 3 * sh.shape[1], out.shape[1]
     for band in range(bands):
-        dstore(weights, LANES * band, spread8(0.0))
+        put(weights, band, spread8(0.0))
     for channel in range(3):
         # a colour that is clamped passes nothing on
         colour = gather8(paint, rows, 4, channel)
         painted = dand(dgt(colour, 0.0), dgt(_BRIGHTEST, colour))
-        g = dselect(painted, dload(sums, LANES * (S_RED + channel)), 0.0)
+        g = dselect(painted, at(sums, S_RED + channel), 0.0)
         for band in range(bands):
-            scatter8(out, places, columns, SH + 3 * band + channel, g * dload(basis, LANES * band))
+            scatter8(out, places, columns, SH + 3 * band + channel, g * at(basis, band))
             if degree > 0:
                 added = g * gather8(sh, rows, stride, 3 * band + channel)
-                dstore(weights, LANES * band, dload(weights, LANES * band) + added)
+                put(weights, band, at(weights, band) + added)
     if degree > 0:
         gx, gy, gz = sh_direction_gradient(degree, x, y, z, weights)
         along = gx * x + gy * y + gz * z
@@ -256,7 +254,7 @@ def splat_gradients(
                 _sum_slots(raw, slot, slot + splats[place, COUNT], lane, by_lane)
                 vstore(out, place * columns + columns - 16, splat16(np.float32(0.0)))
             for k in range(SUMS):
-                dstore(sums, LANES * k, gather8(by_lane, lanes, 16, k))
+                put(sums, k, gather8(by_lane, lanes, 16, k))
             footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
             _exponent_gradient(
                 rows, cam, geometry, w, sums, shifts, len(smoothing) > 0, places, means2d, work
@@ -265,7 +263,7 @@ def splat_gradients(
                 rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out
             )
             for k in range(GRADIENTS):
-                value = dmin(dmax(dload(work, LANES * k), -LARGEST), LARGEST)
+                value = dmin(dmax(at(work, k), -LARGEST), LARGEST)
                 scatter8(out, places, columns, k, value)
 
 
@@ -331,5 +329,5 @@ def sh_basis_values(degree, directions):
         x, y = gather8(directions, rows, 3, 0), gather8(directions, rows, 3, 1)
         sh_basis(degree, x, y, gather8(directions, rows, 3, 2), basis)
         for band in range(bands):
-            scatter8(out, rows, bands, band, dload(basis, LANES * band))
+            scatter8(out, rows, bands, band, at(basis, band))
     return out
