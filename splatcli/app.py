@@ -18,6 +18,7 @@ from stages import STAGE_NAMES
 from stages.base.settings import Setting
 from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
+from stages.raster.torch_device import DEVICES
 from stages.run.pipeline import Pipeline
 
 app = typer.Typer(
@@ -67,6 +68,19 @@ Cluster = Annotated[
         help="Ray cluster that takes runs or blocks (HOST:PORT, ray://HOST:PORT, auto), or local:N "
         'for N workers of this machine: pip install "splat\\[cluster]".',
         show_default="this process",
+    ),
+]
+Device = Annotated[
+    str | None,
+    option(
+        Setting(
+            "device",
+            "--device",
+            str,
+            choices=DEVICES,
+            help=f"What --backend reference draws on: {', '.join(DEVICES)}.",
+        ),
+        shown=False,
     ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
@@ -195,6 +209,7 @@ def render(
         typer.Option("--depth", help="Depth too: .depth.tiff of 32-bit floats, or .depth.mp4."),
     ] = False,
     backend: Backend = None,
+    device: Device = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -208,7 +223,9 @@ def render(
     work.render(
         target,
         work.Wanted(
-            *(out, camera, path, frames, seconds, fps, width, depth, backend, quiet, as_json)
+            *(out, camera, path, frames, seconds, fps, width, depth, backend, device),
+            quiet=quiet,
+            as_json=as_json,
         ),
     )
 

@@ -21,6 +21,7 @@ from splatcli.tasks import Engine, Task, need_of
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Report, Stage
 from stages.base.words import counted
+from stages.raster.backends import drawn_by
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ class _Scene:
         places, weights = ground.looked_at(replace(self.whole, views=training))
         cells = ground.cut(places, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
-        member = sight.members(sight.shares(coarse, cells, cameras, self.settings.backend))
+        member = sight.members(sight.shares(coarse, cells, cameras, drawn_by(self.settings)))
         parts = self._blocks(seeds, coarse, cells, member, ground.margin(places))
         look = look_of(self.whole.views, self.settings.train_side, light)
         crossed = sight.crossing(member)
@@ -236,7 +237,7 @@ class _Scene:
         from stages.measure.judge import load_photographs
         from stages.scene import TrainedSplats, seen_extent
 
-        degree, backend = self.settings.sh_degree, self.settings.backend
+        degree, backend = self.settings.sh_degree, drawn_by(self.settings)
         given = [part.splats.with_sh_degree(degree) for part in parts]
         splats, counts = merge.merged(given, cells, look)
         found = TrainedSplats(splats, float(np.mean([part.passed_on for part in parts])))
@@ -276,7 +277,7 @@ def _judged(splats: Splats, scene: _Scene, held: Sequence[View]) -> _Judged:
     from stages.measure.judge import drawing_of, load_photographs
 
     photographs = load_photographs(scene.whole.folder, held, splats.look)
-    draw = drawing_of(splats, scene.settings.backend)
+    draw = drawing_of(splats, drawn_by(scene.settings))
     return _Judged(draw, photographs, splats.look, [], [])
 
 

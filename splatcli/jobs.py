@@ -17,12 +17,14 @@ from splatcli.tasks import Engine
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
 from stages.base.settings import Setting, settings_of
+from stages.raster.backends import backend_of, drawn_by
 from stages.run import runfolder
 from stages.run.pipeline import Listener, Pipeline
 
 DEFAULT_PRESET = "standard"
 PROCESS_OPTIONS = (
     "backend",
+    "device",
     "max_side",
     "masks",
     "invert_masks",
@@ -129,7 +131,11 @@ def settings_for(
     chosen = dict(base)
     if preset is not None and "train" in chosen:
         chosen["train"] = presets()[preset]
-    return {name: options.changed(settings, typed) for name, settings in chosen.items()}
+    found = {name: options.changed(settings, typed) for name, settings in chosen.items()}
+    if typed.keys() & {"backend", "device"}:  # said now, not after an hour of other work
+        for asked in {drawn_by(each) for each in found.values() if hasattr(each, "backend")}:
+            backend_of(asked).require()
+    return found
 
 
 def training_in_words(settings: Any, typed: Mapping[str, Any], preset: str | None) -> str:

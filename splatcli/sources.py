@@ -51,9 +51,9 @@ def _as_in_its_run(file: Path, splats: Splats) -> Splats:
 def backend_of(pipeline: Pipeline | None) -> str:
     """The backend that a run was trained with, as it was asked for; "auto" without a run, and on a
     machine that cannot run it."""
-    from stages.raster.backends import AUTO, runs_here
+    from stages.raster.backends import AUTO, drawn_by, runs_here
 
-    asked = AUTO if pipeline is None else str(pipeline.recorded_settings()["train"].backend)
+    asked = AUTO if pipeline is None else drawn_by(pipeline.recorded_settings()["train"])
     return asked if runs_here(asked) else AUTO
 
 

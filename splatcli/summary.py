@@ -20,7 +20,7 @@ _HEADLINES = {
         *("features_seconds", "matching_seconds", "mapping_seconds"),
     ),
     "seed": ("splats",),
-    "train": ("splats", "psnr_db", "ssim"),
+    "train": ("splats", "psnr_db", "ssim", "made_by"),
     # Later stages measure at sizes of their own: their PSNR is no sequel of training's.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),
@@ -126,7 +126,12 @@ def show_status(pipeline: Pipeline, steps: list[Step], as_json: bool) -> None:
     busy = pipeline.busy()
     if as_json:
         rows = [
-            {"stage": s.stage.name, "state": _state(s, busy), "reason": s.reason or None}
+            {
+                "stage": s.stage.name,
+                "state": _state(s, busy),
+                "reason": s.reason or None,
+                "warnings": s.manifest.warnings if s.manifest else [],
+            }
             for s in steps
         ]
         console.emit("status", run_folder=str(pipeline.run_folder), busy=busy, stages=rows)

@@ -50,7 +50,7 @@ def need_of(train: Any) -> Need:
     from stages.training.density import needed_mib
 
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
-    return Need(memory_mib, gpus=int(train.backend == "gpu"))
+    return Need(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))
 
 
 class Engine(Protocol):

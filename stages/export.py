@@ -16,7 +16,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.words import counted
 from stages.formats import FORMATS, MESHES
-from stages.raster.backends import backend_of, backend_setting
+from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
     from stages.proof.prover import Prover
@@ -56,6 +56,7 @@ class ExportSettings:
         },
     )
     backend: str = backend_setting()
+    device: str = device_setting()
     mesh_triangles: int = field(
         default=50_000,
         metadata={
@@ -93,7 +94,7 @@ def run(
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
-    prover = Prover.of(splats, cameras, settings.backend)
+    prover = Prover.of(splats, cameras, drawn_by(settings))
     files, figures = [], {}
     for number, name in enumerate(wanted):
         report.progress(number, len(wanted), f"writing .{name}")
@@ -112,7 +113,7 @@ def run(
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
         files.append(file)
         figures[file.format] = {"size_bytes": file.size_bytes}
-    report.metric("backend", backend_of(settings.backend).name)
+    tell(report, drawn_by(settings))
     report.metric("files", len(files))
     report.metric("splats", len(splats))
     report.metric("dropped", dropped)
@@ -139,7 +140,7 @@ def _write_meshes(
     from stages.surface.files import fault_of
     from stages.surface.make import make
 
-    made = make(splats, reconstruction, settings.mesh_triangles, settings.backend, report)
+    made = make(splats, reconstruction, settings.mesh_triangles, drawn_by(settings), report)
     report.metric("mesh", made.figures)
     files = []
     for row in wanted:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.stage import Report, Stage
 from stages.formats.table import FORMATS
-from stages.raster.backends import backend_of, backend_setting
+from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
     from stages.capacity.aim import Aim
@@ -81,6 +81,7 @@ class PruneSettings:
         },
     )
     backend: str = backend_setting()
+    device: str = device_setting()
 
 
 def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report) -> Splats:
@@ -101,16 +102,17 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     kept, held = split_held_out(reconstruction.views)
     photographs = load_photographs(reconstruction.folder, kept, splats.look)
     judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
-    before = mean_psnr_db(splats, judges, settings.backend)
+    backend = drawn_by(settings)
+    before = mean_psnr_db(splats, judges, backend)
     extent = seen_extent(reconstruction)
-    tuner = Tuner(photographs, extent, settings.backend, report, trained.by_heart)
+    tuner = Tuner(photographs, extent, backend, report, trained.by_heart)
     aim = _aim(settings, trained.passed_on, reconstruction)
     shrinking = Shrinking(
-        *(photographs, aim, settings.backend, tuner, settings.rounds, settings.tune_steps, report)
+        *(photographs, aim, backend, tuner, settings.rounds, settings.tune_steps, report)
     )
     found = shrinking.run(splats)
-    after = mean_psnr_db(found.splats, judges, settings.backend)
-    report.metric("backend", backend_of(settings.backend).name)
+    after = mean_psnr_db(found.splats, judges, backend)
+    tell(report, backend)
     report.metric("judged_side_px", splats.look.side)
     report.metric("psnr_before_db", round(before, 3))
     report.metric("psnr_db", round(after, 3))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.raster.backends import backend_of, backend_setting
+from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
     from stages.measure.judge import Photograph
@@ -63,6 +63,7 @@ class QuantiseSettings:
         metadata={"help": "Training photographs to decide by, at most.", "min": 1, "max": 100_000},
     )
     backend: str = backend_setting()
+    device: str = device_setting()
 
 
 def run(
@@ -97,7 +98,7 @@ def run(
     flat = None
     if kept.sh_degree:
         views = split_held_out(inputs["sfm"].views)[0]
-        flat = flat_dc(kept, (kept.look.camera(v.camera) for v in views), settings.backend)
+        flat = flat_dc(kept, (kept.look.camera(v.camera) for v in views), drawn_by(settings))
     drawn = held_by(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
     in_32_bytes = splat32.decode(splat32.encode(drawn))
     judged = {
@@ -128,7 +129,7 @@ def run(
     report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("measured_on", judge.what)
     report.metric("judged_side_px", splats.look.side)
-    report.metric("backend", backend_of(settings.backend).name)
+    tell(report, drawn_by(settings))
     save_splats(folder, kept)
     (folder / _DECISIONS).write_text(json.dumps(decisions, indent=1) + "\n", encoding="utf-8")
     if flat is not None:
@@ -255,7 +256,7 @@ class _Measure:
         """Mean PSNR over the photographs (dB)."""
         from stages.measure.judge import mean_psnr_db
 
-        mean = round(mean_psnr_db(splats, self.photographs, self.settings.backend), 4)
+        mean = round(mean_psnr_db(splats, self.photographs, drawn_by(self.settings)), 4)
         self.done += 1
         # Raw, three lower degrees, each threshold, and about as many numbers of bits.
         total = 5 + len(_THRESHOLDS_OF_255) + _BIT_TRIALS

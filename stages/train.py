@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.words import counted
-from stages.raster.backends import backend_of, backend_setting, passed_over
+from stages.raster.backends import backend_setting, device_setting, drawn_by, passed_over, tell
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from stages.measure.judge import Photograph
+    from stages.raster.definition import MemoryFull
     from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats
     from stages.training.clock import Spent
     from stages.training.optimiser import Model
@@ -113,6 +114,7 @@ class TrainSettings:
         },
     )
     backend: str = backend_setting()
+    device: str = device_setting()
 
 
 _LEARNT = "learnt.json"
@@ -131,9 +133,10 @@ def run(
 ) -> TrainedSplats:
     """Train; write splats.bin, history.csv, a plot, and held-out photographs as a contact sheet
     with a legend."""
+    from stages.raster.definition import MemoryFull
     from stages.raster.smoothing import smoothed
     from stages.scene import TrainedSplats
-    from stages.training.cap import forget_cap
+    from stages.training.cap import forget_cap, lower_cap
     from stages.training.checkpoint import remove_checkpoint
 
     if settings.blocks != "1":
@@ -144,12 +147,15 @@ def run(
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
     if settings.seconds:
         trainer.seconds = max(settings.seconds - (time.monotonic() - started), 1.0)
-    report.metric("backend", backend_of(settings.backend).name)
-    report.metric("device", backend_of(settings.backend).where())
+    tell(report, trainer.backend)
+    report.metric("device", report.device)
     report.metric("passed_over", passed_over(settings.backend))
     report.metric("train_photographs", len(trainer.train))
     report.metric("held_out_photographs", len(trainer.held_out))
-    model = trainer.run(start)
+    try:
+        model = trainer.run(start)
+    except MemoryFull as full:
+        raise _does_not_fit(full, lower_cap(folder, full.fits).splats) from full
     splats = finished(model, settings.sh_degree, start, trainer.look)
     if settings.smooth:
         splats = smoothed(splats, trainer.widths(splats.means))
@@ -161,6 +167,7 @@ def run(
     remove_checkpoint(folder)
     forget_cap(folder)
     report.metric("steps", trainer.schedule.steps)
+    _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
     report.metric("learnt_by_heart", trainer.by_heart > 0)
     report.metric("passed_on", round(trainer.passed_on, 3))
@@ -175,6 +182,29 @@ def run(
         )
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
+
+
+def _report_makers(trainer: Trainer, report: Report) -> None:
+    """What made which steps, on what, and how many splats that had room for."""
+    from stages.training.cap import DEVICE_MEMORY
+
+    report.metric("makers", [asdict(maker) for maker in trainer.makers])
+    if len(trainer.makers) > 1:
+        ends = [f" to step {maker.step:,}" for maker in trainer.makers[1:]] + [""]
+        words = (f"{m.backend} ({m.device}){e}" for m, e in zip(trainer.makers, ends, strict=True))
+        report.metric("made_by", ", then ".join(words))
+        report.warn(
+            "train-several-makers",
+            f"Trained by {report.metrics['made_by']}: none of them alone ends in these bytes.",
+        )
+    if trainer.cap < report.metrics["splat_cap"]:
+        report.metric("splat_cap", trainer.cap)
+        report.metric("splat_cap_from", DEVICE_MEMORY)
+    if report.metrics["splat_cap_from"] == DEVICE_MEMORY:
+        report.warn(
+            "train-gpu-memory",
+            f"The GPU's memory was full: trained with at most {trainer.cap:,} splats.",
+        )
 
 
 def make_trainer(
@@ -228,7 +258,7 @@ def make_trainer(
         report=report,
         smooth=settings.smooth,
         over_any=settings.background == "any",
-        backend=settings.backend,
+        backend=drawn_by(settings),
         within=settings.within,
         lent=lent_rows(len(train)),
         patience_db=settings.patience,
@@ -354,6 +384,18 @@ def write_quality(
         image = np.clip(trainer.drawn(photograph.camera), 0.0, 1.0)
         rows.append((photograph.name, found[i].psnr_db, image, photograph.image))
     contact_sheet(folder / "held_out.png", rows)
+
+
+def _does_not_fit(full: MemoryFull, cap: int) -> SplatError:
+    return SplatError(
+        full.code,
+        given=full.given,
+        wanted=full.wanted,
+        hint=f"The same command again goes on from the last checkpoint with at most {cap:,} "
+        f"splats; --max-splats {cap} begins anew; so does --max-splats with more, once what else "
+        "uses the card is closed.",
+        family=full.family,
+    )
 
 
 def _nothing_left() -> SplatError:

@@ -158,6 +158,7 @@ def _gpu() -> Check:
     try:
         from stages.raster.gpu import device
 
-        return Check("GPU", device.missing() or device.told())
+        missing = device.missing()
+        return Check("GPU", f"{missing}; {device.built()}" if missing else device.told())
     except Exception as error:  # a broken driver may raise anything
         return Check("GPU", _said(error))

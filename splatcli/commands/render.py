@@ -37,6 +37,7 @@ class Wanted:
     width: int | None = None
     depth: bool = False
     backend: str | None = None
+    device: str | None = None
     quiet: bool = False
     as_json: bool = False
 
@@ -44,7 +45,9 @@ class Wanted:
 def render(target: Path | None, wanted: Wanted) -> None:
     """Draw what was asked for. Raises SplatError."""
     from stages.film import sinks
+    from stages.raster.backends import AUTO, asked_for
     from stages.raster.draw import renderer
+    from stages.raster.torch_device import PROCESSOR
 
     kind = _kind_of(wanted)
     splats, pipeline = sources.splats_of(target)
@@ -57,7 +60,9 @@ def render(target: Path | None, wanted: Wanted) -> None:
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
     if not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    backend = wanted.backend or sources.backend_of(pipeline or sources.pipeline_around(target))
+    backend = sources.backend_of(pipeline or sources.pipeline_around(target))
+    if wanted.backend or wanted.device:
+        backend = asked_for(wanted.backend or AUTO, wanted.device or PROCESSOR)
     draw = renderer(splats, backend=backend)
     out = wanted.out
     facts: dict[str, Any] = {}

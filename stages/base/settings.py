@@ -5,7 +5,8 @@ list's items, of which there must then be one at least. "pattern": of a text, a 
 for all of it, with "wanted", the sentence that says what it asks for. "option": the option's name
 where it is not the field's. "together": of a list, the words that one use of the option takes, as
 its help shows them. "needs": another field, without which a value but the default means nothing.
-"affects_output": False where another value gives the same bytes.
+"affects_output": False where another value gives the same bytes. "midway": True where half-done
+work goes on under another value, which the stage then says.
 """
 
 from __future__ import annotations

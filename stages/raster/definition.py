@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import Family, SplatError
 from stages.scene import Camera, Splats
 
 ALPHA_MIN = 1.0 / 255.0  # below it a splat is not drawn in a pixel: it could not change 8 bits
@@ -81,6 +82,21 @@ class Rendering:
     depth: NDArray[np.float32]
     median_depth: NDArray[np.float32]
     culled: int
+
+
+class MemoryFull(SplatError):  # noqa: N818 - what is full, as `Interrupted` says
+    """A device's memory does not hold so many splats. fits: how many it would, about."""
+
+    def __init__(self, splats: int, fits: int, room: str) -> None:
+        super().__init__(
+            "raster-gpu-memory",
+            given=f"{splats:,} splats do not fit into the GPU's memory ({room}).",
+            wanted=f"About {fits:,} would fit.",
+            hint=f"Train with --max-splats {fits}, close what else uses the card, or choose "
+            "--backend cpu.",
+            family=Family.RESOURCES,
+        )
+        self.fits = fits
 
 
 NO_SMOOTHING = np.zeros(0, np.float32)

@@ -36,6 +36,7 @@ from stages.raster.sh import C0, C1, C2, C3
 from stages.scene import Camera, Splats
 
 BLOCK = 32  # pixels; the picture is made block by block to bound memory
+MOST = 4_000_000  # (splat, pixel) pairs at once: 32 MB a tensor in float64, of which some 30 live
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,8 @@ def project(
     det = minors + e * (a0 + c0) + e * e
     opacities = p.opacity_logits.sigmoid() * kept
     if settings.antialias:
-        opacities = opacities * (minors.clamp_min(1e-60) / det).sqrt()
+        least = max(1e-60, torch.finfo(minors.dtype).tiny)
+        opacities = opacities * (minors.clamp_min(least) / det).sqrt()
     seen = (opacities >= ALPHA_MIN).nonzero()[:, 0]
     order = seen[_order(p.rows(seen), z[seen])]
     return Projected(
@@ -196,7 +198,7 @@ def _order(p: Parameters, z: Tensor) -> Tensor:
     keys += [
         _two_d(t.detach()) for t in (p.means, p.opacity_logits, p.log_scales, p.quaternions)
     ] + [p.sh.detach().flatten(1)]
-    table = torch.cat([k.to(torch.float64).cpu() for k in keys], 1).numpy()
+    table = torch.cat([k.cpu().to(torch.float64) for k in keys], 1).numpy()
     return torch.from_numpy(np.lexsort(table.T[::-1])).to(z.device)
 
 
@@ -252,7 +254,7 @@ def render_tensors(
 def render_projected(
     p: Parameters, projected: Projected, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`render_tensors` from footprints already made (their means2d may be asked for gradients)."""
+    """`render_tensors` from footprints already made."""
     like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     centre = torch.tensor(camera.centre, **like)
     rgb = colours(p.rows(projected.index), centre, settings.sh_degree)
@@ -284,8 +286,8 @@ def boxes(projected: Projected) -> tuple[Tensor, Tensor]:
 def picture_blocks(
     projected: Projected, camera: Camera
 ) -> Iterator[tuple[tuple[int, int, int, int], Tensor, Tensor]]:
-    """The picture in blocks: ((top, bottom, left, right), rows of `projected` that can touch it,
-    nearest first, its pixel centres [P, 2])."""
+    """The picture in blocks, in strips where a block holds many splats: ((top, bottom, left,
+    right), rows of `projected` that can touch the block, nearest first, pixel centres [P, 2])."""
     like: dict[str, Any] = {"dtype": projected.depths.dtype, "device": projected.depths.device}
     low, high = boxes(projected)
     for top in range(0, camera.height, BLOCK):
@@ -293,9 +295,12 @@ def picture_blocks(
             bottom, right = min(top + BLOCK, camera.height), min(left + BLOCK, camera.width)
             corner, end = torch.tensor([left, top], **like), torch.tensor([right, bottom], **like)
             rows = ((high >= corner) & (low <= end)).all(1).nonzero()[:, 0]
-            ys, xs = torch.meshgrid(
-                torch.arange(top, bottom, **like) + 0.5,
-                torch.arange(left, right, **like) + 0.5,
-                indexing="ij",
-            )
-            yield (top, bottom, left, right), rows, torch.stack([xs, ys], -1).flatten(0, 1)
+            lines = max(1, MOST // max(1, len(rows) * (right - left)))
+            for first in range(top, bottom, lines):
+                last = min(first + lines, bottom)
+                ys, xs = torch.meshgrid(
+                    torch.arange(first, last, **like) + 0.5,
+                    torch.arange(left, right, **like) + 0.5,
+                    indexing="ij",
+                )
+                yield (first, last, left, right), rows, torch.stack([xs, ys], -1).flatten(0, 1)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from stages.raster.definition import (
     RasterSettings,
     gradient_columns,
 )
+from stages.raster.gpu.device import failures_told
 from stages.raster.reference import (
     Parameters,
     Projected,
@@ -35,6 +37,7 @@ from stages.raster.reference import (
     render_projected,
     weights_of,
 )
+from stages.raster.torch_device import PROCESSOR, device_named, widest
 from stages.scene import Camera
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -54,8 +57,13 @@ class ReferenceForward:
 
 
 class ReferenceRasteriser:
-    """Draws and differentiates in float64 torch. Keeps nothing between two passes: the way back
-    draws again, with gradients."""
+    """Draws and differentiates in torch on any of its devices, in float64 where that has it. Keeps
+    nothing between two passes: the way back draws again, block by block, with gradients."""
+
+    def __init__(self, on: str = PROCESSOR) -> None:
+        """on: one of `torch_device.DEVICES`. Raises SplatError where it is not there."""
+        self.device = device_named(on)
+        self.dtype = widest(self.device)
 
     def forward(
         self,
@@ -66,14 +74,15 @@ class ReferenceRasteriser:
         depths: bool = False,
     ) -> ReferenceForward:
         """See `definition.Rasteriser`."""
-        p = _parameters(arrays)
-        with torch.no_grad():
-            projected = project(p, camera, settings, _widths(smoothing))
+        with failures_told(len(arrays[0])), torch.no_grad():
+            p, widths = self._parameters(arrays), self._widths(smoothing)
+            projected = project(p, camera, settings, widths)
             image, *planes = render_projected(p, projected, camera, settings)
-            culled = int((~drawable(p, _widths(smoothing))).sum())
-        every = [*image.unbind(-1), *(planes if depths else planes[:1])]
-        picture = torch.stack(every).numpy().astype(np.float32)
-        visible = np.sort(projected.index[_touching(projected, camera)].numpy()).astype(np.int32)
+            culled = int((~drawable(p, widths)).sum())
+            every = [*image.unbind(-1), *(planes if depths else planes[:1])]
+            picture = _host(torch.stack(every)).astype(np.float32)
+            touching = projected.index[_touching(projected, camera)]
+            visible = np.sort(_host(touching)).astype(np.int32)
         return ReferenceForward(picture, visible, culled, arrays, camera, settings, smoothing)
 
     def backward(
@@ -84,25 +93,39 @@ class ReferenceRasteriser:
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
     ) -> Backward:
         """See `definition.Rasteriser`."""
-        p = _parameters(arrays, requires_grad=True)
-        projected = project(p, forward.camera, forward.settings, _widths(smoothing))
-        projected.means2d.retain_grad()
-        image, _, _, _ = render_projected(p, projected, forward.camera, forward.settings)
-        if image.requires_grad:
-            torch.autograd.backward(
-                image, torch.tensor(v_image.transpose(1, 2, 0), dtype=torch.float64)
-            )
-        rows = forward.visible
+        rows, degree = forward.visible, forward.settings.sh_degree
+        with failures_told(len(arrays[0])):
+            p = self._parameters(arrays)
+            for tensor in p.tensors():
+                tensor.requires_grad_()
+            projected = project(p, forward.camera, forward.settings, self._widths(smoothing))
+            rgb = colours(p.rows(projected.index), self._tensor(forward.camera.centre), degree)
+            shown, shades = _leaves(projected), rgb.detach().requires_grad_()
+            self._blend_back(shown, shades, forward, self._tensor(v_image))
+            _pass_on((rgb, *vars(projected).values()), (shades, *vars(shown).values()))
         place = np.empty(len(arrays[0]), np.int64)
-        place[projected.index.numpy()] = np.arange(len(projected.index))
-        bands = (min(forward.settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
+        place[_host(projected.index)] = np.arange(len(projected.index))
+        bands = (min(degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
         columns = [_gradient(t, rows) for t in p.tensors()[:4]]
         columns.append(_gradient(p.sh, rows)[:, : 3 * bands])
         values = np.concatenate(columns, 1)
         parameters = np.zeros((len(rows), gradient_columns(bands)), np.float32)
         parameters[:, : values.shape[1]] = np.clip(values, -_LARGEST, _LARGEST)
-        means2d = _gradient(projected.means2d, place[rows]).astype(np.float32)
+        means2d = _gradient(shown.means2d, place[rows]).astype(np.float32)
         return Backward(rows, parameters, means2d)
+
+    def _blend_back(
+        self, shown: Projected, shades: Tensor, forward: ReferenceForward, v_image: Tensor
+    ) -> None:
+        """Gradients of footprints and colours, added up block by block: what autograd remembers
+        of a block is gone before the next."""
+        background = self._tensor(forward.settings.background)
+        for place, rows, pixels in reversed(list(picture_blocks(shown, forward.camera))):
+            if not len(rows):
+                continue
+            weights, passed = weights_of(alphas_at(shown, rows, pixels))
+            colour = weights.T @ shades[rows] + passed[:, None] * background
+            torch.autograd.backward(colour, _part(v_image, place).T)
 
     def contributions(
         self, forward: ReferenceForward, residual: NDArray[np.float32]
@@ -110,14 +133,16 @@ class ReferenceRasteriser:
         """See `definition.Rasteriser`. Colour is affine in each alpha: without the splat a pixel
         changes by -w c + behind alpha / (1 - alpha), "behind" what is composited behind it."""
         camera, settings = forward.camera, forward.settings
-        p = _parameters(forward.arrays)
-        found = torch.zeros(len(forward.arrays[0]), CONTRIBUTIONS, dtype=torch.float64)
-        with torch.no_grad():
-            projected = project(p, camera, settings, _widths(forward.smoothing))
-            centre = torch.tensor(camera.centre, dtype=torch.float64)
-            rgb = colours(p.rows(projected.index), centre, settings.sh_degree)
-            planes = torch.tensor(residual, dtype=torch.float64)
-            for rows, alpha, errors in _blocks(projected, camera, planes):
+        p, planes = self._parameters(forward.arrays), self._tensor(residual)
+        like: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
+        found = torch.zeros(len(forward.arrays[0]), CONTRIBUTIONS, **like)
+        with failures_told(len(found)), torch.no_grad():
+            projected = project(p, camera, settings, self._widths(forward.smoothing))
+            rgb = colours(p.rows(projected.index), self._tensor(camera.centre), settings.sh_degree)
+            for place, rows, pixels in picture_blocks(projected, camera):
+                if not len(rows):
+                    continue
+                alpha, errors = alphas_at(projected, rows, pixels), _part(planes, place)
                 weights, passed = weights_of(alpha)
                 change = torch.zeros_like(alpha)
                 for channel in range(3):
@@ -133,39 +158,51 @@ class ReferenceRasteriser:
                 found[index, LARGEST] = torch.maximum(found[index, LARGEST], weights.amax(1))
                 found[index, SQUARES] += weights.square().sum(1)
                 found[index, PULL:] += weights @ errors.T
-        return found.numpy()[forward.visible]
+        return _host(found).astype(np.float64)[forward.visible]
+
+    def _parameters(self, arrays: Arrays) -> Parameters:
+        return Parameters(*map(self._tensor, arrays))
+
+    def _widths(self, smoothing: NDArray[np.float32]) -> Tensor | None:
+        return self._tensor(smoothing) if len(smoothing) else None
+
+    def _tensor(self, values: Any) -> Tensor:
+        return torch.tensor(values, dtype=self.dtype, device=self.device)
 
 
 def _touching(projected: Projected, camera: Camera) -> Tensor:
     """[M] whether a splat's box holds the centre of a pixel's row and column."""
     low, high = boxes(projected)
-    size = torch.tensor([camera.width, camera.height], dtype=low.dtype)
+    size = torch.tensor([camera.width, camera.height], dtype=low.dtype, device=low.device)
     return ((high >= 0.5) & (low <= size - 0.5)).all(1)
 
 
-def _blocks(
-    projected: Projected, camera: Camera, planes: Tensor
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """(rows of the splats, their alphas [M, P], the planes [3, P]) of the picture's blocks that
-    hold any splat."""
-    for (top, bottom, left, right), rows, pixels in picture_blocks(projected, camera):
-        if len(rows):
-            part = planes[:, top:bottom, left:right].flatten(1)
-            yield rows, alphas_at(projected, rows, pixels), part
+def _part(planes: Tensor, place: tuple[int, int, int, int]) -> Tensor:
+    """[3, P] of planes [3, H, W]: the pixels of a block, as `picture_blocks` gives its place."""
+    top, bottom, left, right = place
+    return planes[:, top:bottom, left:right].flatten(1)
 
 
-def _parameters(arrays: Arrays, requires_grad: bool = False) -> Parameters:
-    return Parameters(
-        *(torch.tensor(a, dtype=torch.float64, requires_grad=requires_grad) for a in arrays)
-    )
+def _leaves(projected: Projected) -> Projected:
+    """The same numbers, from which autograd goes no further back."""
+    kept = [t.detach().requires_grad_(t.requires_grad) for t in vars(projected).values()]
+    return Projected(*kept)
 
 
-def _widths(smoothing: NDArray[np.float32]) -> Tensor | None:
-    return torch.tensor(smoothing, dtype=torch.float64) if len(smoothing) else None
+def _pass_on(made: Iterable[Tensor], leaves: Iterable[Tensor]) -> None:
+    """What the leaves were given, further back: to what each was made from."""
+    given = [(t, leaf.grad) for t, leaf in zip(made, leaves, strict=True) if leaf.grad is not None]
+    if given:
+        torch.autograd.backward([t for t, _ in given], [grad for _, grad in given])
+
+
+def _host(tensor: Tensor) -> NDArray[Any]:
+    found: NDArray[Any] = tensor.detach().cpu().numpy()
+    return found
 
 
 def _gradient(tensor: Tensor, rows: NDArray[np.integer]) -> NDArray[np.float64]:
     width = int(np.prod(tensor.shape[1:]))
     if tensor.grad is None:
         return np.zeros((len(rows), width))
-    return np.asarray(tensor.grad.numpy()[rows].reshape(len(rows), width))
+    return np.asarray(_host(tensor.grad)[rows].reshape(len(rows), width))

@@ -28,9 +28,10 @@ class Request:
     input_files: dict[str, FileRecords]
 
     def key(self, settings_type: type) -> dict[str, Any]:
-        """What decides the output, as plain data: settings that cannot change it are left out."""
-        quiet = _quiet_fields(settings_type)
-        settings = {k: v for k, v in self.settings.items() if k not in quiet}
+        """What half-done work must have been begun for, as plain data: settings that cannot change
+        the output are left out, and those that may change on the way."""
+        free = _quiet_fields(settings_type) | _midway_fields(settings_type)
+        settings = {k: v for k, v in self.settings.items() if k not in free}
         return {"version": self.version, "settings": settings, "inputs": self.inputs}
 
     def write(self, folder: Path, settings_type: type) -> None:
@@ -115,6 +116,10 @@ def _show(value: Any) -> str:
 
 def _quiet_fields(settings_type: type) -> set[str]:
     return {f.name for f in fields(settings_type) if not f.metadata.get("affects_output", True)}
+
+
+def _midway_fields(settings_type: type) -> set[str]:
+    return {f.name for f in fields(settings_type) if f.metadata.get("midway", False)}
 
 
 def _defaults(settings_type: type) -> dict[str, Any]:

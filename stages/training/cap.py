@@ -6,17 +6,21 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
 from stages.base.atomic import replacing
 from stages.base.memory import available_mib
 from stages.training.density import splat_cap
+from stages.training.optimiser import Model
 
 FILE_NAME = "cap.json"
+DEVICE_MEMORY = "the GPU's memory"
 
 
 @dataclass(frozen=True)
 class Cap:
-    """splats: at most. origin: "--max-splats" or "free memory". free_mib: what was free then, if
-    that decided; None where the system did not say."""
+    """splats: at most. origin: "--max-splats", "free memory" or DEVICE_MEMORY. free_mib: what was
+    free then, if that decided; None where the system did not say."""
 
     splats: int
     origin: str
@@ -25,14 +29,31 @@ class Cap:
 
 def cap_for(folder: Path, max_splats: int) -> Cap:
     """`max_splats`, or for 0 what free memory allows: as it was when work in `folder` began, since
-    a run that goes on with another cap would end in other bytes."""
+    a run that goes on with another cap would end in other bytes. Fewer, if a GPU has refused so
+    many by then."""
+    kept = _read(folder / FILE_NAME)
+    if kept is not None and (not max_splats or kept.origin == DEVICE_MEMORY):
+        return kept
     if max_splats:
         return Cap(max_splats, "--max-splats")
-    kept = _read(folder / FILE_NAME)
-    if kept is not None:
-        return kept
     free_mib = available_mib()
-    cap = Cap(splat_cap(free_mib), "free memory", free_mib and round(free_mib))
+    return _kept(Cap(splat_cap(free_mib), "free memory", free_mib and round(free_mib)), folder)
+
+
+def lower_cap(folder: Path, splats: int) -> Cap:
+    """No more than a GPU holds, from now on."""
+    return _kept(Cap(splats, DEVICE_MEMORY), folder)
+
+
+def fitted(model: Model, cap: int) -> Model:
+    """The model, or of too large a one those splats that hide most."""
+    if len(model) <= cap:
+        return model
+    strongest = np.argsort(-model.opacity_logits, kind="stable")[:cap]
+    return model.take(np.sort(strongest))
+
+
+def _kept(cap: Cap, folder: Path) -> Cap:
     with replacing(folder / FILE_NAME) as path:
         path.write_text(json.dumps(asdict(cap)) + "\n", encoding="utf-8")
     return cap

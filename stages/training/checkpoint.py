@@ -17,7 +17,16 @@ from stages.training.optimiser import Model
 from stages.training.pace import Mark
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP6"
+MAGIC = b"SPLATCP7"
+
+
+@dataclass(frozen=True)
+class Maker:
+    """What made the steps from `step` on: a backend, on a device."""
+
+    step: int
+    backend: str
+    device: str
 
 
 @dataclass(frozen=True)
@@ -25,7 +34,7 @@ class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
     done by then), see `schedule.Schedule`. history: as logged. marks: of the
     photographs that decide. passed_on: what they told. times: of each entry of the history, and,
-    last, now."""
+    last, now. makers: one after the other."""
 
     step: int
     plan: tuple[int, int, float]
@@ -33,6 +42,7 @@ class Saved:
     marks: list[Mark]
     passed_on: float
     times: list[Spent]
+    makers: list[Maker]
 
 
 def save_checkpoint(folder: Path, model: Model, saved: Saved) -> None:
@@ -70,6 +80,7 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         [Mark(**mark) for mark in header["marks"]],
         float(header["passed_on"]),
         [Spent(**t) for t in header["times"]],
+        [Maker(**maker) for maker in header["makers"]],
     )
     return model, saved
 

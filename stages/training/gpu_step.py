@@ -84,8 +84,8 @@ class GpuStep:
 
     def load(self, model: Model) -> None:
         """See `step.TrainingStep`."""
-        self._room = int(self._room * max(1.0, len(model) / max(1, self._splats)))
-        self._splats = len(model)
+        self._room = int(self._room * len(model) / max(1, self._splats))
+        self._splats, self._on_host = len(model), model  # known even if there is no room for it
         with failures_told(len(model)):
             self._scene = self.rasteriser.scene(model.arrays)
             self._smoothing = self._on_device(model.smoothing)
@@ -94,7 +94,6 @@ class GpuStep:
             self._steps = self._on_device(model.steps)
             self._gradient_sum = self._on_device(model.gradient_sum)
             self._gradient_count = self._on_device(model.gradient_count)
-        self._on_host = model
 
     def model(self) -> Model:
         """See `step.TrainingStep`."""

@@ -16,18 +16,20 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.images import psnr
 from stages.measure.judge import Photograph, scores, spread
-from stages.raster.backends import AUTO
+from stages.raster.backends import AUTO, backend_of
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import TRANSPARENT, Camera, Look, Splats, by_heart, morton
-from stages.training.checkpoint import Saved, load_checkpoint, save_checkpoint
+from stages.training.cap import fitted, lower_cap
+from stages.training.checkpoint import Maker, Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
 from stages.training.density import AdaptiveDensity, Within
 from stages.training.dropout import Dropout
+from stages.training.frugal_step import FrugalStep
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.pace import Mark, Pace, remaining_gain_db, share_passed_on
 from stages.training.schedule import GROWTH_ENDS, Schedule
-from stages.training.step import step_of
+from stages.training.step import TrainingStep, step_of
 from stages.training.strategy import Strategy
 from stages.training.target import target_of
 from stages.training.views import TrainingView
@@ -65,7 +67,10 @@ class Trainer:
     within: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        self.stepper = step_of(self.backend)
+        self.stepper: TrainingStep = step_of(self.backend)
+        if self.backend == AUTO:
+            self.stepper = FrugalStep(self.stepper, self._memory_full)
+        self.makers: list[Maker] = []
         self._strategy: Strategy = AdaptiveDensity(self.schedule.extent)
         if self.within:
             self._strategy = Within(self._strategy, self.within)
@@ -125,17 +130,34 @@ class Trainer:
             self.passed_on = told.passed_on
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
-            self.clock = Clock(spent)
+            self.clock, self.makers = Clock(spent), told.makers
+            model = fitted(model, self.cap)
             self.report.metric("resumed_from_step", step)
         else:
             model, step = self._first(start), 0
+        self._take_over(step)
         self.stepper.load(model)
         return step
+
+    def _take_over(self, step: int) -> None:
+        """Enter who makes the steps from here on, and say so where somebody else began."""
+        chosen = backend_of(self.backend)
+        maker, before = Maker(step, chosen.name, chosen.where()), self.makers[-1:]
+        if any(replace(maker, step=one.step) == one for one in before):
+            return
+        self.makers.append(maker)
+        for one in before:
+            label = f"going on with {maker.backend} on what {one.backend} began"
+            self.report.progress(step, self.schedule.steps, label)
+
+    def _memory_full(self, fits: int) -> None:
+        self.cap = lower_cap(self.folder, fits).splats
+        self.report.progress(0, 1, f"the GPU's memory is full: going on with {fits:,} splats")
 
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        saved = Saved(step, plan, self.history, self.marks, self.passed_on, times)
+        saved = Saved(step, plan, self.history, self.marks, self.passed_on, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
     def _first(self, start: Splats) -> Model:

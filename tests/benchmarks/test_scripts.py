@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -40,12 +42,30 @@ def test_the_format_benchmark_passes_its_gate_and_prints_each_format():
         assert name in printed
 
 
+def test_the_gpu_benchmark_times_gsplat_beside_it_where_that_is_there(monkeypatch):
+    """Whose rasteriser is played here by colours times opacities."""
+    pytest.importorskip("triton")
+    from tests.benchmarks import gpu
+
+    def rasterization(means, quats, scales, opacities, colors, poses, lenses, width, height, **how):
+        assert how.keys() == {"near_plane", "sh_degree", "packed"}
+        assert (scales > 0).all()
+        picture = (colors[:, 0] * opacities[:, None]).mean(0).expand(1, height, width, 3)
+        return picture, None, {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    where = gpu.view(32, 24)
+    found = gpu.theirs(gpu.random_scene(12, where, degree=3), where, 1, packed=True)
+    assert found.keys() >= {"draw_ms", "both_ms", "step_ms"}
+
+
 def test_the_gpu_benchmark_passes_its_gate_and_writes_its_figures(tmp_path):
     pytest.importorskip("triton")
     out = tmp_path / "gpu.json"
     printed = run("tests.benchmarks.gpu", "--toy", "--out", str(out))
-    assert "gate: gradients agree with the reference" in printed
+    assert "gate: pictures and gradients agree with the reference" in printed
     (line,) = json.loads(out.read_text())["lines"]
     assert line["splats"] == 12
     assert line["entries"] > 0
-    assert min(line[name] for name in ("draw_ms", "both_ms", "step_ms")) > 0
+    assert "32x24" in printed  # the table
+    assert min(line[name] for name in ("draw_ms", "both_ms", "step_ms", "floor_ms")) > 0

@@ -18,6 +18,7 @@ from splatcli.commands import verify as command
 from stages import formats
 from stages.base.errors import SplatError
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Splats
+from stages.train import TrainSettings
 from tests.small_scene import SmallScene, small_scene
 
 
@@ -69,7 +70,7 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
             run_folder=path,
             manifest=outputs.get,
             load=lambda name: outputs[name],
-            recorded_settings=lambda: {"train": SimpleNamespace(backend="auto")},
+            recorded_settings=lambda: {"train": TrainSettings()},
         )
 
     monkeypatch.setattr(sources, "Pipeline", pipeline)

@@ -10,7 +10,7 @@ import torch
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.raster.reference import parameters_of, project, render_tensors, rotation_matrices
-from tests.extremes import kernels
+from tests.extremes import gpu, kernels
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst
 from tests.extremes.oracles import finite_differences
 from tests.extremes.sixty_digits import exact_gradients
@@ -80,13 +80,15 @@ def far_below_a_pixel(backend):
 def _compensation_error(backend, scene, view):
     """det(V V^T) / det(V V^T + e I) = (s^2 / (s^2 + e))^2 for a round footprint of variance s^2.
 
-    The reference gives only splats that are drawn, so there e is as small as the splat.
+    The others give only splats that are drawn, so there e is as small as the splat.
     """
     s2 = (np.exp(np.float64(scene.log_scales[0, 0])) * 60) ** 2
     dilation = 0.3 if backend == "cpu" else 1e-9
     settings = RasterSettings(antialias=True, dilation_px2=dilation)
     if backend == "cpu":
         found = kernels.compensation(scene, view, settings)
+    elif backend == "gpu":
+        found = gpu.opacity(scene, view, settings) / float(scene.opacities[0])
     else:
         opacities = project(parameters_of(scene), view, settings).opacities.detach()
         found = float(opacities[0]) / float(scene.opacities[0])

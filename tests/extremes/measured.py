@@ -37,12 +37,12 @@ class Measured:
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table. measure: what it takes for a backend, or None where it needs a GPU."""
+    """A row of the table. measure: what it takes for a backend."""
 
     number: int
     name: str
     input: str
-    measure: Callable[[str], list[Measured]] | None
+    measure: Callable[[str], list[Measured]]
     backends: tuple[str, ...] = BACKENDS
 
 

@@ -70,7 +70,7 @@ def same_seed(backend):
         drawn = [_drawn(threads) for threads in THREADS]
         trained = [_trained(backend, 120, threads) for threads in THREADS[:2]]
     else:
-        drawn = [_drawn_by_reference() for _ in range(2)]
+        drawn = [_drawn_by(backend) for _ in range(2)]
         trained = [_trained(backend, 4, 1) for _ in range(2)]
     assert backend != "cpu" or len(trained[0][0]) > 40  # it grew, which draws random numbers
     return [
@@ -90,11 +90,17 @@ def _differing(runs):
     )
 
 
-def _drawn_by_reference():
-    scene, view = cloud(300, degree=1), camera(90, 70)
+def five_runs(backend):
+    drawn = [_drawn_by(backend, 60) for _ in range(5)]
+    return [Measured(19, "image and gradients, bytes that differ", _differing(drawn), 0)]
+
+
+def _drawn_by(backend, n=300):
+    """[image, gradients by parameters] of a new rasteriser."""
+    scene, view = cloud(n, degree=1), camera(90, 70)
     v = np.random.default_rng(1).normal(size=(70, 90, 3)).astype(np.float32)
-    image = render(scene, view, RasterSettings(), "reference").image
-    slopes = gradients("reference", scene, view, v).values()
+    image = render(scene, view, RasterSettings(), backend).image
+    slopes = gradients(backend, scene, view, v).values()
     return [image, *map(np.ascontiguousarray, slopes)]
 
 

@@ -11,17 +11,17 @@ import pytest
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN, RasterSettings
 from stages.raster.draw import render
 from stages.scene import rgb_to_dc
-from tests.extremes.table import NO_GPU, ROWS, measured
+from tests.extremes.table import ROWS, measured
 from tests.scenes import BACKENDS, PARAMETERS, camera, cloud, gradients, join, relative, splats
 from tests.tolerances import FLOAT32_IMAGE
 
 
 def cases():
     for row in ROWS:
-        marks = [] if row.measure else [pytest.mark.gpu, pytest.mark.skip(reason=NO_GPU)]
         for backend in row.backends:
-            name = f"row_{row.number:02d}-{row.name}-{backend}"
-            yield pytest.param(row, backend, id=name, marks=marks)
+            if backend in BACKENDS:  # the GPU's are in test_gpu
+                name = f"row_{row.number:02d}-{row.name}-{backend}"
+                yield pytest.param(row, backend, id=name)
 
 
 @pytest.mark.parametrize(("row", "backend"), list(cases()))

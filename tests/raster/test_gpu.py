@@ -26,7 +26,9 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
+from stages.train import TrainSettings
 from tests import processes
+from tests.extremes.gpu import on_gpu
 from tests.extremes.table import ROWS, measured
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
@@ -129,9 +131,7 @@ def test_lists_without_room_draw_what_they_hold_and_say_how_much_it_was():
 
 
 def rows():
-    for row in ROWS:
-        if row.measure is None or row.backends == ("cpu",) or row.name == "every_format":
-            continue
+    for row in filter(on_gpu, ROWS):
         marks = [pytest.mark.skipif(device.interpreted(), reason="minutes, interpreted")]
         yield pytest.param(row, id=row.name, marks=[] if row.number in LIGHT_ROWS else marks)
 
@@ -178,19 +178,39 @@ def test_auto_passes_the_interpreter_over_and_says_why(monkeypatch):
         ("no_triton", "Triton is not installed"),
         ("cpu_build", "built for the CPU alone"),
         ("no_card", "no GPU found"),
+        ("old_driver", "NVIDIA's driver 470.42.01 is too old for CUDA 13.0"),
+        ("amd_card", "an AMD card is here, and torch is built for NVIDIA's"),
+        ("nvidia_card", "an NVIDIA card is here, and torch is built for AMD's"),
+        ("busy_card", "all CUDA-capable devices are busy"),
         ("old_card", "too old"),
         ("no_compiler", "no C compiler"),
         ("", ""),
     ],
 )
-def test_what_is_missing_is_named(fault, said, monkeypatch):
+def test_what_is_missing_is_named(fault, said, monkeypatch, tmp_path):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setenv("CC", "" if fault == "no_compiler" else "cc")
-    monkeypatch.setattr(torch.version, "cuda", None if fault == "cpu_build" else "13.0")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: fault != "no_card")
+    other = fault in ("cpu_build", "nvidia_card")
+    monkeypatch.setattr(torch.version, "cuda", None if other else "13.0")
+    monkeypatch.setattr(torch.version, "hip", "7.1" if fault == "nvidia_card" else None)
+    unseen = ("no_card", "old_driver", "amd_card", "nvidia_card")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: fault not in unseen)
+    nvidia, amd = tmp_path / "version", tmp_path / "kfd"
+    monkeypatch.setattr(device, "_NVIDIA", nvidia)
+    monkeypatch.setattr(device, "_AMD", amd)
+    if fault in ("old_driver", "nvidia_card"):
+        nvidia.write_text("NVRM version: NVIDIA UNIX x86_64 Kernel Module  470.42.01  Thu 15")
+    if fault == "amd_card":
+        amd.write_text("")
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Old Card")
     old = (5, 2) if fault == "old_card" else (9, 0)
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: old)
+
+    def capability():
+        if fault == "busy_card":
+            raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
+        return old
+
+    monkeypatch.setattr(torch.cuda, "get_device_capability", capability)
     if fault == "no_triton":
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     if fault == "no_compiler":
@@ -206,7 +226,7 @@ def test_what_is_missing_is_named(fault, said, monkeypatch):
 
 
 def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
-    run: Any = SimpleNamespace(recorded_settings=lambda: {"train": SimpleNamespace(backend="gpu")})
+    run: Any = SimpleNamespace(recorded_settings=lambda: {"train": TrainSettings(backend="gpu")})
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     assert sources.backend_of(run) == "gpu"
     monkeypatch.delenv("TRITON_INTERPRET")
@@ -220,8 +240,10 @@ def test_memory_that_runs_out_names_the_cap_that_would_fit():
         raise torch.OutOfMemoryError("CUDA out of memory")
     assert told.value.code == "raster-gpu-memory"
     assert "--max-splats 500000" in told.value.hint
-    full = device.out_of_memory(1_000_000, free=0, held=4 << 30, total=8 << 30)
-    assert "About 400,000 would fit" in full.wanted
+    nearly = device.out_of_memory(1_000_000, free=0, held=4 << 30, total=8 << 30)
+    assert nearly.fits == 800_000
+    far = device.out_of_memory(10_000_000, free=1 << 30, held=3 << 30, total=8 << 30)
+    assert "About 2,576,980 would fit" in far.wanted
 
 
 def test_a_gpu_that_is_busy_is_named():

@@ -20,6 +20,7 @@ class CopySettings:
 class CountSettings:
     iterations: int = field(default=7000, metadata={"help": "steps", "min": 1})
     seed: int = field(default=0, metadata={"help": "random seed"})
+    tool: str = field(default="pen", metadata={"help": "what counts", "midway": True})
 
 
 @dataclass(frozen=True)

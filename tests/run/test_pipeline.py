@@ -529,6 +529,18 @@ def test_leftovers_of_other_settings_are_not_used(photos: Path, run_folder: Path
     assert pipeline.load("count") == "10 from 6"  # 12 would be both attempts added up
 
 
+def test_half_done_work_goes_on_under_a_setting_that_may_change_midway(
+    photos: Path, run_folder: Path
+) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    pipeline.run({"count": CountSettings(tool="pencil")})
+    assert pipeline.load("count") == "10 from 6"
+    step = pipeline.plan({"count": CountSettings(tool="pen")})[1]
+    assert step.reason == "tool pencil -> pen"  # what is finished was made with one of them
+
+
 def test_stop_between_stages_keeps_the_finished_ones(photos: Path, run_folder: Path) -> None:
     def stop_then_finish(inputs, settings, folder, report) -> None:
         os.kill(os.getpid(), signal.SIGINT)

@@ -1,10 +1,13 @@
 """Training as a whole: known small problems, and runs that stop and go on."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from splatcli.summary import headline
 from stages import train
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
@@ -380,6 +383,41 @@ def test_a_run_goes_on_under_its_first_cap_whatever_memory_is_free_by_then(
     again, _ = trained("broken", 400.0)
     assert again == few
     assert not (tmp_path / "broken" / "cap.json").exists()
+
+
+def test_a_run_that_another_backend_goes_on_with_says_so(tmp_path):
+    scene = small_scene(tmp_path, views=4, n=40)
+    inputs = {"sfm": scene.reconstruction, "seed": scene.splats.with_sh_degree(0)}
+    folder, labels = tmp_path / "train", []
+    folder.mkdir()
+
+    def trained(backend, stop_at=None):
+        report = Report()
+
+        def listen(label, done, total, numbers):
+            labels.append(label)
+            if label == "training" and done == stop_at:
+                report.stop_requested.set()
+
+        report.listener = listen
+        settings = TrainSettings(6, train_side=24, sh_degree=0, max_splats=60, backend=backend)
+        train.run(inputs, settings, folder, report)
+        return report
+
+    with pytest.raises(Interrupted):
+        trained("cpu", stop_at=2)
+    assert not any("going on with" in label for label in labels)
+    report = trained("reference")
+    assert "going on with reference on what cpu began" in labels
+    assert [(maker["step"], maker["backend"]) for maker in report.metrics["makers"]] == [
+        (0, "cpu"),
+        (3, "reference"),
+    ]
+    assert report.metrics["made_by"] == "cpu (cpu) to step 3, then reference (cpu)"
+    assert "then reference" in dict(report.warnings)["train-several-makers"]
+    told = headline(cast(Any, SimpleNamespace(stage="train", metrics=report.metrics)))
+    assert "made by cpu (cpu) to step 3" in told
+    assert "train-several-makers" not in dict(trained("cpu").warnings)
 
 
 def test_a_cap_that_was_asked_for_is_told_as_that(tmp_path):

@@ -7,15 +7,22 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 
+if TYPE_CHECKING:
+    from stages.raster.definition import MemoryFull
+
 INSTALL = "docs/gpu.md says which build of torch brings what is missing."
 _OLDEST = (7, 0)  # compute capability that Triton compiles for
+BYTES_A_SPLAT = 1500  # of training, with degree 3 and 4 tiles a splat: docs/gpu.md
+_NVIDIA, _AMD = Path("/proc/driver/nvidia/version"), Path("/dev/kfd")  # there with their drivers
 _COMPILERS = ("cc", "gcc", "clang")
 
 
@@ -38,12 +45,36 @@ def missing() -> str:
     if torch.version.cuda is None and torch.version.hip is None:
         return f"torch {torch.__version__} is built for the CPU alone"
     if not torch.cuda.is_available():
-        return "no GPU found that this build of torch can use (no card, or its driver is too old)"
-    if torch.version.cuda and torch.cuda.get_device_capability() < _OLDEST:
-        return f"{torch.cuda.get_device_name()} is too old for Triton"
+        return _unseen(torch.version.cuda)
+    try:
+        if torch.version.cuda and torch.cuda.get_device_capability() < _OLDEST:
+            return f"{torch.cuda.get_device_name()} is too old for Triton"
+    except RuntimeError as error:  # another program may hold it for itself
+        return f"the GPU does not answer: {str(error).splitlines()[0]}"
     if not os.environ.get("CC") and not any(map(shutil.which, _COMPILERS)):
         return "no C compiler found, which Triton needs once to launch its kernels"
     return ""
+
+
+def _unseen(cuda: str | None) -> str:
+    """Why a torch built for CUDA (else for ROCm) sees no card, as far as the system tells."""
+    nvidia, amd = _NVIDIA.exists(), _AMD.exists()
+    if cuda and nvidia:
+        return f"NVIDIA's driver {_driver()} is too old for CUDA {cuda}, or shows no card to it"
+    if cuda and amd:
+        return "an AMD card is here, and torch is built for NVIDIA's (CUDA)"
+    if not cuda and nvidia:
+        return "an NVIDIA card is here, and torch is built for AMD's (ROCm)"
+    return "no GPU found that this build of torch can use"
+
+
+def _driver() -> str:
+    """NVIDIA's, by its number; "" where it does not tell."""
+    try:
+        found = re.search(r"\b\d+\.\d+(\.\d+)?\b", _NVIDIA.read_text())
+    except OSError:
+        found = None
+    return found[0] if found else ""
 
 
 def require() -> Any:
@@ -67,18 +98,28 @@ def _no_triton() -> str:
 
 
 def told() -> str:
-    """Card, memory, driver's runtime, torch and Triton, in one line; of the interpreter as well."""
+    """Card, memory, driver, torch and Triton, in one line; of the interpreter as well."""
     import torch
-    import triton
 
-    built = f"torch {torch.__version__}, Triton {triton.__version__}"
     if interpreted():
-        return f"Triton's interpreter on the CPU, {built}"
+        return f"Triton's interpreter on the CPU, {built()}"
     properties = torch.cuda.get_device_properties(0)
     runtime = torch.version.hip or torch.version.cuda
     kind = "ROCm" if torch.version.hip else "CUDA"
     gib = properties.total_memory / 2**30
-    return f"{properties.name}, {gib:.0f} GiB, {kind} {runtime}, {built}"
+    driver = f"driver {_driver()}, " if _driver() else ""
+    return f"{properties.name}, {gib:.0f} GiB, {driver}{kind} {runtime}, {built()}"
+
+
+def built() -> str:
+    """Which torch, and which Triton."""
+    import torch
+
+    if importlib.util.find_spec("triton") is None:
+        return f"torch {torch.__version__}, no Triton"
+    import triton
+
+    return f"torch {torch.__version__}, Triton {triton.__version__}"
 
 
 @contextmanager
@@ -90,7 +131,7 @@ def failures_told(splats: int) -> Iterator[None]:
         yield
     except torch.OutOfMemoryError as error:
         free, total = torch.cuda.mem_get_info() if torch.cuda.is_available() else (0, 0)
-        held = torch.cuda.memory_allocated() if torch.cuda.is_available() else 0
+        held = torch.cuda.memory_reserved() if torch.cuda.is_available() else 0
         raise out_of_memory(splats, free, held, total) from error
     except RuntimeError as error:
         if "CUDA error" not in str(error) and "HIP error" not in str(error):
@@ -104,16 +145,13 @@ def failures_told(splats: int) -> Iterator[None]:
         ) from error
 
 
-def out_of_memory(splats: int, free: int, held: int, total: int) -> SplatError:
+def out_of_memory(splats: int, free: int, held: int, total: int) -> MemoryFull:
     """The error for `splats` splats that did not fit; bytes free, held by us, and on the card."""
-    fits = int(splats * 0.8 * (free + held) / max(total, 1)) if total else splats // 2
+    from stages.raster.definition import MemoryFull
+
+    fits = splats // 2
+    if total:
+        fits = min(int(0.8 * splats), int(0.9 * (free + held) / BYTES_A_SPLAT))
     gib = 2**30
-    return SplatError(
-        "raster-gpu-memory",
-        given=f"{splats:,} splats do not fit into the GPU's memory "
-        f"({free / gib:.1f} of {total / gib:.1f} GiB free, {held / gib:.1f} GiB held by this run).",
-        wanted=f"About {fits:,} would fit.",
-        hint=f"Go on with --max-splats {fits}, or close what else uses the card. "
-        "The last checkpoint is kept.",
-        family=Family.RESOURCES,
-    )
+    room = f"{free / gib:.1f} of {total / gib:.1f} GiB free, {held / gib:.1f} GiB held by this run"
+    return MemoryFull(splats, fits, room)

@@ -1,0 +1,57 @@
+"""The devices of torch that the reference draws on. Imports torch when it is first asked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stages.base.errors import Family, SplatError
+
+PROCESSOR = "cpu"
+DEVICES = (PROCESSOR, "cuda", "mps", "xpu")
+
+
+def is_there(name: str) -> bool:
+    """Whether this build of torch finds such a device on this machine."""
+    import torch
+
+    known = torch.backends if name == "mps" else torch
+    return name == PROCESSOR or bool(getattr(known, name).is_available())
+
+
+def device_named(name: str) -> Any:
+    """The torch device. Raises SplatError (raster-no-device) where it is not there."""
+    import torch
+
+    if not is_there(name):
+        raise SplatError(
+            "raster-no-device",
+            given=f"--device {name}: torch {torch.__version__} finds no such device here.",
+            wanted=f"One that is there: {', '.join(filter(is_there, DEVICES))}.",
+            hint="Choose that, or another backend. docs/gpu.md says which build of torch brings "
+            "which device.",
+            family=Family.RESOURCES,
+        )
+    return torch.device(name)
+
+
+def widest(device: Any) -> Any:
+    """The dtype to compute in: float64, or float32 on a device that has no other."""
+    import torch
+
+    try:
+        torch.ones(1, dtype=torch.float64, device=device).mul(2)
+    except (TypeError, RuntimeError):
+        return torch.float32
+    return torch.float64
+
+
+def told(name: str) -> str:
+    """What the device is, in a few words. Raises SplatError where it is not there."""
+    import torch
+
+    if name == PROCESSOR:
+        return PROCESSOR
+    device_named(name)
+    made = getattr(torch, name)
+    model = made.get_device_name() if hasattr(made, "get_device_name") else "Apple GPU"
+    return f"{model}, torch {torch.__version__}"

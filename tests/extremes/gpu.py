@@ -1,0 +1,113 @@
+"""The rows of the extremes table on a GPU, or by Triton's interpreter where there is none.
+
+python -m tests.extremes.gpu [--row 3 --row 4] [--float32]
+
+A row takes the interpreter seconds or minutes, so what was measured is kept in gpu.json beside
+this file, and the table's column "gpu" is made of that: with a GPU at hand run this, then
+`python -m tests.extremes --write docs/extremes.md`. --float32: with footprints in float32, kept
+apart; what that costs is in docs/gpu.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.raster.gpu import device
+from stages.scene import Camera, Splats
+from tests.extremes.measured import Measured, Row
+
+ONE = ("cpu",)  # what has one implementation, which all backends share
+KEPT = Path(__file__).with_name("gpu.json")
+DOUBLE, SINGLE = "float64", "float32"
+
+
+def on_gpu(row: Row) -> bool:
+    """Whether a row says anything of kernels on a GPU: files and what only the CPU's kernels have
+    do not."""
+    return row.backends != ONE and row.name != "every_format"
+
+
+@functools.cache
+def kept(real: str = DOUBLE) -> dict[int, list[Measured]]:
+    """What was measured, by row."""
+    return {
+        int(number): [Measured(**line) for line in told["numbers"]]
+        for number, told in _read().get(real, {}).items()
+    }
+
+
+def wheres(real: str = DOUBLE) -> list[str]:
+    """What measured it."""
+    return sorted({told["where"] for told in _read().get(real, {}).values()})
+
+
+def _read() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(KEPT.read_text()) if KEPT.exists() else {}
+    return found
+
+
+def keep(row: Row, found: list[Measured], real: str) -> None:
+    """Put one row's numbers in the place of those kept before."""
+    every = _read()
+    told = {"where": device.told(), "numbers": [asdict(m) for m in found]}
+    column = {**every.get(real, {}), str(row.number): told}
+    every[real] = {number: column[number] for number in sorted(column, key=int)}
+    KEPT.write_text(json.dumps(every, indent=1) + "\n")
+
+
+def opacity(scene: Splats, view: Camera, settings: RasterSettings) -> float:
+    """Of the first splat as the kernels blend it, compensation included."""
+    from stages.raster.gpu.project import LEVEL
+    from stages.raster.gpu.rasteriser import GpuRasteriser
+
+    rasteriser = GpuRasteriser()
+    seen = rasteriser.view(view, settings)
+    records = rasteriser.draw(rasteriser.scene(splat_arrays(scene)), seen).records
+    return float(2.0 ** records[0, LEVEL.value].double())
+
+
+def in_float32() -> None:
+    """From here on, footprints of the backend "gpu" in this process are float32."""
+    import triton.language as tl
+
+    from stages.raster.gpu.rasteriser import GpuRasteriser
+
+    GpuRasteriser.__init__.__defaults__ = (None, tl.float32)
+
+
+def main() -> int:
+    """0 if every number measured is within its bound."""
+    from tests.extremes.table import ROWS
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--row", type=int, action="append", help="of the table; by default all")
+    parser.add_argument("--float32", action="store_true", help="footprints in float32")
+    asked = parser.parse_args()
+    device.require()
+    if asked.float32:
+        in_float32()
+    real, good = SINGLE if asked.float32 else DOUBLE, True
+    for row in ROWS:
+        if not on_gpu(row) or (asked.row and row.number not in asked.row):
+            continue
+        found = row.measure("gpu")
+        keep(row, found, real)
+        for m in found:
+            good &= m.accepted
+            bound = "none" if m.bound is None else f"{m.bound:.3g}"
+            print(
+                f"{row.number:3} {'' if m.accepted else 'FAILS ':6}{m.error:.2g} of {bound}", m.what
+            )
+        sys.stdout.flush()
+    return int(not good)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
