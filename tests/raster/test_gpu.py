@@ -35,8 +35,8 @@ from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 TARGETS = ("cuda:80", "cuda:90", "cuda:100", "hip:gfx942")
-# Rows of the extremes table that the interpreter does in seconds. On a GPU all are done.
-LIGHT_ROWS = (1, 2, 5, 6, 7, 9, 10, 13, 14, 15)
+# Rows of the extremes table that the interpreter does in a second or two. On a GPU all are done.
+LIGHT_ROWS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 13, 14, 15, 22, 24, 31)
 
 
 @pytest.fixture(autouse=True)
@@ -132,8 +132,9 @@ def test_lists_without_room_draw_what_they_hold_and_say_how_much_it_was():
 
 def rows():
     for row in filter(on_gpu, ROWS):
-        marks = [pytest.mark.skipif(device.interpreted(), reason="minutes, interpreted")]
-        yield pytest.param(row, id=row.name, marks=[] if row.number in LIGHT_ROWS else marks)
+        heavy = device.interpreted() and row.number not in LIGHT_ROWS
+        why = "slow, interpreted: python -m tests.extremes.gpu measures it"
+        yield pytest.param(row, id=row.name, marks=[pytest.mark.skipif(heavy, reason=why)])
 
 
 @pytest.mark.parametrize("row", list(rows()))
