@@ -11,7 +11,7 @@ import pytest
 from tests import sample
 
 pytest.importorskip("triton")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.gpu, pytest.mark.slow, pytest.mark.timeout(900)]
 
 WORDS = ("--steps", "40", "--train-side", "64", "--max-splats", "40", "--backend", "gpu")
 

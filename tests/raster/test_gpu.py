@@ -33,6 +33,7 @@ from tests.extremes.table import ROWS, measured
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 
+pytestmark = pytest.mark.gpu
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 TARGETS = ("cuda:80", "cuda:90", "cuda:100", "hip:gfx942")
 # Rows of the extremes table that the interpreter does in a second or two. On a GPU all are done.

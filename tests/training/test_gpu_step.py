@@ -16,6 +16,7 @@ from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from stages.scene import IGNORE, TRANSPARENT
 from stages.training import gpu_step
+from stages.training.dropout import Dropout
 from stages.training.gpu_step import GpuStep, image_loss
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
@@ -24,6 +25,7 @@ from stages.training.views import Level
 from tests.scenes import camera, cloud
 from tests.tolerances import LOSS_GRADIENT
 
+pytestmark = pytest.mark.gpu
 RATES = LearningRates(means=1e-3)
 SETTINGS = RasterSettings(near=0.1, sh_degree=1)
 WAITS = ("item", "cpu", "numpy", "tolist", "nonzero", "__bool__", "__int__", "__float__")
@@ -99,10 +101,15 @@ def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
     assert apart <= LOSS_GRADIENT * top
 
 
-def test_a_steady_step_never_waits_for_the_device(monkeypatch):
-    made, seen = stepper(lag=2), level()
+@pytest.mark.parametrize(
+    ("seen", "dropout"),
+    [(level(), None), (masked(TRANSPARENT, (0.3, -0.2, 0.1)), Dropout(5, 7))],
+    ids=["plain", "cut out, in its light, some splats sitting out"],
+)
+def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
+    made = stepper(lag=2)
     for _ in range(4):
-        made.step(seen, SETTINGS, RATES, smooth=False)
+        made.step(seen, SETTINGS, RATES, False, dropout)
     waits: Counter[str] = Counter()
 
     def counting(name, kept):
@@ -117,7 +124,7 @@ def test_a_steady_step_never_waits_for_the_device(monkeypatch):
     if made.device.type == "cuda":
         torch.cuda.set_sync_debug_mode("error")
     try:
-        made.step(seen, SETTINGS, RATES, smooth=False)
+        made.step(seen, SETTINGS, RATES, False, dropout)
     finally:
         if made.device.type == "cuda":
             torch.cuda.set_sync_debug_mode("default")
