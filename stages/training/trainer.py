@@ -244,7 +244,7 @@ class Trainer:
         if not self.schedule.densifies_after(step):
             return
         model = self._strategy.prune(self.model, self.schedule.prunes_giants(step))
-        budget = self.schedule.budget(step, self.cap)
+        budget = min(self.schedule.budget(step, self.cap), self.cap)  # which may have been lowered
         model = self._strategy.grow(model, budget, self.schedule.rng(step))
         model = model.take(morton.order_of(model.means))
         if self.smooth:

@@ -12,6 +12,8 @@ import pytest
 
 from splatcli import console
 from stages.base.errors import Interrupted, SplatError
+from stages.raster import torch_device
+from stages.raster.gpu import device as gpu
 from stages.run.lock import locked
 
 STAGES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
@@ -221,6 +223,7 @@ def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
         (["process", "photos", "--steps", "many"], "A whole number from 1 to 1,000,000."),
         (["process", "photos", "--preset", "fast"], "One of preview, standard, best."),
         (["process", "photos", "--backend", "cuda"], "One of auto, gpu, cpu, reference."),
+        (["process", "photos", "--device", "cuda"], "--device goes with --backend reference."),
         (["process", "photos", "--format", "obj"], "--format obj cannot be used"),
         (["process", "photos", "--stepz", "4"], "Did you mean --steps"),
         (["process", "photos", "--steps"], "--steps needs a value"),
@@ -242,6 +245,23 @@ def test_wrong_words_are_named_in_our_words_and_exit_2(splat, words: list[str], 
         assert label in result.stderr
     for foreign in ("Traceback", "Value error", "Input should", "Invalid value", "Usage:"):
         assert foreign not in result.output
+    assert not Path("run").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--backend", "gpu"], "The backend gpu cannot run here"),
+        (["--backend", "reference", "--device", "xpu"], "One that is there: cpu."),
+    ],
+)
+def test_what_cannot_draw_here_is_said_before_other_work(splat, monkeypatch, words, said) -> None:
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(gpu, "missing", lambda: "no card")
+    monkeypatch.setattr(torch_device, "is_there", lambda name: name == "cpu")
+    result = splat("process", "photos", *words)
+    assert result.exit_code == 6, result.output
+    assert said in result.stderr
     assert not Path("run").exists()
 
 
