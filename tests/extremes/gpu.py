@@ -14,7 +14,6 @@ import argparse
 import functools
 import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ def on_gpu(row: Row) -> bool:
 def kept(real: str = DOUBLE) -> dict[int, list[Measured]]:
     """What was measured, by row."""
     return {
-        int(number): [Measured(**line) for line in told["numbers"]]
+        int(number): [Measured(int(number), *line) for line in told["numbers"]]
         for number, told in _read().get(real, {}).items()
     }
 
@@ -53,13 +52,23 @@ def _read() -> dict[str, Any]:
     return found
 
 
+def _write(every: dict[str, Any]) -> None:
+    """A row a line."""
+    parts = []
+    for real, column in every.items():
+        lines = (f"  {json.dumps(number)}: {json.dumps(told)}" for number, told in column.items())
+        parts.append(f" {json.dumps(real)}: {{\n" + ",\n".join(lines) + "\n }")
+    KEPT.write_text("{\n" + ",\n".join(parts) + "\n}\n")
+
+
 def keep(row: Row, found: list[Measured], real: str) -> None:
     """Put one row's numbers in the place of those kept before."""
     every = _read()
-    told = {"where": device.told(), "numbers": [asdict(m) for m in found]}
+    numbers = [[m.what, float(f"{m.error:.3g}"), m.bound, m.note] for m in found]
+    told = {"where": device.told(), "numbers": numbers}
     column = {**every.get(real, {}), str(row.number): told}
     every[real] = {number: column[number] for number in sorted(column, key=int)}
-    KEPT.write_text(json.dumps(every, indent=1) + "\n")
+    _write(every)
 
 
 def opacity(scene: Splats, view: Camera, settings: RasterSettings) -> float:
