@@ -61,7 +61,7 @@ def trained(folder: Path, backend: str):
     report.listener = lambda label, *rest: labels.append(label)
     inputs = {"sfm": scene.reconstruction, "seed": scene.splats.with_sh_degree(0)}
     settings = TrainSettings(**{**vars(SETTINGS), "backend": backend})
-    splats = train.run(inputs, settings, folder / "work", report)
+    splats = train.run(inputs, settings, folder / "work", report).splats
     return splats, report, labels
 
 
