@@ -82,7 +82,7 @@ def test_manifest_says_what_was_made_from_what(finished: Pipeline, run_folder: P
     assert copied
     assert counted
     assert counted.inputs == {"copy": copied.output_digest}
-    assert counted.settings == {"iterations": 7000, "seed": 0}
+    assert counted.settings == {"iterations": 7000, "seed": 0, "tool": "pen"}
     assert counted.seed == 0
     assert counted.warnings == [["count-low", "Few letters. Write more."]]
     assert set(copied.input_files["photos"]) == {"a.jpg", "b.jpg"}
