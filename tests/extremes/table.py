@@ -168,8 +168,8 @@ def summary() -> str:
     reported = sum(m.bound is None for m in every)
     return (
         f"{len(ROWS)} rows, {len(every)} numbers: {held} within their bounds, {limits} beyond for "
-        f"a known reason, {failing} failing, {reported} only reported; {missing} rows without the GPU's "
-        "kernels."
+        f"a known reason, {failing} failing, {reported} only reported; {missing} rows without "
+        "the GPU's kernels."
     )
 
 
