@@ -14,6 +14,7 @@ from splatcli import blocks, jobs
 from splatcli.tasks import Ending, InTurn
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Interrupted, SplatError
+from stages.blocks import sight
 from stages.run.pipeline import Listener, Pipeline
 from stages.scene import save_splats, split_held_out
 from stages.structure.reconstruction_files import save_reconstruction
@@ -138,6 +139,17 @@ def test_one_block_is_the_scene_as_ever(tmp_path, photos) -> None:
 )
 def test_auto_means_a_block_for_so_many_photographs(asked, photographs, wanted) -> None:
     assert blocks.blocks_wanted(asked, photographs) == wanted
+
+
+def test_a_block_that_no_photograph_shows_is_the_coarse_model_s(
+    tmp_path, photos, monkeypatch
+) -> None:
+    monkeypatch.setattr(sight, "members", lambda share: np.array([[True], [False]]) & (share >= 0))
+    manifest = trained(tmp_path / "run", photos, blocks="2", steps=20).manifest("train")
+    assert manifest is not None
+    folders = [row["run_folder"] for row in manifest.metrics["blocks"]]
+    assert folders == ["blocks/1", "blocks/coarse"]
+    assert "train-blocks-unseen" in [code for code, _ in manifest.warnings]
 
 
 def test_blocks_need_a_number_of_splats_to_share(tmp_path, photos) -> None:
