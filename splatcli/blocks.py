@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 OpenEngine = Callable[[Path, Listener], AbstractContextManager[Engine]]
 FOLDER, COARSE = "blocks", "coarse"
 PHOTOGRAPHS_A_BLOCK = 250
-COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4  # as much less than is asked of the whole
+# As much less than is asked of the whole; and no more splats than one of the blocks gets.
+COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4
 
 
 def in_blocks(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
@@ -102,7 +103,7 @@ class _Scene:
         started = time.monotonic()
         light = light_wanted(self.whole, self.settings.light, self.report)
         self.settings = replace(self.settings, light="on" if light else "off")
-        coarse = self._coarse(seeds)
+        coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
         places, weights = ground.looked_at(replace(self.whole, views=training))
         cells = ground.cut(places, weights, blocks)
@@ -123,12 +124,12 @@ class _Scene:
         self.report.metric("train_seconds", round(time.monotonic() - started, 1))
         return trained
 
-    def _coarse(self, seeds: Splats) -> Splats:
+    def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(
             self.settings,
             steps=max(1, self.settings.steps // COARSE_STEPS),
             train_side=max(16, self.settings.train_side // COARSE_SIDE),
-            max_splats=max(1, self.settings.max_splats // COARSE_SPLATS),
+            max_splats=max(1, self.settings.max_splats // fewer),
         )
         block_folders.begin(self.pipeline, self.root / COARSE, self.whole, seeds, settings)
         self._run([COARSE], settings.max_splats)

@@ -20,7 +20,7 @@ OPACITY_MIN = 0.005
 OPACITY_RESET = 0.01
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 
-BASE_MIB = 3072.0  # libraries, at most 1 GiB of photographs, matching them
+BASE_MIB = 2048.0  # libraries, and photographs of which at most 1 GiB is kept
 
 
 def splat_cap(available_mib: float | None) -> int:
