@@ -8,6 +8,7 @@ them.
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -160,6 +161,9 @@ class _Scene:
                 f"No photograph shows {counted(len(empty), 'block')} of {len(cells)} "
                 f"({', '.join(empty)}): the coarse model stands there. Ask for fewer --blocks.",
             )
+        for left in self.root.iterdir():  # by an earlier cut into more blocks
+            if left.name.isdigit() and left.name not in folders:
+                shutil.rmtree(left)
         self._run([folder for folder in folders if folder != COARSE], largest)
         parts: list[TrainedSplats] = []
         told = []

@@ -128,6 +128,13 @@ def test_stopped_blocks_go_on_and_end_in_the_same_bytes(tmp_path, photos) -> Non
     assert finished.stat().st_mtime_ns == before
 
 
+def test_blocks_cut_anew_leave_none_of_the_old_ones(tmp_path, photos) -> None:
+    trained(tmp_path / "run", photos, blocks="3", steps=20)
+    again = trained(tmp_path / "run", photos, blocks="2", steps=20)
+    assert digest(again) == digest(trained(tmp_path / "new", photos, blocks="2", steps=20))
+    assert sorted(p.name for p in (tmp_path / "run/blocks").iterdir()) == ["1", "2", "coarse"]
+
+
 def test_one_block_is_the_scene_as_ever(tmp_path, photos) -> None:
     auto = trained(tmp_path / "auto", photos, blocks="auto")
     assert not (tmp_path / "auto" / "blocks").exists()
