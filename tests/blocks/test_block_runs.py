@@ -20,6 +20,8 @@ from stages.scene import save_splats, split_held_out
 from stages.structure.reconstruction_files import save_reconstruction
 from tests.small_scene import small_scene
 
+pytestmark = pytest.mark.timeout(300)  # the first to train compiles kernels
+
 SMALL = {"steps": 150, "train_side": 72, "sh_degree": 1, "max_splats": 400}
 
 
