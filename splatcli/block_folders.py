@@ -10,15 +10,16 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stages.base.libraries import versions
 from stages.run.digests import combined_digest, record_files
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Pipeline
 from stages.run.runfile import RunFile
-from stages.scene import Reconstruction, Splats, save_splats
-from stages.structure.reconstruction_files import save_reconstruction
+
+if TYPE_CHECKING:
+    from stages.scene import Reconstruction, Splats
 
 _POINTS = 100_000  # of the sparse cloud, at most: it only says how large the scene is
 
@@ -29,6 +30,9 @@ def begin(
     """Make `folder` a run folder with ingest, sfm and seed finished: `part`, whose pictures lie
     with the whole's, and the splats to start from. settings: of training. Equal inputs make equal
     folders, so that it may be begun again at any time. Raises SplatError, OSError."""
+    from stages.scene import save_splats
+    from stages.structure.reconstruction_files import save_reconstruction
+
     folder.mkdir(parents=True, exist_ok=True)
     pipeline = Pipeline(folder)
     ingest = _of(whole, "ingest")

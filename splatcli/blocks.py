@@ -8,6 +8,7 @@ them.
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -17,6 +18,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatcli import block_folders
 from splatcli.tasks import Engine, Task, need_of
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Report, Stage
@@ -36,7 +38,8 @@ if TYPE_CHECKING:
 OpenEngine = Callable[[Path, Listener], AbstractContextManager[Engine]]
 FOLDER, COARSE = "blocks", "coarse"
 PHOTOGRAPHS_A_BLOCK = 250
-COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4  # as much less than is asked of the whole
+# As much less than is asked of the whole; and no more splats than one of the blocks gets.
+COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4
 
 
 def in_blocks(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
@@ -101,7 +104,7 @@ class _Scene:
         started = time.monotonic()
         light = light_wanted(self.whole, self.settings.light, self.report)
         self.settings = replace(self.settings, light="on" if light else "off")
-        coarse = self._coarse(seeds).splats
+        coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
         places, weights = ground.looked_at(replace(self.whole, views=training))
         cells = ground.cut(places, weights, blocks)
@@ -122,14 +125,16 @@ class _Scene:
         self.report.metric("train_seconds", round(time.monotonic() - started, 1))
         return trained
 
-    def _coarse(self, seeds: Splats) -> TrainedSplats:
+    def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(
             self.settings,
             steps=max(1, self.settings.steps // COARSE_STEPS),
             train_side=max(16, self.settings.train_side // COARSE_SIDE),
-            max_splats=max(1, self.settings.max_splats // COARSE_SPLATS),
+            max_splats=max(1, self.settings.max_splats // fewer),
         )
-        return self._trained({COARSE: (self.whole, seeds, settings)})[COARSE]
+        block_folders.begin(self.pipeline, self.root / COARSE, self.whole, seeds, settings)
+        self._run([COARSE], settings.max_splats)
+        return self._trained(COARSE).splats
 
     def _blocks(
         self,
@@ -139,72 +144,70 @@ class _Scene:
         member: NDArray[np.bool_],
         margin: float,
     ) -> list[TrainedSplats]:
-        """What each block learnt; the coarse splats of a cell that no photograph shows."""
-        from stages.blocks import merge
-        from stages.scene import TrainedSplats
-
-        runs = {}
+        """What each block learnt of its cell; the coarse splats of a cell that no photograph shows.
+        One block at a time is held whole."""
+        folders, largest = [], 0
         for number, (cell, chosen) in enumerate(zip(cells, member, strict=True), start=1):
             views = tuple(v for v, own in zip(self.whole.views, chosen, strict=True) if own)
+            folders.append(COARSE)
             if any(view.role != "test" for view in views):
-                wide = cell.widened(margin)
-                inside = int(wide.holds(coarse.means).sum())
-                own = max(1, round(self.settings.max_splats * inside / len(coarse)))
-                start = merge.surrounded(seeds, coarse, wide, own)
-                settings = replace(
-                    self.settings,
-                    max_splats=max(len(start), len(coarse) - inside + own),
-                    within=(*wide.low, *wide.high),
-                )
-                runs[str(number)] = (replace(self.whole, views=views), start, settings)
-        empty = [str(n) for n in range(1, len(cells) + 1) if str(n) not in runs]
+                folders[-1] = str(number)
+                part, wide = replace(self.whole, views=views), cell.widened(margin)
+                largest = max(largest, self._begin(str(number), part, seeds, coarse, wide))
+        empty = [str(n) for n, folder in enumerate(folders, start=1) if folder == COARSE]
         if empty:
             self.report.warn(
                 "train-blocks-unseen",
                 f"No photograph shows {counted(len(empty), 'block')} of {len(cells)} "
                 f"({', '.join(empty)}): the coarse model stands there. Ask for fewer --blocks.",
             )
-        found = self._trained(runs)
-        none = TrainedSplats(coarse)
-        parts = [found.get(str(number), none) for number in range(1, len(cells) + 1)]
-        self._record(cells, runs, parts)
-        return parts
-
-    def _record(
-        self, cells: Sequence[Cell], runs: Mapping[str, Any], parts: Sequence[TrainedSplats]
-    ) -> None:
-        """Which block gave how many splats: they lie in this order."""
+        for left in self.root.iterdir():  # by an earlier cut into more blocks
+            if left.name.isdigit() and left.name not in folders:
+                shutil.rmtree(left)
+        self._run([folder for folder in folders if folder != COARSE], largest)
+        parts: list[TrainedSplats] = []
         told = []
-        for number, (cell, part) in enumerate(zip(cells, parts, strict=True), start=1):
-            run = str(number) if str(number) in runs else COARSE
-            count = int(cell.holds(part.splats.means).sum())
-            views = runs[run][0].views if run in runs else ()
+        for folder, cell, chosen in zip(folders, cells, member, strict=True):
+            trained = self._trained(folder)
+            own = trained.splats.take(cell.holds(trained.splats.means))
+            parts.append(replace(trained, splats=own))
             told.append(
                 {
-                    "block": number,
-                    "run_folder": f"{FOLDER}/{run}",
+                    "run_folder": f"{FOLDER}/{folder}",
                     "low_x_z": cell.low,
                     "high_x_z": cell.high,
-                    "photographs": len(views),
-                    "splats_trained": len(part.splats),
-                    "splats_given": count,
+                    "photographs": int(chosen.sum()),
+                    "splats_trained": len(trained.splats),
+                    "splats_given": len(own),
                 }
             )
         self.report.metric("blocks", told)
+        return parts
 
-    def _trained(
-        self, runs: Mapping[str, tuple[Reconstruction, Splats, Any]]
-    ) -> dict[str, TrainedSplats]:
-        """The trained splats of runs in folders of these names. Raises SplatError for one that
-        failed, once the others have ended."""
-        from splatcli import block_folders
+    def _begin(
+        self, name: str, part: Reconstruction, seeds: Splats, coarse: Splats, wide: Cell
+    ) -> int:
+        """Make a block's run folder; how many splats it may have, its surroundings included. Of
+        the whole's, it has the share that the coarse model has in its cell."""
+        from stages.blocks import merge
 
-        names = list(runs)
-        for name, (part, start, settings) in runs.items():
-            block_folders.begin(self.pipeline, self.root / name, part, start, settings)
+        inside = int(wide.holds(coarse.means).sum())
+        own = max(1, round(self.settings.max_splats * inside / len(coarse)))
+        start = merge.surrounded(seeds, coarse, wide, own)
+        cap: int = max(len(start), len(coarse) - inside + own)
+        settings = replace(self.settings, max_splats=cap, within=(*wide.low, *wide.high))
+        block_folders.begin(self.pipeline, self.root / name, part, start, settings)
+        return cap
+
+    def _trained(self, name: str) -> TrainedSplats:
+        found: TrainedSplats = Pipeline(self.root / name).load("train")
+        return found
+
+    def _run(self, names: Sequence[str], most_splats: int) -> None:
+        """Train in the run folders of these names. Raises SplatError for the first that failed,
+        once the others have ended."""
         tasks = [Task(self.root / name, until="train") for name in names]
-        largest = max(settings.max_splats for _, _, settings in runs.values())
-        need = need_of(replace(self.settings, max_splats=largest))
+        need = need_of(replace(self.settings, max_splats=most_splats))
         failed = None
         ended = self.engine.results(tasks, need, self.report.stop_requested)
         for done, (number, ending) in enumerate(ended, start=1):
@@ -219,7 +222,6 @@ class _Scene:
                 )
         if failed is not None:
             raise failed
-        return {name: Pipeline(self.root / name).load("train") for name in names}
 
     def _joined(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.raster.definition import OPACITY
 from stages.scene import logit
@@ -20,7 +21,7 @@ OPACITY_MIN = 0.005
 OPACITY_RESET = 0.01
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 
-BASE_MIB = 3072.0  # libraries, at most 1 GiB of photographs, matching them
+BASE_MIB = 2048.0  # libraries, and photographs of which at most 1 GiB is kept
 
 
 def splat_cap(available_mib: float | None) -> int:
@@ -83,22 +84,26 @@ class AdaptiveDensity:
 @dataclass(frozen=True)
 class Within:
     """Another strategy that grows in a rectangle of the ground plane alone: low and high x and z of
-    `bounds` (x0, z0, x1, z1)."""
+    `bounds` (x0, z0, x1, z1). Outside, where nothing could take its place, no giant is pruned."""
 
     rule: Strategy
     bounds: tuple[float, ...]
 
     def prune(self, model: Model, settled: bool) -> Model:
-        return self.rule.prune(model, settled)
+        inside = self._inside(model)
+        there = self.rule.prune(model.take(~inside), False)
+        return self.rule.prune(model.take(inside), settled).joined(there)
 
     def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
-        at = model.means[:, [0, 2]]
-        inside = ((at >= self.bounds[:2]) & (at < self.bounds[2:])).all(1)
-        model.gradient_sum[~inside] = 0.0
+        model.gradient_sum[~self._inside(model)] = 0.0
         return self.rule.grow(model, budget, rng)
 
     def reset(self, model: Model) -> Model:
         return self.rule.reset(model)
+
+    def _inside(self, model: Model) -> NDArray[np.bool_]:
+        at = model.means[:, [0, 2]]
+        return np.asarray(((at >= self.bounds[:2]) & (at < self.bounds[2:])).all(1))
 
 
 def _children(parents: Model, rng: np.random.Generator) -> Model:

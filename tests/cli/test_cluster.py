@@ -48,11 +48,11 @@ def words(out: str, *more: str) -> list[str]:
     return processes.splat("batch", *captures, "--out", out, *SMALL, *more)
 
 
-def outputs(runs: Path) -> dict[str, str]:
+def outputs(runs: Path, which: str = "*/") -> dict[str, str]:
     """SHA-256 of each output file of each stage of each run."""
     return {
         path.relative_to(runs).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(runs.glob("*/[1-7]-*/**/*"))
+        for path in sorted(runs.glob(f"{which}[1-7]-*/**/*"))
         if path.is_file() and path.name != "manifest.json"
     }
 
@@ -70,7 +70,7 @@ def ray_workers(driver: int) -> list[int]:
     return found
 
 
-def batch_with_kills(folder: Path, command: Sequence[str], kills: int) -> int:
+def with_kills(folder: Path, command: Sequence[str], kills: int) -> int:
     """Run it, and kill a worker as many times at random moments; how many were."""
     chance, done = random.Random(SEED), 0
     with processes.running(command, cwd=folder) as process:
@@ -84,8 +84,20 @@ def batch_with_kills(folder: Path, command: Sequence[str], kills: int) -> int:
     return done
 
 
+def blocks_of(folder: Path, name: str, *more: str, kills: int = 0) -> dict[str, str]:
+    """Outputs of a capture in two blocks, from the cameras that were found before."""
+    for done in sorted((folder / "alone" / "front").glob("[1-3]-*")):
+        shutil.copytree(done, folder / name / done.name)
+    shutil.copy(folder / "alone" / "front" / "run.json", folder / name)
+    command = processes.splat(
+        "process", "captures/front", "--out", name, "--blocks", "2", *SMALL, *more
+    )
+    assert with_kills(folder, command, kills) == kills
+    return outputs(folder / name, "blocks/*/") | outputs(folder / name, "")
+
+
 def test_workers_that_are_killed_change_nothing(folder: Path) -> None:
-    killed = batch_with_kills(folder, words("killed", "--cluster", "local:2"), KILLS)
+    killed = with_kills(folder, words("killed", "--cluster", "local:2"), KILLS)
     assert killed == KILLS
     assert outputs(folder / "killed") == outputs(folder / "alone")
     with (folder / "killed" / "batch.csv").open(encoding="utf-8") as file:
@@ -105,3 +117,12 @@ def test_a_head_that_is_killed_leaves_nobody_behind_and_is_gone_on_with(folder: 
         time.sleep(0.2)
     subprocess.run(command, cwd=folder, check=True, timeout=600)
     assert outputs(folder / "headless") == outputs(folder / "alone")
+
+
+def test_blocks_are_the_same_whoever_trains_them(folder: Path) -> None:
+    here = blocks_of(folder, "here")
+    assert sum(name.startswith("blocks/") for name in here) > 10
+    for workers in (1, 2, 4):
+        address, kills = f"local:{workers}", int(workers == 2)
+        found = blocks_of(folder, f"by-{workers}", "--cluster", address, kills=kills)
+        assert found == here, workers

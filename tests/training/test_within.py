@@ -1,0 +1,44 @@
+"""A block grows in its own rectangle, and keeps what stands around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.training.density import THRESHOLD, AdaptiveDensity, Within
+from stages.training.optimiser import Model, new_model
+
+
+@pytest.fixture
+def model() -> Model:
+    """Four splats at x = -2, -1, 1, 2, all of them wanted more of; those farthest out giants."""
+    n = 4
+    means = np.array([[x, 5.0, 0.0] for x in (-2, -1, 1, 2)], np.float32)
+    sizes = np.log(np.array([2.0, 0.001, 0.001, 2.0], np.float32))
+    found = new_model(
+        means,
+        np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+        np.repeat(sizes[:, None], 3, axis=1),
+        np.zeros(n, np.float32),
+        np.zeros((n, 1, 3), np.float32),
+    )
+    found.gradient_sum[:], found.gradient_count[:] = 10 * THRESHOLD, 1
+    return found
+
+
+BLOCK = Within(AdaptiveDensity(extent=1.0), (0.0, -9.0, 9.0, 9.0))
+
+
+def test_a_block_grows_in_its_own_rectangle_alone(model) -> None:
+    grown = BLOCK.grow(model.take(np.arange(3)), 100, np.random.default_rng(0))
+    assert sorted(grown.means[:, 0]) == [-2, -1, 1, 1]
+
+
+def test_giants_go_where_something_can_take_their_place(model) -> None:
+    assert sorted(BLOCK.prune(model, True).means[:, 0]) == [-2, -1, 1]
+    assert sorted(BLOCK.rule.prune(model, True).means[:, 0]) == [-1, 1]
+
+
+def test_what_does_not_show_goes_everywhere(model) -> None:
+    model.opacity_logits[1:3] = -20.0
+    assert sorted(BLOCK.prune(model, False).means[:, 0]) == [-2, 2]
