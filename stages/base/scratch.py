@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
 
-LARGE_BYTES = 1 << 28
+LARGE_BYTES = 1 << 26
 _folder: ContextVar[Path | None] = ContextVar("scratch", default=None)
 _maps: WeakSet[mmap.mmap] = WeakSet()
 

@@ -18,6 +18,7 @@ from stages.scene import Camera, Look, Splats
 from stages.scene.far import recentred
 from stages.scene.rotations import quaternions_of
 
+_SAMPLE = 4096
 _UP = np.array([0.0, -1.0, 0.0])
 
 
@@ -48,29 +49,39 @@ class Similarity:
     def of_splats(self, splats: Splats) -> Splats:
         """The splats there. What is nowhere near the origin of their file is told from an origin
         beside it, so that positions keep their digits."""
-        linear = self.scale * self.rotation
-        means = np.empty((len(splats), 3))
-        quaternions, sh = np.empty_like(splats.quaternions), splats.sh
+        linear, kind = self.scale * self.rotation, splats.means.dtype
+        shift = self._shift(splats) if kind == np.float32 else np.zeros(3)
+        means, logs, quaternions = (
+            scratch.empty(array.shape, kind)
+            for array in (splats.means, splats.log_scales, splats.quaternions)
+        )
+        sh = splats.sh
         turn, bands = _product(quaternions_of(self.rotation)), _sh_turns(self.rotation, splats)
         turns = not np.array_equal(self.rotation, np.eye(3))
         if turns and splats.sh_degree:
             sh = scratch.empty(splats.sh.shape, splats.sh.dtype)
         for rows in passing(len(splats)):
-            means[rows] = splats.means[rows].astype(np.float64) @ linear.T + self.offset
+            there = splats.means[rows].astype(np.float64) @ linear.T + self.offset
+            means[rows] = there - shift
+            logs[rows] = splats.log_scales[rows] + np.log(self.scale)
             quaternions[rows] = splats.quaternions[rows].astype(np.float64) @ turn.T
             if sh is not splats.sh:
                 sh[rows] = np.einsum("km,nmc->nkc", bands, splats.sh[rows].astype(np.float64))
-        kind, origin = splats.means.dtype, linear @ splats.origin
-        placed = recentred(means, origin) if kind == np.float32 else (means, origin)
         return replace(
             splats,
-            means=placed[0],
+            means=means,
             quaternions=quaternions if turns else splats.quaternions,
-            log_scales=(splats.log_scales + np.log(self.scale)).astype(kind),
+            log_scales=logs,
             sh=sh,
-            origin=placed[1] + 0.0,
+            origin=linear @ splats.origin + shift + 0.0,
             look=self.of_look(splats.look),
         )
+
+    def _shift(self, splats: Splats) -> NDArray[np.float64]:
+        """[3] what is better told by the origin than by each splat, as a sample says."""
+        sample = splats.means[:: max(1, len(splats) // _SAMPLE)].astype(np.float64)
+        there = sample @ (self.scale * self.rotation).T + self.offset
+        return recentred(there, np.zeros(3))[1]
 
 
 def about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:

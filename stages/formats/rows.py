@@ -125,9 +125,9 @@ def logs_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.flo
 def allocated(count: int, degree: int) -> Splats:
     """`count` splats for a reader to fill, float32; what they hold is not defined."""
     return Splats(
-        means=np.empty((count, 3), np.float32),
-        quaternions=np.empty((count, 4), np.float32),
-        log_scales=np.empty((count, 3), np.float32),
+        means=scratch.empty((count, 3)),
+        quaternions=scratch.empty((count, 4)),
+        log_scales=scratch.empty((count, 3)),
         opacity_logits=np.empty(count, np.float32),
         sh=scratch.empty((count, (degree + 1) ** 2, 3)),
         sh_degrees=np.zeros(count, np.uint8),

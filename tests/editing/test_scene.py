@@ -15,7 +15,6 @@ from stages.editing.words import Typed
 from stages.measure.judge import Photograph
 from stages.raster.draw import render
 from stages.scene import Camera, Look, Splats, View, look_at
-from stages.scene.far import recentred
 from tests import scenes
 
 
@@ -97,9 +96,3 @@ def test_what_no_photograph_needs_close_before_a_camera_is_a_floater() -> None:
     distances = np.linalg.norm(found.means - eye, axis=1)
     assert distances.min() > 1
     assert len(found) > 0.95 * len(clean)
-
-
-def test_positions_put_beside_an_origin_are_where_they_were() -> None:
-    means, origin = recentred(np.array([[5e6, 0, 0], [5e6 + 1, 0, 0]]), np.zeros(3))
-    assert origin[0] == pytest.approx(5e6, abs=2)
-    np.testing.assert_allclose(means[:, 0] + origin[0], [5e6, 5e6 + 1])

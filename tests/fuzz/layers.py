@@ -37,6 +37,19 @@ def files(ending: str) -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
 
 
+@functools.cache
+def _streamed() -> dict[str, bytes]:
+    """lod-meta.json and its chunks."""
+    with tempfile.TemporaryDirectory() as folder:
+        formats.write(Path(folder) / "lod-meta.json", many_splats(SPLATS))
+        every = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in every}
+
+
+def _streamed_beside() -> dict[str, bytes]:
+    return {name: content for name, content in _streamed().items() if name != "lod-meta.json"}
+
+
 def _whole(ending: str) -> Callable[[], bytes]:
     return lambda: files(ending)[f"a.{ending}"]
 
@@ -161,6 +174,9 @@ _PROCESS_EACH = ("usda", "usdc", "usdz")
 
 LAYERS: dict[str, Layer] = {
     **{ending: _on_disk(ending) for ending in formats.FORMATS},
+    "lod-meta.json": Layer(
+        "lod-meta.json", lambda: _streamed()["lod-meta.json"], beside=_streamed_beside, text=True
+    ),
     "html": Layer("a.html", lambda: _html_parts()[1], _html_around, text=True),
     "ply, header and words": Layer("a.ply", _whole("ply"), text=True),
     "ply, ascii": Layer("a.ply", _ascii_ply, text=True),

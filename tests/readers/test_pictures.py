@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from stages import formats
+from stages.editing import levels
 from stages.formats.rows import degrees_in_use
 from stages.measure.images import psnr
 from stages.raster.draw import render
@@ -25,6 +26,7 @@ from tests.viewer.screenshots import coloured_scene, views, wrong_versions
 
 pytestmark = pytest.mark.slow
 WORSE_DB = 5.0
+LEVELS_DB = 33.0  # it chooses the level, and near is drawn at 39 dB, farther at 47 and 52
 
 
 def scene() -> Splats:
@@ -56,3 +58,26 @@ def test_engines_draw_what_render_draws(
                 assert right > ENGINE_DB[name], (suffix, view.name)
                 for what, wrong in wrong_versions(theirs).items():
                     assert psnr(wrong, ours) < right - WORSE_DB, (suffix, view.name, what)
+
+
+def test_playcanvas_draws_levels_of_detail_from_three_distances(
+    browser: Browser, packages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seen from farther, what it draws is less and less of the finest level, and looks the same."""
+    splats = scene()
+    monkeypatch.setattr(levels, "_FEWEST", len(splats) // 3)
+    path = tmp_path / "lod-meta.json"
+    formats.write(path, splats)
+    assert (tmp_path / "1_0").is_dir()
+    with served(packages, tmp_path) as address:
+        engine = Engine(browser, address, "playcanvas")
+        assert engine.open(path.name) == len(splats)
+        view = views()[0].camera
+        for away in (0.0, 6.0, 20.0):
+            pose = view.world_to_camera.copy()
+            pose[2, 3] += away
+            camera = replace(view, world_to_camera=pose)
+            ours = np.clip(render(splats, camera).image, 0, 1)
+            assert ours.max() > 0.3
+            found = psnr(engine.draw(camera_for(path, camera)), ours)
+            assert found > LEVELS_DB, away

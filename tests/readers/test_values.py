@@ -32,7 +32,7 @@ def test_other_readers_find_what_was_written(
     tmp_path: Path, reader: Reader, suffix: str, degree: int
 ) -> None:
     splats = replace(many_splats().with_sh_degree(degree), origin=np.zeros(3))
-    path = tmp_path / f"a.{suffix}"
+    path = tmp_path / formats.BY_ENDING[suffix].name("a")
     formats.write(path, splats)
     try:
         content = reader.read(path)

@@ -145,7 +145,11 @@ READERS = (
     Reader("usd-core", ("usda", "usdc", "usdz"), read_back),
     Reader("gsply", ("ply", "compressed.ply", "spz"), _gsply),
     Reader("tinyusdz", ("usda", "usdc", "usdz"), _tinyusdz),
-    Reader("splat-transform", ("ply", "splat", "compressed.ply", "spz", "sog"), _splat_transform),
+    Reader(
+        "splat-transform",
+        ("ply", "splat", "compressed.ply", "spz", "sog", "lod-meta.json"),
+        _splat_transform,
+    ),
     Reader("@adobe/spz", ("spz",), _adobe_spz),
     Reader("Open3D", ("ply", "splat", "spz"), _open3d),
 )
