@@ -55,8 +55,7 @@ def material_of(pipeline: Pipeline) -> Material:
     nothing-held-out)."""
     from stages.measure.judge import load_photographs
     from stages.scene import split_held_out
-    from stages.trade.measuring import DECIDING_PHOTOGRAPHS, Material
-    from stages.trade.points import spread_over
+    from stages.trade.measuring import Material, deciding
 
     splats = sources.finished_splats(pipeline)
     reconstruction = pipeline.load("sfm")
@@ -70,10 +69,11 @@ def material_of(pipeline: Pipeline) -> Material:
             family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
-    chosen = spread_over(training, DECIDING_PHOTOGRAPHS)
     return Material(
         splats=splats,
-        training=load_photographs(reconstruction.folder, chosen, splats.look),
+        training=load_photographs(
+            reconstruction.folder, deciding(training, splats.look), splats.look
+        ),
         held_out=load_photographs(reconstruction.folder, held, splats.look),
         views=reconstruction.views,
         units=reconstruction.units,

@@ -16,14 +16,16 @@ from stages.formats.rows import kept_rows
 from stages.measure.judge import Photograph, Score, drawing_of, scores
 from stages.measure.speed import seconds_a_frame
 from stages.measure.worth import Worth, floaters, measure_worth
-from stages.scene import QuantisedSplats, Splats, View, split_held_out
-from stages.trade.points import Moment, Point, Trade, change_db, mean_db
+from stages.scene import Look, QuantisedSplats, Splats, View, split_held_out
+from stages.trade.points import Moment, Point, Trade, change_db, mean_db, spread_over
 from stages.trade.thin import Thin, measure_thin
 
 # Shares of the splats that are left, each taken from the one before: what single splats are worth
 # no longer adds up where many go at once.
 SHARES = (0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
-DECIDING_PHOTOGRAPHS = 24  # spread over those of training; they say which splats go
+# Of photographs of training, spread over them, that say which splats go: what none of them shows
+# goes first, so as many as the time allows. 24 at least.
+DECIDING_PIXELS, _LEAST_DECIDING = 24e6, 24
 TIMED_FRAMES = 4
 
 Tell = Callable[[str], None]
@@ -142,3 +144,12 @@ def _fewer(material: Material, own: list[Score], worth: Worth, tell: Tell) -> li
         splats = splats.take(np.sort(np.argsort(-worth.sse_change, kind="stable")[:count]))
         points.append(_point(material, f"{share:.0%}", splats, _scores(material, splats), own))
     return points
+
+
+def deciding(views: Sequence[View], look: Look) -> list[View]:
+    """Those photographs of training that decide, at the size that they are judged at."""
+    if not views:
+        return []
+    camera = look.camera(views[0].camera)
+    most = round(DECIDING_PIXELS / (camera.width * camera.height))
+    return spread_over(views, max(_LEAST_DECIDING, most))

@@ -20,7 +20,7 @@ _MOST_COUNT, _MOST_ANGLE_DEG = 8.0, 60.0  # more is as good
 _MARGIN = 0.08
 _MIDDLE = (0.03, 0.97)  # of what is seen, by area: what is far away would make the rest small
 _PATCHES = 1.25  # to a cell, a side, at least: fewer leave gaps between them
-_NAMED = 30  # photographs at most whose names stand on the map
+_APART = 0.05  # of the map: names that stand closer cannot be read
 
 
 def plan_view(thin: Thin) -> Figure:
@@ -60,12 +60,7 @@ def _map(
     bar = figure.colorbar(drawn, ax=axes, extend="max", location="bottom", shrink=0.8, pad=0.02)
     bar.set_label(label, fontsize=9)
     axes.plot(*eyes.T, "^", color="black", ms=4, label="photograph")
-    if len(eyes) <= _NAMED:
-        for name, eye in zip(thin.names, eyes, strict=True):
-            if name.isascii():
-                axes.annotate(
-                    PurePosixPath(name).stem, eye, (3, 2), textcoords="offset points", fontsize=5
-                )
+    _name(axes, thin.names, eyes, _APART * float((high - low).max()))
     if len(thin.floaters):
         axes.plot(*_on_map(thin, thin.floaters).T, "x", color="red", ms=4, label="floater")
     if ring.inward:
@@ -75,6 +70,18 @@ def _map(
     _mark(axes, [_on_map(thin, p.centre) for p in thin.places], "abc", ORANGE, "thin place")
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
+
+
+def _name(axes: Axes, names: tuple[str, ...], eyes: NDArray[np.float64], apart: float) -> None:
+    """The photographs' names, as far as they do not lie on each other, in letters that the plot's
+    font has."""
+    named = np.zeros((0, 2))
+    for name, eye in zip(names, eyes, strict=True):
+        if name.isascii() and (np.linalg.norm(named - eye, axis=1) > apart).all():
+            place = (eye[0], eye[1])
+            stem = PurePosixPath(name).stem
+            axes.annotate(stem, place, (3, 2), textcoords="offset points", fontsize=5)
+            named = np.concatenate([named, eye[None]])
 
 
 def _eyes(thin: Thin) -> NDArray[np.float64]:

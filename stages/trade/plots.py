@@ -46,7 +46,14 @@ def _time(trade: Trade) -> Figure:
     for below in (0.1, 0.5):
         level = quality[-1] - below
         axes.axhline(level, color=GREY, linewidth=0.8, linestyle=":")
-        axes.annotate(f"last − {below:g} dB", (0, level), fontsize=8, color=GREY, va="bottom")
+        axes.annotate(
+            f"last − {below:g} dB",
+            (0, level),
+            (4, 1),
+            textcoords="offset points",
+            fontsize=8,
+            color=GREY,
+        )
     axes.set_xlim(left=0)
     axes.legend(loc="lower right")
     return figure
@@ -107,9 +114,11 @@ def _curve(axes: Axes, trade: Trade, costs: list[float]) -> None:
     _with_bars(axes, costs[1:], points[1:], BLUE, "o")
     axes.plot(costs[:1], [points[0].psnr_db], "D", color=ORANGE, label="this run")
     at = knee([float(p.splats) for p in points], [p.psnr_db for p in points])
-    axes.plot([costs[at]], [points[at].psnr_db], "o", ms=13, mfc="none", color=ORANGE, label="knee")
+    if at:  # as in the words: the run itself is none
+        knee_at = [costs[at]], [points[at].psnr_db]
+        axes.plot(*knee_at, "o", ms=13, mfc="none", color=ORANGE, label="knee")
     axes.errorbar([], [], yerr=[], fmt="o", color=BLUE, label="95 % interval of the change")
-    axes.legend(loc="lower right")
+    axes.legend()
 
 
 def _with_bars(

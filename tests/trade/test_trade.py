@@ -13,9 +13,9 @@ from stages.base.errors import SplatError
 from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE
 from stages.measure.judge import load_photographs
-from stages.scene import Look, QuantisedSplats, split_held_out
+from stages.scene import Camera, Look, QuantisedSplats, View, split_held_out
 from stages.trade import words
-from stages.trade.measuring import SHARES, Material, measure_trade
+from stages.trade.measuring import SHARES, Material, deciding, measure_trade
 from stages.trade.pair import Side, pair, verdict
 from stages.trade.pair_report import write_pair
 from stages.trade.points import spread_over
@@ -211,3 +211,14 @@ def test_the_comparison_shows_every_judge_three_times(scene, tmp_path) -> None:
 def test_few_are_taken_from_all_over() -> None:
     assert spread_over(range(10), 5) == [0, 2, 4, 6, 8]
     assert spread_over(range(3), 24) == [0, 1, 2]
+
+
+def test_all_photographs_decide_where_time_allows() -> None:
+    views = [View(str(i), "", camera(800, 600)) for i in range(60)]
+    assert len(deciding(views, Look(side=480))) == 60
+    assert len(deciding(views, Look(side=800))) == 50
+    assert len(deciding([replace(v, camera=camera(8000, 6000)) for v in views], Look())) == 24
+
+
+def camera(width: int, height: int) -> Camera:
+    return Camera(width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4))
