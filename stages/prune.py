@@ -185,5 +185,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=6, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=7, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

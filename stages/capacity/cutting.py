@@ -50,9 +50,15 @@ def choose(
     sse_a_number: float,
     most: int,
     share: float = SPLATS_A_ROUND,
+    harm: bool = False,
 ) -> Cut | None:
-    """At most `most` splats, and bands of a share of the others, that save less squared error than
-    `sse_a_number` for each of their numbers; the least worth first. None if there is nothing.
+    """At most `most` splats, and bands of a share of the others, that are worth less squared error
+    than `sse_a_number` for each of their numbers; the least worth first. None if there is nothing.
+
+    Worth is by how much the picture changes; harm: by how much the error does. By the error,
+    neighbours that are each a little too much seem to harm one by one, and are missed together (a
+    carpet fell by 5 dB without the tenth that seemed to harm most), and what learns on after a cut
+    mends what the residual asks for in any case. How much the error will change is foretold by it.
 
     Floaters and what lies where no photograph looks go whatever the price. What continues a picture
     beyond its rim, where none speaks against it, goes last, and only at an infinite price.
@@ -60,7 +66,8 @@ def choose(
     seen, beside = worth.photographs > 0, beside_pictures(splats, list(cameras))
     floating = floaters(splats, worth, list(cameras))
     free = floating | (~seen & ~beside)
-    ratio = worth.sse_change / numbers_of(splats.sh_degrees)
+    alone = worth.sse_change if harm else worth.picture_change
+    ratio = alone / numbers_of(splats.sh_degrees)
     ratio[~seen & beside] = np.finfo(np.float64).max
     ratio[free] = -np.inf
     order = np.argsort(ratio, kind="stable")
@@ -70,7 +77,7 @@ def choose(
     gone[chosen] = True
     # bands by the worth of the last splat that goes: what is worth more stays, splat or band
     limit = float(ratio[chosen[-1]]) if 0 < len(chosen) == most else sse_a_number
-    degrees, colour, bands_sse = _cut_bands(splats, worth, gone, limit, share)
+    degrees, colour, bands_sse = _cut_bands(splats, worth, gone, limit, share, harm)
     if not len(chosen) and np.array_equal(degrees, splats.sh_degrees):
         return None
     predicted = float(worth.sse_change[chosen].sum()) + bands_sse
@@ -93,14 +100,15 @@ def _cut_bands(
     gone: NDArray[np.bool_],
     sse_a_number: float,
     share: float,
+    harm: bool,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
     """(degrees, colour, predicted change) of the splats that stay, as in `Cut`."""
     degrees, colour = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     best, to = np.full(len(splats), np.inf), np.zeros(len(splats), np.int64)
-    numbers = numbers_of(degrees)
+    numbers, change = numbers_of(degrees), worth.cut_change if harm else worth.cut_picture
     for degree in range(splats.sh_degree):
         saved = numbers - numbers_of(np.full(1, degree))
-        ratio = np.where(saved > 0, worth.cut_change[:, degree] / np.maximum(saved, 1), np.inf)
+        ratio = np.where(saved > 0, change[:, degree] / np.maximum(saved, 1), np.inf)
         better = (ratio < best) & ~gone
         best[better], to[better] = ratio[better], degree
     order = np.argsort(best, kind="stable")[: max(1, int(BANDS * share * len(splats)))]

@@ -21,6 +21,8 @@ BACK_OFFS = 3  # times that a round may ask for half as much
 # Splats that go together cost more than the sum of each alone, since they stood in for each other:
 # this much at first, then what the last round told that cost enough to tell.
 OVERLAP, TELLING = 1.3, 0.01  # TELLING: of the squared error
+TINY = float(np.finfo(np.float64).tiny)
+WRONG = 0.5  # of what taking out harm should save: so much less may come of it
 PRICE, LOSS, ROUNDS = "price", "loss", "rounds"  # why it stopped
 
 
@@ -77,15 +79,16 @@ class Shrinking:
         price = price_of(drawing_of(splats, self.backend), self.photographs)
         found = Outcome(splats, price, mean_db, mean_db, _least_tenth_db(worth))
         planned, share, overlap = self._planned(splats), SPLATS_A_ROUND, OVERLAP
+        if planned:
+            worth = self._without_harm(found, worth)
+            best = max(best, worth.psnr_db, key=np.mean)
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
             excess = self.aim.excess(found.splats)
-            cut = self._cut(found, worth, excess, share, free=number == 0)
-            if cut is None and number:
+            cut = self._cut(found, worth, excess, share)
+            if cut is None:
                 found.stopped_by = PRICE
                 break
-            if cut is None:
-                continue
             fewer, seen = cut.of(found.splats), worth.photographs[~cut.gone]
             measured = squared_error(fewer, self.photographs, self.backend) - worth.sse
             fewer = self.tuner.tuned(fewer, self.tune_steps * self.rounds // planned, seen)
@@ -108,9 +111,30 @@ class Shrinking:
         self.aim.check_end(found.splats, found.end_db)
         return found
 
+    def _without_harm(self, found: Outcome, worth: Worth) -> Worth:
+        """Take out what the photographs are better without. Fewer, where they turn out to be missed
+        together: drawing tells."""
+        share = SPLATS_A_ROUND
+        for _ in range(BACK_OFFS + 1):
+            most = max(1, int(share * len(found.splats)))
+            limits = (self.tuner.cameras, -TINY, min(most, len(found.splats) - 1))
+            cut = choose(found.splats, worth, *limits, share, harm=True)
+            if cut is None:
+                return worth
+            fewer = cut.of(found.splats)
+            after = self._worth(fewer)
+            measured = after.sse - worth.sse
+            kept = measured <= cut.predicted_sse + WRONG * abs(cut.predicted_sse)
+            told = (cut.predicted_sse, measured, float(after.psnr_db.mean()), kept)
+            found.rounds.append(_round(found.splats, cut, *told))
+            if kept:
+                found.splats = fewer
+                return after
+            share /= 2
+        return worth
+
     def _worth(self, splats: Splats) -> Worth:
-        by_heart = self.tuner.by_heart > 0
-        return measure_worth(splats, self.photographs, self.backend, by_heart)
+        return measure_worth(splats, self.photographs, self.backend)
 
     def _planned(self, splats: Splats) -> int:
         """As many rounds as targets need, and a few for what they leave over."""
@@ -120,14 +144,9 @@ class Shrinking:
         needed = math.log(left / len(splats)) / math.log(1 - SPLATS_A_ROUND)
         return max(self.rounds, math.ceil(needed) + 4)
 
-    def _cut(
-        self, found: Outcome, worth: Worth, excess: int, share: float, free: bool
-    ) -> Cut | None:
-        """free: take only what harms or does nothing."""
+    def _cut(self, found: Outcome, worth: Worth, excess: int, share: float) -> Cut | None:
         forced = excess > 0 or self.aim.min_psnr_db > 0
         limit = math.inf if forced else self.aim.price * found.price.sse_a_number
-        if free and not excess:
-            limit = np.finfo(np.float64).tiny
         most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
         most = min(most, excess, len(found.splats) - 1) if excess else most
         return choose(

@@ -25,38 +25,34 @@ RIM = 0.25  # of the longer side: as far as seeds continue a photograph beyond i
 @dataclass(frozen=True)
 class Worth:
     """Per splat [N]. sse_change: of the summed squared error over all photographs if it alone
-    were removed (negative: they would be better without it). weight: summed blend weight;
+    were removed (negative: they would be better without it). picture_change: the summed squared
+    change of the pictures then, whatever the photographs say to it. weight: summed blend weight;
     largest_weight: in any pixel. photographs: in how many it has a weight of 1/255 somewhere.
     sse: summed squared error now. scene_depth, psnr_db [photographs]: median depth of each picture,
     and how near it is.
 
-    cut_change [N, L]: of the summed squared error if its colour kept only the bands up to degree
+    cut_change, cut_picture [N, L]: the same two if its colour kept only the bands up to degree
     0..L - 1, the mean of what is lost baked in: cut_colour [N, L, 3], what that adds to its colour.
     """
 
     sse_change: NDArray[np.float64]
+    picture_change: NDArray[np.float64]
     weight: NDArray[np.float64]
     largest_weight: NDArray[np.float64]
     photographs: NDArray[np.int32]
     sse: float
     scene_depth: NDArray[np.float64]
     cut_change: NDArray[np.float64]
+    cut_picture: NDArray[np.float64]
     cut_colour: NDArray[np.float64]
     psnr_db: NDArray[np.float64]
 
 
-def measure_worth(
-    splats: Splats, photographs: Iterable[Photograph], backend: str, by_heart: bool = False
-) -> Worth:
-    """What each splat does for the photographs, drawn by its own look.
-
-    by_heart: leave what the residual says out of the changes, so that they are of the picture
-    alone. Where splats sat steps out in training, neighbours stand in for each other, each a little
-    too much: a third of them seem to harm, and without the tenth that seems to harm most, a carpet
-    fell by 5 dB. By the change of the picture more than half of its splats could go for nothing.
-    """
+def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: str) -> Worth:
+    """What each splat does for the photographs, drawn by its own look."""
     n = len(splats)
-    change, weight, largest = np.zeros(n), np.zeros(n), np.zeros(n)
+    change, picture = np.zeros(n), np.zeros(n)
+    weight, largest = np.zeros(n), np.zeros(n)
     seen_in, sse, depths, psnr_db = np.zeros(n, np.int32), 0.0, [], []
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
     settings, bands = settings_of(splats), _Bands(splats)
@@ -70,24 +66,26 @@ def measure_worth(
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
         depths.append(float(np.median(solid)) if solid.size else np.inf)
-        if by_heart:
-            residual = np.zeros_like(residual)
+        alone = rasteriser.contributions(forward, np.zeros_like(residual))[:, CHANGE]
         found = rasteriser.contributions(forward, residual)
         rows = forward.visible
         change[rows] += found[:, CHANGE]
+        picture[rows] += alone
         weight[rows] += found[:, WEIGHT]
         largest[rows] = np.maximum(largest[rows], found[:, LARGEST])
         seen_in[rows] += found[:, LARGEST] >= SEEN
         bands.add(photograph.camera.centre, rows, found)
-    cut_change, cut_colour = bands.cuts()
+    cut_change, cut_picture, cut_colour = bands.cuts()
     return Worth(
         change,
+        picture,
         weight,
         largest,
         seen_in,
         sse,
         np.array(depths),
         cut_change,
+        cut_picture,
         cut_colour,
         np.array(psnr_db),
     )
@@ -118,14 +116,15 @@ class _Bands:
         self.pull[rows] += g
         self.squares[rows] += q
 
-    def cuts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(cut_change, cut_colour) of `Worth`: with s added to the colour, each photograph's error
-        changes by 2 (d + s) g + (d + s)^2 q; s is what makes the mean of d, weighted by q, zero."""
+    def cuts(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """(cut_change, cut_picture, cut_colour) of `Worth`: with s added to the colour, each
+        photograph's error changes by 2 (d + s) g + (d + s)^2 q; s is what makes the mean of d,
+        weighted by q, zero."""
         with np.errstate(invalid="ignore", divide="ignore"):
             s = np.where(self.squares > 0, -self.shift / self.squares, 0.0)
-        first_order = 2 * (self.linear + s * self.pull)
-        second_order = self.square + 2 * s * self.shift + s * s * self.squares
-        return (first_order + second_order).sum(2), s
+        by_residual = 2 * (self.linear + s * self.pull)
+        of_picture = self.square + 2 * s * self.shift + s * s * self.squares
+        return (by_residual + of_picture).sum(2), of_picture.sum(2), s
 
 
 def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[np.float64]:

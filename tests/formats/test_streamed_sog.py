@@ -23,7 +23,7 @@ from stages.measure.judge import decibels
 from stages.proof import second_readers
 from stages.raster.draw import renderer, settings_of
 from stages.scene import Camera, Splats, look_at
-from tests.editing.test_decimate import wall
+from tests.editing.walls import wall
 from tests.formats.truth import many_splats
 
 

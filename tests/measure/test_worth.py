@@ -40,19 +40,19 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) 
             assert not np.array_equal(plain.sh[row, 0], cut.sh[row, 0])
 
 
-def test_by_heart_a_splat_is_worth_what_the_picture_changes_without_it(tmp_path) -> None:
+def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> None:
     scene = small_scene(tmp_path, views=4, n=60)
     photographs = load_photographs(
         scene.reconstruction.folder, scene.reconstruction.views, scene.splats.look
     )
-    worth = measure_worth(scene.splats, photographs, "cpu", by_heart=True)
-    assert (worth.sse_change >= 0).all()
+    worth = measure_worth(scene.splats, photographs, "cpu")
+    assert (worth.picture_change >= 0).all()
     draw = drawing_of(scene.splats, "cpu")
     for row in (0, 10, 20):
         fewer = drawing_of(scene.splats.take(np.arange(60) != row), "cpu")
         changes = [fewer(p.camera).astype(float) - draw(p.camera) for p in photographs]
         wanted = sum(np.square(change).sum() for change in changes)
-        assert worth.sse_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
+        assert worth.picture_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
 
 
 def test_colours_by_degree_are_the_definition_s() -> None:

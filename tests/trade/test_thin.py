@@ -14,7 +14,7 @@ from stages.scene import Look, View
 from stages.trade.points import Trade
 from stages.trade.thin import Thin, measure_thin
 from stages.trade.thin_words import about_coverage, about_framing
-from tests.measure.test_coverage import ball, camera, place, ring, surface
+from tests.measure.rings import ball, camera, place, ring, surface
 
 
 def thin_of(headings: Sequence[int], height: int = 20, hanging: Iterable[int] = ()) -> Thin:
