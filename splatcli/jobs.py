@@ -224,9 +224,18 @@ def run_all(
     view = typed.pop("view", False)
     preset = typed.pop("preset", None)
     settings = settings_for(base, typed, preset)
+    if "cameras" in typed:
+        _check_cameras(typed["cameras"])
     if photos is None and not (quiet or as_json):
         console.note(training_in_words(settings["train"], typed, preset))
     run(pipeline, settings, quiet=quiet, as_json=as_json, view=view)
+
+
+def _check_cameras(path: Path) -> None:
+    """Raises SplatError for cameras that cannot be read: before all photographs are."""
+    from stages.cameras.table import read_cameras
+
+    read_cameras(path)
 
 
 def run_stage(

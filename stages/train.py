@@ -441,5 +441,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=10, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=11, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -24,6 +24,8 @@ SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without 
 MOST_MODELS = 8
 LOOSE_INLIERS = 15
 PAIR_INLIERS = 30  # fewer may be chance, and say nothing against a model
+SETTLING_ROUNDS = 25
+_LEAST_NOISE = 0.05  # px
 
 
 def map_photographs(job: Job) -> None:
@@ -43,9 +45,28 @@ def map_photographs(job: Job) -> None:
         key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
     )
     groups = [sorted(m.images[i].name for i in m.reg_image_ids()) for m in ordered]
+    if ordered:
+        _settle(ordered[0])
     model = _plain(ordered[0], ordered[1:], job) if ordered else None
     save_model(out, model, groups=groups, timed_out=timed_out)
     shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _settle(model: pycolmap.Reconstruction) -> None:
+    """Move all of it to where most of what is seen wants it. The mapper adjusts by plain least
+    squares, in which the worst matches pull hardest, and together bend a long arc of cameras. The
+    lens stays: a focal length hardly differs from a bend, and moved either way by chance."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    model.update_point_3d_errors()
+    usual = model.compute_mean_reprojection_error()
+    options.ceres.loss_function_scale = max(usual, _LEAST_NOISE)
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.max_num_iterations = SETTLING_ROUNDS
+    options.print_summary = False
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
 
 
 def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:

@@ -265,6 +265,14 @@ def test_what_cannot_draw_here_is_said_before_other_work(splat, monkeypatch, wor
     assert not Path("run").exists()
 
 
+def test_cameras_that_cannot_be_read_are_refused_before_anything_is_made(splat) -> None:
+    Path("cameras.json").write_text("{")
+    for name, code in (("nothing", "cameras-unknown"), ("cameras.json", "cameras-unreadable")):
+        result = splat("process", "photos", "--cameras", name)
+        assert code in result.stderr
+        assert not Path("run").exists()
+
+
 def test_wrong_words_are_json_where_json_is_asked_for(splat) -> None:
     for words in (["--steps", "0"], ["--stepz", "0"]):
         (event,) = events(splat("process", "photos", "--json", *words))
