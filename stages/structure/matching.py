@@ -150,7 +150,9 @@ def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
             sorted_.append(largest)
             held.append(words)
             ticks.write("sorting features", photographs + done, 2 * photographs)
-        wanted = retrieval.candidates(held)
+        wanted = retrieval.candidates(
+            held, lambda done: ticks.write("comparing words", done, photographs)
+        )
 
         def look(pair: Pair) -> int:
             return len(nearest.matches(sorted_[pair[0]], sorted_[pair[1]]))

@@ -5,24 +5,29 @@ Costs next to nothing a pair, so that a first look need not be at every two of m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from stages.base.blocks import blocks
+
 CANDIDATES = 48  # of each photograph; up to so many others, all are
 NEIGHBOURS = 4  # in order of the capture, either way
+_AT_ONCE = 64  # photographs compared with all others between two ticks
 
 
-def candidates(held: Sequence[NDArray[np.int64]]) -> list[tuple[int, int]]:
+def candidates(
+    held: Sequence[NDArray[np.int64]], tick: Callable[[int], None] = lambda done: None
+) -> list[tuple[int, int]]:
     """Pairs (first, second) to look at: the most alike of each photograph, and neighbours.
 
     held: the words of each photograph's features. Alike are those that share many rare words
-    (Sivic and Zisserman 2003).
+    (Sivic and Zisserman 2003). tick: told how many photographs are compared with all others.
     """
     photographs = len(held)
-    alike = _likeness(held)
+    alike = _likeness(held, tick)
     index = np.arange(photographs)
     pairs = set()
     for i, row in enumerate(alike):
@@ -33,7 +38,9 @@ def candidates(held: Sequence[NDArray[np.int64]]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _likeness(held: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
+def _likeness(
+    held: Sequence[NDArray[np.int64]], tick: Callable[[int], None]
+) -> NDArray[np.float64]:
     """[P, P] cosines between photographs as vectors of words; the rarer a word, the more it
     counts. Rounded, so that no machine's last digit decides."""
     photographs = len(held)
@@ -46,6 +53,10 @@ def _likeness(held: Sequence[NDArray[np.int64]]) -> NDArray[np.float64]:
     holders = np.bincount(table.indices, minlength=table.shape[1])
     table.data *= np.log(photographs / np.maximum(holders, 1))[table.indices]
     lengths = np.sqrt(np.asarray(table.multiply(table).sum(axis=1)).ravel())
-    scaled = sparse.diags(1.0 / np.maximum(lengths, 1e-12)) @ table
-    likeness: NDArray[np.float64] = np.round((scaled @ scaled.T).toarray(), 9)
+    scaled = (sparse.diags(1.0 / np.maximum(lengths, 1e-12)) @ table).tocsr()
+    others = scaled.T.tocsr()
+    likeness = np.empty((photographs, photographs))
+    for part in blocks(photographs, _AT_ONCE):
+        likeness[part] = np.round((scaled[part] @ others).toarray(), 9)
+        tick(part.stop)
     return likeness
