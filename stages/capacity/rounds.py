@@ -20,7 +20,7 @@ from stages.scene import Splats
 BACK_OFFS = 3  # times that a round may ask for half as much
 # Splats that go together cost more than the sum of each alone, since they stood in for each other:
 # this much at first, then what the last round told that cost enough to tell.
-OVERLAP, TELLING = 1.3, 0.01  # TELLING: of the squared error
+OVERLAP, TELLING = 1.25, 0.01  # TELLING: of the squared error
 TINY = float(np.finfo(np.float64).tiny)
 WRONG = 0.5  # of what taking out harm should save: so much less may come of it
 PRICE, LOSS, ROUNDS = "price", "loss", "rounds"  # why it stopped
