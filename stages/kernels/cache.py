@@ -29,9 +29,9 @@ def folder() -> Path:
     return Path(os.environ[_VARIABLE])
 
 
-def are_compiled(kernel: str = "") -> bool:
+def are_compiled(kernel: str = "*") -> bool:
     """Whether an earlier run left compiled kernels, or this one; the first compiles for a while."""
-    return any(folder().rglob(f"*{kernel}*.nbi"))
+    return any(folder().rglob(f"*.{kernel}-*.nbi"))
 
 
 def others() -> list[Path]:

@@ -102,3 +102,13 @@ def test_a_change_in_any_room_with_kernels_makes_another_folder() -> None:
         if "@kernel" in path.read_text("utf-8")
     }
     assert with_kernels <= set(cache._ROOMS)
+
+
+def test_what_is_compiled_is_known_kernel_by_kernel(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path)
+    assert not cache.are_compiled()
+    (tmp_path / "cpu_1").mkdir()
+    (tmp_path / "cpu_1" / "contributions.gather-165.py311.nbi").touch()
+    assert cache.are_compiled()
+    assert cache.are_compiled("gather")
+    assert not cache.are_compiled("gather_contributions")
