@@ -132,7 +132,8 @@ def _thin(material: Material, worth: Worth, tell: Tell) -> Thin:
 
 
 def _fewer(material: Material, own: list[Score], worth: Worth, tell: Tell) -> list[Point]:
-    """Fewer and fewer splats, the least worth to the training photographs first. worth: of all."""
+    """Fewer and fewer splats: first goes what changes the training pictures least. worth: of
+    all."""
     splats, points = material.splats, []
     for share in SHARES:
         count = round(share * len(material.splats))
@@ -141,7 +142,7 @@ def _fewer(material: Material, own: list[Score], worth: Worth, tell: Tell) -> li
         tell(f"leaving {share:.0%} of the splats")
         if len(splats) < len(material.splats):
             worth = measure_worth(splats, material.training, material.backend)
-        splats = splats.take(np.sort(np.argsort(-worth.sse_change, kind="stable")[:count]))
+        splats = splats.take(np.sort(np.argsort(-worth.picture_change, kind="stable")[:count]))
         points.append(_point(material, f"{share:.0%}", splats, _scores(material, splats), own))
     return points
 
