@@ -111,8 +111,8 @@ class TrainSettings:
             "help": "Grow only in this rectangle of the ground plane (world units); what is "
             "outside stays as coarse as it is.",
             "together": "X0 Z0 X1 Z1",
-            "min": -1e15,
-            "max": 1e15,
+            "min": -1e30,
+            "max": 1e30,
         },
     )
     backend: str = backend_setting()

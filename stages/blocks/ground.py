@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stages.scene import Reconstruction
 
-ENDLESS = 1e15  # world units: the outer sides of the outer cells (JSON has no infinity)
+ENDLESS = 1e30  # world units: the outer sides of the outer cells (JSON has no infinity)
 MARGIN = 0.05  # of what photographs look at: as far beyond its own cell a block grows
 _GROUND = [0, 2]
 _POINTS = 20_000  # of the sparse cloud, about: enough to say where to cut
