@@ -7,7 +7,7 @@ compared with the splats that it was made from. A file that came out wrong stops
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.words import counted
-from stages.formats import FORMATS, MESHES
+from stages.formats import FORMATS, MESHES, Format
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
+    from stages.capacity.rounding import Fitting
     from stages.proof.prover import Prover
     from stages.scene import (
         ExportedAssets,
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 _MESH = "mesh"  # to `--format`: every format of meshes
 _CHOICES = (*FORMATS, _MESH, *MESHES)
 _INDEX = "assets.json"
+_FITTED = "fitted"  # a folder for each format whose splats are not those of quantise
+_DECIDING = 12  # photographs that tell whether fitting was worth it
 # Every system must take the name, USD's packages too: brackets separate names inside them.
 _NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 
@@ -55,6 +58,15 @@ class ExportSettings:
             "folder, no suffix.",
         },
     )
+    fit_steps: int = field(
+        default=45,
+        metadata={
+            "help": "Steps of fine-tuning after each kind of value that a format rounds (.splat, "
+            ".spz, .sog, .compressed.ply); 0 for none.",
+            "min": 0,
+            "max": 100_000,
+        },
+    )
     backend: str = backend_setting()
     device: str = device_setting()
     mesh_triangles: int = field(
@@ -74,12 +86,12 @@ def run(
 
     Metrics: files (how many), splats, dropped, formats: by format size_bytes, bytes_per_splat and
     the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
-    the file, the worst camera) and the largest errors of the values; mesh: the figures of
+    the file, the worst camera) and the largest errors of the values, and for formats that round
+    plain_db and fitted_db (see `capacity.rounding.Fitting`); mesh: the figures of
     `surface.make`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
     file from being written.
     """
     from stages import formats
-    from stages.formats.coarse import held_by
     from stages.formats.rows import kept_rows
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
@@ -95,17 +107,19 @@ def run(
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
     prover = Prover.of(splats, cameras, drawn_by(settings))
+    fitting = _fitting(inputs, splats, settings, wanted, report) if len(splats) else None
     files, figures = [], {}
     for number, name in enumerate(wanted):
         report.progress(number, len(wanted), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
-        held = held_by(FORMATS[name], quantised)
+        held, fit = _held(FORMATS[name], quantised, fitting, folder)
         formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
         size = FORMATS[name].size_bytes(path)
         files.append(ExportedFile(name, path.name, size))
         figures[name] = {
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
+            **fit,
             # pictures of all the splats' colours, values of those that it should hold
             **_proven(replace(prover, splats=held), path, report),
         }
@@ -120,6 +134,60 @@ def run(
     report.metric("formats", figures)
     _write_index(folder, files)
     return ExportedAssets(folder, tuple(files))
+
+
+def _held(
+    row: Format, quantised: QuantisedSplats, fitting: Fitting | None, folder: Path
+) -> tuple[Splats, dict[str, Any]]:
+    """(what the file should hold, figures of the fitting). Fitted splats are kept in `folder`."""
+    from stages.formats.coarse import held_by
+    from stages.scene import save_splats
+
+    if fitting is None or not row.rounds:
+        return held_by(row, quantised), {}
+    held, figures = fitting.fitted(row, quantised)
+    kept = folder / _FITTED / row.ending
+    kept.mkdir(parents=True, exist_ok=True)
+    save_splats(kept, held)
+    return held, figures
+
+
+def _fitting(
+    inputs: Mapping[str, Any],
+    splats: Splats,
+    settings: ExportSettings,
+    wanted: Sequence[str],
+    report: Report,
+) -> Fitting | None:
+    """What fits splats to formats that round; None where none is wanted, or no photographs are."""
+    import numpy as np
+
+    from stages.capacity.rounding import Fitting
+    from stages.capacity.tuning import Tuner
+    from stages.measure.judge import load_photographs
+    from stages.measure.worth import measure_worth
+    from stages.scene import seen_extent, split_held_out, spread_over
+
+    reconstruction: Reconstruction = inputs["sfm"]
+    training = split_held_out(reconstruction.views)[0]
+    if not (settings.fit_steps and training and any(FORMATS[name].rounds for name in wanted)):
+        return None
+    by_heart, backend, folder = inputs["train"].by_heart, drawn_by(settings), reconstruction.folder
+    photographs = load_photographs(folder, training, splats.look)
+    tuner = Tuner(photographs, seen_extent(reconstruction), backend, report, by_heart)
+    seen = np.zeros(len(splats), np.int32)
+    if by_heart:  # only then it matters
+        seen = measure_worth(splats, photographs, backend).photographs
+    deciding = load_photographs(folder, spread_over(training, _DECIDING), splats.look)
+    return Fitting(tuner, deciding, backend, settings.fit_steps, seen)
+
+
+def fitted_in(folder: Path, ending: str) -> Splats | None:
+    """What the file of a format in a finished folder holds, if its splats were fitted to it."""
+    from stages.scene import load_splats
+
+    fitted = folder / _FITTED / ending
+    return load_splats(fitted) if fitted.is_dir() else None
 
 
 def _write_meshes(
@@ -153,9 +221,11 @@ def _write_meshes(
 
 
 def _clear(folder: Path) -> None:
-    """Remove what a writer that was killed left half done; whole files are written over."""
+    """Remove what a writer that was killed left half done, and splats that were fitted to other
+    settings; whole files are written over."""
     import shutil
 
+    shutil.rmtree(folder / _FITTED, ignore_errors=True)
     for path in sorted(folder.glob(".partial-*")):
         if path.is_dir():
             shutil.rmtree(path)
@@ -231,8 +301,8 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=6,
-    reads=("sfm", "quantise"),
+    version=7,
+    reads=("sfm", "train", "quantise"),
     settings_type=ExportSettings,
     run=run,
     load=load,

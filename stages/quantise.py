@@ -51,9 +51,10 @@ class QuantiseSettings:
         },
     )
     sog_loss_db: float = field(
-        default=0.1,
+        default=0.3,
         metadata={
-            "help": "PSNR of training photographs that fewer bits in a .sog may cost besides (dB).",
+            "help": "PSNR of training photographs that fewer bits in a .sog may cost besides, "
+            "before fine-tuning at export finds some of it back (dB).",
             "min": 0,
             "max": 100,
         },
@@ -220,7 +221,7 @@ def _measures(
 ) -> tuple[_Measure, _Measure]:
     """(what decides, what judges): training photographs, and those held out if there are any."""
     from stages.measure.judge import load_photographs
-    from stages.scene import split_held_out
+    from stages.scene import split_held_out, spread_over
 
     training, held = split_held_out(reconstruction.views)
     if not training:
@@ -231,9 +232,7 @@ def _measures(
             hint="Run `splat sfm` again.",
             family=Family.RUN_FOLDER,
         )
-    # Spread over the capture: views next to each other say the same.
-    count = min(settings.max_views, len(training))
-    lent = tuple(training[i * len(training) // count] for i in range(count))
+    lent = tuple(spread_over(training, settings.max_views))
     judges, what = (held, "held out") if held else (lent, "training")
     decider = _Measure(load_photographs(reconstruction.folder, lent, look), settings, report)
     judge = _Measure(
@@ -287,7 +286,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=5,
+    version=6,
     reads=("sfm", "prune"),
     settings_type=QuantiseSettings,
     run=run,

@@ -17,7 +17,7 @@ from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.proof import second_readers
 from stages.proof.content import FileContent
-from stages.scene import ExportedAssets, QuantisedSplats, Splats
+from stages.scene import ExportedAssets, QuantisedSplats, Splats, TrainedSplats
 from stages.surface import fuse, ply
 from tests.small_scene import SmallScene, small_scene
 
@@ -34,6 +34,7 @@ def exported(
     splats = scene.splats if splats is None else splats
     inputs = {
         "sfm": scene.reconstruction,
+        "train": TrainedSplats(splats),
         "quantise": QuantisedSplats(splats, splats.sh_degree, {}),
     }
     return export.run(inputs, ExportSettings(**settings), folder, report), report
@@ -76,7 +77,8 @@ def test_equal_inputs_give_equal_files_and_load_gives_the_list(
         folder = tmp_path / name
         folder.mkdir()
         assets, _ = exported(scene, folder, formats=tuple(FORMATS))
-        contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+        every = [path for path in folder.rglob("*") if path.is_file()]
+        contents.append({path.relative_to(folder): path.read_bytes() for path in every})
         assert export.load(folder) == assets
     assert contents[0] == contents[1]
 

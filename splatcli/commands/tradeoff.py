@@ -53,6 +53,7 @@ def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> 
 def material_of(pipeline: Pipeline) -> Material:
     """What is measured of a finished run. Raises SplatError (stage-not-finished, run-half-anew,
     nothing-held-out)."""
+    from stages.export import fitted_in
     from stages.measure.judge import load_photographs
     from stages.scene import split_held_out
     from stages.trade.measuring import Material, deciding
@@ -69,6 +70,8 @@ def material_of(pipeline: Pipeline) -> Material:
             family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
+    exported = tuple(sources.exported_formats(pipeline))
+    fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
     return Material(
         splats=splats,
         training=load_photographs(
@@ -80,6 +83,7 @@ def material_of(pipeline: Pipeline) -> Material:
         backend=sources.backend_of(pipeline),
         levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
-        exported=tuple(sources.exported_formats(pipeline)),
+        exported=exported,
         quantised=pipeline.load("quantise"),
+        fitted={name: splats for name, splats in fitted.items() if splats is not None},
     )

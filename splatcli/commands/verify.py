@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,8 @@ _ONLY_ITSELF = (
 @dataclass(frozen=True)
 class _Original:
     """What files are compared with. name: in words. came_as: the format that it was read from.
-    itself: whether that was the file in question. backend: what draws. quantised: of a run."""
+    itself: whether that was the file in question. backend: what draws. quantised: of a run;
+    exported: its export's folder."""
 
     splats: Splats
     views: tuple[View, ...]
@@ -35,13 +37,20 @@ class _Original:
     itself: bool = False
     backend: str = "auto"
     quantised: QuantisedSplats | None = None
+    exported: Path | None = None
 
-    def held_in(self, file: Path) -> Splats:
-        """What `file` should hold, as export decided where a run is known."""
+    def held_in(self, file: Path) -> Iterator[Splats]:
+        """What `file` may hold, likeliest first: where a run is known, what its export fitted to
+        the format, and what a conversion of the run's splats would."""
+        from stages import export
         from stages.formats import format_of
         from stages.formats.coarse import held_by
 
-        return held_by(format_of(file), self.quantised) if self.quantised else self.splats
+        row = format_of(file)
+        if self.exported is not None:
+            fitted = export.fitted_in(self.exported, row.ending)
+            yield from () if fitted is None else (fitted,)
+        yield held_by(row, self.quantised) if self.quantised else self.splats
 
 
 def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool) -> None:
@@ -66,8 +75,10 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
             cameras = cameras_for(original.splats, original.views)
             prover = Prover.of(original.splats, cameras, original.backend, original.came_as)
         del read
-        held = replace(prover, splats=original.held_in(file))
-        proof = held.prove(file, exact=original.itself)
+        for held in original.held_in(file):
+            proof = replace(prover, splats=held).prove(file, exact=original.itself)
+            if not proof.fault:
+                break
         found.append((file, proof))
         if as_json:
             console.emit("verified", **_facts(file, proof, original))
@@ -118,7 +129,8 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     splats = kept_rows(quantised.splats)[0]
     backend = sources.backend_of(run)
     name = f"the run {run.run_folder}"
-    return _Original(splats, seen, name, backend=backend, quantised=quantised)
+    exported = run.stage_folder("export")
+    return _Original(splats, seen, name, backend=backend, quantised=quantised, exported=exported)
 
 
 def _tell(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,10 +44,16 @@ class Tuner:
         self.stepper = step_of(backend)
         self.steps = 0  # made so far
 
-    def tuned(self, splats: Splats, steps: int, seen: NDArray[np.int32]) -> Splats:
+    def tuned(
+        self,
+        splats: Splats,
+        steps: int,
+        seen: NDArray[np.int32],
+        still: Collection[str] = (),
+    ) -> Splats:
         """After `steps` more. seen [N]: how many photographs show each splat. No splat gets smaller
-        than what they show, unless it was; bands above a splat's own degree stay empty. Raises
-        Interrupted."""
+        than what they show, unless it was; bands above a splat's own degree stay empty. still: what
+        does not change to the bit, of the fields of `LearningRates`. Raises Interrupted."""
         if not steps or not len(splats):
             return splats
         model = new_model(*(np.array(a, np.float32, order="C") for a in splats.arrays))
@@ -62,8 +68,9 @@ class Tuner:
                 MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** share,
                 RATE * (RATE_END / RATE) ** share,
             )
+            rates = replace(rates, **dict.fromkeys(still, 0.0))
             self.stepper.step(self._level(), settings, rates, False, self._dropout())
-        return self._finished(self.stepper.model(), splats)
+        return _with(self._finished(self.stepper.model(), splats), splats, still)
 
     def _dropout(self) -> Dropout | None:
         if not self.by_heart:
@@ -93,6 +100,16 @@ class Tuner:
             opacity_logits=model.opacity_logits.copy(),
             sh=model.sh.copy(),
         )
+
+
+def _with(tuned: Splats, before: Splats, still: Collection[str]) -> Splats:
+    """`tuned`, with `still` as it was: lengths of quaternions and clamped sizes were looked at."""
+    sh = tuned.sh.copy()
+    for name, bands in (("sh_dc", slice(0, 1)), ("sh_rest", slice(1, None))):
+        if name in still:
+            sh[:, bands] = before.sh[:, bands]
+    arrays = {name: getattr(before, name) for name in still if not name.startswith("sh_")}
+    return replace(tuned, sh=sh, **arrays)
 
 
 def _level(photograph: Photograph) -> Level:

@@ -40,8 +40,12 @@ class Bits:
 
 def of_sog(splats: Splats, bits: Bits) -> Splats:
     """What a .sog holds of them in so many bits, on the grids that its writer will find again."""
-    exact = least_turned(splats)
-    found = exact
+    return on_grids(least_turned(splats), bits)
+
+
+def on_grids(splats: Splats, bits: Bits) -> Splats:
+    """The same, axes named as they are."""
+    exact = found = splats
     for name, count in asdict(bits).items():
         found = told(exact, found, name, count)
     return found

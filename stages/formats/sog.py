@@ -67,8 +67,11 @@ def members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, b
 
 
 def _add(package: zipfile.ZipFile, name: str, content: bytes) -> None:
-    """Stored, with the oldest time that zip knows: equal splats give equal bytes."""
-    package.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
+    """With the oldest time that zip knows: equal splats give equal bytes. Text is packed, for
+    codebooks are long; pictures are already."""
+    packing = zipfile.ZIP_DEFLATED if name.endswith(".json") else zipfile.ZIP_STORED
+    info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+    package.writestr(info, content, compress_type=packing)
 
 
 def _webp(pixels: NDArray[np.uint8]) -> bytes:

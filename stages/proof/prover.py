@@ -23,7 +23,7 @@ from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.raster.backends import AUTO
 from stages.raster.draw import renderer, settings_of
-from stages.scene import Camera, Splats, View, split_held_out
+from stages.scene import Camera, Splats, View, split_held_out, spread_over
 from stages.scene.framing import around
 
 _SIDE_PX = 480
@@ -57,9 +57,7 @@ def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...
     chosen = held or training
     if not chosen:
         return tuple(camera.fitted(_SIDE_PX) for camera in around(splats, _CAMERAS, _MIDDLE))
-    count = min(_CAMERAS, len(chosen))
-    spread = (chosen[i * len(chosen) // count] for i in range(count))
-    return tuple(view.camera.fitted(_SIDE_PX) for view in spread)
+    return tuple(view.camera.fitted(_SIDE_PX) for view in spread_over(chosen, _CAMERAS))
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from stages.scene.capture import (
     scene_extent,
     seen_extent,
     split_held_out,
+    spread_over,
 )
 from stages.scene.look import Look, look_of, near_plane
 from stages.scene.splats import (
@@ -59,4 +60,5 @@ __all__ = [
     "scene_extent",
     "seen_extent",
     "split_held_out",
+    "spread_over",
 ]

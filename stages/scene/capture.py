@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from stages.scene.camera import Camera
 from stages.scene.light import Light
 
+Item = TypeVar("Item")
 HELD_OUT_EVERY = 8
 PHOTOS_FOLDER = "photos/"  # of a capture: where its normalised pictures are
 IGNORE, TRANSPARENT = "ignore", "transparent"  # what masks may mean
@@ -121,6 +124,12 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
     held = tuple(eight[0] for eight in alone if eight)
     names = {view.name for view in held}
     return tuple(view for view in ordered if view.name not in names), held
+
+
+def spread_over(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many of them, evenly: photographs next to each other say the same."""
+    count = min(most, len(items))
+    return [items[i * len(items) // count] for i in range(count)]
 
 
 def scene_extent(views: tuple[View, ...]) -> float:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ from stages.formats.rows import kept_rows
 from stages.measure.judge import Photograph, Score, drawing_of, scores
 from stages.measure.speed import seconds_a_frame
 from stages.measure.worth import Worth, floaters, measure_worth
-from stages.scene import Look, QuantisedSplats, Splats, View, split_held_out
-from stages.trade.points import Moment, Point, Trade, change_db, mean_db, spread_over
+from stages.scene import Look, QuantisedSplats, Splats, View, split_held_out, spread_over
+from stages.trade.points import Moment, Point, Trade, change_db, mean_db
 from stages.trade.thin import Thin, measure_thin
 
 # Shares of the splats that are left, each taken from the one before: what single splats are worth
@@ -35,7 +35,8 @@ Tell = Callable[[str], None]
 class Material:
     """What is measured. splats: the run's last, in the frame of its cameras. training, held_out:
     photographs that decide, and that judge. levelled: whether up is -Y. history: as training logged
-    it. exported: formats. quantised: what was decided on for files; None where nothing was."""
+    it. exported: formats. quantised: what was decided on for files; None where nothing was. fitted:
+    by format, what its file holds where export fine-tuned it."""
 
     splats: Splats
     training: Sequence[Photograph]
@@ -47,6 +48,7 @@ class Material:
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
     quantised: QuantisedSplats | None = None
+    fitted: Mapping[str, Splats] = field(default_factory=dict)
 
 
 def measure_trade(material: Material, tell: Tell) -> Trade:
@@ -99,6 +101,7 @@ def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, .
             tell(f"writing and judging .{name}")
             path = Path(folder) / f"scene.{name}"
             held = held_by(row, material.quantised) if material.quantised else splats
+            held = material.fitted.get(name, held)
             formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)
             read = replace(formats.read(path), look=splats.look)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -99,9 +99,3 @@ def knee(costs: Sequence[float], psnr_db: Sequence[float]) -> int:
     above = y - (y[low] + (x - x[low]) / span * (y[high] - y[low]))
     best = int(np.argmax(above))
     return best if above[best] > 1e-9 else high
-
-
-def spread_over(items: Sequence[Any], most: int) -> list[Any]:
-    """At most so many of them, evenly: photographs next to each other say the same."""
-    count = min(most, len(items))
-    return [items[i * len(items) // count] for i in range(count)]

@@ -20,9 +20,8 @@ from stages.measure.coverage import (
 )
 from stages.measure.judge import Photograph, drawing_of
 from stages.measure.shimmer import Framing, framings, shimmer, small_psnr_db
-from stages.scene import Camera, Splats, View, look_at
+from stages.scene import Camera, Splats, View, look_at, spread_over
 from stages.scene.framing import depth_of_interest
-from stages.trade.points import spread_over
 
 MOST_PHOTOGRAPHS = 200  # that coverage is found by
 FRAMED = 3  # photographs from which extremes are drawn

@@ -68,6 +68,7 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     def pipeline(path: Path) -> SimpleNamespace:
         return SimpleNamespace(
             run_folder=path,
+            stage_folder=lambda name: exported,
             manifest=outputs.get,
             load=lambda name: outputs[name],
             recorded_settings=lambda: {"train": TrainSettings()},

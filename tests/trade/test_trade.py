@@ -13,12 +13,11 @@ from stages.base.errors import SplatError
 from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE
 from stages.measure.judge import load_photographs
-from stages.scene import Camera, Look, QuantisedSplats, View, split_held_out
+from stages.scene import Camera, Look, QuantisedSplats, View, split_held_out, spread_over
 from stages.trade import words
 from stages.trade.measuring import SHARES, Material, deciding, measure_trade
 from stages.trade.pair import Side, pair, verdict
 from stages.trade.pair_report import write_pair
-from stages.trade.points import spread_over
 from stages.trade.report import write_report
 from tests.small_scene import small_scene
 
