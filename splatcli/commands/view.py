@@ -47,16 +47,21 @@ def show(target: Path | None, port: int, open_browser: bool) -> None:
 def _items(
     target: Path | None, pipeline: Pipeline | None, splats: Splats, content: Path
 ) -> dict[str, Item]:
-    """What is served; the splats are written to `content`, as the viewer reads them best."""
-    from stages.formats import ply
+    """What is served; the splats are written to `content`, as the viewer reads them best. An asset
+    that streams is served as it is."""
+    from stages.formats import format_of, ply
     from stages.viewer.site import site
 
     run = pipeline or sources.pipeline_around(target)
     sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
     units = sfm.units if sfm else "arbitrary"
-    ply.write(content, splats, units=units)
+    if pipeline is None and target is not None and format_of(target).levels:
+        content = target
+    else:
+        ply.write(content, splats, units=units)
     seen, photos = (sfm.views, sfm.folder) if sfm else ((), None)
-    return site(_title(target, pipeline), splats, content, seen, photos, units)
+    source = str(pipeline.run_folder if pipeline is not None else target)
+    return site(_title(target, pipeline), splats, content, seen, photos, units, source)
 
 
 def _title(target: Path | None, pipeline: Pipeline | None) -> str:

@@ -70,6 +70,9 @@ def _prepared(typed: Typed, target: Path) -> Operation:
     match typed.word:
         case "crop":
             return _selecting(regions.parsed(value).holds)
+        case "drop":
+            inside = regions.parsed(value).holds
+            return _selecting(lambda splats: ~inside(splats))
         case "keep":
             return _selecting(expression.parsed(value).holds)
         case "drop-floaters":

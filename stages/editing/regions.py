@@ -1,4 +1,4 @@
-"""Parts of space to keep: a box, a ball, or what lies between given points."""
+"""Parts of space: a box, a ball, what lies between given points, or within a lasso."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ _HULL = Kind(
     "Write the corners down, or save them as points from another program.",
 )
 _CELLS = 1 << 22  # point x face, of one block
+_VIEW = 12  # numbers of a lasso that say from where it was drawn
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class Region:
 
 
 def parsed(text: str) -> Region:
-    """Of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r` or `hull:FILE`. Raises SplatError "edit-crop",
-    "edit-hull-unreadable"."""
+    """Of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or `lasso:...`, as the page of
+    `splat view` writes it. Raises SplatError "edit-region", "edit-hull-unreadable"."""
     kind, _, rest = text.partition(":")
     if kind == "box" and (ends := numbers(rest, 6)) is not None:
         low, high = ends[:3], ends[3:]
@@ -52,11 +53,16 @@ def parsed(text: str) -> Region:
         return Region(lambda at: np.asarray(np.linalg.norm(at - middle, axis=1) <= radius))
     if kind == "hull" and rest:
         return Region(_inside_hull(Path(rest)))
+    if kind == "lasso" and (drawn := numbers(rest, rest.count(",") + 1)) is not None:
+        view, corners = drawn[:_VIEW], drawn[_VIEW:]
+        if len(corners) >= 6 and len(corners) % 2 == 0:
+            return Region(_inside_lasso(view, corners.reshape(-1, 2)))
     raise SplatError(
-        "edit-crop",
-        given=f"--crop {text} names no part of space.",
-        wanted="box:x0,y0,z0,x1,y1,z1 with its least corner first, sphere:x,y,z,r, or hull:FILE.",
-        hint="`splat info` tells the bounds of the scene.",
+        "edit-region",
+        given=f"{text[:100]!r} names no part of space.",
+        wanted="box:x0,y0,z0,x1,y1,z1 with its least corner first, sphere:x,y,z,r, hull:FILE, or "
+        "lasso: and its numbers.",
+        hint="`splat info` tells the bounds of the scene; the page of `splat view` writes a lasso.",
         family=Family.USAGE,
     )
 
@@ -92,6 +98,27 @@ def _inside_hull(path: Path) -> Inside:
             part = slice(start, start + step)
             found[part] = (at[part] @ faces[:, :3].T + faces[:, 3] <= slack).all(axis=1)
         return found
+
+    return inside
+
+
+def _inside_lasso(view: NDArray[np.float64], corners: NDArray[np.float64]) -> Inside:
+    """view [12]: three rows that take (x, y, z, 1) to pixels times depth, and depth. corners
+    [K, 2]: pixels; inside is what an odd number of sides lies to the right of.
+
+    Added and multiplied in the order in which the page does it: to the last bit the same.
+    """
+
+    def inside(at: NDArray[np.float64]) -> NDArray[np.bool_]:
+        x, y, z = at.T
+        u, v, depth = (a * x + b * y + c * z + d for a, b, c, d in view.reshape(3, 4))
+        found = np.zeros(len(at), bool)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = u / depth, v / depth
+            for (ax, ay), (bx, by) in zip(corners, np.roll(corners, 1, axis=0), strict=True):
+                passed = u < (bx - ax) * (v - ay) / (by - ay) + ax
+                found ^= ((ay > v) != (by > v)) & passed
+        return np.asarray(found & (depth > 0))
 
     return inside
 

@@ -25,7 +25,8 @@ class Word:
 WORDS = {
     word.name: word
     for word in (
-        Word("crop", "box:...|sphere:...|hull:FILE", "Keep what lies inside."),
+        Word("crop", "box:...|sphere:...|hull:FILE|lasso:...", "Keep what lies inside."),
+        Word("drop", "box:...|sphere:...|hull:FILE|lasso:...", "Leave out what lies inside."),
         Word("keep", "CONDITION", "Keep where it is true: 'opacity > 0.1 and scale < 0.5'."),
         Word("drop-floaters", "", "Leave out what hangs in empty space."),
         Word("rotate", "AXIS:DEGREES", "Turn about the origin: x:90, or 0,1,1:30."),

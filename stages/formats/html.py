@@ -39,7 +39,8 @@ def write(
     views: cameras to look from. Raises SplatError when the file cannot be written.
     """
     splats, dropped = kept_rows(splats)
-    scene = document.scene_data(path.stem, splats, shots_of(views, splats), units=units)
+    shots = shots_of(views, splats)
+    scene = document.scene_data(path.stem, splats, shots, units=units, source=path.name)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(document.head(scene).encode("utf-8"))
         for chunk in _chunks(_zipped(ply.blocks(splats, units))):

@@ -255,12 +255,48 @@ def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]
     return {file: sorted(ranges) for file, ranges in found.items()}
 
 
-def _source(folder: Path, name: Any) -> Source:
-    """A chunk: a folder's meta.json, or a .sog."""
+def parts_of(path: Path) -> dict[str, Path]:
+    """By address relative to its folder: the asset and every file of its chunks. Raises SplatError
+    "splats-unreadable"."""
+    found = {path.name: path}
+    with reading(path):
+        meta = json.loads(path.read_text(encoding="utf-8"))
+        for name in [*meta["filenames"], *filter(None, [meta.get("environment")])]:
+            place = _place(path.parent, name)
+            chunk = place.parent.iterdir() if place.name == "meta.json" else [place]
+            files = (file for file in chunk if file.is_file())
+            found |= {file.relative_to(path.parent).as_posix(): file for file in files}
+    return found
+
+
+def widths(path: Path, finest: Splats) -> list[float]:
+    """How wide the splats of each level are, in world units: two standard deviations of the middle
+    one of the finest, and so much more where there are fewer. Raises SplatError."""
+    with reading(path):
+        meta = json.loads(path.read_text(encoding="utf-8"))
+        counts = np.zeros(meta["lodLevels"])
+        waiting = [meta["tree"]]
+        while waiting:
+            node = waiting.pop()
+            waiting += node.get("children") or []
+            for level, at in (node.get("lods") or {}).items():
+                counts[int(level)] += at["count"]
+    width = 2 * float(np.exp(np.median(finest.log_scales.max(axis=1))))
+    every: list[float] = (width * np.sqrt(counts.max() / np.maximum(counts, 1))).tolist()
+    return every
+
+
+def _place(folder: Path, name: Any) -> Path:
     parts = PurePosixPath(name).parts if isinstance(name, str) else ("..",)
     place = folder.joinpath(*parts)
     if ".." in parts or PurePosixPath(name).is_absolute() or not place.is_file():
         raise BadFileError(f"its chunk {str(name)[:80]!r} is not beside it")
+    return place
+
+
+def _source(folder: Path, name: Any) -> Source:
+    """A chunk: a folder's meta.json, or a .sog."""
+    place = _place(folder, name)
     if place.name == "meta.json":
         files = [file for file in place.parent.iterdir() if file.is_file()]
         return Source(in_folder(place.parent), sum(file.stat().st_size for file in files))

@@ -12,14 +12,17 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
+import numpy as np
+
 from stages.page.shots import Shot, as_plain
 from stages.scene import Splats
 
 CHUNK_START = '<script type="text/plain" class="splats">'
 CHUNK_END = "</script>\n"
 PAGE_END = "</body>\n</html>\n"
-_SCRIPTS = ("lens.js", "content.js", "panel.js", "main.js")
+_SCRIPTS = ("lens.js", "levels.js", "content.js", "panel.js", "select.js", "main.js")
 _LIVE_SCRIPTS = ("orbit.js", "panel.js", "live.js")
+_MIDDLE_PERCENT, _WIDER = (1, 99), 0.1
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self' data: blob:"
@@ -27,17 +30,37 @@ _POLICY = (
 
 
 def scene_data(
-    title: str, splats: Splats, shots: Sequence[Shot], *, units: str, content: str = ""
+    title: str,
+    splats: Splats,
+    shots: Sequence[Shot],
+    *,
+    units: str,
+    source: str,
+    content: str = "",
+    levels: Sequence[float] = (),
 ) -> dict[str, Any]:
-    """What the page shows, as plain data. content: the address of the splats' .ply; "" if the
-    document holds them."""
+    """What the page shows, as plain data. source: what `splat edit` would read. content: the
+    address of the splats' .ply, or of a lod-meta.json; "" if the document holds them. levels: how
+    wide the splats of each level of detail are, of an asset that streams."""
     return {
         "title": title,
+        "source": source,
         "count": len(splats),
         "units": units,
         "content": content,
+        "levels": list(levels),
+        "bounds": _bounds(splats),
         "shots": [as_plain(shot, splats.means) for shot in shots],
     }
+
+
+def _bounds(splats: Splats) -> dict[str, list[float]]:
+    """What a box is chosen in: of the middle of the splats, for a few lie far away."""
+    if not len(splats):
+        return {"min": [0.0] * 3, "max": [0.0] * 3}
+    low, high = np.percentile(splats.means, _MIDDLE_PERCENT, axis=0)
+    wider = _WIDER * (high - low)
+    return {"min": (low - wider).tolist(), "max": (high + wider).tolist()}
 
 
 def head(scene: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from stages.formats import format_of, streamed_sog
 from stages.page import document
 from stages.page.shots import Shot, shots_of
 from stages.scene import Splats, View
@@ -20,12 +21,23 @@ def site(
     views: Sequence[View] = (),
     photos: Path | None = None,
     units: str = "arbitrary",
+    source: str = "",
 ) -> dict[str, Item]:
-    """By address. content: the splats as .ply. photos: the folder that `View.image` starts from;
-    a photograph that is not there is left out."""
+    """By address. content: the splats as .ply, or the lod-meta.json of an asset that streams.
+    photos: the folder that `View.image` starts from; a photograph that is not there is left out.
+    source: what `splat edit` would read, if it is not the content. Raises SplatError."""
     shots, items = with_photographs(shots_of(views, splats), views, photos)
-    items["/scene.ply"] = Item(content, "application/octet-stream")
-    scene = document.scene_data(title, splats, shots, units=units, content="scene.ply")
+    streams = format_of(content).levels
+    files = streamed_sog.parts_of(content) if streams else {"scene.ply": content}
+    items |= {f"/{name}": Item(file, "application/octet-stream") for name, file in files.items()}
+    levels = streamed_sog.widths(content, splats) if streams else []
+    scene = document.scene_data(
+        *(title, splats, shots),
+        units=units,
+        source=source or str(content),
+        content=next(iter(files)),
+        levels=levels,
+    )
     page = document.head(scene) + document.tail()
     items["/"] = Item(page.encode("utf-8"), "text/html; charset=utf-8")
     return items

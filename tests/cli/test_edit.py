@@ -151,7 +151,7 @@ def test_operations_written_to_a_file_are_read_back(tmp_path: Path) -> None:
     ("words", "code", "status"),
     [
         (["--keep", "x >"], "edit-keep", 2),
-        (["--crop", "cube:1"], "edit-crop", 2),
+        (["--crop", "cube:1"], "edit-region", 2),
         (["--crop", "hull:none.json"], "edit-hull-unreadable", 3),
         (["--rotate", "y"], "edit-rotate", 2),
         (["--rotate", "0,0,0:20"], "edit-rotate", 2),

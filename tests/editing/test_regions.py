@@ -36,9 +36,21 @@ def test_a_hull_of_the_corners_of_a_box_is_the_box(tmp_path: Path) -> None:
         assert (parsed(f"hull:{tmp_path / name}").holds(SPLATS) == wanted).all()
 
 
+def test_a_lasso_is_what_lies_before_the_camera_and_within_its_corners() -> None:
+    """By hand: a camera at z = -1 that looks along z, 100 pixels to the unit; an L of corners."""
+    view = "100,0,0,0,0,100,0,0,0,0,1,1"
+    found = parsed(f"lasso:{view},0,0,100,0,100,50,50,50,50,100,0,100").holds(SPLATS)
+    x, y, z = SPLATS.means.astype(np.float64).T
+    u, v = 100 * x / (z + 1), 100 * y / (z + 1)
+    whole = (z > -1) & (u > 0) & (v > 0) & (u < 100) & (v < 100)
+    assert (found == whole & ~((u > 50) & (v > 50))).all()
+    assert 10 < found.sum() < 200
+
+
 @pytest.mark.parametrize(
     "text",
     [
+        *("lasso:", "lasso:1,2,3", "lasso:" + "1," * 15 + "1", "lasso:" + "1," * 18 + "1"),
         *("box", "box:1,2,3", "box:1,1,1,0,0,0", "box:a,b,c,d,e,f"),
         *("sphere:0,0,0,-1", "sphere:0,0,0,nan", "ball:0,0,0,1", "", "hull:"),
     ],
@@ -46,7 +58,7 @@ def test_a_hull_of_the_corners_of_a_box_is_the_box(tmp_path: Path) -> None:
 def test_what_names_no_part_of_space_is_refused(text: str) -> None:
     with pytest.raises(SplatError) as refused:
         parsed(text)
-    assert refused.value.code == "edit-crop"
+    assert refused.value.code == "edit-region"
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def test_a_damaged_page_is_refused(
 def test_names_cannot_break_out_of_the_page() -> None:
     splats = scenes.cloud(3)
     shots = [Shot(HOSTILE, scenes.camera())]
-    text = document.head(document.scene_data(HOSTILE, splats, shots, units="arbitrary"))
+    text = document.head(document.scene_data(HOSTILE, splats, shots, units="arbitrary", source=""))
     elements = Elements(text)
     assert elements.scene()["shots"][0]["name"] == HOSTILE
     assert elements.scene()["title"] == HOSTILE

@@ -19,6 +19,13 @@ function frustumOf(shot, width, height, near) {
     ];
 }
 
+// What a shot's lens makes of the viewer's camera counts too: it is asked for when a frame is drawn.
+function projectionOf(camera) {
+    const matrix = camera.projectionMatrix.clone();
+    if (camera.calculateProjection) camera.calculateProjection(matrix);
+    return matrix;
+}
+
 class Lens {
     constructor(app, canvas, moved) {
         this.app = app;

@@ -1,6 +1,7 @@
 // Address options: ?camera=NAME starts there, ?bare leaves all controls away, ?webgl asks for it.
 // For scripts: `splatReady` is a promise that resolves when the first camera is drawn, and
-// `splatShow(name)` one that resolves when the camera of that name is.
+// `splatShow(name)` one that resolves when the camera of that name is; `splatSelection` what is
+// selected.
 const STEADY_FRAMES = 6; // sorting runs beside drawing and takes a few frames to be seen
 
 function settingsFor(scene) {
@@ -64,13 +65,14 @@ async function start() {
     const scene = JSON.parse(find("scene").textContent);
     const query = new URLSearchParams(location.search);
     const bare = query.has("bare");
+    const streamed = scene.levels.length > 0; // then the viewer fetches what it wants of it
     if (scene.count === 0) throw new Error("There is not one splat to show.");
     const viewer = await SuperSplatViewer.createViewer({
         container: find("view"),
         settings: settingsFor(scene),
         contentUrl: scene.content || "scene.ply",
-        contentFilename: "scene.ply",
-        contents: contentOf(scene),
+        contentFilename: streamed ? "lod-meta.json" : "scene.ply",
+        contents: streamed ? undefined : contentOf(scene),
         renderer: query.has("webgl") ? "webgl" : "webgpu",
         ui: !bare,
         noanim: true
@@ -81,6 +83,8 @@ async function start() {
     let panel = null;
     const lens = new Lens(app, app.graphicsDevice.canvas, () => panel && panel.moved());
     viewer.events.on("cameraMode:changed", () => lens.release()); // by a button or a key
+    // After the lens has placed the camera.
+    if (streamed) window.splatLevels = new Levels(app, await (await fetch(scene.content)).json(), scene.levels);
     const show = (shot) => {
         viewer.selectAnnotation(scene.shots.indexOf(shot)); // where orbiting goes on from
         lens.hold(shot);
@@ -88,6 +92,7 @@ async function start() {
         return steady(app);
     };
     if (!bare) panel = new Panel(scene, show);
+    if (!bare) window.splatSelection = new Selection(scene, app);
     app.on("prerender", () => panel && panel.frames++);
     const named = (name) => scene.shots.find((shot) => shot.name === name);
     window.splatShow = async (name) => {

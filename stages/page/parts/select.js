@@ -1,0 +1,201 @@
+// Selecting by eye: a box in the scene, or what a lasso surrounds on the screen, written as the
+// operations of `splat edit` that select the same splats, to the last one. Numbers are rounded
+// before they are used, and added and multiplied in the order in which Python does it.
+const CORNER_PX = 4; // between neighbouring corners of a lasso, at least
+const DOTS = 200000; // of what is selected, at most
+const ENDS = ["x from", "y from", "z from", "x to", "y to", "z to"];
+const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+
+const rounded = (value) => Number(value.toPrecision(9));
+
+function boxOf(ends) {
+    const [x0, y0, z0, x1, y1, z1] = ends;
+    return {
+        text: `box:${ends.join(",")}`,
+        holds: (x, y, z) => x >= x0 && x <= x1 && y >= y0 && y <= y1 && z >= z0 && z <= z1
+    };
+}
+
+// view [12]: three rows that take a point (x, y, z, 1) to pixels times depth, and depth.
+function seenBy(view, x, y, z) {
+    const row = (i) => view[i] * x + view[i + 1] * y + view[i + 2] * z + view[i + 3];
+    const depth = row(8);
+    return depth > 0 ? [row(0) / depth, row(4) / depth] : null;
+}
+
+function lassoOf(view, corners) {
+    const holds = (x, y, z) => {
+        const at = seenBy(view, x, y, z);
+        let inside = false;
+        for (let i = 0, j = corners.length - 1; at && i < corners.length; j = i++) {
+            const [[ax, ay], [bx, by]] = [corners[i], corners[j]];
+            if (ay > at[1] === by > at[1]) continue;
+            if (at[0] < ((bx - ax) * (at[1] - ay)) / (by - ay) + ax) inside = !inside;
+        }
+        return inside;
+    };
+    return { text: `lasso:${[...view, ...corners.flat()].join(",")}`, holds };
+}
+
+function viewOf(app) {
+    const { camera } = app.root.findByName("camera");
+    const model = app.root.findByName("gsplat").getWorldTransform();
+    const m = projectionOf(camera).mul(camera.viewMatrix).mul(model).data;
+    const { clientWidth: width, clientHeight: height } = app.graphicsDevice.canvas;
+    const row = (of) => [0, 4, 8, 12].map((i) => rounded(of(m[i], m[i + 1], m[i + 3])));
+    return [
+        ...row((x, _, w) => (width / 2) * (w + x)),
+        ...row((_, y, w) => (height / 2) * (w - y)),
+        ...row((x, y, w) => w)
+    ];
+}
+
+// [N * 3] of the splats, null where they stream: then only what is near has come.
+function centresOf(app) {
+    const { resource } = app.root.findByName("gsplat").gsplat;
+    if (resource.octree) return null;
+    return resource.centers || resource.gsplatData.getCenters();
+}
+
+class Selection {
+    constructor(scene, app) {
+        this.scene = scene;
+        this.app = app;
+        this.centres = centresOf(app);
+        this.chain = [];
+        this.region = null;
+        this.corners = [];
+        this.canvas = find("view").appendChild(document.createElement("canvas"));
+        this.canvas.id = "overlay";
+        this.canvas.onpointerdown = (event) => this.begin(event);
+        this.canvas.onpointermove = (event) => event.buttons && this.draw(event);
+        this.canvas.onpointerup = () => this.end();
+        find("tool").onchange = () => this.choose();
+        find("keep").onclick = () => this.add("crop");
+        find("drop").onclick = () => this.add("drop");
+        find("undo").onclick = () => this.undo();
+        find("copy").onclick = () => navigator.clipboard.writeText(find("chain").value);
+        this.makeSliders();
+        app.on("frameend", () => this.paint());
+        find("select").hidden = false;
+        this.update();
+    }
+
+    makeSliders() {
+        const { min, max } = this.scene.bounds;
+        this.sliders = ENDS.map((label, i) => {
+            const [low, high] = [min[i % 3], max[i % 3]];
+            const slider = document.createElement("input");
+            const all = { type: "range", min: low, max: high, step: "any", value: i < 3 ? low : high };
+            Object.assign(slider, all, { title: label, oninput: () => this.choose() });
+            return find("box").appendChild(slider);
+        });
+    }
+
+    choose() {
+        const tool = find("tool").value;
+        find("box").hidden = tool !== "box";
+        this.canvas.style.pointerEvents = tool === "lasso" ? "auto" : "none";
+        this.corners = [];
+        this.region = tool === "box" ? boxOf(this.ends()) : null;
+        this.update();
+    }
+
+    ends() {
+        const ends = this.sliders.map((slider) => rounded(slider.valueAsNumber));
+        return [...ends.slice(0, 3), ...ends.slice(3).map((end, i) => Math.max(end, ends[i]))];
+    }
+
+    begin(event) {
+        this.canvas.setPointerCapture(event.pointerId);
+        this.corners = [];
+        this.draw(event);
+    }
+
+    draw({ offsetX, offsetY }) {
+        const last = this.corners.at(-1);
+        if (last && Math.hypot(offsetX - last[0], offsetY - last[1]) < CORNER_PX) return;
+        this.corners.push([rounded(offsetX), rounded(offsetY)]);
+        this.app.renderNextFrame = true;
+    }
+
+    end() {
+        this.region = this.corners.length > 2 ? lassoOf(viewOf(this.app), this.corners) : null;
+        this.corners = [];
+        this.update();
+    }
+
+    add(word) {
+        if (!this.region) return;
+        this.chain.push({ word, region: this.region });
+        find("tool").value = "";
+        this.choose();
+    }
+
+    undo() {
+        this.chain.pop();
+        this.update();
+    }
+
+    left(x, y, z) {
+        return this.chain.every(({ word, region }) => region.holds(x, y, z) === (word === "crop"));
+    }
+
+    update() {
+        this.chosen = [];
+        let left = 0;
+        for (let i = 0; this.centres && i < this.centres.length; i += 3) {
+            const at = this.centres.subarray(i, i + 3);
+            if (!this.left(...at)) continue;
+            left++;
+            if (this.region && this.region.holds(...at)) this.chosen.push(i);
+        }
+        const count = (n) => n.toLocaleString("en");
+        const told = this.region ? `${count(this.chosen.length)} of ${count(left)} selected` : `${count(left)} left`;
+        find("chosen").textContent = this.centres ? told : "";
+        for (const name of ["keep", "drop"]) find(name).disabled = !this.region;
+        find("undo").disabled = find("copy").disabled = !this.chain.length;
+        const words = this.chain.map(({ word, region }) => `--${word} ${region.text}`);
+        find("chain").value = [`splat edit ${this.source()} OUT`, ...words].join(" ");
+        this.app.renderNextFrame = true;
+    }
+
+    source() {
+        const { source } = this.scene;
+        return /^[\w@%+=:,./-]+$/.test(source) ? source : `'${source.replaceAll("'", "'\\''")}'`;
+    }
+
+    paint() {
+        const { canvas } = this;
+        const { clientWidth: width, clientHeight: height } = this.app.graphicsDevice.canvas;
+        if (canvas.width !== width) canvas.width = width;
+        if (canvas.height !== height) canvas.height = height;
+        const pen = canvas.getContext("2d");
+        pen.clearRect(0, 0, width, height);
+        if (!this.region && !this.corners.length) return;
+        const view = viewOf(this.app);
+        pen.fillStyle = pen.strokeStyle = "#fc0";
+        const step = Math.ceil(this.chosen.length / DOTS) || 1;
+        for (let i = 0; i < this.chosen.length; i += step) {
+            const at = seenBy(view, ...this.centres.subarray(this.chosen[i], this.chosen[i] + 3));
+            if (at) pen.fillRect(at[0], at[1], 1, 1);
+        }
+        this.paintLines(pen, [...this.corners.map((to, i) => [this.corners.at(i - 1), to])]);
+        if (find("tool").value === "box") this.paintLines(pen, this.edges(view));
+    }
+
+    edges(view) {
+        const ends = this.ends();
+        const corner = (i) => seenBy(view, ends[i & 1 ? 3 : 0], ends[i & 2 ? 4 : 1], ends[i & 4 ? 5 : 2]);
+        return EDGES.map((pair) => pair.map(corner)).filter(([a, b]) => a && b);
+    }
+
+    paintLines(pen, lines) {
+        pen.beginPath();
+        for (const [from, to] of lines) {
+            pen.moveTo(...from);
+            pen.lineTo(...to);
+        }
+        pen.stroke();
+    }
+}

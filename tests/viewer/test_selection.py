@@ -1,0 +1,112 @@
+"""Selecting by eye: what the page writes selects on the command line what was seen selected."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+from typer.testing import CliRunner
+
+from splatcli.app import app
+from stages import formats
+from tests.formats.truth import many_splats
+from tests.viewer.browser import Browser
+from tests.viewer.screenshots import SIZE
+
+CHAIN = "document.getElementById('chain').value"
+CHOSEN = "splatSelection.chosen.map(i => Array.from(splatSelection.centres.subarray(i, i + 3)))"
+
+
+def opened(browser: Browser, folder: Path) -> Path:
+    """The page of a file with a name that a shell would take apart."""
+    page = folder / "it's a page.html"
+    formats.write(page, many_splats(2000))
+    browser.resize((900, 700))
+    browser.open(page.as_uri() + "?webgl")
+    browser.run("window.splatReady")
+    browser.run("document.getElementById('select').open = true")
+    return page
+
+
+def lasso(browser: Browser, corners: list[tuple[float, float]]) -> None:
+    browser.run(
+        "(tool => { tool.value = 'lasso'; tool.onchange(); })(document.getElementById('tool'))"
+    )
+    for number, (x, y) in enumerate([*corners, corners[-1]]):
+        kind = ["mousePressed", *["mouseMoved"] * (len(corners) - 1), "mouseReleased"][number]
+        browser.call(
+            *("Input.dispatchMouseEvent",),
+            type=kind,
+            x=x,
+            y=y,
+            button="left",
+            buttons=1,
+            clickCount=1,
+        )
+
+
+def selected(browser: Browser) -> np.ndarray:
+    """[N, 3] centres, in an order of their own."""
+    return in_order(np.array(browser.run(CHOSEN), np.float32).reshape(-1, 3))
+
+
+def in_order(means: np.ndarray) -> np.ndarray:
+    return means[np.lexsort(means.T)]
+
+
+def edited(browser: Browser, page: Path) -> np.ndarray:
+    """[N, 3] centres that what the page wrote leaves."""
+    words = shlex.split(browser.run(CHAIN))
+    assert words[:4] == ["splat", "edit", page.name, "OUT"]
+    out = page.with_name("out.ply")
+    result = CliRunner().invoke(app, ["edit", str(page), str(out), *words[4:]])
+    assert result.exit_code == 0, result.stderr
+    return in_order(formats.read(out).means)
+
+
+def test_a_lasso_selects_on_the_command_line_what_it_did_by_eye(
+    browser: Browser, tmp_path: Path
+) -> None:
+    page = opened(browser, tmp_path)
+    hollow = [(420, 200), (650, 220), (700, 500), (560, 300), (430, 520)]
+    lasso(browser, [(x + 0.5, y) for x, y in hollow])
+    seen = selected(browser)
+    assert 50 < len(seen) < 1500
+    assert f"{len(seen)} of 2,000 selected" in browser.run(
+        "document.getElementById('chosen').textContent"
+    )
+    picture = browser.picture()
+    yellow = (picture[..., 0] > 0.9) & (picture[..., 2] < 0.1)
+    assert yellow[200:520, 420:700].sum() > 30
+    browser.run("document.getElementById('keep').click()")
+    np.testing.assert_array_equal(edited(browser, page), seen)
+
+
+def test_a_box_after_a_lasso_is_a_chain_and_the_last_is_taken_back(
+    browser: Browser, tmp_path: Path
+) -> None:
+    page = opened(browser, tmp_path)
+    lasso(browser, [(420, 200), (650, 220), (600, 500)])
+    lassoed = selected(browser)
+    browser.run("document.getElementById('drop').click()")
+    browser.run(
+        "(tool => { tool.value = 'box'; tool.onchange(); })(document.getElementById('tool'));"
+        "(side => { side.value = '0.125'; side.oninput(); })"
+        "(document.querySelector('#box input'))"
+    )
+    boxed = selected(browser)
+    assert 0 < len(boxed) < 2000 - len(lassoed)
+    assert (boxed[:, 0] >= 0.12).all()
+    browser.run("document.getElementById('keep').click()")
+    np.testing.assert_array_equal(edited(browser, page), boxed)
+    browser.run("document.getElementById('undo').click()")
+    assert len(edited(browser, page)) == 2000 - len(lassoed)
+
+
+def test_looking_around_selects_nothing(browser: Browser, tmp_path: Path) -> None:
+    page = opened(browser, tmp_path)
+    assert shlex.split(browser.run(CHAIN)) == ["splat", "edit", page.name, "OUT"]
+    assert "2,000 left" in browser.run("document.getElementById('chosen').textContent")
+    assert browser.run("document.getElementById('keep').disabled")
+    browser.resize(SIZE)
