@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.words import counted
+from stages.capacity.usual import DECIDING
 from stages.formats import FORMATS, MESHES, Format
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
@@ -33,7 +34,6 @@ _MESH = "mesh"  # to `--format`: every format of meshes
 _CHOICES = (*FORMATS, _MESH, *MESHES)
 _INDEX = "assets.json"
 _FITTED = "fitted"  # a folder for each format whose splats are not those of quantise
-_DECIDING = 12  # photographs that tell whether fitting was worth it
 # Every system must take the name, USD's packages too: brackets separate names inside them.
 _NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 
@@ -178,7 +178,7 @@ def _fitting(
     seen = np.zeros(len(splats), np.int32)
     if by_heart:  # only then it matters
         seen = measure_worth(splats, photographs, backend).photographs
-    deciding = load_photographs(folder, spread_over(training, _DECIDING), splats.look)
+    deciding = load_photographs(folder, spread_over(training, DECIDING), splats.look)
     return Fitting(tuner, deciding, backend, settings.fit_steps, seen)
 
 

@@ -3,18 +3,19 @@ its way; the rest goes on learning a little. Prove that it cost nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.stage import Report, Stage
+from stages.capacity.usual import DECIDING, SOG_LOSS_DB
 from stages.formats.table import FORMATS
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
-    from stages.capacity.aim import Aim
     from stages.capacity.rounds import Outcome
+    from stages.measure.judge import Photograph
     from stages.scene import Reconstruction, Splats, TrainedSplats
 
 
@@ -90,6 +91,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     import numpy as np
 
     from stages.capacity import words
+    from stages.capacity.aim import Aim, felt_share
     from stages.capacity.rounds import Shrinking
     from stages.capacity.tuning import Tuner
     from stages.measure.judge import load_photographs, mean_psnr_db
@@ -106,7 +108,16 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     before = mean_psnr_db(splats, judges, backend)
     extent = seen_extent(reconstruction)
     tuner = Tuner(photographs, extent, backend, report, trained.by_heart)
-    aim = _aim(settings, trained.passed_on, reconstruction)
+    size_bytes = _sizes(settings, splats, photographs, reconstruction)
+    aim = Aim(
+        settings.price,
+        settings.max_loss_db,
+        felt_share(trained.passed_on),
+        settings.max_splats,
+        settings.max_mb * 1e6,
+        settings.min_psnr,
+        size_bytes,
+    )
     shrinking = Shrinking(
         *(photographs, aim, backend, tuner, settings.rounds, settings.tune_steps, report)
     )
@@ -127,29 +138,37 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     return found.splats
 
 
-def _aim(settings: PruneSettings, passed_on: float, reconstruction: Reconstruction) -> Aim:
-    """What is asked for. The size is measured on a file that is really written."""
+def _sizes(
+    settings: PruneSettings,
+    splats: Splats,
+    photographs: Sequence[Photograph],
+    reconstruction: Reconstruction,
+) -> Callable[[Splats], int]:
+    """Measures the file that --max-mb speaks of, as one that is really written: in as few bits as
+    quantise will choose, which hardly depends on how many splats are left."""
     import tempfile
 
     from stages import formats
-    from stages.capacity.aim import Aim, felt_share
+    from stages.base.lazy import named
+    from stages.capacity.bits import fewest_bits
+    from stages.formats.coarse import Bits
+    from stages.measure.judge import mean_psnr_db
+    from stages.scene import spread_over
+
+    row = FORMATS[settings.mb_of]
+    few: dict[str, int] = {}
+    if settings.max_mb and row.coarse:
+        deciding, backend = spread_over(photographs, DECIDING), drawn_by(settings)
+        few, _ = fewest_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
 
     def size_bytes(splats: Splats) -> int:
+        held = named(row.coarse)(splats, Bits(**few)) if few else splats
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"scene.{settings.mb_of}"
-            views, units = reconstruction.views, reconstruction.units
-            formats.write(path, splats, units=units, views=views)
-            return FORMATS[settings.mb_of].size_bytes(path)
+            formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
+            return row.size_bytes(path)
 
-    return Aim(
-        settings.price,
-        settings.max_loss_db,
-        felt_share(passed_on),
-        settings.max_splats,
-        settings.max_mb * 1e6,
-        settings.min_psnr,
-        size_bytes,
-    )
+    return size_bytes
 
 
 def _report_cuts(before: Splats, found: Outcome, report: Report) -> None:
@@ -185,5 +204,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=7, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=8, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.capacity.usual import DECIDING, SOG_LOSS_DB
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
@@ -24,17 +25,6 @@ if TYPE_CHECKING:
 _DECISIONS, _FLAT = "decisions.json", "flat_dc.npy"
 # Colour that a splat may lose with its higher bands, in steps of 8 bits; the largest that passes.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
-# Of what a .sog tells its values in: (numbers of a splat, the fewest bits).
-_NUMBERS = {
-    "position": (3, 10),
-    "rotation": (3, 4),
-    "scale": (3, 4),
-    "colour": (3, 4),
-    "opacity": (1, 3),
-    "palette": (0, 5),
-}
-_ENTROPY = 0.9  # of the bits of a palette's numbers: about what compression leaves
-_LEAST_DB = 1e-4  # a loss below it is chance
 _BIT_TRIALS = 25  # about as many as are made
 
 
@@ -51,7 +41,7 @@ class QuantiseSettings:
         },
     )
     sog_loss_db: float = field(
-        default=0.3,
+        default=SOG_LOSS_DB,
         metadata={
             "help": "PSNR of training photographs that fewer bits in a .sog may cost besides, "
             "before fine-tuning at export finds some of it back (dB).",
@@ -60,7 +50,7 @@ class QuantiseSettings:
         },
     )
     max_views: int = field(
-        default=12,
+        default=DECIDING,
         metadata={"help": "Training photographs to decide by, at most.", "min": 1, "max": 100_000},
     )
     backend: str = backend_setting()
@@ -79,6 +69,7 @@ def run(
     import numpy as np
 
     from stages.base.atomic import replacing
+    from stages.capacity.bits import fewest_bits
     from stages.formats import FORMATS, splat32
     from stages.formats.coarse import held_by
     from stages.measure.flat import flat_dc
@@ -109,7 +100,7 @@ def run(
     }
 
     counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
-    bits, sog_db = _bits(kept, settings, decider)
+    bits, sog_db = fewest_bits(kept, decider.psnr, settings.sog_loss_db)
     decisions: dict[str, object] = {
         "sh_degree": kept.sh_degree,
         "bits": bits,
@@ -157,56 +148,6 @@ def _cut_each(
         if raw_db - decider.psnr(candidate) < settings.max_loss_db:
             return candidate, steps
     return kept, 0.0
-
-
-def _bits(
-    kept: Splats, settings: QuantiseSettings, decider: _Measure
-) -> tuple[dict[str, int], float]:
-    """(by attribute, in how many bits a .sog tells it; PSNR of such a file). The next bit goes
-    where it saves most bytes for what it costs, as long as all together cost no more than they
-    may. A step that follows is foretold to cost four times as much: half the precision."""
-    from stages.formats.axes import least_turned
-    from stages.formats.coarse import Bits, of_sog, palette_bits, told
-    from stages.formats.rows import kept_rows
-
-    exact = least_turned(kept_rows(kept)[0])
-    found = asdict(Bits(palette=palette_bits(len(exact))))
-    if not len(exact):
-        return found, 0.0
-    splats = of_sog(exact, Bits(**found))
-    best = decider.psnr(splats)
-    floor, least = best - settings.sog_loss_db, {n: bits for n, (_, bits) in _NUMBERS.items()}
-    if not kept.sh_degree:
-        least["palette"] = found["palette"]
-    losses = {
-        name: best - decider.psnr(told(exact, splats, name, bits - 1))
-        for name, bits in found.items()
-        if bits > least[name]
-    }
-    while losses:
-        name = max(losses, key=lambda n: _saved(n, found[n], exact) / max(losses[n], _LEAST_DB))
-        tried = told(exact, splats, name, found[name] - 1)
-        psnr = decider.psnr(tried)
-        if psnr < floor:
-            del losses[name]
-            continue
-        losses[name] = 4 * max(best - psnr, _LEAST_DB)
-        splats, best = tried, psnr
-        found[name] -= 1
-        if found[name] == least[name]:
-            del losses[name]
-    return found, best
-
-
-def _saved(name: str, bits: int, splats: Splats) -> float:
-    """Bytes that one bit less of an attribute is worth, about: each number's, or half a palette and
-    a bit of each label."""
-    if name != "palette":
-        return _NUMBERS[name][0] * len(splats) / 8
-    labelled = int((splats.sh_degrees > 0).sum())
-    numbers = 3 * (splats.sh.shape[1] - 1)
-    found: float = (1 << (bits - 1)) * numbers * _ENTROPY + labelled / 8
-    return found
 
 
 def _bytes(splats: Splats) -> int:
