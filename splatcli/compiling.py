@@ -12,7 +12,7 @@ from stages.base import threads
 from stages.base.stage import Stage
 from stages.run.pipeline import Listener
 
-_BEFORE = ("ingest", "sfm")  # stages that draw nothing
+_BEFORE = ("ingest", "sfm", "seed")  # stages that draw nothing
 _PATIENCE_S = 300.0
 _LAST = "gather_contributions"  # of the kernels, see `training.warm`
 
@@ -22,8 +22,8 @@ class Compiling(Listener):
     processes must not compile the same. Whatever becomes of it, the run goes on and compiles what
     is missing. backend: that the run will train with.
 
-    Compiling takes one core and most of the time that placing 20 photographs takes two; it is as
-    urgent as that, because training waits for both.
+    Compiling takes one core for as long as 20 photographs are placed and seeded on the other; it is
+    as urgent as that, because training waits for both.
     """
 
     def __init__(self, backend: str) -> None:

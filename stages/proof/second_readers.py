@@ -214,10 +214,11 @@ def usd(path: Path) -> Splats:
             continue
         get = prim.GetAttribute
         degree = get("radiance:sphericalHarmonicsDegree").Get()
-        coefficients = np.asarray(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
+        # Copied, because for arrays that cannot be written all drawing would be compiled anew.
+        coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
         parts.append(
             splats_of(
-                means=np.asarray(get("positions").Get(), np.float32),
+                means=np.array(get("positions").Get(), np.float32),
                 quaternions=np.asarray(get("orientations").Get(), np.float32)[:, columns],
                 log_scales=np.log(np.asarray(get("scales").Get()), dtype=np.float64),
                 opacity_logits=logits(np.asarray(get("opacities").Get())),

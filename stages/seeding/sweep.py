@@ -10,6 +10,9 @@ wrong.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import threads
 from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
 from stages.seeding.places import cells, centres, seen, unprojected
@@ -63,7 +67,9 @@ def agreed_points(
     ]
     grey = [np.ascontiguousarray(picture.mean(2), np.float32) for picture in pictures]
     partners = _partners(cameras, points)
-    guesses = [_swept(i, cameras, grey, partners[i], points) for i in range(len(cameras))]
+    with ThreadPoolExecutor(threads.count()) as pool:
+        sweep = functools.partial(_swept, cameras=cameras, grey=grey, points=points)
+        guesses = list(pool.map(sweep, range(len(cameras)), partners))
     for view, guess in zip(ordered, guesses, strict=True):
         mask = mask_of(folder, view, guess.camera.width, guess.camera.height)
         if mask is not None:
@@ -108,9 +114,9 @@ def _partners(cameras: list[Camera], points: NDArray[np.float64]) -> list[list[i
 
 def _swept(
     i: int,
+    partners: list[int],
     cameras: list[Camera],
     grey: list[NDArray[np.float32]],
-    partners: list[int],
     points: NDArray[np.float64],
 ) -> _Guess:
     """The best of PLANES planes at each pixel, as the two most alike of the partners see it."""
@@ -134,12 +140,24 @@ def _swept(
             likeness = covariance / np.sqrt((variance + FLAT) * (variance2 + FLAT))
             likeness[missing] = -1
             alike.append(likeness)
-        scores[plane] = np.sort(np.stack(alike), 0)[-2:].mean(0)
+        scores[plane] = _mean_of_best_two(alike)
     best = scores.argmax(0)
     score = scores.max(0)
     score[(best == 0) | (best == PLANES - 1) | (variance < FLAT / 2)] = -1
     depth = 1 / (inverse[0] + _peak(scores, best) * (inverse[1] - inverse[0]))
     return _Guess(camera, depth.astype(np.float32), score)
+
+
+def _mean_of_best_two(alike: Sequence[NDArray[np.floating]]) -> NDArray[np.floating]:
+    """Pixel by pixel; a fifth of what sorting takes."""
+    best, *others = alike
+    if not others:
+        return best
+    second = np.full_like(best, -np.inf)
+    for other in others:
+        second = np.maximum(second, np.minimum(best, other))
+        best = np.maximum(best, other)
+    return np.asarray((best + second) / 2)
 
 
 def _box(picture: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -156,7 +156,7 @@ class Workbench:
         timed = replace(job, step="mapping", max_seconds=max(1, int(budget)))
 
         # COLMAP looks at its own clock only between photographs.
-        self._run(timed, lambda: self._tick(job, "registered", more), timed.max_seconds + 60.0)
+        self._run(timed, lambda: self._tick(job, "photographs", more), timed.max_seconds + 60.0)
 
     def _run(self, job: Job, tick: Callable[[], None], max_seconds: float | None = None) -> None:
         seconds = self.seconds_left() if max_seconds is None else max_seconds

@@ -38,15 +38,20 @@ def map_photographs(job: Job) -> None:
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     started = time.monotonic()
-    models = _global(job, scratch) if job.mapper == "global" else _incremental(job, scratch)
-    timed_out = job.mapper != "global" and time.monotonic() - started >= job.max_seconds
-    ordered = sorted(
-        (m for m in models.values() if m.num_reg_images() > 0),
-        key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
-    )
+    with Placing(Ticks(Path(job.progress)), len(job.names)) as placing:
+        if job.mapper == "global":
+            models = _global(job, scratch)
+        else:
+            models = _incremental(job, scratch, placing)
+        timed_out = job.mapper != "global" and time.monotonic() - started >= job.max_seconds
+        ordered = sorted(
+            (m for m in models.values() if m.num_reg_images() > 0),
+            key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
+        )
+        if ordered:
+            placing.ending()
+            _settle(ordered[0])
     groups = [sorted(m.images[i].name for i in m.reg_image_ids()) for m in ordered]
-    if ordered:
-        _settle(ordered[0])
     model = _plain(ordered[0], ordered[1:], job) if ordered else None
     save_model(out, model, groups=groups, timed_out=timed_out)
     shutil.rmtree(scratch, ignore_errors=True)
@@ -69,7 +74,7 @@ def _settle(model: pycolmap.Reconstruction) -> None:
     model.update_point_3d_errors()
 
 
-def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
+def _incremental(job: Job, scratch: Path, placing: Placing) -> dict[int, pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1  # more threads sum residuals in another order each time
     options.random_seed = options.mapper.random_seed = job.seed
@@ -92,17 +97,16 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
             options.init_image_id1, options.init_image_id2 = pair
             options.multiple_models = False
             options.mapper.init_min_tri_angle = 4.0
-    with Placing(Ticks(Path(job.progress)), len(job.names)) as placing:
-        return dict(
-            pycolmap.incremental_mapping(
-                job.database,
-                job.images_root,
-                scratch,
-                options,
-                initial_image_pair_callback=placing.began,
-                next_image_callback=placing.placed,
-            )
+    return dict(
+        pycolmap.incremental_mapping(
+            job.database,
+            job.images_root,
+            scratch,
+            options,
+            initial_image_pair_callback=placing.began,
+            next_image_callback=placing.placed,
         )
+    )
 
 
 def _global(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:

