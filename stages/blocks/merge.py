@@ -28,6 +28,22 @@ def surrounded(seeds: Splats, coarse: Splats, cell: Cell, most: int) -> Splats:
     return _joined([inside, coarse.take(~cell.holds(coarse.means))], coarse.look)
 
 
+def shown_most(
+    splats: Splats,
+    own: NDArray[np.bool_],
+    most: int,
+    photographs: Sequence[Photograph],
+    backend: str,
+) -> NDArray[np.bool_]:
+    """[N] as many of a block's splats `own` [N]: without those whose going changes the pictures of
+    its photographs least."""
+    change = measure_worth(splats, photographs, backend).picture_change
+    rows = np.flatnonzero(own)
+    kept = own.copy()
+    kept[rows[np.argsort(change[rows], kind="stable")[: len(rows) - most]]] = False
+    return kept
+
+
 def merged(parts: Sequence[Splats], cells: Sequence[Cell], look: Look) -> tuple[Splats, list[int]]:
     """(the splats of each part whose centres lie in its cell, part after part; how many of each).
 
