@@ -15,7 +15,7 @@ from stages.measure.worth import measure_worth
 from stages.scene import Look, Splats
 
 REACH = 3.0  # standard deviations: as far as a splat is there
-STEPS_A_PHOTOGRAPH, MOST_STEPS = 6, 600  # of putting seams right
+STEPS_A_PHOTOGRAPH, MOST_STEPS = 24, 1200  # of putting seams right
 
 
 def surrounded(seeds: Splats, coarse: Splats, cell: Cell, most: int) -> Splats:

@@ -100,7 +100,9 @@ def test_seams_are_where_a_splat_reaches_over_its_border(tmp_path) -> None:
 
 def test_a_block_with_too_many_splats_gives_those_that_its_photographs_show() -> None:
     """What hides behind a wall stays behind; what is another block's is given in any case by it."""
-    wall = scenes.splats([(x / 8, y / 8, 2.0) for x in range(-6, 7) for y in range(-5, 6)], 0.1, 0.95)
+    wall = scenes.splats(
+        [(x / 8, y / 8, 2.0) for x in range(-6, 7) for y in range(-5, 6)], 0.1, 0.95
+    )
     hidden = scenes.splats([(x / 8, 0.1, 3.0) for x in range(-6, 7)], 0.05, 0.9)
     both = scenes.join(hidden, wall)
     seen = [Photograph("a", scenes.camera(), np.zeros((48, 64, 3), np.uint8))]
