@@ -110,7 +110,8 @@ class _Scene:
         cells = ground.cut(places, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
         member = sight.members(sight.shares(coarse, cells, cameras, drawn_by(self.settings)))
-        parts = self._blocks(seeds, coarse, cells, member, ground.margin(places))
+        folders = self._blocks(seeds, coarse, cells, member, ground.margin(places))
+        parts = self._parts(folders, cells, member)
         look = look_of(self.whole.views, self.settings.train_side, light)
         crossed = sight.crossing(member)
         crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
@@ -143,9 +144,9 @@ class _Scene:
         cells: Sequence[Cell],
         member: NDArray[np.bool_],
         margin: float,
-    ) -> list[TrainedSplats]:
-        """What each block learnt of its cell; the coarse splats of a cell that no photograph shows.
-        One block at a time is held whole."""
+    ) -> list[str]:
+        """Train each block; by cell, the run folder that has it: the coarse model's for a cell that
+        no photograph shows."""
         folders, largest = [], 0
         for number, (cell, chosen) in enumerate(zip(cells, member, strict=True), start=1):
             views = tuple(v for v, own in zip(self.whole.views, chosen, strict=True) if own)
@@ -165,12 +166,25 @@ class _Scene:
             if left.name.isdigit() and left.name not in folders:
                 shutil.rmtree(left)
         self._run([folder for folder in folders if folder != COARSE], largest)
+        return folders
+
+    def _parts(
+        self, folders: Sequence[str], cells: Sequence[Cell], member: NDArray[np.bool_]
+    ) -> list[TrainedSplats]:
+        """What each block learnt of its cell, together no more splats than the whole may have. One
+        block at a time is held whole."""
         parts: list[TrainedSplats] = []
         told = []
-        for folder, cell, chosen in zip(folders, cells, member, strict=True):
+        given = [
+            int(cell.holds(self._trained(folder).splats.means).sum())
+            for folder, cell in zip(folders, cells, strict=True)
+        ]
+        share = min(1.0, self.settings.max_splats / max(1, sum(given)))
+        for number, (folder, cell, chosen) in enumerate(zip(folders, cells, member, strict=True)):
             trained = self._trained(folder)
-            own = trained.splats.take(cell.holds(trained.splats.means))
-            parts.append(replace(trained, splats=own))
+            views = tuple(v for v, shows in zip(self.whole.views, chosen, strict=True) if shows)
+            own = self._own(trained.splats, cell, int(share * given[number]), views)
+            parts.append(replace(trained, splats=trained.splats.take(own)))
             told.append(
                 {
                     "run_folder": f"{FOLDER}/{folder}",
@@ -178,11 +192,25 @@ class _Scene:
                     "high_x_z": cell.high,
                     "photographs": int(chosen.sum()),
                     "splats_trained": len(trained.splats),
-                    "splats_given": len(own),
+                    "splats_given": int(own.sum()),
                 }
             )
         self.report.metric("blocks", told)
         return parts
+
+    def _own(
+        self, splats: Splats, cell: Cell, most: int, views: Sequence[View]
+    ) -> NDArray[np.bool_]:
+        """[N] which of a block's splats are of the whole: those of its cell, at most as many."""
+        from stages.blocks import merge
+        from stages.measure.judge import load_photographs
+
+        own = cell.holds(splats.means)
+        if own.sum() <= most:
+            return own
+        training = [view for view in views if view.role != "test"]
+        photographs = load_photographs(self.whole.folder, training, splats.look)
+        return merge.shown_most(splats, own, most, photographs, drawn_by(self.settings))
 
     def _begin(
         self, name: str, part: Reconstruction, seeds: Splats, coarse: Splats, wide: Cell

@@ -60,6 +60,8 @@ def edit(
             views = scene.views_there()
             formats.write(target, scene.splats, units=scene.units, views=views)
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
+            if views:
+                facts |= _proven(source, target, scene)
     if as_json:
         console.emit("edited", **facts)
     else:
@@ -90,6 +92,28 @@ def _opened(source: Path) -> Edited:
     )
 
 
+def _proven(source: Path, target: Path, scene: Edited) -> dict[str, Any]:
+    """What another parser reads in `target`, drawn from cameras that training never saw. Raises
+    SplatError "edit-verify-failed"."""
+    from stages.formats import format_of
+    from stages.formats.rows import kept_rows
+    from stages.proof.prover import Prover, cameras_for
+
+    splats = kept_rows(scene.splats)[0]
+    came_as = format_of(source).ending if source.is_file() else ""
+    cameras = cameras_for(splats, scene.views_there())
+    proof = Prover.of(splats, cameras, scene.backend, came_as).prove(target)
+    if proof.fault:
+        raise SplatError(
+            "edit-verify-failed",
+            given=f"{target} came out wrong: {proof.fault}.",
+            wanted="A file that another program reads as the same splats.",
+            hint="Write another format, and report this with the file that was read.",
+            family=Family.QUALITY,
+        )
+    return proof.figures
+
+
 def _db(scene: Edited) -> float | None:
     found = scene.psnr_db()
     return None if found is None else round(found, 3)
@@ -117,6 +141,8 @@ def _show(facts: dict[str, Any]) -> None:
     if "psnr_db" in facts:
         change = facts["psnr_db"] - facts["psnr_before_db"]
         told += f", {facts['psnr_db']:.2f} dB on photographs ({change:+.2f})"
+    if "verify_db" in facts:
+        told += f", {console.figure('verify_db', facts['verify_db'])} read back and drawn again"
     if "target" in facts:
         console.note(f"{facts['target']}: {told}, {console.size(facts['size_bytes'])}")
     else:

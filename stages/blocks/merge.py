@@ -15,7 +15,7 @@ from stages.measure.worth import measure_worth
 from stages.scene import Look, Splats
 
 REACH = 3.0  # standard deviations: as far as a splat is there
-STEPS_A_PHOTOGRAPH, MOST_STEPS = 6, 600  # of putting seams right
+STEPS_A_PHOTOGRAPH, MOST_STEPS = 24, 1200  # of putting seams right
 
 
 def surrounded(seeds: Splats, coarse: Splats, cell: Cell, most: int) -> Splats:
@@ -26,6 +26,22 @@ def surrounded(seeds: Splats, coarse: Splats, cell: Cell, most: int) -> Splats:
     if len(inside) > most:
         inside = inside.take(np.linspace(0, len(inside) - 1, most).round().astype(np.int64))
     return _joined([inside, coarse.take(~cell.holds(coarse.means))], coarse.look)
+
+
+def shown_most(
+    splats: Splats,
+    own: NDArray[np.bool_],
+    most: int,
+    photographs: Sequence[Photograph],
+    backend: str,
+) -> NDArray[np.bool_]:
+    """[N] as many of a block's splats `own` [N]: without those whose going changes the pictures of
+    its photographs least."""
+    change = measure_worth(splats, photographs, backend).picture_change
+    rows = np.flatnonzero(own)
+    kept = own.copy()
+    kept[rows[np.argsort(change[rows], kind="stable")[: len(rows) - most]]] = False
+    return kept
 
 
 def merged(parts: Sequence[Splats], cells: Sequence[Cell], look: Look) -> tuple[Splats, list[int]]:

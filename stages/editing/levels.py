@@ -1,4 +1,4 @@
-"""Levels of detail of one scene: each a quarter of the splats of the one before it."""
+"""Levels of detail of one scene, each a quarter of the splats of the one before it; and a page."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from pathlib import Path
 
 from stages.editing.decimate import FAR, decimated
 from stages.editing.joining import chosen
-from stages.formats import streamed_sog
+from stages.formats import html, streamed_sog
 from stages.formats.rows import drawable
-from stages.scene import Splats
+from stages.scene import Splats, View
 
 # On a surface a quarter of the splats are twice as large, and look as large twice as far away.
 A_LEVEL = 4
@@ -23,9 +23,15 @@ def levels_of(splats: Splats) -> list[Splats]:
     return found
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats` and coarser levels of them as a streamed SOG; return how many could not be
-    drawn and were left out. Raises SplatError when it cannot be written."""
+def write(
+    path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
+) -> int:
+    """Write `splats` and coarser levels of them as a streamed SOG, and beside it a page that shows
+    it on any web server; return how many could not be drawn and were left out.
+
+    views: cameras to look from. Raises SplatError when it cannot be written.
+    """
     kept = chosen(splats, drawable(splats))
     streamed_sog.write_levels(Path(path), levels_of(kept), units)
+    html.write_beside(Path(path), kept, units, views)
     return len(splats) - len(kept)

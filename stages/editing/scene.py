@@ -60,8 +60,10 @@ class Edited:
         return measure_worth(self.splats, _Moved(self.photographs, self.moved), self.backend)
 
     def appraise(self, splats: Splats) -> Appraisal:
-        """What pruning goes by: squared error, and nothing beyond a picture's rim is left out that
-        the next view would show."""
+        """Squared error, and nothing beyond a picture's rim is left out that the next view would
+        show. Not the change of the pictures, as pruning has it: there the splats that stay learn
+        on, here they do not. The sample's 31,741 at a half are 22.1 dB held out by error, 21.6 by
+        change."""
         worth = self.but(splats).worth()
         unseen = (worth.photographs == 0) & beside_pictures(splats, self.cameras())
         alone: NDArray[np.float64] = np.where(unseen, np.inf, worth.sse_change)

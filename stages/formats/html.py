@@ -17,7 +17,7 @@ from pathlib import Path
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import tell
-from stages.formats import ply
+from stages.formats import ply, streamed_sog
 from stages.formats.rows import kept_rows
 from stages.page import document
 from stages.page.shots import shots_of
@@ -49,6 +49,20 @@ def write(
             file.write(document.CHUNK_END.encode("ascii"))
         file.write(document.tail().encode("utf-8"))
     return dropped
+
+
+def write_beside(content: Path, splats: Splats, units: str, views: tuple[View, ...]) -> None:
+    """The page of an asset that streams, which holds none of its splats. Raises SplatError."""
+    scene = document.scene_data(
+        content.parent.absolute().name,
+        *(splats, shots_of(views, splats)),
+        units=units,
+        source=content.name,
+        content=content.name,
+        levels=streamed_sog.widths(content, splats),
+    )
+    with replacing(content.with_suffix(".html")) as temporary:
+        temporary.write_text(document.head(scene) + document.tail(), encoding="utf-8")
 
 
 def _zipped(blocks: Iterable[bytes]) -> Iterator[bytes]:

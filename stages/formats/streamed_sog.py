@@ -281,6 +281,8 @@ def widths(path: Path, finest: Splats) -> list[float]:
             waiting += node.get("children") or []
             for level, at in (node.get("lods") or {}).items():
                 counts[int(level)] += at["count"]
+    if not len(finest):
+        return [0.0] * len(counts)
     width = 2 * float(np.exp(np.median(finest.log_scales.max(axis=1))))
     every: list[float] = (width * np.sqrt(counts.max() / np.maximum(counts, 1))).tolist()
     return every

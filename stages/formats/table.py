@@ -68,11 +68,12 @@ class Format:
 
     def files(self, path: Path) -> list[Path]:
         """`path` and what lies beside it and belongs to it."""
+        page = path.with_suffix(self.sidecar) if self.sidecar else path
+        beside = [path, page] if page != path and page.is_file() else [path]
         if self.levels:
             every = sorted(path.parent.glob("*_*/*"))
-            return [path, *(file for file in every if CHUNK.match(file.parent.name))]
-        beside = path.with_suffix(self.sidecar) if self.sidecar else path
-        return [path, beside] if beside != path and beside.is_file() else [path]
+            return [*beside, *(file for file in every if CHUNK.match(file.parent.name))]
+        return beside
 
     def size_bytes(self, path: Path) -> int:
         return sum(file.stat().st_size for file in self.files(path))
@@ -202,6 +203,8 @@ TABLE = (
         anatomy="stages.proof.anatomy:streamed_sog",
         order="stages.formats.streamed_sog:order",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
+        sidecar=".html",
+        wants_views=True,
         levels=True,
     ),
     Format(

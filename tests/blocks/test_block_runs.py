@@ -81,6 +81,7 @@ def test_blocks_are_runs_of_their_own_and_one_in_the_end(tmp_path, photos) -> No
     assert [row["run_folder"] for row in told] == ["blocks/1", "blocks/2", "blocks/3"]
     assert manifest.metrics["splats"] == len(splats)
     given = sum(row["splats_given"] for row in told)
+    assert given <= SMALL["max_splats"]
     assert len(splats) == given - manifest.metrics["pruned_at_seams"]
     assert len(splats) == sum(manifest.metrics["splats_by_block"])
     for row in told:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from stages.blocks import ground, merge, sight
+from stages.measure.judge import Photograph
 from stages.raster.backends import AUTO
 from stages.scene import Camera, look_at
+from tests import scenes
 from tests.small_scene import small_scene
 
 
@@ -94,3 +96,18 @@ def test_seams_are_where_a_splat_reaches_over_its_border(tmp_path) -> None:
     splats = replace(splats, means=means, log_scales=sizes)
     cells = ground.cut(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
     assert merge.at_seams(splats, [2, 1], cells).tolist() == [True, False, True]
+
+
+def test_a_block_with_too_many_splats_gives_those_that_its_photographs_show() -> None:
+    """What hides behind a wall stays behind; what is another block's is given in any case by it."""
+    wall = scenes.splats(
+        [(x / 8, y / 8, 2.0) for x in range(-6, 7) for y in range(-5, 6)], 0.1, 0.95
+    )
+    hidden = scenes.splats([(x / 8, 0.1, 3.0) for x in range(-6, 7)], 0.05, 0.9)
+    both = scenes.join(hidden, wall)
+    seen = [Photograph("a", scenes.camera(), np.zeros((48, 64, 3), np.uint8))]
+    own = np.ones(len(both), bool)
+    own[-3:] = False
+    found = merge.shown_most(both, own, len(wall) - 3, seen, AUTO)
+    assert not found[: len(hidden)].any()
+    assert (found[len(hidden) :] == own[len(hidden) :]).all()

@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from splatcli.app import app
+from splatcli.commands import edit as command
 from stages import formats
 from stages.base import scratch
+from stages.editing.scene import Edited
 from stages.editing.words import WORDS, Typed, as_text, from_file
-from stages.scene import Splats
+from stages.scene import Splats, View, look_at
+from tests import scenes
 from tests.cli.help_text import help_of
 from tests.formats.truth import many_splats
 
@@ -128,6 +132,26 @@ def test_events_are_lines_of_json(source: Path, tmp_path: Path) -> None:
     assert (last["event"], last["splats"], last["units"]) == ("edited", 10, "metres")
     assert last["size_bytes"] == (tmp_path / "b.ply").stat().st_size
     assert err == ""
+
+
+def test_where_cameras_are_known_what_is_written_is_proven(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = scenes.camera(matrix=look_at(np.array([0.0, -1.0, -9.0]), np.zeros(3)))
+    known = Edited(result_of(source), views=(View("a", "", camera),))
+    monkeypatch.setattr(command, "_opened", lambda path: known)
+    _, err = edited(source, tmp_path / "b.ply", "--scale", "2", "--rotate", "x:30")
+    assert "read back and drawn again" in err
+    out, _ = edited(source, tmp_path / "b.glb", "--move", "1,0,0", "--json")
+    assert json.loads(out.splitlines()[-1])["verify_db"] > 60
+    right = formats.write
+
+    def wrong(path: Path, splats: Splats, **more: Any) -> int:
+        return right(path, replace(splats, means=splats.means * [1, -1, 1]), **more)
+
+    monkeypatch.setattr(formats, "write", wrong)
+    _, err = edited(source, tmp_path / "c.ply", "--move", "1,0,0", code=7)
+    assert "edit-verify-failed" in err
 
 
 def test_a_file_of_operations_is_done_where_it_stands(source: Path, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_an_asset_takes_the_place_of_an_earlier_one(asset: Path) -> None:
     formats.write(asset, many_splats(100))
     assert len(formats.read(asset)) == 100
     names = {path.name for path in asset.parent.iterdir()}
-    assert names == {"lod-meta.json", "0_0", "notes.txt"}
+    assert names == {"lod-meta.json", "lod-meta.html", "0_0", "notes.txt"}
     row = formats.format_of(asset)
     assert row.size_bytes(asset) == sum(p.stat().st_size for p in asset.parent.rglob("*.*")) - 4
 

@@ -18,7 +18,7 @@ from stages.formats.table import CHUNK
 from stages.measure.images import psnr
 from stages.raster.draw import render
 from stages.scene import Camera, View, look_at
-from stages.viewer.server import LocalServer
+from stages.viewer.server import Item, LocalServer
 from stages.viewer.site import site
 from tests.editing.walls import wall
 from tests.formats.truth import many_splats
@@ -54,9 +54,12 @@ def asset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def address(asset: Path) -> Iterator[str]:
+    """Of a page that `splat view` serves; beside it the asset's own page, as any server would."""
     splats = formats.read(asset)
     seen = views(streamed_sog.widths(asset, splats))
-    server = LocalServer(site("test", splats, asset, seen))
+    page = asset.with_suffix(".html")
+    own = {f"/{page.name}": Item(page, "text/html; charset=utf-8")}
+    server = LocalServer(site("test", splats, asset, seen) | own)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield server.address
@@ -85,6 +88,16 @@ def test_three_distances_are_drawn_from_three_levels(
     assert fetched(browser) == {"0", "1", "2"}
     browser.run("window.splatShow('2')")
     assert browser.run("splatLevels.budget") == 500
+
+
+def test_the_asset_s_own_page_shows_it_wherever_it_is_served(
+    browser: Browser, address: str, asset: Path
+) -> None:
+    browser.open(address + "lod-meta.html?bare&webgl")
+    shown = browser.run("window.splatReady")
+    assert (shown["name"], shown["splats"]) == ("in front", SPLATS)
+    assert browser.picture().max() > 0.5
+    assert asset.with_suffix(".html") in formats.format_of(asset).files(asset)
 
 
 def test_what_streams_can_be_selected_from_though_not_all_of_it_is_there(

@@ -2,7 +2,8 @@
 // For scripts: `splatReady` is a promise that resolves when the first camera is drawn, and
 // `splatShow(name)` one that resolves when the camera of that name is; `splatSelection` what is
 // selected.
-const STEADY_FRAMES = 6; // sorting runs beside drawing and takes a few frames to be seen
+// Sorting runs beside drawing and takes a few frames to be seen; every ten, what streams is asked for.
+const STEADY_FRAMES = 12;
 
 function settingsFor(scene) {
     const pose = (shot) => {

@@ -74,7 +74,10 @@ class Selection {
         find("keep").onclick = () => this.add("crop");
         find("drop").onclick = () => this.add("drop");
         find("undo").onclick = () => this.undo();
-        find("copy").onclick = () => navigator.clipboard.writeText(find("chain").value);
+        find("copy").onclick = () => {
+            find("chain").select();
+            document.execCommand("copy"); // the newer way is not there for a page from disk
+        };
         this.makeSliders();
         app.on("frameend", () => this.paint());
         find("select").hidden = false;
@@ -144,11 +147,11 @@ class Selection {
     update() {
         this.chosen = [];
         let left = 0;
-        for (let i = 0; this.centres && i < this.centres.length; i += 3) {
-            const at = this.centres.subarray(i, i + 3);
-            if (!this.left(...at)) continue;
+        const at = this.centres || [];
+        for (let i = 0; i < at.length; i += 3) {
+            if (!this.left(at[i], at[i + 1], at[i + 2])) continue;
             left++;
-            if (this.region && this.region.holds(...at)) this.chosen.push(i);
+            if (this.region && this.region.holds(at[i], at[i + 1], at[i + 2])) this.chosen.push(i);
         }
         const count = (n) => n.toLocaleString("en");
         const told = this.region ? `${count(this.chosen.length)} of ${count(left)} selected` : `${count(left)} left`;
