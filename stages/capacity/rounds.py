@@ -29,8 +29,8 @@ PRICE, LOSS, ROUNDS = "price", "loss", "rounds"  # why it stopped
 @dataclass(frozen=True)
 class Round:
     """One round as it was tried. splats: before. predicted_sse, measured_sse: change of the squared
-    error by the cut alone, foretold and drawn. psnr_db: mean over the photographs, fine-tuned.
-    kept: or taken back."""
+    error by the cut alone, foretold and drawn. psnr_db: mean over the photographs, fine-tuned;
+    of harm that stays, as it was. kept: or taken back."""
 
     splats: int
     removed: int
@@ -122,9 +122,9 @@ class Shrinking:
             if cut is None:
                 return worth
             fewer = cut.of(found.splats)
-            after = self._worth(fewer)
-            measured = after.sse - worth.sse
+            measured = squared_error(fewer, self.photographs, self.backend) - worth.sse
             kept = measured <= cut.predicted_sse + WRONG * abs(cut.predicted_sse)
+            after = self._worth(fewer) if kept else worth
             told = (cut.predicted_sse, measured, float(after.psnr_db.mean()), kept)
             found.rounds.append(_round(found.splats, cut, *told))
             if kept:
