@@ -60,7 +60,7 @@ def _time(trade: Trade) -> Figure:
 
 
 def _formats(trade: Trade) -> Figure:
-    figure, axes = new_plot("The same splats in each file format", "file size (MB)", _PSNR)
+    figure, axes = new_plot("The run in each file format", "file size (MB)", _PSNR)
     for point in trade.formats:
         written = point.label.removeprefix(".") in trade.exported
         _with_bars(axes, [_megabytes(point)], [point], ORANGE if written else BLUE, "o")
