@@ -430,5 +430,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=9, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=10, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -11,8 +11,8 @@ from types import TracebackType
 from stages.structure.ticks import Ticks
 
 LONG_S = 0.5  # between two photographs: so long mostly if all cameras were adjusted between them
-ENDING = 0.25  # of all the time: what follows when all are placed, adjusting all of them once more
-_EVEN = 0.85  # of that is told when it has taken as long as expected; what is left, ever slower
+ENDING = 0.4  # of all the time: what follows when all are placed, adjusting all of them once more
+_EVEN = 0.8  # of that is told when it has taken as long as expected; what is left, ever slower
 _CAUTION = 0.9  # of the pace so far: who is ahead of what is placed must stand and wait
 _EVERY_S = 0.3
 
@@ -20,7 +20,7 @@ _EVERY_S = 0.3
 class Placing:
     """Context manager; told of each photograph, it keeps `ticks` up to date.
 
-    For each tenth more photographs, COLMAP adjusts all cameras and says nothing meanwhile; with
+    For each fifth more photographs, COLMAP adjusts all cameras and says nothing meanwhile; with
     hundreds that takes longer than to place them. What is told therefore follows what is placed at
     the pace so far, adjusting included, and catches up while cameras are adjusted. Room is left for
     the last adjustments, whose end nobody knows: of what is left to tell, they tell ever less.

@@ -12,7 +12,7 @@ from stages.structure.ticks import Ticks, read
 
 PHOTOGRAPHS = 300
 PLACING_S, ADJUSTING_S = 0.15, 0.05  # each photograph; each photograph that is there
-AT_THE_END = {"quick": 1.0, "usual": 4.0, "slow": 4.8}  # times an adjustment
+AT_THE_END = {"quick": 3.0, "usual": 5.0, "slow": 6.2}  # times an adjustment
 STEP_S = 0.1
 
 
@@ -41,7 +41,7 @@ def placed(folder: Path, at_the_end: float = AT_THE_END["usual"]) -> Clock:
     adjusted = 2
     for count in range(3, PHOTOGRAPHS + 1):
         clock.spend(PLACING_S, placing)
-        if count >= 1.1 * adjusted:
+        if count >= 1.2 * adjusted:
             adjusted = count
             clock.spend(ADJUSTING_S * count, placing)
         placing.placed()
@@ -55,11 +55,11 @@ def test_no_two_seconds_pass_without_progress(end: float, tmp_path: Path) -> Non
     said = placed(tmp_path, end).said
     changes += [now for (_, before), (now, told) in itertools.pairwise(said) if told > before]
     assert max(b - a for a, b in itertools.pairwise(changes)) < 2.0
-    assert 0.75 * PHOTOGRAPHS < said[-1][1] <= PHOTOGRAPHS
+    assert 0.7 * PHOTOGRAPHS < said[-1][1] <= PHOTOGRAPHS
     assert all(before <= told for (_, before), (_, told) in itertools.pairwise(said))
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.75])
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.55])
 def test_the_time_left_can_be_believed(share: float, tmp_path: Path) -> None:
     said = placed(tmp_path).said
     now, told = next(pair for pair in said if pair[1] >= share * PHOTOGRAPHS)
