@@ -204,5 +204,5 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=8, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune", version=9, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
 )

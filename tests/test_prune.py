@@ -9,6 +9,7 @@ import pytest
 from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
+from stages.capacity import rounds
 from stages.capacity.aim import LEAST_FELT, MOST_FELT, felt_share
 from stages.measure.judge import load_photographs, mean_psnr_db
 from stages.measure.worth import Worth, beside_pictures, floaters
@@ -177,6 +178,32 @@ def test_no_rounds_remove_nothing(scene, tmp_path) -> None:
     result, report = run(scene, trained, tmp_path, rounds=0)
     assert len(result) == len(trained)
     assert report.metrics["psnr_change_db"] == 0
+
+
+def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost(
+    scene, tmp_path, monkeypatch
+) -> None:
+    trained = join(scene.splats, unseen(5), floater_before(scene, 1))
+    usual, _ = run(scene, trained, tmp_path)
+    monkeypatch.setattr(rounds, "LOOKED_AT", 4)
+    result, report = run(scene, trained, tmp_path)
+    assert len(result) == pytest.approx(len(usual), rel=0.15)
+    assert training_db(scene, result) > training_db(scene, usual) - 0.3
+    assert not rows_of(unseen(5), result).any()
+    # what is foretold, of all photographs, and measured, on those that decide
+    told = [one for one in report.metrics["rounds"] if one["predicted_sse"] > 1]
+    assert all(0.4 < one["measured_sse"] / one["predicted_sse"] < 2.5 for one in told)
+
+
+def test_what_only_a_photograph_sees_that_does_not_decide_stays(
+    scene, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(rounds, "LOOKED_AT", 1)  # of nine, the first
+    result, _ = run(scene, scene.splats, tmp_path)
+    far = scene.reconstruction.views[5].camera
+    seen = [Splats.take(s, far.project(s.means)[1] < 3) for s in (scene.splats, result)]
+    assert len(seen[1]) > 0.4 * len(seen[0])
+    assert training_db(scene, result) > training_db(scene, scene.splats) - 3
 
 
 def test_the_same_input_gives_the_same_bytes_and_load_gives_them_back(scene, tmp_path) -> None:

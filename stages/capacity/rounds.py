@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,6 +21,7 @@ BACK_OFFS = 3  # times that a round may ask for half as much
 # Splats that go together cost more than the sum of each alone, since they stood in for each other:
 # this much at first, then what the last round told that cost enough to tell.
 OVERLAP, TELLING = 1.25, 0.01  # TELLING: of the squared error
+LOOKED_AT = 48  # photographs in a round; what the others told at first goes on counting
 TINY = float(np.finfo(np.float64).tiny)
 WRONG = 0.5  # of what taking out harm should save: so much less may come of it
 PRICE, LOSS, ROUNDS = "price", "loss", "rounds"  # why it stopped
@@ -60,7 +61,8 @@ class Outcome:
 @dataclass
 class Shrinking:
     """One model on its way down. rounds: at most, unless targets want more. tune_steps: after each
-    of as many; where targets want more rounds, they share the steps."""
+    of as many; where targets want more rounds, they share the steps. All photographs tell what it
+    learns and what each splat is worth at first, as many as `LOOKED_AT` decide."""
 
     photographs: Sequence[Photograph]
     aim: Aim
@@ -70,13 +72,22 @@ class Shrinking:
     tune_steps: int
     report: Report
 
+    def __post_init__(self) -> None:
+        count = len(self.photographs)
+        decide = min(count, LOOKED_AT)
+        self.decide = [i * count // decide for i in range(decide)]
+        self.others = sorted(set(range(count)) - set(self.decide))
+        # in the order in which worth tells of photographs
+        self.cameras = [self.tuner.cameras[i] for i in (*self.others, *self.decide)]
+
     def run(self, splats: Splats) -> Outcome:
         """The smaller model. Raises SplatError for targets that cannot be met, and Interrupted."""
-        worth = self._worth(splats)
+        worth = self._first_worth(splats)
         best = worth.psnr_db
         mean_db = float(best.mean())
         self.aim.check_start(mean_db)
-        price = price_of(drawing_of(splats, self.backend), self.photographs)
+        price = price_of(drawing_of(splats, self.backend), self._pictures(self.decide))
+        price = price.of_more(len(self.photographs) / max(1, len(self.decide)))
         found = Outcome(splats, price, mean_db, mean_db, _least_tenth_db(worth))
         planned, share, overlap = self._planned(splats), SPLATS_A_ROUND, OVERLAP
         if planned:
@@ -90,9 +101,10 @@ class Shrinking:
                 found.stopped_by = PRICE
                 break
             fewer, seen = cut.of(found.splats), worth.photographs[~cut.gone]
-            measured = squared_error(fewer, self.photographs, self.backend) - worth.sse
+            measured = squared_error(fewer, self._pictures(self.decide), self.backend)
+            measured = (measured - _fresh_sse(worth)) * _told_by(worth)
             fewer = self.tuner.tuned(fewer, self.tune_steps * self.rounds // planned, seen)
-            after = self._worth(fewer)
+            after = self._worth(fewer, worth, cut)
             kept = excess > 0 or self.aim.holds(after.psnr_db, best)
             predicted = cut.predicted_sse * (overlap if cut.predicted_sse > 0 else 1)
             told = (predicted, measured, float(after.psnr_db.mean()), kept)
@@ -117,14 +129,15 @@ class Shrinking:
         share = SPLATS_A_ROUND
         for _ in range(BACK_OFFS + 1):
             most = max(1, int(share * len(found.splats)))
-            limits = (self.tuner.cameras, -TINY, min(most, len(found.splats) - 1))
+            limits = (self.cameras, -TINY, min(most, len(found.splats) - 1))
             cut = choose(found.splats, worth, *limits, share, harm=True)
             if cut is None:
                 return worth
             fewer = cut.of(found.splats)
-            measured = squared_error(fewer, self.photographs, self.backend) - worth.sse
+            measured = squared_error(fewer, self._pictures(self.decide), self.backend)
+            measured = (measured - _fresh_sse(worth)) * _told_by(worth)
             kept = measured <= cut.predicted_sse + WRONG * abs(cut.predicted_sse)
-            after = self._worth(fewer) if kept else worth
+            after = self._worth(fewer, worth, cut) if kept else worth
             told = (cut.predicted_sse, measured, float(after.psnr_db.mean()), kept)
             found.rounds.append(_round(found.splats, cut, *told))
             if kept:
@@ -133,8 +146,18 @@ class Shrinking:
             share /= 2
         return worth
 
-    def _worth(self, splats: Splats) -> Worth:
-        return measure_worth(splats, self.photographs, self.backend)
+    def _pictures(self, numbers: list[int]) -> Iterator[Photograph]:
+        return (self.photographs[i] for i in numbers)
+
+    def _first_worth(self, splats: Splats) -> Worth:
+        others = None
+        if self.others:
+            others = measure_worth(splats, self._pictures(self.others), self.backend)
+        return measure_worth(splats, self._pictures(self.decide), self.backend, others)
+
+    def _worth(self, splats: Splats, before: Worth, cut: Cut) -> Worth:
+        others = before.others.take(~cut.gone) if before.others else None
+        return measure_worth(splats, self._pictures(self.decide), self.backend, others)
 
     def _planned(self, splats: Splats) -> int:
         """As many rounds as targets need, and a few for what they leave over."""
@@ -150,8 +173,18 @@ class Shrinking:
         most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
         most = min(most, excess, len(found.splats) - 1) if excess else most
         return choose(
-            found.splats, worth, self.tuner.cameras, limit, min(most, len(found.splats) - 1), share
+            found.splats, worth, self.cameras, limit, min(most, len(found.splats) - 1), share
         )
+
+
+def _fresh_sse(worth: Worth) -> float:
+    """Of the photographs that decide."""
+    return worth.sse - (worth.others.sse if worth.others else 0.0)
+
+
+def _told_by(worth: Worth) -> float:
+    """How much larger a change is of all photographs than of those that decide."""
+    return 1 + (worth.others.sse if worth.others else 0.0) / max(_fresh_sse(worth), TINY)
 
 
 def _round(

@@ -8,8 +8,9 @@ worth keeping if the squared error that it saves is worth as many.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,10 @@ class Price:
     samples: int
     independent: float
     sse: float
+
+    def of_more(self, times: float) -> Price:
+        """For as many times the photographs, which tell as much each."""
+        return Price(round(self.samples * times), self.independent * times, self.sse * times)
 
     @property
     def bits_a_number(self) -> float:
@@ -54,7 +59,7 @@ def price_of(draw: Drawing, photographs: Iterable[Photograph]) -> Price:
         samples += residual.size if kept is None else 3 * int(kept.sum())
         sse += float(np.square(residual, dtype=np.float64).sum())
         tiles.append(_tiles(residual))
-    return Price(samples, samples * independent_share(np.concatenate(tiles)), sse)
+    return Price(samples, samples * independent_share(tiles), sse)
 
 
 def _tiles(residual: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -65,14 +70,15 @@ def _tiles(residual: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.ascontiguousarray(whole.swapaxes(1, 2), np.float32).reshape(-1, side, side, 3)
 
 
-def independent_share(tiles: NDArray[np.floating]) -> float:
-    """How many of the samples [tiles, side, side, 3] would tell their mean square as well if they
-    were independent: 1 / the sum of squared correlations with all samples around, which is read
-    off the mean power spectrum; colours along the axes on which they do not correlate."""
-    flat = tiles.reshape(-1, 3).astype(np.float64)
-    _, axes = np.linalg.eigh(flat.T @ flat)
-    power = np.zeros(tiles.shape[1:])
-    for tile in tiles:
+def independent_share(pictures: Sequence[NDArray[np.floating]]) -> float:
+    """How many of the samples, of each picture [tiles, side, side, 3], would tell their mean square
+    as well if they were independent: 1 / the sum of squared correlations with all samples around,
+    which is read off the mean power spectrum; colours along the axes on which they do not
+    correlate."""
+    flats = (tiles.reshape(-1, 3).astype(np.float64) for tiles in pictures)
+    _, axes = np.linalg.eigh(sum(flat.T @ flat for flat in flats))
+    power = np.zeros(pictures[0].shape[1:])
+    for tile in chain.from_iterable(pictures):
         power += np.abs(np.fft.fft2(tile @ axes, axes=(0, 1))) ** 2
     total = power.sum()
     return float(total**2 / (power.size * np.square(power).sum())) if total > 0 else 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,6 +33,8 @@ class Worth:
 
     cut_change, cut_picture [N, L]: the same two if its colour kept only the bands up to degree
     0..L - 1, the mean of what is lost baked in: cut_colour [N, L, 3], what that adds to its colour.
+    bands: the sums that this was told from. others: what it went on from, included in all but
+    psnr_db.
     """
 
     sse_change: NDArray[np.float64]
@@ -46,16 +48,38 @@ class Worth:
     cut_picture: NDArray[np.float64]
     cut_colour: NDArray[np.float64]
     psnr_db: NDArray[np.float64]
+    bands: tuple[NDArray[np.float64], ...] = ()
+    others: Worth | None = None
+
+    def take(self, rows: NDArray[np.bool_]) -> Worth:
+        """Of these splats alone; their bands are no longer told."""
+        return replace(
+            self,
+            sse_change=self.sse_change[rows],
+            picture_change=self.picture_change[rows],
+            weight=self.weight[rows],
+            largest_weight=self.largest_weight[rows],
+            photographs=self.photographs[rows],
+            bands=tuple(sums[rows] for sums in self.bands),
+        )
 
 
-def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: str) -> Worth:
-    """What each splat does for the photographs, drawn by its own look."""
+def measure_worth(
+    splats: Splats, photographs: Iterable[Photograph], backend: str, others: Worth | None = None
+) -> Worth:
+    """What each splat does for the photographs, drawn by its own look. others: what it did for
+    further ones, before it or what is around it changed a little; that goes on counting."""
     n = len(splats)
     change, picture = np.zeros(n), np.zeros(n)
     weight, largest = np.zeros(n), np.zeros(n)
     seen_in, sse, depths, psnr_db = np.zeros(n, np.int32), 0.0, [], []
+    if others is not None:
+        change, picture = others.sse_change.copy(), others.picture_change.copy()
+        weight, largest = others.weight.copy(), others.largest_weight.copy()
+        seen_in, sse = others.photographs.copy(), others.sse
+        depths = others.scene_depth.tolist()
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
-    settings, bands = settings_of(splats), _Bands(splats)
+    settings, bands = settings_of(splats), _Bands(splats, others.bands if others else ())
     for photograph in photographs:
         forward = rasteriser.forward(arrays, photograph.camera, settings, depths=True)
         drawn, truth = forward.image[:3].transpose(1, 2, 0), photograph.image
@@ -88,6 +112,8 @@ def measure_worth(splats: Splats, photographs: Iterable[Photograph], backend: st
         cut_picture,
         cut_colour,
         np.array(psnr_db),
+        bands.sums,
+        others,
     )
 
 
@@ -95,11 +121,15 @@ class _Bands:
     """Sums over photographs for each degree that colours may be cut to: d the change of a splat's
     colour there, g the pull of the residual on it, q its squared weights."""
 
-    def __init__(self, splats: Splats) -> None:
+    def __init__(self, splats: Splats, start: tuple[NDArray[np.float64], ...]) -> None:
         shape = (len(splats), splats.sh_degree, 3)
         self.splats = splats
-        self.linear, self.square, self.shift = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        self.pull, self.squares = np.zeros((len(splats), 1, 3)), np.zeros((len(splats), 1, 1))
+        if start:
+            self.sums = tuple(sums.copy() for sums in start)
+        else:
+            shapes = (shape, shape, shape, (len(splats), 1, 3), (len(splats), 1, 1))
+            self.sums = tuple(np.zeros(one) for one in shapes)
+        self.linear, self.square, self.shift, self.pull, self.squares = self.sums
 
     def add(
         self, centre: NDArray[np.floating], rows: NDArray[np.int32], found: NDArray[np.float64]

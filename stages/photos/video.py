@@ -132,7 +132,7 @@ def _opened(path: Path) -> Any:
         limits = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
         return av.open(str(path), options=limits, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
+        reason = getattr(error, "strerror", None) or str(error)
         raise Unusable(
             f"it does not open as a video ({reason}); a recording that was cut off may lack "
             "its index"

@@ -16,12 +16,12 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 def test_noise_counts_in_full() -> None:
-    assert independent_share(noise()) == pytest.approx(1.0, abs=0.05)
+    assert independent_share([noise()]) == pytest.approx(1.0, abs=0.05)
 
 
 def test_grey_noise_is_a_third() -> None:
     grey = noise()[..., :1] * np.ones(3)
-    assert independent_share(grey) == pytest.approx(1 / 3, rel=0.05)
+    assert independent_share([grey]) == pytest.approx(1 / 3, rel=0.05)
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0])
@@ -30,7 +30,7 @@ def test_a_blur_leaves_as_many_as_its_correlations_say(sigma: float) -> None:
     its square 2 pi sigma^2."""
     blurred = np.stack([cv2.GaussianBlur(tile, (0, 0), sigma) for tile in noise()])
     wanted = 1 / (2 * math.pi * sigma**2)
-    assert independent_share(blurred) == pytest.approx(wanted, rel=0.1)
+    assert independent_share([blurred]) == pytest.approx(wanted, rel=0.1)
 
 
 def test_the_price_is_the_slope_of_the_code_length() -> None:

@@ -55,6 +55,22 @@ def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> No
         assert worth.picture_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
 
 
+def test_worth_goes_on_from_what_other_photographs_told(tmp_path) -> None:
+    scene = small_scene(tmp_path, views=6, n=60)
+    photographs = load_photographs(
+        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.look
+    )
+    whole = measure_worth(scene.splats, photographs, "cpu")
+    others = measure_worth(scene.splats, photographs[:4], "cpu")
+    found = measure_worth(scene.splats, photographs[4:], "cpu", others)
+    for name in ("sse_change", "picture_change", "weight", "cut_change", "cut_picture"):
+        np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-9)
+    assert (found.photographs == whole.photographs).all()
+    assert found.sse == pytest.approx(whole.sse)
+    assert (found.scene_depth == whole.scene_depth).all()
+    assert (found.psnr_db == whole.psnr_db[4:]).all()
+
+
 def test_colours_by_degree_are_the_definition_s() -> None:
     splats, centre = many_splats(6), np.array([0.3, -4.0, 1.0])
     found = colours_by_degree(splats, centre)
