@@ -96,6 +96,14 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
+    growth: str = field(
+        default="adaptive",
+        metadata={
+            "help": "How splats become more: adaptive (cloned and split where photographs pull at "
+            "them), or relocation (those that do not show move to where others do).",
+            "choices": ("adaptive", "relocation"),
+        },
+    )
     blocks: str = field(
         default="1",
         metadata={
@@ -262,6 +270,7 @@ def make_trainer(
         over_any=settings.background == "any",
         backend=drawn_by(settings),
         within=settings.within,
+        growth=settings.growth,
         lent=lent_rows(len(train)),
         patience_db=settings.patience,
     )
@@ -441,5 +450,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=11, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=12, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -95,8 +95,10 @@ class Within:
         return self.rule.prune(model.take(inside), settled).joined(there)
 
     def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
-        model.gradient_sum[~self._inside(model)] = 0.0
-        return self.rule.grow(model, budget, rng)
+        inside = self._inside(model)
+        there = model.take(~inside)
+        there.forget_gradients()
+        return self.rule.grow(model.take(inside), budget - len(there), rng).joined(there)
 
     def reset(self, model: Model) -> Model:
         return self.rule.reset(model)

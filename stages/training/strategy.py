@@ -1,7 +1,8 @@
 """How many splats there are, and where they are: three verbs, whatever the rule behind them.
 
 A strategy is a small object without a memory: models go in and come out, and what a verb needs to
-know of the run it is told. To add one: write the class, and name it in STRATEGIES.
+know of the run it is told. To add one: write the class, and name it in `strategies.STRATEGIES` and
+in the setting `TrainSettings.growth`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,23 +16,24 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.images import psnr
 from stages.measure.judge import Photograph, scores, spread
-from stages.raster.backends import AUTO, backend_of
-from stages.raster.definition import RasterSettings
+from stages.raster.backends import AUTO, backend_of, rasteriser_of
+from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import TRANSPARENT, Camera, Look, Splats, by_heart, morton
 from stages.training.cap import fitted, lower_cap
 from stages.training.checkpoint import Maker, Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
-from stages.training.density import AdaptiveDensity, Within
+from stages.training.colours import Recolouring
+from stages.training.density import Within
 from stages.training.dropout import Dropout
 from stages.training.frugal_step import FrugalStep
-from stages.training.optimiser import LearningRates, Model, new_model
+from stages.training.optimiser import LearningRates, Model, empty_model, new_model
 from stages.training.pace import Mark, Pace, remaining_gain_db, share_passed_on
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.step import TrainingStep, step_of
-from stages.training.strategy import Strategy
+from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
-from stages.training.views import TrainingView
+from stages.training.views import Level, TrainingView
 
 CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
@@ -49,7 +50,7 @@ class Trainer:
     photographs always are. backend: what draws and steps. lent: rows of `train` that decide, and
     are trained on only once it grows no more. patience_db: what going on must promise to give.
     seconds: of wall time in all, 0 for as long as the steps take. within: where it grows, see
-    `density.Within`; () for everywhere."""
+    `density.Within`; () for everywhere. growth: by which of STRATEGIES."""
 
     schedule: Schedule
     train: list[TrainingView]
@@ -65,13 +66,14 @@ class Trainer:
     patience_db: float = 0.0
     seconds: float = 0.0
     within: tuple[float, ...] = ()
+    growth: str = "adaptive"
 
     def __post_init__(self) -> None:
         self.stepper: TrainingStep = step_of(self.backend)
         if self.backend == AUTO:
             self.stepper = FrugalStep(self.stepper, self._memory_full)
         self.makers: list[Maker] = []
-        self._strategy: Strategy = AdaptiveDensity(self.schedule.extent)
+        self._strategy = STRATEGIES[self.growth](self.schedule.extent)
         if self.within:
             self._strategy = Within(self._strategy, self.within)
         self.ended = ""  # why before all steps, if it did
@@ -96,6 +98,8 @@ class Trainer:
             loss = self.step(step)
             self._adapt(step)
             step += 1
+            if step == self.schedule.steps:
+                self._recolour()
             if self.schedule.passes(step, EVALUATIONS):
                 self._record(step)
             self._replan(step)
@@ -110,6 +114,18 @@ class Trainer:
             self._tick(step, loss)
             self.report.offer(partial(self.draw, step))
         return self.model
+
+    def _recolour(self) -> None:
+        """See `colours`; at full size, in all of its view-dependent colour."""
+        model = self.model
+        self.stepper.load(empty_model())  # a device may have no room for both
+        rasteriser = rasteriser_of(backend_of(self.backend).name)
+        settings = self.settings(self.schedule.sh_degree)
+        widths = model.smoothing if self.smooth else NO_SMOOTHING
+        self.stepper.load(Recolouring(rasteriser, settings, self._full_size, widths).of(model))
+
+    def _full_size(self) -> Iterator[Level]:
+        return (view.levels[-1] for view in self.train)
 
     @property
     def by_heart(self) -> float:
