@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.judge import Photograph
+from stages.raster.backends import rasteriser_of
+from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
 from stages.raster.draw import settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
+from stages.training.colours import Recolouring
 from stages.training.dropout import Dropout
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
@@ -27,7 +30,8 @@ MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 
 class Tuner:
     """Goes on with splats where training left them. extent: of the scene, world units. by_heart:
-    see `scene.by_heart`; splats sit steps out here as they did in training."""
+    see `scene.by_heart`; splats sit steps out here as they did in training, and colours are settled
+    for the whole after it."""
 
     def __init__(
         self,
@@ -41,7 +45,7 @@ class Tuner:
         self.by_heart = by_heart
         self.cameras = [photograph.camera for photograph in photographs]
         self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
-        self.stepper = step_of(backend)
+        self.stepper, self.rasteriser = step_of(backend), rasteriser_of(backend)
         self.steps = 0  # made so far
 
     def tuned(
@@ -70,7 +74,19 @@ class Tuner:
             )
             rates = replace(rates, **dict.fromkeys(still, 0.0))
             self.stepper.step(self._level(), settings, rates, False, self._dropout())
-        return _with(self._finished(self.stepper.model(), splats), splats, still)
+        tuned = _with(self._finished(self.stepper.model(), splats), splats, still)
+        return self._recoloured(tuned, settings, still) if self.by_heart else tuned
+
+    def _recoloured(
+        self, splats: Splats, settings: RasterSettings, still: Collection[str]
+    ) -> Splats:
+        """See `training.colours`."""
+        if "sh_dc" in still:
+            return splats
+        model = new_model(*splat_arrays(splats))
+        model.sh_degrees[:] = 0 if "sh_rest" in still else splats.sh_degrees
+        where = self.rasteriser, settings, lambda: map(_level, self.photographs), NO_SMOOTHING
+        return replace(splats, sh=Recolouring(*where).of(model).sh)
 
     def _dropout(self) -> Dropout | None:
         if not self.by_heart:

@@ -1,9 +1,9 @@
 """Colours for all photographs at once: with the geometry at rest, a picture is linear in them.
 
-Training ends on one photograph, then another; colours are still where the last ones pulled them,
-and where splats sat steps out, they are those of a scene that is never drawn whole. One step of
-conjugate gradients over all photographs, as long as serves it best, takes that out. A second one
-already fits noise, and so does squaring errors that no colour explains: things that moved, edges.
+Where splats sat steps out, those that stayed learnt colours for scenes that lacked the others, and
+none of these scenes is ever drawn. One step of conjugate gradients over all photographs, as long as
+serves it best, fits colours to the scene that is. A second one already fits noise, and so does
+squaring errors that no colour explains: things that moved, edges.
 """
 
 from __future__ import annotations
@@ -36,21 +36,28 @@ class Recolouring:
     def of(self, model: Model) -> Model:
         """`model` with the colours that all photographs together ask for next."""
         pull, weight = np.zeros(model.sh.shape), np.zeros(model.sh.shape)
-        before = 0.0
         for forward, error in self._errors(model):
             trust = _trust(error)
-            before += _loss(error)
             self._add(model, forward, trust * error, pull)
             self._add(model, forward, trust, weight, of_size=True)
         stride = np.where(_own_bands(model), pull / (weight + RESTING), 0.0)
+        slope = float((pull * stride).sum())
         there = replace(model, sh=(model.sh + stride).astype(np.float32))
-        after = sum(_loss(error) for _, error in self._errors(there))
-        slope = 2.0 * float((pull * stride).sum())
-        bend = after - before + slope  # of the loss, taken as a parabola along the stride
-        if not (slope > 0.0 and bend > 0.0):
+        curve = self._change(model, there) + 2.0 * slope  # the parabola's: the rest is a line
+        if not (slope > 0.0 and curve > 0.0):
             return model  # nothing to gain, or not finite
-        length = slope / (2.0 * bend)
+        length = slope / curve
         return replace(model, sh=(model.sh + length * stride).astype(np.float32))
+
+    def _change(self, model: Model, there: Model) -> float:
+        """By how much the errors of `there` are larger than those of `model`, squared and weighed
+        by how far these are to be trusted."""
+        found = 0.0
+        both = zip(self._errors(model), self._errors(there), strict=True)
+        for (_, error), (_, moved) in both:
+            change = np.square(moved) - np.square(error)
+            found += float((_trust(error) * change).sum(dtype=np.float64))
+        return found
 
     def _errors(self, model: Model) -> Iterator[tuple[object, NDArray[np.float32]]]:
         """(forward, photograph less drawing [3, H, W]) of each photograph."""
@@ -83,13 +90,6 @@ def _trust(error: NDArray[np.float32]) -> NDArray[np.float32]:
     """1 for an error that colours explain, less beyond."""
     least = np.float32(EXPLICABLE)
     return np.asarray(least / np.maximum(np.abs(error), least), np.float32)
-
-
-def _loss(error: NDArray[np.float32]) -> float:
-    """Squared as far as it is explicable, and straight on from there."""
-    size = np.abs(error)
-    near = np.minimum(size, np.float32(EXPLICABLE))
-    return float((near * (2 * size - near)).sum(dtype=np.float64))
 
 
 def _own_bands(model: Model) -> NDArray[np.bool_]:

@@ -98,7 +98,7 @@ class Trainer:
             loss = self.step(step)
             self._adapt(step)
             step += 1
-            if step == self.schedule.steps:
+            if step == self.schedule.steps and self.by_heart:
                 self._recolour()
             if self.schedule.passes(step, EVALUATIONS):
                 self._record(step)
