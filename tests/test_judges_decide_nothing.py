@@ -49,9 +49,9 @@ def made(reconstruction: Reconstruction, folder: Path) -> dict[str, bytes]:
         place = folder / stage.name
         place.mkdir(parents=True)
         inputs[stage.name] = stage.run(inputs, settings, place, Report())
-        for path in place.glob("*"):
-            if path.name == "splats.bin" or stage.name == "export":
-                found[f"{stage.name}/{path.name}"] = path.read_bytes()
+        for path in place.rglob("*"):
+            if path.is_file() and (path.name == "splats.bin" or stage.name == "export"):
+                found[path.relative_to(folder).as_posix()] = path.read_bytes()
     return found
 
 
