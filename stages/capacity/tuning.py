@@ -16,7 +16,7 @@ from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
 from stages.raster.draw import settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
-from stages.training.colours import Recolouring
+from stages.training.colours import Recolouring, worth_settling
 from stages.training.dropout import Dropout
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
@@ -75,7 +75,9 @@ class Tuner:
             rates = replace(rates, **dict.fromkeys(still, 0.0))
             self.stepper.step(self._level(), settings, rates, False, self._dropout())
         tuned = _with(self._finished(self.stepper.model(), splats), splats, still)
-        return self._recoloured(tuned, settings, still) if self.by_heart else tuned
+        if worth_settling(self.by_heart, len(self.photographs)):
+            return self._recoloured(tuned, settings, still)
+        return tuned
 
     def _recoloured(
         self, splats: Splats, settings: RasterSettings, still: Collection[str]

@@ -20,6 +20,8 @@ from stages.training.target import forget_ignored, target_of
 from stages.training.views import Level
 
 RESTING = 1.0  # pixels that a splat must cover for its colours to be free to move by half
+# Of more, what each photograph asks hardly weighs in the whole; and each costs as much as two steps.
+MOST_PHOTOGRAPHS = 48
 EXPLICABLE = 0.03  # an error beyond it counts by its size, not by its square (Huber 1964)
 
 
@@ -84,6 +86,11 @@ class Recolouring:
         found = backward.parameters[:, SH : used_columns(total.shape[1])]
         found = found.reshape(len(found), *total.shape[1:])
         total[backward.rows] += np.abs(found) if of_size else found
+
+
+def worth_settling(by_heart: float, photographs: int) -> bool:
+    """Whether splats sat steps out, and so few photographs were learnt that it shows."""
+    return by_heart > 0 and photographs <= MOST_PHOTOGRAPHS
 
 
 def _trust(error: NDArray[np.float32]) -> NDArray[np.float32]:

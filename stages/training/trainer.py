@@ -23,7 +23,7 @@ from stages.scene import TRANSPARENT, Camera, Look, Splats, by_heart, morton
 from stages.training.cap import fitted, lower_cap
 from stages.training.checkpoint import Maker, Saved, load_checkpoint, save_checkpoint
 from stages.training.clock import Clock, Spent
-from stages.training.colours import Recolouring
+from stages.training.colours import Recolouring, worth_settling
 from stages.training.density import Within
 from stages.training.dropout import Dropout
 from stages.training.frugal_step import FrugalStep
@@ -98,7 +98,7 @@ class Trainer:
             loss = self.step(step)
             self._adapt(step)
             step += 1
-            if step == self.schedule.steps and self.by_heart:
+            if step == self.schedule.steps and worth_settling(self.by_heart, len(self.train)):
                 self._recolour()
             if self.schedule.passes(step, EVALUATIONS):
                 self._record(step)
