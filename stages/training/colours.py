@@ -20,7 +20,7 @@ from stages.training.target import forget_ignored, target_of
 from stages.training.views import Level
 
 RESTING = 1.0  # pixels that a splat must cover for its colours to be free to move by half
-# Of more, what each photograph asks hardly weighs in the whole; and each costs as much as two steps.
+# Of more, what each photograph asks hardly weighs, and each costs as much as two steps.
 MOST_PHOTOGRAPHS = 48
 EXPLICABLE = 0.03  # an error beyond it counts by its size, not by its square (Huber 1964)
 
