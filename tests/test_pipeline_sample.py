@@ -110,7 +110,9 @@ def test_verify_finds_what_the_manifest_says(result: dict[str, Any], copied: Pat
     for each in found:
         assert each["right"], each["fault"]
         kept = metrics(result, "export")["formats"][each["format"]]
-        assert {name: each[name] for name in kept} == kept
+        # what fitting gave is told once, where it was done
+        again = {name: kept[name] for name in kept if name not in ("plain_db", "fitted_db")}
+        assert {name: each[name] for name in again} == again
 
 
 def test_asking_for_a_format_that_is_there_runs_nothing_and_loses_none(copied: Path) -> None:
