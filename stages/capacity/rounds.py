@@ -15,7 +15,7 @@ from stages.capacity.tuning import Tuner
 from stages.measure.judge import Photograph, drawing_of
 from stages.measure.price import Price, price_of
 from stages.measure.worth import Worth, measure_worth, squared_error
-from stages.scene import Splats
+from stages.scene import Splats, spread_over
 
 BACK_OFFS = 3  # times that a round may ask for half as much
 # Splats that go together cost more than the sum of each alone, since they stood in for each other:
@@ -73,10 +73,9 @@ class Shrinking:
     report: Report
 
     def __post_init__(self) -> None:
-        count = len(self.photographs)
-        decide = min(count, LOOKED_AT)
-        self.decide = [i * count // decide for i in range(decide)]
-        self.others = sorted(set(range(count)) - set(self.decide))
+        every = range(len(self.photographs))
+        self.decide = spread_over(every, LOOKED_AT)
+        self.others = sorted(set(every) - set(self.decide))
         # in the order in which worth tells of photographs
         self.cameras = [self.tuner.cameras[i] for i in (*self.others, *self.decide)]
 

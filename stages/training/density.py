@@ -35,6 +35,16 @@ def needed_mib(splats: int) -> float:
     return BASE_MIB + splats * BYTES_PER_SPLAT / (1024 * 1024)
 
 
+def sound(model: Model, settled: bool, extent: float) -> NDArray[np.bool_]:
+    """[N] whose values are finite, and once training has settled no giants."""
+    keep = np.ones(len(model), bool)
+    for array in model.arrays:
+        keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
+    if settled:
+        keep &= np.exp(model.log_scales.max(1)) <= GIANT * extent
+    return keep
+
+
 @dataclass(frozen=True)
 class AdaptiveDensity:
     """Clones small splats and splits large ones where the picture pulls at them hardest; see
@@ -48,12 +58,8 @@ class AdaptiveDensity:
     threshold: float = THRESHOLD
 
     def prune(self, model: Model, settled: bool) -> Model:
-        keep = model.opacity_logits >= logit(OPACITY_MIN)
-        for array in model.arrays:
-            keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
-        if settled:
-            keep &= np.exp(model.log_scales.max(1)) <= GIANT * self.extent
-        return model.take(keep)
+        shows = model.opacity_logits >= logit(OPACITY_MIN)
+        return model.take(shows & sound(model, settled, self.extent))
 
     def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
         pull = model.gradient_sum / np.maximum(model.gradient_count, 1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stages.scene import logit
 from stages.scene.rotations import matrices_of
-from stages.training.density import GIANT, OPACITY_MIN
+from stages.training.density import OPACITY_MIN, sound
 from stages.training.optimiser import Model
 
 MOST_COPIES = 51  # of one splat in a round: beyond it the copies' scale is no sum of small numbers
@@ -35,12 +35,7 @@ class Relocation:
     extent: float
 
     def prune(self, model: Model, settled: bool) -> Model:
-        keep = np.ones(len(model), bool)
-        for array in model.arrays:
-            keep &= np.isfinite(array).all(tuple(range(1, array.ndim)))
-        if settled:
-            keep &= np.exp(model.log_scales.max(1)) <= GIANT * self.extent
-        return model.take(keep)
+        return model.take(sound(model, settled, self.extent))
 
     def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
         opacities = _opacities(model)
