@@ -237,7 +237,7 @@ class Trainer:
         self.marks.append(Mark(step, self._mean_db(self.lent), self._mean_db(self._told())))
         self.passed_on = share_passed_on(self.marks)
         promised = remaining_gain_db(self.marks, round(GROWTH_ENDS * self.schedule.steps))
-        if self.by_heart and self.patience_db and promised < self.patience_db:
+        if self.by_heart > 0.5 and self.patience_db and promised < self.patience_db:
             self.schedule = self.schedule.grown(step)
             self.ended = f"after {step} steps growth promised no more than {self.patience_db} dB"
 

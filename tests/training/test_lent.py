@@ -7,7 +7,7 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
-from stages.scene import Look
+from stages.scene import Look, by_heart
 from stages.train import lent_rows
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.trainer import Trainer
@@ -53,6 +53,11 @@ def test_few_are_lent_and_of_too_few_none(n, wanted):
     rows = lent_rows(n)
     assert len(rows) == len(set(rows)) == wanted
     assert all(0 <= row < n for row in rows)
+
+
+def test_in_doubt_splats_sit_out_half():
+    shares = [by_heart(passed_on) for passed_on in (0.0, 0.1, 0.25, 0.4, 1.0)]
+    assert shares == pytest.approx([1, 1, 0.5, 0, 0])
 
 
 def test_what_is_learnt_by_heart_is_cut_short_and_says_so(tmp_path):
