@@ -109,7 +109,7 @@ class Splats:
 
 # Of what photographs in training gain. Measured where growth ends, by one to four photographs: 0.0
 # to 0.23 on a carpet that is learnt by heart, 0.34 on a toy and 0.5 to 0.9 on a scene that are not.
-# To take one for by heart that is not costs 0.3 dB, the other way round 1.2: so doubt counts as half.
+# To take one for by heart that is not costs 0.3 dB, the other way round 1.2, so doubt counts.
 ALL_BY_HEART, NOT_BY_HEART = 0.1, 0.4
 
 
