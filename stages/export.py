@@ -301,7 +301,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=8,
+    version=9,
     reads=("sfm", "train", "quantise"),
     settings_type=ExportSettings,
     run=run,

@@ -49,6 +49,7 @@ class Fitting:
     def fitted(self, row: Format, quantised: QuantisedSplats) -> tuple[Splats, dict[str, Any]]:
         """(what a file of the format should hold, figures: PSNR of the photographs that decide, as
         the file would be drawn without fine-tuning and with it). Raises Interrupted."""
+        self.tuner.steps = 0  # what a file holds does not depend on those written before it
         plain = held_by(row, quantised)
         exact = held_by(row, replace(quantised, decisions={}))
         bits = quantised.decisions.get("bits")

@@ -114,3 +114,10 @@ def test_compact_files_hold_splats_that_were_fitted_to_them_if_that_helps(
         )
         better = max(fitted[name]["plain_db"], fitted[name]["fitted_db"])
         assert drawn == pytest.approx(better, abs=0.02)
+
+
+def test_a_file_does_not_depend_on_what_else_is_written(scene: SmallScene, tmp_path: Path) -> None:
+    exported(scene, tmp_path / "alone", formats=("sog",), fit_steps=10)
+    exported(scene, tmp_path / "others", formats=("splat", "spz", "sog"), fit_steps=10)
+    alone, others = (tmp_path / name / "scene.sog" for name in ("alone", "others"))
+    assert alone.read_bytes() == others.read_bytes()
