@@ -2,9 +2,11 @@
 tests.benchmarks.quality --out FOLDER [CAPTURE ...]`.
 
 For the sample and for every folder of photographs that is named: cameras and seeds once, then
-training, pruning and quantising for each preset and seed. What comes out is judged at one size,
-over the same photographs, which decided nothing: the held-out ones, and for the sample further ones
-that its renderer draws. Finished cells are kept in FOLDER, so a stopped bench goes on.
+training, pruning and quantising for each preset and seed. A folder that holds cameras, as a scene
+of COLMAP's or a synthetic NeRF scene does, is taken with them, and with its own split if it has
+one. What comes out is judged at one size, over the same photographs, which decided nothing: the
+held-out ones, and for the sample further ones that its renderer draws. Finished cells are kept in
+FOLDER, so a stopped bench goes on.
 
 `--keep FILE` stores the figures, `--against FILE` compares with stored ones: paired
 over photographs and seeds, "better", "worse" or "not told apart".
@@ -16,6 +18,7 @@ import argparse
 import json
 import resource
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,11 +28,14 @@ from rich.console import Console
 from rich.table import Table
 
 from stages import STAGE_NAMES, load_stage
+from stages.base.errors import SplatError
 from stages.base.stage import Report
+from stages.cameras.table import read_cameras
 from stages.measure.bootstrap import paired_difference
 from stages.measure.judge import Photograph, drawing_of, load_photographs, scores
 from stages.run.pipeline import Pipeline
 from stages.scene import Look, Reconstruction, Splats, near_plane, split_held_out
+from stages.sfm import SfmSettings
 from stages.train import PRESETS
 from tests.benchmarks.sample_judges import judges_in, render_judges
 from tests.sample import PHOTOS
@@ -57,7 +63,7 @@ class Capture:
     def __init__(self, name: str, photos: Path, out: Path, side: int) -> None:
         self.name, self.folder = name, out / name
         pipeline = Pipeline(self.folder / "run", photos)
-        pipeline.run(until="seed")
+        pipeline.run({"sfm": with_its_cameras(photos)}, until="seed")
         self.reconstruction: Reconstruction = pipeline.load("sfm")
         self.seeds: Splats = pipeline.load("seed")
         self.judges = self._judges(out, side)
@@ -70,6 +76,30 @@ class Capture:
             return found
         render_judges(out / "judges")
         return (*load_photographs(out / "judges", judges_in(self.reconstruction), look), *found)
+
+
+def with_its_cameras(photos: Path) -> SfmSettings:
+    """How cameras are come by: those that lie with the photographs, else they are searched."""
+    try:
+        found = read_cameras(photos)
+    except SplatError as error:
+        if error.code != "cameras-unknown":
+            raise
+        return SfmSettings()
+    split = {"train", "test"} <= {view.role for view in found.views}
+    return SfmSettings(cameras=photos, split=split)
+
+
+def named(folders: Sequence[Path]) -> dict[str, Path]:
+    """Each capture by its folder's name, or by its parent's where the name says nothing. Raises
+    SystemExit for two of one name, whose cells would be taken for each other's."""
+    found = {SAMPLE: PHOTOS}
+    for folder in (path.resolve() for path in folders):
+        name = folder.parent.name if folder.name in ("images", "photos", "input") else folder.name
+        if name in found:
+            raise SystemExit(f"{found[name]} and {folder} are both called {name}")
+        found[name] = folder
+    return found
 
 
 def measured(capture: Capture, preset: str, seed: int, side: int) -> Cell:
@@ -170,9 +200,8 @@ def main() -> None:
     parser.add_argument("--keep", metavar="FILE", type=Path)
     parser.add_argument("--against", metavar="FILE", type=Path)
     given = parser.parse_args()
-    captures = {SAMPLE: PHOTOS, **{path.resolve().name: path for path in given.captures}}
     cells = []
-    for name, photos in captures.items():
+    for name, photos in named(given.captures).items():
         capture = Capture(name, photos, given.out, given.side)
         for preset in given.presets:
             cells += [measured(capture, preset, seed, given.side) for seed in range(given.seeds)]
