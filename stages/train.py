@@ -47,7 +47,8 @@ class TrainSettings:
     max_splats: int = field(
         default=0,
         metadata={
-            "help": "Splats at most; 0 takes what free memory allows.",
+            "help": "Splats at most; 0: what free memory allows, and no more numbers than the "
+            "photographs have.",
             "min": 0,
             "max": 100_000_000,
         },
@@ -185,13 +186,18 @@ def run(
         report.metric("ended_early", trainer.ended)
     report.metric("splats", len(splats))
     if len(splats) >= 0.98 * trainer.cap:
-        report.warn(
-            "train-splat-cap-reached",
-            f"Growth stopped at the cap of {trainer.cap:,} splats; more memory, or a higher "
-            "--max-splats, may add detail.",
-        )
+        _warn_of_cap(trainer.cap, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
+
+
+def _warn_of_cap(cap: int, report: Report) -> None:
+    from stages.training.cap import PHOTOGRAPHS
+
+    more = "more memory, or a higher --max-splats, may add detail"
+    if report.metrics["splat_cap_from"] == PHOTOGRAPHS:
+        more = "they have as many numbers as the photographs; more or larger ones may add detail"
+    report.warn("train-splat-cap-reached", f"Growth stopped at the cap of {cap:,} splats; {more}.")
 
 
 def _report_makers(trainer: Trainer, report: Report) -> None:
@@ -227,7 +233,7 @@ def make_trainer(
     """Load the photographs and compute the cap, before anything grows."""
     from stages.measure.judge import load_photographs
     from stages.scene import look_of, seen_extent, split_held_out
-    from stages.training.cap import cap_for
+    from stages.training.cap import cap_for, splats_told
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
     from stages.training.views import load_views
@@ -248,7 +254,8 @@ def make_trainer(
             f"Used at their own size, smaller than --train-side {settings.train_side}: "
             f"{counted(len(smaller), 'photograph')}. --max-side sets how large ingest keeps them.",
         )
-    cap = cap_for(folder, settings.max_splats)
+    told = splats_told([view.levels[-1].camera for view in train], settings.sh_degree)
+    cap = cap_for(folder, settings.max_splats, told)
     report.metric("splat_cap", cap.splats)
     report.metric("splat_cap_from", cap.origin)
     report.metric("splat_cap_free_mib", cap.free_mib)

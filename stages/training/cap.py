@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -10,34 +11,46 @@ import numpy as np
 
 from stages.base.atomic import replacing
 from stages.base.memory import available_mib
+from stages.scene import Camera
 from stages.training.density import splat_cap
 from stages.training.optimiser import Model
 
 FILE_NAME = "cap.json"
 DEVICE_MEMORY = "the GPU's memory"
+PHOTOGRAPHS = "the photographs' pixels"
+GEOMETRY = 11  # numbers of a splat but its colour: place, rotation, scales, opacity
+FEWEST = 10_000  # splats that are allowed however few pixels there are
 
 
 @dataclass(frozen=True)
 class Cap:
-    """splats: at most. origin: "--max-splats", "free memory" or DEVICE_MEMORY. free_mib: what was
-    free then, if that decided; None where the system did not say."""
+    """splats: at most. origin: "--max-splats", "free memory", PHOTOGRAPHS or DEVICE_MEMORY.
+    free_mib: what was free then, if that decided; None where the system did not say."""
 
     splats: int
     origin: str
     free_mib: float | None = None
 
 
-def cap_for(folder: Path, max_splats: int) -> Cap:
-    """`max_splats`, or for 0 what free memory allows: as it was when work in `folder` began, since
-    a run that goes on with another cap would end in other bytes. Fewer, if a GPU has refused so
-    many by then."""
+def cap_for(folder: Path, max_splats: int, told: int) -> Cap:
+    """`max_splats`, or for 0 what free memory allows, and no more than `told`: as it was when work
+    in `folder` began, since a run that goes on with another cap would end in other bytes. Fewer, if
+    a GPU has refused so many by then."""
     kept = _read(folder / FILE_NAME)
     if kept is not None and (not max_splats or kept.origin == DEVICE_MEMORY):
         return kept
     if max_splats:
         return Cap(max_splats, "--max-splats")
     free_mib = available_mib()
-    return _kept(Cap(splat_cap(free_mib), "free memory", free_mib and round(free_mib)), folder)
+    held = Cap(splat_cap(free_mib), "free memory", free_mib and round(free_mib))
+    return _kept(min(held, Cap(told, PHOTOGRAPHS), key=lambda cap: cap.splats), folder)
+
+
+def splats_told(cameras: Sequence[Camera], sh_degree: int) -> int:
+    """How many splats of `sh_degree` have no more numbers than the photographs of `cameras`: with
+    more, some are told by nothing."""
+    numbers = sum(3 * camera.width * camera.height for camera in cameras)
+    return max(FEWEST, numbers // (GEOMETRY + 3 * (sh_degree + 1) ** 2))
 
 
 def lower_cap(folder: Path, splats: int) -> Cap:

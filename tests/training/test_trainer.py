@@ -421,16 +421,29 @@ def test_a_run_that_another_backend_goes_on_with_says_so(tmp_path):
 
 
 def test_a_cap_that_was_asked_for_is_told_as_that(tmp_path):
-    assert cap.cap_for(tmp_path, 500) == cap.Cap(500, "--max-splats")
+    assert cap.cap_for(tmp_path, 500, 100) == cap.Cap(500, "--max-splats")
     assert not list(tmp_path.iterdir())
+
+
+def test_no_more_is_modelled_than_the_photographs_tell(tmp_path, monkeypatch):
+    """60 x 40 pixels of three numbers each; a splat of degree 1 has 23, one of degree 3 has 59."""
+    small = camera(width=60, height=40)
+    monkeypatch.setattr(cap, "FEWEST", 10)
+    assert cap.splats_told([small] * 5, 1) == 5 * 60 * 40 * 3 // 23
+    assert cap.splats_told([small] * 5, 3) == 5 * 60 * 40 * 3 // 59
+    monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
+    assert cap.cap_for(tmp_path, 0, 610) == cap.Cap(610, cap.PHOTOGRAPHS)
+    assert cap.cap_for(tmp_path, 0, 10**9).splats == 610  # it stays as it began
+    (tmp_path / cap.FILE_NAME).unlink()
+    assert cap.cap_for(tmp_path, 0, 10**9).origin == "free memory"
 
 
 def test_a_damaged_note_of_the_cap_is_written_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
     for text in ("", "[]", '{"splats": "many", "origin": "?"}', '{"splats": 0, "origin": "?"}'):
         (tmp_path / cap.FILE_NAME).write_text(text)
-        assert cap.cap_for(tmp_path, 0).free_mib == 4096
-        assert cap.cap_for(tmp_path, 0) == cap._read(tmp_path / cap.FILE_NAME)
+        assert cap.cap_for(tmp_path, 0, 10**9).free_mib == 4096
+        assert cap.cap_for(tmp_path, 0, 10**9) == cap._read(tmp_path / cap.FILE_NAME)
 
 
 def test_pictures_on_disk_train_to_the_same_bytes_as_pictures_in_memory(tmp_path):
