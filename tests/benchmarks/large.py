@@ -39,7 +39,7 @@ from pathlib import Path
 from splatcli.app import app
 app(sys.argv[2:], standalone_mode=False)
 words = Path("/proc/self/status").read_text().split()
-found = {"mib": int(words[words.index("VmHWM:") + 1]) / 1024, "seconds": sum(os.times()[:4])}
+found = {"mib": int(words[words.index("VmHWM:") + 1]) / 1024, "processor": sum(os.times()[:4])}
 Path(sys.argv[1]).write_text(json.dumps(found))
 """
 
@@ -98,7 +98,7 @@ JOBS = (
 
 
 def done(job: Job, scene: Scene) -> dict[str, Any]:
-    """Runs it: mib, seconds, and what the command said last of what it did."""
+    """Runs it: mib, processor (seconds), and what the command said last of what it did."""
     folder = scene.path.parent
     verb, *options = job.words(scene)
     files = [str(folder / name) for name in (job.source, job.out) if name]
@@ -160,7 +160,7 @@ def measure(scene: Scene, jobs: Sequence[Job]) -> None:
         found = done(job, scene)
         mb = f"{written(job, scene) / 1e6:,.0f}" if job.out else ""
         print(
-            f"| {scene.count:,} | {job.name} | {found['seconds']:,.0f} | {found['mib']:,.0f} | "
+            f"| {scene.count:,} | {job.name} | {found['processor']:,.0f} | {found['mib']:,.0f} | "
             f"{mb} | {found.get('splats', scene.count):,} |",
             flush=True,
         )
