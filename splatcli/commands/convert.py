@@ -24,11 +24,12 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     Raises SplatError: what keeps a file from being read or written, and "convert-verify-failed".
     """
     from stages import formats
+    from stages.base import scratch
     from stages.formats.rows import kept_rows
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
-    with _progress(quiet, as_json) as say:
+    with _progress(quiet, as_json) as say, scratch.scratch_in(target.parent, spare=True):
         say(f"reading {source}")
         splats = formats.read(source)
         say(f"writing {target}")

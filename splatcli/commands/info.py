@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,10 +34,12 @@ def show(target: Path | None, speed: bool, as_json: bool) -> None:
 
     Raises SplatError for what cannot be read; values that are not finite are warned of.
     """
+    from stages.base import scratch
     from stages.proof.census import census_of
 
-    splats, pipeline = splats_of(target, strict=False)
-    census = census_of(splats)
+    with scratch.scratch_in(Path(tempfile.gettempdir()), spare=True):
+        splats, pipeline = splats_of(target, strict=False)
+        census = census_of(splats)
     facts = describe(splats, census)
     if pipeline is None and target is not None:
         facts = {**_about_file(target, len(splats)), **facts}

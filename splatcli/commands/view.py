@@ -22,26 +22,30 @@ if TYPE_CHECKING:
 
 def show(target: Path | None, port: int, open_browser: bool) -> None:
     """Serve the page until Ctrl-C. Raises SplatError."""
+    from stages.base import scratch
     from stages.formats.rows import kept_rows
     from stages.viewer.server import LocalServer
 
-    splats, pipeline = sources.splats_of(target)
-    splats, _ = kept_rows(splats)
-    if len(splats) == 0:
-        raise SplatError(
-            "view-empty",
-            given=f"{_title(target, pipeline)} holds no splat that can be drawn.",
-            wanted="At least one.",
-            hint="See what it holds with `splat info`.",
-        )
     with tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
-        items = _items(target, pipeline, splats, Path(folder) / "scene.ply")
+        with scratch.scratch_in(Path(folder), spare=True):
+            splats, pipeline = sources.splats_of(target)
+            splats, _ = kept_rows(splats)
+            count = len(splats)
+            if not count:
+                raise SplatError(
+                    "view-empty",
+                    given=f"{_title(target, pipeline)} holds no splat that can be drawn.",
+                    wanted="At least one.",
+                    hint="See what it holds with `splat info`.",
+                )
+            items = _items(target, pipeline, splats, Path(folder) / "scene.ply")
+        del splats  # the page is made: it need not wait beside them
         try:
             server = LocalServer(items, port)
         except OSError as error:
             raise _port_refused(port, error) from error
         with server:
-            _serve(server, len(splats), open_browser)
+            _serve(server, count, open_browser)
 
 
 def _items(

@@ -4,12 +4,50 @@ from __future__ import annotations
 
 import errno
 import os
+import platform
+import re
+import shutil
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stages.base.disk import is_full
 from stages.base.errors import Family, SplatError
+
+_LEFT = ".partial-"
+
+
+def partial_prefix() -> str:
+    """What the names of files and folders begin with that are not whole yet. It says which process
+    of which machine makes them, for `clear_left`."""
+    return f"{_LEFT}{_machine()}-{os.getpid()}-"
+
+
+def _machine() -> str:
+    return f"{zlib.crc32(platform.node().encode()):08x}"
+
+
+def clear_left(folder: Path) -> None:
+    """Delete what processes of this machine that were killed left half-written in `folder`."""
+    if os.name != "posix":  # elsewhere to ask whether a process runs would end it
+        return
+    mark = re.compile(re.escape(f"{_LEFT}{_machine()}-") + r"(\d+)-")
+    with suppress(OSError):  # nobody waits for it
+        for left in list(folder.iterdir()):
+            found = mark.match(left.name)
+            if found and not _runs(int(found[1])):
+                left.unlink() if not left.is_dir() else shutil.rmtree(left, ignore_errors=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # somebody else's
+        return True
+    return True
 
 
 @contextmanager
@@ -21,7 +59,7 @@ def replacing(path: Path) -> Iterator[Path]:
     "file-not-written" for what the operating system refuses.
     """
     path = Path(path)
-    temporary = path.with_name(f".partial-{os.getpid()}-{path.name}")
+    temporary = path.with_name(partial_prefix() + path.name)
     try:
         if not path.parent.is_dir():  # said here, because some writers would make the folder
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -18,15 +19,18 @@ from numpy.typing import NDArray
 from stages.base.errors import Family, SplatError
 
 LARGE_BYTES = 1 << 26
-_folder: ContextVar[Path | None] = ContextVar("scratch", default=None)
+_folder: ContextVar[tuple[Path, bool] | None] = ContextVar("scratch", default=None)
 _maps: WeakSet[mmap.mmap] = WeakSet()
 
 
 @contextmanager
-def scratch_in(folder: Path) -> Iterator[None]:
+def scratch_in(folder: Path, spare: bool = False) -> Iterator[None]:
     """Inside, large arrays that `empty` makes are files in `folder`; nobody sees them, and they end
-    with the last look at them, or with the process, however that ends."""
-    token = _folder.set(folder)
+    with the last look at them, or with the process, however that ends.
+
+    spare: only while the disk keeps more room than they take; else they are in memory, as without.
+    """
+    token = _folder.set((folder, spare))
     try:
         yield
     finally:
@@ -36,10 +40,13 @@ def scratch_in(folder: Path) -> Iterator[None]:
 def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     """As np.empty; mapped from a file if it is large and somebody named a place for it. Raises
     SplatError "disk-full"."""
-    folder, size = _folder.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
-    if folder is None or size < LARGE_BYTES:
+    place, size = _folder.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if place is None or size < LARGE_BYTES:
         return np.empty(shape, dtype)
+    folder, spare = place
     try:
+        if spare and shutil.disk_usage(folder).free < 2 * size:
+            return np.empty(shape, dtype)
         with tempfile.TemporaryFile(dir=folder, prefix=".scratch-") as file:
             # Reserved now: a disk that is full when a page is written would end the process.
             if hasattr(os, "posix_fallocate"):
@@ -48,6 +55,8 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
                 file.truncate(size)
             found = np.memmap(file, dtype, "r+", shape=shape)
     except OSError as error:
+        if spare:
+            return np.empty(shape, dtype)
         raise SplatError(
             "disk-full",
             given=f"{folder} has no {size / 1e9:.1f} GB for splats on their way: {error.strerror}.",

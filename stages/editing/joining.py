@@ -38,22 +38,6 @@ def joined(first: Splats, second: Splats) -> Splats:
     return replace(first, **arrays)
 
 
-def chosen(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
-    """The rows where `keep` [N] is true, in their order."""
-    if keep.all():
-        return splats
-    count, width = int(keep.sum()), splats.sh.shape[1]
-    arrays: dict[str, Any] = {n: _empty(splats, n, count, width) for n in _FIELDS}
-    start = 0
-    for rows in passing(len(splats)):
-        mask = keep[rows]
-        there = slice(start, start + int(mask.sum()))
-        for name in _FIELDS:
-            arrays[name][there] = getattr(splats, name)[rows][mask]
-        start = there.stop
-    return replace(splats, **arrays)
-
-
 def _empty(like: Splats, name: str, count: int, width: int) -> NDArray[Any]:
     values = getattr(like, name)
     shape = (count, width, 3) if name == "sh" else (count, *values.shape[1:])

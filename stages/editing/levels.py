@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages.editing.decimate import FAR, decimated
-from stages.editing.joining import chosen
 from stages.formats import html, streamed_sog
-from stages.formats.rows import drawable
+from stages.formats.rows import kept_rows
 from stages.scene import Splats, View
 
 # On a surface a quarter of the splats are twice as large, and look as large twice as far away.
@@ -31,7 +30,7 @@ def write(
 
     views: cameras to look from. Raises SplatError when it cannot be written.
     """
-    kept = chosen(splats, drawable(splats))
+    kept, dropped = kept_rows(splats)
     streamed_sog.write_levels(Path(path), levels_of(kept), units)
     html.write_beside(Path(path), kept, units, views)
-    return len(splats) - len(kept)
+    return dropped

@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages import formats
+from stages.base.atomic import partial_prefix
 from stages.base.errors import Family, SplatError
 from stages.editing import expression, floaters, regions, turning
 from stages.editing.decimate import FAR, NEAR, decimated
-from stages.editing.joining import chosen, joined
+from stages.editing.joining import joined
 from stages.editing.scene import Edited
 from stages.editing.turning import Similarity
 from stages.editing.words import WORDS, Typed
-from stages.formats.rows import drawable
+from stages.formats.rows import chosen, kept_rows
 from stages.measure.worth import floaters as hanging
 from stages.scene import Splats
 
@@ -62,7 +63,7 @@ def done(scene: Edited, chain: Sequence[tuple[Typed, Operation]]) -> Iterator[Do
 
 def without_undrawable(splats: Splats) -> Splats:
     """Those that a viewer can draw: what operations may count on."""
-    return chosen(splats, drawable(splats))
+    return kept_rows(splats)[0]
 
 
 def _prepared(typed: Typed, target: Path) -> Operation:
@@ -149,7 +150,7 @@ def _fitting(most: float, target: Path) -> Operation:
     row = formats.format_of(target)
 
     def size_bytes(scene: Edited) -> int:
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".size-") as folder:
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=partial_prefix()) as folder:
             path = Path(folder) / row.name("scene")
             formats.write(path, scene.splats, units=scene.units, views=scene.views_there())
             return row.size_bytes(path)

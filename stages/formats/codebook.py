@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import scratch
 from stages.base.blocks import blocks, passing
 
 SIZE = 256
@@ -20,8 +21,8 @@ def of_numbers(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.flo
     ordered = np.sort(values, axis=None)
     new = np.ones(len(ordered), bool)
     np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
-    distinct = ordered[new].astype(np.float64)
-    if len(distinct) <= size:
+    if np.count_nonzero(new) <= size:
+        distinct = ordered[new].astype(np.float64)
         padding = np.full(size - len(distinct), distinct[-1] if len(distinct) else 0.0)
         return np.concatenate([distinct, padding])
     # Half of the first centres where the values are many, half spread evenly, for the far ones.
@@ -48,9 +49,13 @@ def of_numbers(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.flo
 
 def _running(ordered: NDArray[np.floating], power: int) -> NDArray[np.float64]:
     """[M + 1] sums of the first 0, 1, 2, ... values to a power of 1 or 2."""
-    sums = np.zeros(len(ordered) + 1)
-    np.power(ordered, power, out=sums[1:], dtype=np.float64)
-    return np.cumsum(sums, out=sums)
+    sums = scratch.empty((len(ordered) + 1,), np.float64)
+    sums[0] = 0
+    for rows in blocks(len(ordered)):
+        part = sums[rows.start : rows.stop + 1]  # begins with the sum so far
+        np.power(ordered[rows], power, out=part[1:], dtype=np.float64)
+        np.cumsum(part, out=part)
+    return sums
 
 
 def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -78,7 +83,8 @@ def of_vectors(
             return vectors[first[order]], np.argsort(order)[which]
     labels = np.zeros(len(vectors), np.intp)
     palette = [np.zeros((1, vectors.shape[1]), np.float32)]
-    rows = np.flatnonzero(vectors.any(axis=1))
+    some = [np.flatnonzero(vectors[part].any(axis=1)) + part.start for part in blocks(len(vectors))]
+    rows = np.concatenate([np.zeros(0, np.intp), *some])
     rng = np.random.default_rng(seed)
     sample = np.sort(rng.permutation(rows)[:_SAMPLE])
     coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)

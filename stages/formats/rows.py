@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks
+from stages.base.blocks import blocks, passing
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
 
@@ -21,6 +21,7 @@ LOG_SCALE_MIN = -87.0  # below it a scale is no normal float32 any more
 # What linear 0 and 1 become: alpha is drawn between 1/255 and 0.99, so neither can be told from
 # the exact value.
 LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
+_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
 
 _keeps_damage: ContextVar[bool] = ContextVar("keeps_damage", default=False)
 
@@ -65,10 +66,27 @@ def _drawable(splats: Splats) -> NDArray[np.bool_]:
 
 def kept_rows(splats: Splats) -> tuple[Splats, int]:
     """(the drawable splats, how many were dropped)."""
-    mask = drawable(splats)
-    if mask.all():
-        return splats, 0
-    return splats.take(mask), int(len(mask) - mask.sum())
+    kept = chosen(splats, drawable(splats))
+    return kept, len(splats) - len(kept)
+
+
+def chosen(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
+    """The rows where `keep` [N] is true, in their order."""
+    if keep.all():
+        return splats
+    count = int(keep.sum())
+    arrays: dict[str, Any] = {}
+    for name in _FIELDS:
+        values = getattr(splats, name)
+        arrays[name] = scratch.empty((count, *values.shape[1:]), values.dtype)
+    start = 0
+    for rows in passing(len(splats)):
+        mask = keep[rows]
+        there = slice(start, start + int(mask.sum()))
+        for name in _FIELDS:
+            arrays[name][there] = getattr(splats, name)[rows][mask]
+        start = there.stop
+    return replace(splats, **arrays)
 
 
 def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -128,7 +146,7 @@ def allocated(count: int, degree: int) -> Splats:
         means=scratch.empty((count, 3)),
         quaternions=scratch.empty((count, 4)),
         log_scales=scratch.empty((count, 3)),
-        opacity_logits=np.empty(count, np.float32),
+        opacity_logits=scratch.empty((count,)),
         sh=scratch.empty((count, (degree + 1) ** 2, 3)),
         sh_degrees=np.zeros(count, np.uint8),
     )
@@ -145,23 +163,19 @@ def degrees_in_use(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def checked(splats: Splats) -> Splats:
-    """What a reader hands out: infinite opacity and scale logarithms made finite (files hold them
-    for opaque and for flat splats), and the degree of each splat found.
+    """What a reader hands out: infinite opacity and scale logarithms made finite in their place
+    (files hold them for opaque and for flat splats), and the degree of each splat found.
 
     Raises BadFileError if any other value is not finite: such a file is damaged, and silence would
     move or lose splats.
     """
-    logits = np.clip(splats.opacity_logits, -1e30, 1e30)
-    logits = np.where(
-        np.isinf(splats.opacity_logits), np.clip(logits, LOGIT_MIN, LOGIT_MAX), logits
-    )
-    logs = np.where(np.isneginf(splats.log_scales), LOG_SCALE_MIN, splats.log_scales)
-    clean = replace(
-        splats,
-        opacity_logits=logits.astype(splats.opacity_logits.dtype, copy=False),
-        log_scales=logs.astype(splats.log_scales.dtype, copy=False),
-        sh_degrees=degrees_in_use(splats.sh),
-    )
+    for rows in blocks(len(splats)):
+        logits, logs = splats.opacity_logits[rows], splats.log_scales[rows]
+        flat, opaque = np.isneginf(logs), np.isinf(logits)
+        logs[flat] = LOG_SCALE_MIN
+        logits[opaque] = np.clip(logits[opaque], LOGIT_MIN, LOGIT_MAX)
+        np.clip(logits, -1e30, 1e30, out=logits)
+    clean = replace(splats, sh_degrees=degrees_in_use(splats.sh))
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
         bad = not_finite(getattr(clean, name))
         if bad and not keeps_damage():
@@ -184,7 +198,7 @@ def joined(parts: list[Splats]) -> Splats:
     wide = [part.with_sh_degree(degree) for part in parts]
     empty = {"opacity_logits": (0,), "sh_degrees": (0,), "sh": (0, 1, 3), "quaternions": (0, 4)}
     arrays: dict[str, Any] = {}
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees"):
+    for name in _FIELDS:
         dtype = np.uint8 if name == "sh_degrees" else np.float32
         rows = [getattr(part, name) for part in wide]
         arrays[name] = np.concatenate(rows) if rows else np.zeros(empty.get(name, (0, 3)), dtype)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import scratch
 from stages.base.atomic import replacing
 from stages.base.blocks import passing
 from stages.formats import codebook, smallest_three
@@ -56,10 +57,9 @@ def members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, b
     meta["asset"] = {"generator": "splat", "units": units}
     if splats.origin.any():
         meta["asset"]["splat_origin"] = [float(v) for v in splats.origin]
-    # The view-dependent part is large: the others do without it.
-    base = splats.with_sh_degree(0).take(places)
-    pictures = {**_positions(base, meta), **_shapes(base, meta), **_colours(base, meta)}
-    del base
+    pictures: dict[str, NDArray[np.uint8]] = {}
+    for part in (_positions, _shapes, _colours):
+        pictures |= part(splats, places, meta)
     if degree and len(splats):
         pictures |= _rest(splats, places, meta)
     told = {"meta.json": json.dumps(meta, allow_nan=False).encode()}
@@ -97,18 +97,21 @@ def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return pixels.reshape(height, width, -1)
 
 
-def _positions(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
+def _positions(
+    splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
+) -> dict[str, NDArray[np.uint8]]:
+    """places: the order in which the splats are written; of what follows too."""
     low, high = (np.zeros(3), np.zeros(3))
     if len(splats):  # the curve rises: the ends of the bent are the bent ends
         low, high = (bent(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
     span = np.where(high > low, high - low, 1.0)
-    steps = np.empty((len(splats), 3), np.uint16)
+    halves = np.empty((2, len(splats), 3), np.uint8)
     for rows in passing(len(splats)):
-        steps[rows] = np.rint((bent(splats.means[rows]) - low) / span * STEPS)
+        steps = np.rint((bent(splats.means[places[rows]]) - low) / span * STEPS).astype(np.uint16)
+        halves[:, rows] = steps & 255, steps >> 8
     files = ["means_l.webp", "means_u.webp"]
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
-    halves = (steps & 255, steps >> 8)
-    return {name: _picture(half.astype(np.uint8)) for name, half in zip(files, halves, strict=True)}
+    return {name: _picture(half) for name, half in zip(files, halves, strict=True)}
 
 
 def bent(means: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -122,27 +125,33 @@ def unbent(curved: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sign(curved) * np.expm1(np.abs(curved))
 
 
-def _shapes(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
-    logs = np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
-    book = codebook.of_numbers(logs)
+def _shapes(
+    splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
+) -> dict[str, NDArray[np.uint8]]:
+    book = codebook.of_numbers(np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
     meta["scales"] = {"codebook": _written(book), "files": ["scales.webp"]}
-    turns = np.empty((len(splats), 4), np.uint8)
+    scales, turns = (np.empty((len(splats), n), np.uint8) for n in (3, 4))
     for rows in passing(len(splats)):
-        largest, others = smallest_three.split(unit_quaternions(splats.quaternions[rows]))
+        part = splats.take(places[rows])
+        scales[rows] = codebook.nearest(book, part.log_scales)
+        largest, others = smallest_three.split(unit_quaternions(part.quaternions))
         turns[rows, :3] = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
         turns[rows, 3] = 252 + largest
     meta["quats"] = {"files": ["quats.webp"]}
-    scales = codebook.nearest(book, logs)
     return {"scales.webp": _picture(scales), "quats.webp": _picture(turns)}
 
 
-def _colours(splats: Splats, meta: dict[str, Any]) -> dict[str, NDArray[np.uint8]]:
-    dc = np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT)
-    book = codebook.of_numbers(dc)
+def _colours(
+    splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
+) -> dict[str, NDArray[np.uint8]]:
+    book = codebook.of_numbers(np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT))
     meta["sh0"] = {"codebook": _written(book), "files": ["sh0.webp"]}
-    opacity = np.rint(255 * linear_opacities(splats)).astype(np.uint8)
-    indices = codebook.nearest(book, dc)
-    return {"sh0.webp": _picture(np.concatenate([indices, opacity[:, None]], axis=1))}
+    pixels = np.empty((len(splats), 4), np.uint8)
+    for rows in passing(len(splats)):
+        part = splats.take(places[rows])
+        pixels[rows, :3] = codebook.nearest(book, part.sh[:, 0])
+        pixels[rows, 3] = np.rint(255 * linear_opacities(part))
+    return {"sh0.webp": _picture(pixels)}
 
 
 def palette_size(count: int) -> int:
@@ -153,9 +162,8 @@ def palette_size(count: int) -> int:
 def _rest(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
-    """places: the order in which the splats are written."""
     count = splats.sh.shape[1] - 1
-    vectors = np.empty((len(splats), count, 3), np.float32)
+    vectors = scratch.empty((len(splats), count, 3))
     for rows in passing(len(splats)):
         vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
     size = palette_size(len(splats))
@@ -173,6 +181,7 @@ def _rest(
         "codebook": _written(book),
         "files": files,
     }
-    halves = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
-    pixels = (centroids.reshape(lines, PER_LINE * count, 3), _picture(halves.astype(np.uint8)))
+    halves = np.zeros((len(labels), 3), np.uint8)
+    halves[:, 0], halves[:, 1] = labels & 255, labels >> 8
+    pixels = (centroids.reshape(lines, PER_LINE * count, 3), _picture(halves))
     return dict(zip(files, pixels, strict=True))

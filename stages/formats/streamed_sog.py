@@ -9,7 +9,6 @@ take leaves one after the other, and rows of a leaf follow a Morton curve.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.atomic import make_folder, replacing
+from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import passing
 from stages.formats import sog
@@ -56,7 +55,7 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
     an earlier asset left in it goes. lod-meta.json comes last. Raises SplatError."""
     make_folder(path.parent)
     tree = _cut(levels)
-    partial = path.with_name(f".partial-{os.getpid()}-chunks")
+    partial = path.with_name(partial_prefix() + "chunks")
     try:
         make_folder(partial)
         places = _write_chunks(partial, tree, levels, units)

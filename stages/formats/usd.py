@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.atomic import replacing
+from stages.base.atomic import partial_prefix, replacing
 from stages.base.blocks import passing
 from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
 from stages.scene import Splats
@@ -139,7 +139,7 @@ def _write_package(path: Path, splats: Splats, units: str, name: str) -> None:
     """
     from pxr import Sdf
 
-    with tempfile.TemporaryDirectory(prefix=".partial-", dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(prefix=partial_prefix(), dir=path.parent) as folder:
         inner = Path(folder) / "scene.usdc"
         _export(_layer(splats, units, ".usdc"), inner)
         moment = time.mktime((1980, 1, 1, 12, 0, 0, 0, 0, -1))

@@ -22,15 +22,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.blocks import blocks
 from stages.raster.definition import ALPHA_MIN, LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
+from stages.scene.quantiles import quantiles
 
 NEEDLE_ASPECT = 100.0
 GIANT_PART = 0.1  # of the extent
 OUTLIER_BOXES = 5.0
-_MIDDLE_PERCENT = (1, 99)
+_MIDDLE = (0.01, 0.5, 0.99)
 _VALUES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-_BLOCK = 1 << 16  # rows at a time: what is made on the way stays small
 
 
 @dataclass(frozen=True)
@@ -69,14 +70,13 @@ def census_of(splats: Splats) -> Census:
     degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
     by_degree = {int(d): int(n) for d, n in zip(degrees, counts, strict=True)}
     whole, not_finite = _finite(splats)
-    box: dict[str, Any] = _box(splats.means[whole].astype(np.float64))
+    box: dict[str, Any] = _box(splats.means[whole])
     extent = float(np.linalg.norm(box["middle_high"] - box["middle_low"]))
     found: dict[str, Any] = dict.fromkeys(
         ("needles", "giants", "outliers", "transparent", "no_rotation", "too_large"), 0
     )
     keys = np.empty(len(splats), np.uint64)
-    for start in range(0, len(splats), _BLOCK):
-        rows = slice(start, start + _BLOCK)
+    for rows in blocks(len(splats)):
         block = splats.take(rows)
         keys[rows] = _fingerprints(block)
         for name, marks in _marks(block.take(whole[rows]), box, extent).items():
@@ -100,8 +100,7 @@ def _finite(splats: Splats) -> tuple[NDArray[np.bool_], dict[str, int]]:
     """([N] whether every value is finite; by attribute, how many splats fail)."""
     whole = np.ones(len(splats), bool)
     failed = dict.fromkeys(_VALUES, 0)
-    for start in range(0, len(splats), _BLOCK):
-        rows = slice(start, start + _BLOCK)
+    for rows in blocks(len(splats)):
         for name in _VALUES:
             values = getattr(splats, name)[rows]
             good = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
@@ -110,17 +109,17 @@ def _finite(splats: Splats) -> tuple[NDArray[np.bool_], dict[str, int]]:
     return whole, {name: n for name, n in failed.items() if n}
 
 
-def _box(means: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+def _box(means: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
     if not len(means):
         nothing = np.zeros(3)
         return dict.fromkeys(("low", "high", "middle_low", "middle_high", "median_centre"), nothing)
-    low, high = np.percentile(means, _MIDDLE_PERCENT, axis=0)
+    low, middle_low, centre, middle_high, high = quantiles(means, (0, *_MIDDLE, 1))
     return {
-        "low": means.min(axis=0),
-        "high": means.max(axis=0),
-        "middle_low": low,
-        "middle_high": high,
-        "median_centre": np.median(means, axis=0),
+        "low": low,
+        "high": high,
+        "middle_low": middle_low,
+        "middle_high": middle_high,
+        "median_centre": centre,
     }
 
 

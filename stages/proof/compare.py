@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import scratch
+from stages.base.blocks import blocks
 from stages.base.lazy import named
 from stages.formats import BY_ENDING, Format
 from stages.proof.matching import Rows, extent_of, matched_rows
@@ -68,14 +70,14 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
     degree = min([max(splats.sh_degree, file.sh_degree), *kept])
     errors: dict[str, NDArray[np.floating]] = {}
     sums = np.zeros(3)
-    for start in range(0, len(file), _BLOCK):
-        a = splats.take(rows[start : start + _BLOCK]).with_sh_degree(degree)
-        b = file.take(np.arange(start, start + len(a))).with_sh_degree(degree)
+    for block in blocks(len(file), _BLOCK):
+        a = splats.take(rows[block]).with_sh_degree(degree)
+        b = file.take(block).with_sh_degree(degree)
         a = turned(a) if upright else a
         for name, values in _block(a, b).items():
             if name not in errors:
-                errors[name] = np.empty(len(file), np.float32)
-            errors[name][start : start + len(a)] = values
+                errors[name] = scratch.empty((len(file),))
+            errors[name][block] = values
         pair = a.sh[:, 1:].astype(np.float64), b.sh[:, 1:].astype(np.float64)
         sums += [np.square(x).sum() for x in (pair[0] - pair[1], *pair)]
     return _summary(errors, sums, extent_of(splats), rows)

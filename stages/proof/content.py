@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import scratch
 from stages.base.blocks import blocks
 from stages.scene import Splats
 
@@ -47,6 +48,6 @@ def splats_by_rows(
     for rows in blocks(count) if count else [slice(0, 0)]:
         for name, values in values_of(rows).items():
             if name not in arrays:
-                arrays[name] = np.empty((count, *values.shape[1:]), np.float32)
+                arrays[name] = scratch.empty((count, *values.shape[1:]))
             arrays[name][rows] = values
     return splats_of(**arrays)

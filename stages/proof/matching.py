@@ -7,8 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import scratch
 from stages.base.blocks import blocks, passing
 from stages.scene import Splats, dc_to_rgb
+from stages.scene.quantiles import quantiles
 
 Rows = NDArray[np.intp]
 
@@ -30,7 +32,7 @@ def extent_of(splats: Splats) -> float:
     where there is no such length. Never 0."""
     if len(splats) == 0:
         return 1.0
-    low, high = np.percentile(splats.means.astype(np.float64), (5, 95), axis=0)
+    low, high = quantiles(splats.means, (0.05, 0.95))
     largest = float(np.exp(min(float(splats.log_scales.max()), 80.0)))
     return float(np.linalg.norm(high - low)) or max(largest, 1e-12)
 
@@ -67,7 +69,7 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
 
 def _values(splats: Splats) -> NDArray[np.float32]:
     """[N, 7] opacity, colour and sizes, each as a multiple of what may differ."""
-    values = np.empty((len(splats), 7), np.float32)
+    values = scratch.empty((len(splats), 7))
     for rows in blocks(len(splats)):
         block = splats.take(rows)
         values[rows, 0] = block.opacities / _OPACITY

@@ -1,7 +1,8 @@
 """Proof that a file holds the splats that it was made from.
 
 A parser that did not write it reads it back, the rasteriser draws it from cameras that training
-never saw, and every value is compared with the original's.
+never saw, and every value is compared with the original's. Of very many splats those in the middle
+are drawn: drawing takes more memory than they do.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.blocks import blocks
 from stages.base.lazy import named
 from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
@@ -21,6 +23,7 @@ from stages.measure.judge import CAP_DB, decibels
 from stages.proof import diagnosis, second_readers
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
+from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
 from stages.raster.draw import renderer, settings_of
 from stages.scene import Camera, Splats, View, split_held_out, spread_over
@@ -29,6 +32,7 @@ from stages.scene.framing import around
 _SIDE_PX = 480
 _CAMERAS = 3
 _MIDDLE = 0.5  # of the splats, to look at where no photographs tell: the rest is background
+_MOST_DRAWN = 1 << 22
 _LOSSLESS_DB = 45.0  # below it a file that should hold everything is wrong
 _LOSSY_DB = 30.0  # below it the loss is worth a warning
 
@@ -64,11 +68,13 @@ def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...
 class Prover:
     """Compares files with one original, whose pictures are drawn once.
 
-    splats: the original, as `rows.kept_rows` leaves it. came_as: the format of the file that it was
-    read from, "" if it was not; after a lossy one nothing can be asked of float32.
+    splats: the original, as `rows.kept_rows` leaves it. drawn: which of its rows are. came_as: the
+    format of the file that it was read from, "" if it was not; after a lossy one nothing can be
+    asked of float32.
     """
 
     splats: Splats
+    drawn: NDArray[np.bool_] | slice
     cameras: tuple[Camera, ...]
     pictures: tuple[NDArray[np.float32], ...]
     backend: str
@@ -82,9 +88,10 @@ class Prover:
         backend: str = AUTO,
         came_as: str = "",
     ) -> Prover:
-        draw = renderer(splats, backend=backend)
+        drawn = _middle(splats)
+        draw = renderer(splats.take(drawn), settings_of(splats), backend)
         pictures = tuple(draw(camera).image for camera in cameras)
-        return cls(splats, cameras, pictures, backend, came_as)
+        return cls(splats, drawn, cameras, pictures, backend, came_as)
 
     def prove(self, path: Path, exact: bool = False) -> Proof:
         """Read `path` with a second parser, draw it and compare. Nothing is raised for a file
@@ -109,9 +116,9 @@ class Prover:
         return self._compared(content, names, lossy)
 
     def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:
-        by_camera = self._decibels(content)
-        worst = min(by_camera, default=CAP_DB)
         found = differences(self.splats, content, *names)
+        by_camera = self._decibels(content, found.rows)
+        worst = min(by_camera, default=CAP_DB)
         figures = {
             "verify_db": round(worst, 2),
             "verify_mean_db": round(float(np.mean(by_camera)), 2) if by_camera else worst,
@@ -127,15 +134,30 @@ class Prover:
         loss_db = worst if lossy and worst < _LOSSY_DB and not fault else None
         return Proof(len(content.splats), figures, fault, loss_db)
 
-    def _decibels(self, content: FileContent) -> list[float]:
-        """By camera. The camera is moved into the file's axes, not the file's splats into ours:
-        so the turn of positions, rotations and SH is checked by something other than itself."""
-        draw = renderer(content.splats, settings_of(self.splats), self.backend)
+    def _decibels(self, content: FileContent, rows: Rows) -> list[float]:
+        """By camera; rows: see `Differences`. The camera is moved into the file's axes, not the
+        file's splats into ours: so the turn of positions, rotations and SH is checked by something
+        other than itself."""
+        drawn = self.drawn if isinstance(self.drawn, slice) else self.drawn[rows]
+        draw = renderer(content.splats.take(drawn), settings_of(self.splats), self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
             decibels(draw(camera).image, np.clip(picture, 0.0, 1.0))
             for camera, picture in zip(moved, self.pictures, strict=True)
         ]
+
+
+def _middle(splats: Splats) -> NDArray[np.bool_] | slice:
+    """Rows that are drawn: all, or the `_MOST_DRAWN` nearest to the middle."""
+    if len(splats) <= _MOST_DRAWN:
+        return slice(None)
+    middle = [np.median(splats.means[:, axis]) for axis in range(3)]
+    far = np.empty(len(splats), np.float32)
+    for rows in blocks(len(splats)):
+        far[rows] = np.linalg.norm(splats.means[rows] - middle, axis=1)
+    drawn = np.zeros(len(splats), bool)
+    drawn[np.argpartition(far, _MOST_DRAWN)[:_MOST_DRAWN]] = True
+    return drawn
 
 
 def _drawable(content: FileContent) -> FileContent:

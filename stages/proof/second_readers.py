@@ -20,10 +20,18 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base import scratch
 from stages.base.blocks import forget, passing
 from stages.base.lazy import named
 from stages.formats import format_of
-from stages.proof.content import Y_DOWN, Y_UP, FileContent, logits, splats_of
+from stages.proof.content import (
+    Y_DOWN,
+    Y_UP,
+    FileContent,
+    logits,
+    splats_by_rows,
+    splats_of,
+)
 from stages.scene import Splats
 
 __all__ = ["FileContent", "read_back"]
@@ -48,11 +56,11 @@ def ply(path: Path) -> Splats:
     per_channel = sum(name.startswith("f_rest_") for name in names) // 3
     count = len(vertex.data)
     arrays: dict[str, NDArray[np.float32]] = {
-        "means": np.zeros((count, 3), np.float32),
-        "quaternions": np.zeros((count, 4), np.float32),
-        "log_scales": np.zeros((count, 3), np.float32),
-        "opacity_logits": np.zeros(count, np.float32),
-        "sh": np.zeros((count, per_channel + 1, 3), np.float32),
+        "means": scratch.empty((count, 3)),
+        "quaternions": scratch.empty((count, 4)),
+        "log_scales": scratch.empty((count, 3)),
+        "opacity_logits": scratch.empty((count,)),
+        "sh": scratch.empty((count, per_channel + 1, 3)),
     }
     for part in passing(count, _PLY_ROWS):
         rows = vertex.data[part]
@@ -106,16 +114,22 @@ def html(path: Path) -> Splats:
 
 
 def splat(path: Path) -> Splats:
-    records = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 32)
-    floats = np.ascontiguousarray(records[:, :24]).view("<f4")
-    colours = records[:, 24:28].astype(np.float32) / 255
-    return splats_of(
-        means=floats[:, :3],
-        quaternions=(records[:, 28:].astype(np.float32) - 128) / 128,
-        log_scales=np.log(floats[:, 3:], dtype=np.float64),
-        opacity_logits=logits(colours[:, 3]),
-        sh=((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
-    )
+    content, size = _Bytes(path), path.stat().st_size
+    assert size % 32 == 0, "its records are not all whole"
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        part = np.frombuffer(content[32 * rows.start : 32 * rows.stop], np.uint8).reshape(-1, 32)
+        floats = np.ascontiguousarray(part[:, :24]).view("<f4")
+        colours = part[:, 24:28].astype(np.float32) / 255
+        return {
+            "means": floats[:, :3],
+            "quaternions": (part[:, 28:].astype(np.float32) - 128) / 128,
+            "log_scales": np.log(floats[:, 3:], dtype=np.float64),
+            "opacity_logits": logits(colours[:, 3]),
+            "sh": ((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
+        }
+
+    return splats_by_rows(size // 32, values_of)
 
 
 class _Bytes:

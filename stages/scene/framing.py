@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera, look_at
+from stages.scene.quantiles import quantiles
 from stages.scene.splats import Splats
 
 _WIDTH_WITHOUT_A_PHOTOGRAPH_PX = 960
@@ -20,10 +21,7 @@ def in_front_of(splats: Splats) -> Camera:
 def around(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
     """`count` cameras evenly around the middle `part` of the splats, the first in front; each sees
     all of that part."""
-    means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
-    if len(means) == 0:
-        means = np.zeros((1, 3))
-    low, high = np.quantile(means, (0.5 - part / 2, 0.5 + part / 2), axis=0)
+    low, high = quantiles(splats.means, (0.5 - part / 2, 0.5 + part / 2))
     middle = (low + high) / 2
     distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
     width = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
 from stages.scene.capture import TRANSPARENT, View, scene_extent
+from stages.scene.quantiles import quantiles
 
 NEAR_SHARE = 0.01  # of the cameras' extent: nearer than that no photograph is in focus
 # Of the box of the middle 98 % of the splats, where no camera tells: a scene is mostly seen from
 # within or just outside its box, which is then some two to three extents across.
 NEAR_SHARE_OF_BOX = 0.004
-_MIDDLE_PERCENT = (1, 99)
+_MIDDLE = (0.01, 0.99)
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,7 @@ def near_plane(views: tuple[View, ...]) -> float:
 
 def near_plane_of(means: NDArray[np.floating]) -> float:
     """A near plane for splats [N, 3] that come without cameras, world units."""
-    known = means[np.isfinite(means).all(axis=1)].astype(np.float64)
-    if len(known) == 0:
+    if not np.isfinite(means).all(axis=1).any():
         return NEAR_SHARE
-    low, high = np.percentile(known, _MIDDLE_PERCENT, axis=0)
+    low, high = quantiles(means, _MIDDLE)
     return max(NEAR_SHARE_OF_BOX * float(np.linalg.norm(high - low)), 1e-8)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -51,3 +53,15 @@ def test_a_disk_without_room_is_said_before_anything_is_written(tmp_path: Path) 
     with scratch.scratch_in(tmp_path), pytest.raises(SplatError) as refused:
         scratch.empty((1 << 44,))
     assert refused.value.code == "disk-full"
+
+
+def test_where_a_disk_only_helps_memory_does_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with scratch.scratch_in(tmp_path, spare=True):
+        assert isinstance(scratch.empty((1000,)), np.memmap)
+    with scratch.scratch_in(tmp_path / "none", spare=True):
+        assert type(scratch.empty((1000,))) is np.ndarray
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=7000))
+    with scratch.scratch_in(tmp_path, spare=True):
+        assert type(scratch.empty((1000,))) is np.ndarray, "the rest is for what is written"

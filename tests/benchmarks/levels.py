@@ -1,4 +1,4 @@
-"""What levels of detail cost where they are used: `python -m tests.benchmarks.levels FILE`.
+"""Levels of detail where they are used: `python -m tests.benchmarks.levels FILE [FEWEST]`.
 
 Each level is drawn from three sides, from as far away as its splats are a pixel wide (two standard
 deviations of the median splat), and compared with the full scene, both antialiased. The last
@@ -47,8 +47,9 @@ def truth_of(full: Splats, camera: Camera, settings: Any) -> np.ndarray:
     return np.clip(found, 0, 1)
 
 
-def main(path: Path) -> None:
-    levels._FEWEST = 2000  # more of them than an asset of this size has
+def main(path: Path, fewest: int = 2000) -> None:
+    """fewest: no level follows one of so many; by default there are more than an asset has."""
+    levels._FEWEST = fewest
     full = formats.read(path)
     plain = settings_of(full)
     smooth = replace(plain, antialias=True)
@@ -68,4 +69,4 @@ def main(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *map(int, sys.argv[2:]))

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from splatcli.app import app
 from stages import formats
+from stages.base import scratch
 from tests.cli.help_text import help_of
 from tests.formats.truth import many_splats
 
@@ -30,6 +31,19 @@ def test_any_format_becomes_any_other(tmp_path: Path, source: str, target: str) 
     formats.write(tmp_path / f"a.{source}", many_splats(20))
     converted(tmp_path / f"a.{source}", tmp_path / f"b.{target}", "--quiet")
     assert len(formats.read(tmp_path / f"b.{target}")) == 20
+
+
+@pytest.mark.parametrize("ending", ["ply", "splat", "sog"])
+def test_through_the_disk_it_comes_out_the_same(
+    tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As large scenes go."""
+    formats.write(tmp_path / "a.ply", many_splats(3000))
+    first, again = (tmp_path / f"{name}.{ending}" for name in "bc")
+    told = converted(tmp_path / "a.ply", first)[1]
+    monkeypatch.setattr(scratch, "LARGE_BYTES", 1)
+    assert converted(tmp_path / "a.ply", again)[1] == told.replace("b." + ending, "c." + ending)
+    assert first.read_bytes() == again.read_bytes()
 
 
 def test_usd_is_read_and_written_too(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from plyfile import PlyData
 
 from stages import formats
 from stages.formats import splat32
+from stages.proof import prover as proving
 from stages.proof import usd_validators
 from stages.proof.prover import Proof, Prover, cameras_for
 from stages.proof.second_readers import read_back
@@ -277,3 +278,22 @@ def test_what_the_usd_librarys_validators_find_is_a_fault(
     assert old in text
     path.write_text(text.replace(old, new))
     assert word in prover.prove(path).fault
+
+
+@pytest.mark.parametrize("name", ["ply", "sog"])
+def test_of_very_many_splats_the_middle_is_drawn_and_all_are_compared(
+    scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(proving, "_MOST_DRAWN", len(scene.splats) // 2)
+    cameras = cameras_for(scene.splats, scene.reconstruction.views)
+    some = Prover.of(scene.splats, cameras)
+    right = written(some, tmp_path, name, scene.splats)
+    assert not right.fault
+    assert right.figures["verify_db"] > 30
+    assert isinstance(some.drawn, np.ndarray)
+    assert np.count_nonzero(some.drawn) == len(scene.splats) // 2
+    far = scene.splats.means.copy()
+    outside = int(np.flatnonzero(~some.drawn)[0])
+    far[outside] += 100
+    wrong = written(some, tmp_path, name, replace(scene.splats, means=far))
+    assert wrong.figures["max_position_error"] > 50
