@@ -65,8 +65,8 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Ray cluster that takes runs or blocks (HOST:PORT, ray://HOST:PORT, auto), or local:N "
-        'for N workers of this machine: pip install "splat\\[cluster]".',
+        help="Ray cluster that takes runs, or one run's blocks and shares of its matching "
+        '(HOST:PORT, ray://HOST:PORT, auto), or local:N for N workers of this machine: pip install "splat\\[cluster]".',
         show_default="this process",
     ),
 ]

@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from splatcli import cluster, console, jobs, options
-from splatcli.tasks import Ending, Task, need_of
+from splatcli.tasks import Ending, Run, need_of
 from stages import STAGE_NAMES
 from stages.base.atomic import make_folder, replacing
 from stages.base.errors import Family, SplatError
@@ -56,7 +56,7 @@ def batch(
     for what concerns all of them, and Interrupted."""
     settings = jobs.fresh_settings(options.given_only(given))
     out = out.absolute()  # workers stand elsewhere
-    tasks = [Task(out / name, path, settings) for name, path in named(captures).items()]
+    tasks = [Run(out / name, path, settings) for name, path in named(captures).items()]
     make_folder(out)
     with locked(out), cluster.engine_at(address, out, captures) as engine:
         board = Board(out, [task.run_folder.name for task in tasks])

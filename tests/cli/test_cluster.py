@@ -126,3 +126,18 @@ def test_blocks_are_the_same_whoever_trains_them(folder: Path) -> None:
         address, kills = f"local:{workers}", int(workers == 2)
         found = blocks_of(folder, f"by-{workers}", "--cluster", address, kills=kills)
         assert found == here, workers
+
+
+def cameras_of(folder: Path, name: str, *more: str, kills: int = 0) -> dict[str, str]:
+    """Outputs of all stages for the whole sample."""
+    command = processes.splat("process", str(sample.PHOTOS), "--out", name, *SMALL, *more)
+    assert with_kills(folder, command, kills) == kills
+    return outputs(folder / name, "")
+
+
+def test_shares_of_structure_are_the_same_whoever_does_them(folder: Path) -> None:
+    here = cameras_of(folder, "unshared")
+    for workers in (1, 2, 4):
+        address, kills = f"local:{workers}", int(workers == 2)
+        found = cameras_of(folder, f"shared-{workers}", "--cluster", address, kills=kills)
+        assert found == here, workers
