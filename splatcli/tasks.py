@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from splatcli import console
 from stages.base.errors import Family, Interrupted, SplatError
@@ -20,6 +20,9 @@ from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
     from stages.structure.shares import Share
+
+
+Place: TypeAlias = Path | str  # a path, or a URL
 
 
 class Task(Protocol):

@@ -104,6 +104,15 @@ def test_workers_that_are_killed_change_nothing(folder: Path) -> None:
         assert [row["status"] for row in csv.DictReader(file)] == ["done", "done"]
 
 
+def test_runs_at_urls_are_the_same_and_a_killed_worker_changes_nothing(folder: Path) -> None:
+    url = folder.as_uri()
+    command = processes.splat(
+        *("batch", f"{url}/captures/*", "--out", f"{url}/far", *SMALL, "--cluster", "local:2")
+    )
+    assert with_kills(folder, command, 2) == 2
+    assert outputs(folder / "far") == outputs(folder / "alone")
+
+
 def test_a_head_that_is_killed_leaves_nobody_behind_and_is_gone_on_with(folder: Path) -> None:
     command = words("headless", "--cluster", "local:2")
     with processes.running(command, cwd=folder) as process:
