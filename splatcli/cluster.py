@@ -14,7 +14,7 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from threading import Event
@@ -108,7 +108,9 @@ class Cluster:
 
 def _with_threads(task: Task, threads: int) -> Ending:
     os.environ["SPLAT_THREADS"] = str(threads)
-    return work_on(task)
+    ending = work_on(task)
+    where = f" (On {socket.gethostname()}.)"  # whose disk is full, say
+    return replace(ending, said=ending.said + where) if ending.status else ending
 
 
 @contextmanager
@@ -184,6 +186,10 @@ def check(answers: Sequence[Answer], ours: str, token: Path | None = None) -> No
 
 def _ray() -> Any:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # A cluster asks for the token where there is one; who joins it does not show it by itself.
+    token = Path.home() / ".ray" / "auth_token"
+    if token.is_file() or os.environ.keys() & {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}:
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
     try:
         return importlib.import_module("ray")
     except ImportError:

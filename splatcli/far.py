@@ -7,6 +7,7 @@ away first: a stage that is half there is not there.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,6 +21,7 @@ from splatcli.tasks import Place, Run
 from stages.base.atomic import make_folder
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Stage
+from stages.run.failures import disk_full
 from stages.run.lock import locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Listener
@@ -163,6 +165,8 @@ class Folder:
             hint = "Check your rights there, and that credentials are set where the worker runs."
             raise _error("url-not-permitted", self.url, "It may not be used", hint) from error
         except Exception as error:
+            if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+                raise disk_full("copying", Path(tempfile.gettempdir())) from error
             said = f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
             hint = "Give the same command again: what is finished is kept."
             raise _error("url-failed", self.url, said, hint, Family.RESOURCES) from error
@@ -203,7 +207,9 @@ class FarRun:
             try:
                 listeners = Together(put_back, listener or Listener())
                 Run(run_folder, photos, self.settings).work(listeners)
-            except SplatError as error:  # scratch folders tell nobody anything
+            except SplatError as error:
+                if error.code == "disk-full":  # the scratch folder's
+                    raise
                 said = error.given.replace(str(run_folder), str(self.run_folder))
                 error.given = said.replace(str(photos), str(self.photos))
                 raise

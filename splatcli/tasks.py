@@ -115,6 +115,8 @@ def work_on(task: Task, listener: Listener | None = None) -> Ending:
         task.work(listener)
     except Interrupted:
         raise
+    except SplatError as error:
+        return ending_of(error)
     except Exception as error:
         known = as_splat_error(error, "the run", task.folder)
         return ending_of(known or error)
