@@ -30,7 +30,7 @@ def _sfm(
     folder: Path,
     report: Report,
 ) -> Any:
-    if settings.cameras is not None:  # a tenth of the pairs, and cameras of their own
+    if settings.cameras is not None:  # few pairs, of cameras of their own
         return plain.run(inputs, settings, folder, report)
     run: Callable[..., Any] = plain.run
     with open_engine(pipeline.run_folder, Listener()) as engine:

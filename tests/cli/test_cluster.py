@@ -137,16 +137,22 @@ def test_blocks_are_the_same_whoever_trains_them(folder: Path) -> None:
         assert found == here, workers
 
 
-def cameras_of(folder: Path, name: str, *more: str, kills: int = 0) -> dict[str, str]:
-    """Outputs of all stages for the whole sample."""
-    command = processes.splat("process", str(sample.PHOTOS), "--out", name, *SMALL, *more)
-    assert with_kills(folder, command, kills) == kills
+def cameras_of(folder: Path, address: str | None, kills: int = 0) -> dict[str, str]:
+    """Outputs of the sample's first two stages."""
+    name = f"at-{address}"
+    code = (
+        "from pathlib import Path; from splatcli import jobs; "
+        "from stages.run.pipeline import Pipeline; "
+        f"whole = Pipeline(Path({name!r}), Path({str(sample.PHOTOS)!r})); "
+        f"jobs.in_blocks(whole, {address!r}).run(jobs.defaults(), until='sfm')"
+    )
+    assert with_kills(folder, processes.python(code), kills) == kills
     return outputs(folder / name, "")
 
 
-def test_shares_of_structure_are_the_same_whoever_does_them(folder: Path) -> None:
-    here = cameras_of(folder, "unshared")
+def test_shares_of_structure_are_the_same_whoever_does_them(tmp_path: Path) -> None:
+    here = cameras_of(tmp_path, None)
+    assert len(here) > 24
     for workers in (1, 2, 4):
-        address, kills = f"local:{workers}", int(workers == 2)
-        found = cameras_of(folder, f"shared-{workers}", "--cluster", address, kills=kills)
+        found = cameras_of(tmp_path, f"local:{workers}", kills=int(workers == 2))
         assert found == here, workers
