@@ -65,8 +65,9 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Ray cluster that takes runs or blocks (HOST:PORT, ray://HOST:PORT, auto), or local:N "
-        'for N workers of this machine: pip install "splat\\[cluster]".',
+        help="Ray cluster that takes runs, or one run's blocks and shares of its matching "
+        "(HOST:PORT, ray://HOST:PORT, auto), or local:N for N workers of this machine: "
+        'pip install "splat\\[cluster]".',
         show_default="this process",
     ),
 ]
@@ -125,12 +126,17 @@ def process(
 
 def batch(
     captures: Annotated[
-        list[Path], typer.Argument(help="Folders of photographs, or videos: one run for each.")
+        list[str],
+        typer.Argument(
+            help="Folders of photographs, or videos: one run for each. Also URLs that fsspec "
+            "knows, such as 's3://bucket/captures/*'."
+        ),
     ],
     *,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the run folders and batch.csv.")
-    ] = Path("runs"),
+        str,
+        typer.Option("--out", "-o", help="Folder, or URL, for the run folders and batch.csv."),
+    ] = "runs",
     cluster: Cluster = None,
     quiet: Quiet = False,
     as_json: AsJson = False,

@@ -11,7 +11,6 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatcli import block_folders
-from splatcli.tasks import Engine, Task, need_of
+from splatcli.tasks import Engine, OpenEngine, Run, do_all, need_of
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Report, Stage
 from stages.base.words import counted
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats, View
     from stages.training.clock import Spent
 
-OpenEngine = Callable[[Path, Listener], AbstractContextManager[Engine]]
 FOLDER, COARSE = "blocks", "coarse"
 PHOTOGRAPHS_A_BLOCK = 250
 # As much less than is asked of the whole; and no more splats than one of the blocks gets.
@@ -43,16 +41,9 @@ COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4
 
 
 def in_blocks(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
-    """The pipeline, training in blocks where its settings ask for it. open_engine(folder,
-    listener): what trains them there."""
-
-    def replaced(stage: Stage) -> Stage:
-        run = partial(_train, pipeline, stage, open_engine)
-        return replace(stage, run=run) if stage.name == "train" else stage
-
-    layout = pipeline.layout
-    pipeline.layout = replace(layout, stages=tuple(map(replaced, layout.stages)))
-    return pipeline
+    """The pipeline, training in blocks where its settings ask for it."""
+    plain = pipeline.layout.stage("train")
+    return pipeline.with_run("train", partial(_train, pipeline, plain, open_engine))
 
 
 def blocks_wanted(asked: str, photographs: int) -> int:
@@ -234,22 +225,15 @@ class _Scene:
     def _run(self, names: Sequence[str], most_splats: int) -> None:
         """Train in the run folders of these names. Raises SplatError for the first that failed,
         once the others have ended."""
-        tasks = [Task(self.root / name, until="train") for name in names]
-        need = need_of(replace(self.settings, max_splats=most_splats))
-        failed = None
-        ended = self.engine.results(tasks, need, self.report.stop_requested)
-        for done, (number, ending) in enumerate(ended, start=1):
-            self.report.progress(done, len(names), "blocks")
-            if ending.status and failed is None:
-                failed = SplatError(
-                    ending.code,
-                    given=f"In {tasks[number].run_folder}: {ending.said}",
-                    wanted="Every block trained.",
-                    hint="Give the same command again: blocks that are finished are kept.",
-                    family=Family(max(ending.status, Family.USAGE)),
-                )
-        if failed is not None:
-            raise failed
+        tasks = [Run(self.root / name, until="train") for name in names]
+        do_all(
+            self.engine,
+            tasks,
+            need_of(replace(self.settings, max_splats=most_splats)),
+            self.report.stop_requested,
+            lambda done: self.report.progress(done, len(names), "blocks"),
+            hint="Give the same command again: blocks that are finished are kept.",
+        )
 
     def _joined(
         self,

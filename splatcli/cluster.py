@@ -14,13 +14,13 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from threading import Event
 from typing import Any
 
-from splatcli.tasks import Ending, Engine, InTurn, Need, Task, work_on
+from splatcli.tasks import Ending, Engine, InTurn, Need, Place, Task, work_on
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.run.pipeline import Listener
@@ -108,12 +108,14 @@ class Cluster:
 
 def _with_threads(task: Task, threads: int) -> Ending:
     os.environ["SPLAT_THREADS"] = str(threads)
-    return work_on(task)
+    ending = work_on(task)
+    where = f" (On {socket.gethostname()}.)"  # whose disk is full, say
+    return replace(ending, said=ending.said + where) if ending.status else ending
 
 
 @contextmanager
 def engine_at(
-    address: str | None, folder: Path, paths: Iterable[Path], listener: Listener | None = None
+    address: str | None, folder: Place, paths: Iterable[Place], listener: Listener | None = None
 ) -> Iterator[Engine]:
     """What does the work in `folder`: a cluster, or without an address this process, which tells
     the listener. Raises as `opened`."""
@@ -125,26 +127,39 @@ def engine_at(
 
 
 @contextmanager
-def opened(address: str, folder: Path, paths: Iterable[Path]) -> Iterator[Cluster]:
+def opened(address: str, folder: Place, paths: Iterable[Place]) -> Iterator[Cluster]:
     """The cluster at `address` ("local:N": N workers of this machine, started and ended here).
 
     Each of its machines must have this splat, and see `folder` (which exists, and may be written
-    to) and what exists of `paths`. Raises SplatError: cluster-not-installed, cluster-not-found,
-    cluster-other-splat, cluster-folder-unseen.
+    to, or is a URL) and what exists of `paths`. Raises SplatError: cluster-not-installed,
+    cluster-not-found, cluster-other-splat, cluster-folder-unseen.
     """
     ray = _ray()
     _start(ray, address)
     try:
-        with tempfile.NamedTemporaryFile(dir=folder, prefix=".seen-") as token:
-            wanted = [token.name, *(str(path.absolute()) for path in paths if path.exists())]
-            answers = _asked(ray, wanted)
-            check(answers, edition(), Path(token.name))
+        with _token(folder) as token:
+            paths = list(paths)
+            local = (p.absolute() for p in paths if isinstance(p, Path) and p.exists())
+            far = [path for path in (*paths, folder) if isinstance(path, str)]
+            here = [path for path in (token, *local) if path is not None]
+            answers = _asked(ray, [*map(str, here), *far])
+            check(answers, edition(), token)
         yield Cluster(ray, tuple(answers))
     finally:
         ray.shutdown()
 
 
-def check(answers: Sequence[Answer], ours: str, token: Path) -> None:
+@contextmanager
+def _token(folder: Place) -> Iterator[Path | None]:
+    """A file that is new there; none at a URL."""
+    if isinstance(folder, str):
+        yield None
+        return
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".seen-") as file:
+        yield Path(file.name)
+
+
+def check(answers: Sequence[Answer], ours: str, token: Path | None = None) -> None:
     """Raises SplatError (cluster-other-splat, cluster-folder-unseen) for workers that cannot."""
     for answer in answers:
         if answer.edition != ours:
@@ -157,18 +172,24 @@ def check(answers: Sequence[Answer], ours: str, token: Path) -> None:
                 family=Family.USAGE,
             )
         if answer.unseen:
-            folder = token.parent if str(token) in answer.unseen else Path(answer.unseen[0])
+            new = token is not None and str(token) in answer.unseen
+            folder = token.parent if token is not None and new else answer.unseen[0]
             raise SplatError(
                 "cluster-folder-unseen",
                 given=f"The worker {answer.host} does not see {folder}.",
                 wanted="Photographs and run folders where all workers see them, at the same path.",
-                hint="Put them on a folder that is shared, and name that.",
+                hint="Put them on a folder that is shared, and name that; or at a URL that all of "
+                "them can read.",
                 family=Family.USAGE,
             )
 
 
 def _ray() -> Any:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # A cluster asks for the token where there is one; who joins it does not show it by itself.
+    token = Path.home() / ".ray" / "auth_token"
+    if token.is_file() or os.environ.keys() & {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}:
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
     try:
         return importlib.import_module("ray")
     except ImportError:
@@ -242,9 +263,22 @@ def question() -> Callable[[list[str]], tuple[str, list[str]]]:
     """(edition, paths that are not seen), for a worker that may have no splat: a function of a
     function, so that it travels as itself and not as a name to import."""
 
+    def seen(path: str) -> bool:
+        import os
+
+        if "://" not in path:
+            return os.path.exists(path)
+        try:
+            import fsspec
+
+            system, root = fsspec.core.url_to_fs(path)
+            system.exists(root)
+        except Exception:  # whatever is missing there: a package, a right, a network
+            return False
+        return True
+
     def ask(paths: list[str]) -> tuple[str, list[str]]:
         import importlib.metadata
-        import os
 
         try:
             from splatcli import cluster
@@ -255,6 +289,6 @@ def question() -> Callable[[list[str]], tuple[str, list[str]]]:
                 found = importlib.metadata.version("splat")
             except importlib.metadata.PackageNotFoundError:
                 found = ""
-        return found, [path for path in paths if not os.path.exists(path)]
+        return found, [path for path in paths if not seen(path)]
 
     return ask

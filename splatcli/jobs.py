@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from splatcli import blocks, cluster, console, options, progress, summary
+from splatcli import blocks, cluster, console, options, progress, sharing, summary
 from splatcli import live_view as watching
 from splatcli.compiling import Compiling
 from splatcli.folders import DEFAULT, find_run_folder
@@ -266,12 +266,15 @@ def run_stage(
 
 
 def in_blocks(pipeline: Pipeline, address: str | None) -> Pipeline:
-    """The pipeline; if it has blocks, the cluster at `address` trains them, or this process."""
+    """The pipeline; if it has blocks, the cluster at `address` trains them, or this process. A
+    cluster does shares of structure from motion, too."""
 
     def opened(folder: Path, listener: Listener) -> AbstractContextManager[Engine]:
-        return cluster.engine_at(address, folder, [pipeline.run_folder], listener)
+        seen = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
+        return cluster.engine_at(address, folder, seen, listener)
 
-    return blocks.in_blocks(pipeline, opened)
+    shared = pipeline if address is None else sharing.with_shares(pipeline, opened)
+    return blocks.in_blocks(shared, opened)
 
 
 def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from stages.scene import Capture, Reconstruction
     from stages.structure.job import Job
     from stages.structure.ladder import Attempt, Climb
+    from stages.structure.shares import Hands
     from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PHOTOGRAPHS = 3
@@ -124,9 +125,14 @@ class SfmSettings:
 
 
 def run(
-    inputs: Mapping[str, Any], settings: SfmSettings, folder: Path, report: Report
+    inputs: Mapping[str, Any],
+    settings: SfmSettings,
+    folder: Path,
+    report: Report,
+    hands: Hands | None = None,
 ) -> Reconstruction:
-    """Reconstruct the capture in inputs["ingest"]; see the module's docstring.
+    """Reconstruct the capture in inputs["ingest"]; see the module's docstring. hands: who does
+    shares of features and matching (`structure.shares`), which changes no byte.
 
     Leaves in `folder`: reconstruction.json and arrays (`load` reads them), colmap/ (undistorted
     pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
@@ -152,6 +158,7 @@ def run(
         report=report,
         deadline=time.monotonic() + 60.0 * settings.max_minutes,
         allow_partial=settings.allow_partial,
+        hands=hands,
     )
     climbed = ladder.climb(
         bench.try_rung,

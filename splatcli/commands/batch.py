@@ -16,12 +16,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from splatcli import cluster, console, jobs, options
-from splatcli.tasks import Ending, Task, need_of
+from splatcli import cluster, console, far, jobs, options
+from splatcli.tasks import Ending, Place, need_of
 from stages import STAGE_NAMES
-from stages.base.atomic import make_folder, replacing
+from stages.base.atomic import replacing
 from stages.base.errors import Family, SplatError
-from stages.run.lock import locked
 from stages.run.manifest import Manifest
 
 TABLE = "batch.csv"
@@ -45,8 +44,8 @@ class Row:
 
 
 def batch(
-    captures: Sequence[Path],
-    out: Path,
+    captures: Sequence[str],
+    out: str,
     address: str | None,
     given: Mapping[str, Any],
     quiet: bool,
@@ -55,11 +54,11 @@ def batch(
     """Bring each capture's run to its end; exit with the worst status of all. Raises SplatError
     for what concerns all of them, and Interrupted."""
     settings = jobs.fresh_settings(options.given_only(given))
-    out = out.absolute()  # workers stand elsewhere
-    tasks = [Task(out / name, path, settings) for name, path in named(captures).items()]
-    make_folder(out)
-    with locked(out), cluster.engine_at(address, out, captures) as engine:
-        board = Board(out, [task.run_folder.name for task in tasks])
+    runs = far.place_of(out)
+    photos = named(far.spread_out(captures))
+    tasks = [far.run_at(far.inside(runs, name), path, settings) for name, path in photos.items()]
+    with far.kept(runs) as here, cluster.engine_at(address, runs, photos.values()) as engine:
+        board = Board(here, runs, list(photos))
         with board.shown(quiet, as_json):
             for number, ending in engine.results(tasks, need_of(settings["train"])):
                 board.ended(number, ending)
@@ -70,14 +69,13 @@ def batch(
         raise typer.Exit(board.worst)
 
 
-def named(captures: Sequence[Path]) -> dict[str, Path]:
+def named(captures: Sequence[Place]) -> dict[str, Place]:
     """Captures by the name of their run folder: the folder's or the video's own. Raises SplatError
     "batch-same-name"."""
-    found: dict[str, Path] = {}
-    taken: dict[str, Path] = {}
+    found: dict[str, Place] = {}
+    taken: dict[str, Place] = {}
     for path in captures:
-        whole = path.absolute()
-        name = whole.stem if whole.is_file() else whole.name
+        name = far.name_of(path)
         if not name or name.casefold() in taken:
             other = taken.get(name.casefold(), path)
             raise SplatError(
@@ -87,15 +85,16 @@ def named(captures: Sequence[Path]) -> dict[str, Path]:
                 hint="Name the folders above them (captures/*), or rename one.",
                 family=Family.USAGE,
             )
-        found[name] = taken[name.casefold()] = whole
+        found[name] = taken[name.casefold()] = path
     return found
 
 
 class Board:
-    """What is known of each run, on the screen and in batch.csv."""
+    """What is known of each run, on the screen and in batch.csv. out: the folder with what of the
+    runs tells of them. runs: the folder that was asked for."""
 
-    def __init__(self, out: Path, names: Sequence[str]) -> None:
-        self.out = out
+    def __init__(self, out: Path, runs: Place, names: Sequence[str]) -> None:
+        self.out, self.runs = out, runs
         self.rows = [Row(name) for name in names]
         self.worst = 0
         self.write()
@@ -103,6 +102,8 @@ class Board:
     def ended(self, number: int, ending: Ending) -> None:
         """Note how a run ended."""
         name = self.rows[number].capture
+        with suppress(SplatError):  # what cannot be read is told as blanks
+            far.look(self.runs, name, self.out)
         row = replace(figures_of(self.out / name), status=ending.code or DONE)
         self.rows[number] = row
         self.worst = max(self.worst, ending.status)
@@ -115,6 +116,8 @@ class Board:
             writer = csv.writer(f, lineterminator="\n")
             writer.writerow(field.name for field in fields(Row))
             writer.writerows(map(astuple, self.rows))
+        if isinstance(self.runs, str):
+            far.Folder.at(self.runs).put(self.out, [TABLE])
 
     def tell(self, number: int, ending: Ending, quiet: bool, as_json: bool) -> None:
         """A line, or an event, for a run that ended."""
@@ -158,7 +161,7 @@ class Board:
     def show(self, quiet: bool, as_json: bool) -> None:
         """The whole table, once all is over."""
         if as_json:
-            console.emit("result", folder=str(self.out), rows=[vars(row) for row in self.rows])
+            console.emit("result", folder=str(self.runs), rows=[vars(row) for row in self.rows])
             return
         if not quiet:
             console.table(
@@ -176,7 +179,7 @@ class Board:
                     for row in self.rows
                 ],
             )
-        console.out.print(str(self.out / TABLE), markup=False)
+        console.out.print(str(far.inside(self.runs, TABLE)), markup=False)
 
 
 def figures_of(run_folder: Path) -> Row:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -38,6 +39,12 @@ class Pipeline:
         self.run_folder = Path(run_folder)
         self.photos = Path(photos).absolute() if photos is not None else None
         self.layout = Layout(self.run_folder, every)
+
+    def with_run(self, name: str, run: Callable[..., Any]) -> Pipeline:
+        """This pipeline, the stage `name` done by `run`, which makes the same of the same."""
+        stages = (replace(s, run=run) if s.name == name else s for s in self.layout.stages)
+        self.layout = replace(self.layout, stages=tuple(stages))
+        return self
 
     def stage_folder(self, name: str) -> Path:
         """Where the finished output of a stage lies (whether or not it does yet)."""

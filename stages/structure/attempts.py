@@ -11,7 +11,8 @@ import json
 import re
 import sqlite3
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -24,6 +25,7 @@ from stages.structure.gates import Failure, Figures, check_keypoints, check_mode
 from stages.structure.job import Job, looked_path
 from stages.structure.ladder import LADDER, Attempt, Rung
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
+from stages.structure.shares import Hands, hand_out_features, hand_out_pairs
 from stages.structure.sparse_model import load_result, measure, without_odd_views
 
 MORE_FEATURES = 2.0  # times as many, at most
@@ -33,13 +35,15 @@ _SECONDS = "seconds.json"
 
 @dataclass
 class Workbench:
-    """Runs rungs for one capture. base: the job that rungs vary. deadline: time.monotonic()."""
+    """Runs rungs for one capture. base: the job that rungs vary. deadline: time.monotonic().
+    hands: who does shares of features and matching; None: this machine, unshared."""
 
     folder: Path
     base: Job
     report: Report
     deadline: float
     allow_partial: bool = False
+    hands: Hands | None = None
 
     def out_of_time(self) -> bool:
         return self.seconds_left() <= 0
@@ -125,6 +129,9 @@ class Workbench:
             return
         if database.exists():
             _repair_or_delete(database)
+        if self.hands is not None:
+            with self._timed("features"):
+                hand_out_features(job, self.hands, self._look)
         self._run(replace(job, step="features"), lambda: self._tick(job, "photographs"))
         marker.touch()
 
@@ -143,9 +150,24 @@ class Workbench:
             return job
         if not rung.drop_stationary:
             sqlite.repair(database)
+        if self.hands is not None:
+            self._share_matching(job, self.hands)
         self._run(replace(job, step="matching"), lambda: self._tick(job, "pairs"))
         marker.touch()
         return job
+
+    def _share_matching(self, job: Job, hands: Hands) -> None:
+        """Until no pairs are left to choose: which those are depends on how the others matched."""
+        left = 1
+        while left:
+            self._run(replace(job, step="choosing"), lambda: self._tick(job, "photographs"))
+            with self._timed("matching"):
+                left = hand_out_pairs(job, hands, self._look)
+
+    def _look(self) -> None:
+        """At the clock."""
+        if self.out_of_time():
+            raise WorkerTimedOut
 
     def _mapping(self, job: Job, rung: Rung) -> None:
         if _finished(Path(job.out)):
@@ -161,11 +183,16 @@ class Workbench:
     def _run(self, job: Job, tick: Callable[[], None], max_seconds: float | None = None) -> None:
         seconds = self.seconds_left() if max_seconds is None else max_seconds
         Path(job.progress).unlink(missing_ok=True)
+        with self._timed("matching" if job.step == "choosing" else job.step):
+            run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+
+    @contextmanager
+    def _timed(self, step: str) -> Iterator[None]:
         started, before = time.monotonic(), self.seconds_by_step()
         try:
-            run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+            yield
         finally:
-            before[job.step] = before.get(job.step, 0.0) + time.monotonic() - started
+            before[step] = before.get(step, 0.0) + time.monotonic() - started
             with replacing(self.folder / _SECONDS) as path:
                 path.write_text(json.dumps(before))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import pycolmap
@@ -13,8 +14,9 @@ from stages.structure.job import CameraGuess, Job
 FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess where EXIF says nothing
 
 
-def create(path: Path, job: Job) -> None:
-    """A database with the cameras and photographs, ids = position + 1.
+def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
+    """A database with the cameras and photographs, ids = position + 1. only: of the photographs at
+    these positions.
 
     Written by hand because COLMAP trusts EXIF focal lengths that a resize made wrong. Appears
     under its name when complete.
@@ -30,6 +32,8 @@ def create(path: Path, job: Job) -> None:
         rig.add_ref_sensor(camera.sensor_id)
         database.write_rig(rig, use_rig_id=True)
     for image_id, (name, position) in enumerate(zip(job.names, job.camera_of, strict=True), 1):
+        if only is not None and image_id - 1 not in only:
+            continue
         image = pycolmap.Image()
         image.image_id = image_id
         image.name = name

@@ -19,7 +19,7 @@ from stages.base import memory
 from stages.base.memory import MIB
 from stages.structure import blank_database
 from stages.structure import database as sqlite
-from stages.structure.job import Job
+from stages.structure.job import Job, shares_path
 from stages.structure.ticks import Ticks
 
 LARGEST_SIDE = 3200  # pixels; larger photographs are made smaller for finding features
@@ -33,20 +33,32 @@ Features = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 def extract(job: Job) -> None:
-    """SIFT features of every photograph into the job's database; goes on where it stopped."""
+    """SIFT features of every photograph into the job's database; goes on where it stopped, with
+    what finished shares hold."""
     path = Path(job.database)
     if not path.exists():
         blank_database.create(path, job)
+    sqlite.gather(path, sorted(shares_path(job).glob("*.db")))
     have = sqlite.photographs_with_features(path)
-    ticks = Ticks(Path(job.progress))
     missing = [position for position in range(len(job.names)) if position not in have]
+    _extract(job, missing, len(have))
+
+
+def extract_share(job: Job) -> None:
+    """Those of the job's share of the photographs, into a database of their own."""
+    blank_database.create(Path(job.database), job, job.photographs)
+    _extract(job, list(job.photographs), 0)
+
+
+def _extract(job: Job, missing: list[int], have: int) -> None:
+    ticks = Ticks(Path(job.progress))
     cv2.setNumThreads(1)  # a thread a photograph is quicker than several
-    with pycolmap.Database.open(path) as database:
+    with pycolmap.Database.open(job.database) as database:
         for done, (position, (keypoints, descriptors)) in enumerate(_found(job, missing), 1):
             database.write_keypoints(position + 1, keypoints)
             plain = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors)
             database.write_descriptors(position + 1, plain)
-            ticks.write("finding features", len(have) + done, len(job.names))
+            ticks.write("finding features", have + done, have + len(missing))
 
 
 def _found(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:

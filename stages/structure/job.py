@@ -6,7 +6,11 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-STEPS = ("features", "matching", "mapping", "neighbours", "triangulation")
+STEPS = (
+    *("features", "matching", "mapping"),
+    *("neighbours", "triangulation"),  # of known cameras
+    *("choosing", "features share", "matching share"),  # where others help
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class Job:
     mapper: "incremental" or "global". loose: register photographs with fewer matches.
     other_pair: start from another pair of photographs than COLMAP would. refine: move the known
     cameras to where the matches want them. max_seconds: of mapping.
+    Of a share: source: the database of the whole job; photographs, or pairs: the positions that it
+    is about.
     """
 
     step: str
@@ -56,6 +62,9 @@ class Job:
     other_pair: bool = False
     refine: bool = False
     max_seconds: int = 3600
+    source: str = ""
+    photographs: tuple[int, ...] = ()
+    pairs: tuple[tuple[int, int], ...] = ()
 
     def write(self, path: Path) -> Path:
         path.write_text(json.dumps(asdict(self), ensure_ascii=False), encoding="utf-8")
@@ -67,6 +76,8 @@ class Job:
         data["names"] = tuple(data["names"])
         data["camera_of"] = tuple(data["camera_of"])
         data["masks"] = tuple(data["masks"])
+        data["photographs"] = tuple(data["photographs"])
+        data["pairs"] = tuple((first, second) for first, second in data["pairs"])
         data["cameras"] = tuple(CameraGuess(**camera) for camera in data["cameras"])
         return cls(**data)
 
@@ -80,3 +91,23 @@ def known_path(job: Job) -> Path:
 def looked_path(job: Job) -> Path:
     """Where matching says how many pairs it looked at before it chose some."""
     return Path(job.database).with_suffix(".looked")
+
+
+def alike_path(job: Job) -> Path:
+    """Where matching keeps what its first look found: alike [P, P]."""
+    return Path(job.database).with_suffix(".alike.npz")
+
+
+def words_path(job: Job) -> Path:
+    """Where matching keeps the vocabulary of the whole job: [W, 128]."""
+    return Path(job.source or job.database).with_suffix(".words.npy")
+
+
+def chosen_path(job: Job) -> Path:
+    """Where the step "choosing" leaves the pairs to match next, as JSON."""
+    return Path(job.database).with_suffix(".chosen.json")
+
+
+def shares_path(job: Job) -> Path:
+    """The folder for finished shares of the job."""
+    return Path(job.database).with_suffix(".shares")

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import functools
-import threading
+import json
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from stages.base.atomic import replacing
+from stages.structure import blank_database, nearest, pairs, retrieval
 from stages.structure import database as sqlite
-from stages.structure import nearest, pairs, retrieval
-from stages.structure.job import Job, looked_path
+from stages.structure.job import (
+    Job,
+    alike_path,
+    chosen_path,
+    looked_path,
+    shares_path,
+    words_path,
+)
 from stages.structure.pairs import Pair
 from stages.structure.ticks import Ticks
 from stages.structure.words import SAMPLE, Sorted, sort_by_word, two_words, vocabulary
@@ -27,91 +37,132 @@ _KEPT = 256  # photographs whose sorted features stay in memory
 
 def match(job: Job) -> None:
     """Match and verify pairs of photographs; pairs that the database holds are not done again."""
-    photographs = len(job.names)
-    known = sqlite.inliers_of_pairs(Path(job.database))
-    with pycolmap.Database.open(job.database) as database:
-        matcher = _Matcher(job, database, known)
-        if job.matching == "exhaustive":
-            matcher.run(pairs.every(photographs))
-        elif job.matching == "sequential":
-            matcher.run(pairs.sequential(photographs))
-        else:
-            alike = _first_look(job, matcher.album)
-            first = pairs.promising(alike)
-            inliers = matcher.run(first)
-            matcher.run(pairs.closing_gaps(alike, first, inliers))
+    with _matcher(job, job.database) as matcher:
+        for wanted in _rounds(job, matcher.album, matcher.inliers):
+            matcher.run(wanted)
 
 
 def match_pairs(job: Job, wanted: list[Pair]) -> None:
     """Match and verify the `wanted` pairs, less those that the database holds."""
-    known = sqlite.inliers_of_pairs(Path(job.database))
-    with pycolmap.Database.open(job.database) as database:
-        _Matcher(job, database, known).run(wanted)
+    with _matcher(job, job.database) as matcher:
+        matcher.run(wanted)
+
+
+def choose(job: Job) -> None:
+    """Take in what finished shares hold, and leave the pairs to match next (`chosen_path`): none
+    once `match` would find nothing to do."""
+    database = Path(job.database)
+    sqlite.gather(database, sorted(shares_path(job).glob("*.db")))
+    inliers = sqlite.inliers_of_pairs(database)
+    missing: list[Pair] = []
+    with sqlite.Features(database) as features:
+        album = _Album(job, features)
+        album.words()  # once, and not in each share
+        for wanted in _rounds(job, album, inliers):
+            missing = [pair for pair in wanted if pair not in inliers]
+            if missing:
+                break
+    chosen_path(job).write_text(json.dumps(missing))
+
+
+def match_share(job: Job) -> None:
+    """Match and verify the job's share of the pairs, into a database of their own."""
+    blank_database.create(Path(job.database), job, ())
+    sqlite.take_cameras(Path(job.database), Path(job.source))
+    with _matcher(job, job.source, still=True) as matcher:
+        matcher.run(list(job.pairs))
+
+
+@contextmanager
+def _matcher(job: Job, features: str, still: bool = False) -> Iterator[_Matcher]:
+    """features: the database that has them, see `database.Features`. Readers leave first: the last
+    to close a database puts it in order."""
+    with (
+        pycolmap.Database.open(job.database) as database,
+        sqlite.Features(Path(features), still) as found,
+    ):
+        yield _Matcher(job, database, found)
+
+
+def _rounds(job: Job, album: _Album, inliers: Mapping[Pair, int]) -> Iterator[list[Pair]]:
+    """Pairs to match, each list once the ones before are matched. inliers: of those that are."""
+    photographs = len(job.names)
+    if job.matching == "exhaustive":
+        yield pairs.every(photographs)
+    elif job.matching == "sequential":
+        yield pairs.sequential(photographs)
+    else:
+        alike = _first_look(job, album)
+        first = pairs.promising(alike)
+        yield first
+        yield pairs.closing_gaps(alike, first, {pair: inliers[pair] for pair in first})
 
 
 class _Album:
     """The features of photographs by position, sorted by word; read by several threads."""
 
-    def __init__(self, database: pycolmap.Database, photographs: int, ticks: Ticks) -> None:
-        self.lock = threading.Lock()  # around all use of the database
-        self._database = database
-        each = max(1, SAMPLE // photographs)
-        rows = []
-        for i in range(photographs):
-            rows.append(_spread(self.descriptors(i), each))
-            ticks.write("sorting features", i + 1, 2 * photographs)
-        self._words = vocabulary(np.concatenate(rows))
+    def __init__(self, job: Job, features: sqlite.Features) -> None:
+        self._job, self._features = job, features
+        self.words = functools.cache(self._vocabulary)
         self.sorted = functools.lru_cache(_KEPT)(self._sorted)
-        self.points = functools.lru_cache(_KEPT)(self._points)
+        self.points = functools.lru_cache(_KEPT)(features.points)
 
-    def descriptors(self, position: int) -> NDArray[np.uint8]:
-        """[N, 128], largest features first."""
-        with self.lock:
-            return np.asarray(self._database.read_descriptors(position + 1).data).reshape(-1, 128)
-
-    def _points(self, position: int) -> NDArray[np.float64]:
-        """[N, 2] x, y of features."""
-        with self.lock:
-            return self._database.read_keypoints(position + 1)[:, :2].astype(np.float64)
+    def _vocabulary(self) -> NDArray[np.float32]:
+        """Of all photographs; kept beside the database, for shares and for another time."""
+        path, photographs = words_path(self._job), len(self._job.names)
+        if not path.exists():
+            ticks, each = Ticks(Path(self._job.progress)), max(1, SAMPLE // photographs)
+            rows = []
+            for i in range(photographs):
+                rows.append(_spread(self._features.descriptors(i), each))
+                ticks.write("sorting features", i + 1, 2 * photographs)
+            with replacing(path) as partial:
+                np.save(partial, vocabulary(np.concatenate(rows)))
+        found: NDArray[np.float32] = np.load(path)
+        return found
 
     def largest(self, position: int) -> tuple[Sorted, NDArray[np.int64]]:
         """For a first look: the largest features, and what words they are."""
-        first = self.descriptors(position)[:FIRST_LOOK]
-        return sort_by_word(first, self._words, FIRST_COMPARED), two_words(first, self._words)
+        first, words = self._features.descriptors(position)[:FIRST_LOOK], self.words()
+        return sort_by_word(first, words, FIRST_COMPARED), two_words(first, words)
 
     def _sorted(self, position: int) -> Sorted:
-        return sort_by_word(self.descriptors(position), self._words)
+        return sort_by_word(self._features.descriptors(position), self.words())
 
 
 class _Matcher:
-    """Matches and verifies pairs in several threads, and writes what they find."""
+    """Matches and verifies pairs in several threads, and writes what they find. inliers: of the
+    pairs that are matched."""
 
-    def __init__(self, job: Job, database: pycolmap.Database, inliers: dict[Pair, int]) -> None:
-        self._ticks = Ticks(Path(job.progress))
-        self.album = _Album(database, len(job.names), self._ticks)
-        self._job, self._database, self._inliers = job, database, inliers
+    def __init__(self, job: Job, database: pycolmap.Database, features: sqlite.Features) -> None:
+        self.album = _Album(job, features)
+        self.inliers = sqlite.inliers_of_pairs(Path(job.database))
+        self._job, self._database, self._features = job, database, features
         self._cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
+        self._ticks = Ticks(Path(job.progress))
 
-    def run(self, wanted: list[Pair]) -> dict[Pair, int]:
-        """Inliers of each of the `wanted` pairs."""
-        missing = [pair for pair in wanted if pair not in self._inliers]
+    def run(self, wanted: list[Pair]) -> None:
+        """Match the `wanted` pairs, less those that are matched."""
+        missing = [pair for pair in wanted if pair not in self.inliers]
         done = len(wanted) - len(missing)
+        self.album.words()  # now, and not in several threads at once
         with ThreadPoolExecutor(self._job.threads) as pool:
             for pair, (matches, geometry) in zip(
                 missing, pool.map(self._match, missing), strict=True
             ):
-                self._write(pair, matches, geometry)
-                self._inliers[pair] = len(geometry.inlier_matches)
+                first, second = pair[0] + 1, pair[1] + 1
+                if matches is not None:
+                    self._database.write_matches(first, second, matches)
+                self._database.write_two_view_geometry(first, second, geometry)
+                self.inliers[pair] = len(geometry.inlier_matches)
                 done += 1
                 self._ticks.write("matching", done, len(wanted))
-        return {pair: self._inliers[pair] for pair in wanted}
 
     def _match(self, pair: Pair) -> tuple[NDArray[np.uint32] | None, pycolmap.TwoViewGeometry]:
         """(matches, None if the database has them, geometry without inliers if it has few)."""
         first, second = pair
-        with self.album.lock:
-            known = self._database.exists_matches(first + 1, second + 1)
-            matches = self._database.read_matches(first + 1, second + 1) if known else None
+        known = self._features.matches(first, second)
+        matches = known
         if matches is None:
             matches = nearest.matches(self.album.sorted(first), self.album.sorted(second))
         geometry = pycolmap.TwoViewGeometry()
@@ -126,22 +177,17 @@ class _Matcher:
             )
             if len(found.inlier_matches) >= FEWEST_INLIERS:
                 geometry = found
-        return (None if known else matches), geometry
-
-    def _write(
-        self, pair: Pair, matches: NDArray[np.uint32] | None, geometry: pycolmap.TwoViewGeometry
-    ) -> None:
-        first, second = pair[0] + 1, pair[1] + 1
-        with self.album.lock:
-            if matches is not None:
-                self._database.write_matches(first, second, matches)
-            self._database.write_two_view_geometry(first, second, geometry)
+        return (matches if known is None else None), geometry
 
 
 def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
     """[P, P] matches among the largest features of each two photographs that may look alike; none
-    of others. How many were looked at is left for the parent."""
-    photographs = len(job.names)
+    of others. It is kept for another time, and how many were looked at for the parent."""
+    photographs, kept = len(job.names), alike_path(job)
+    if kept.exists():
+        found: NDArray[np.int32] = np.load(kept)["alike"]
+        return found
+    album.words()
     ticks = Ticks(Path(job.progress))
     alike = np.zeros((photographs, photographs), np.int32)
     sorted_, held = [], []
@@ -161,7 +207,10 @@ def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
             alike[pair] = count
             ticks.write("looking for pairs", done, len(wanted))
     looked_path(job).write_text(str(len(wanted)))
-    return alike + alike.T
+    alike += alike.T
+    with replacing(kept) as partial:
+        np.savez_compressed(partial, alike=alike)
+    return alike
 
 
 def _spread(rows: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:

@@ -25,6 +25,9 @@ def main(arguments: list[str]) -> int:
         "mapping": mapping.map_photographs,
         "neighbours": known_worker.match_neighbours,
         "triangulation": known_worker.triangulate,
+        "choosing": matching.choose,
+        "features share": features.extract_share,
+        "matching share": matching.match_share,
     }
     steps[job.step](job)
     return 0

@@ -104,6 +104,15 @@ def test_workers_that_are_killed_change_nothing(folder: Path) -> None:
         assert [row["status"] for row in csv.DictReader(file)] == ["done", "done"]
 
 
+def test_runs_at_urls_are_the_same_and_a_killed_worker_changes_nothing(folder: Path) -> None:
+    url = folder.as_uri()
+    command = processes.splat(
+        *("batch", f"{url}/captures/*", "--out", f"{url}/far", *SMALL, "--cluster", "local:2")
+    )
+    assert with_kills(folder, command, 2) == 2
+    assert outputs(folder / "far") == outputs(folder / "alone")
+
+
 def test_a_head_that_is_killed_leaves_nobody_behind_and_is_gone_on_with(folder: Path) -> None:
     command = words("headless", "--cluster", "local:2")
     with processes.running(command, cwd=folder) as process:
@@ -125,4 +134,25 @@ def test_blocks_are_the_same_whoever_trains_them(folder: Path) -> None:
     for workers in (1, 2, 4):
         address, kills = f"local:{workers}", int(workers == 2)
         found = blocks_of(folder, f"by-{workers}", "--cluster", address, kills=kills)
+        assert found == here, workers
+
+
+def cameras_of(folder: Path, address: str | None, kills: int = 0) -> dict[str, str]:
+    """Outputs of the sample's first two stages."""
+    name = f"at-{address}"
+    code = (
+        "from pathlib import Path; from splatcli import jobs; "
+        "from stages.run.pipeline import Pipeline; "
+        f"whole = Pipeline(Path({name!r}), Path({str(sample.PHOTOS)!r})); "
+        f"jobs.in_blocks(whole, {address!r}).run(jobs.defaults(), until='sfm')"
+    )
+    assert with_kills(folder, processes.python(code), kills) == kills
+    return outputs(folder / name, "")
+
+
+def test_shares_of_structure_are_the_same_whoever_does_them(tmp_path: Path) -> None:
+    here = cameras_of(tmp_path, None)
+    assert len(here) > 24
+    for workers in (1, 2, 4):
+        found = cameras_of(tmp_path, f"local:{workers}", kills=int(workers == 2))
         assert found == here, workers
