@@ -9,8 +9,7 @@ has filled counts for the next, so that a few thousand points cover everything t
 A guess too near is worse than none: training dresses it in what the one photograph shows behind
 it, and it hangs as a cloud before all cameras that look past it. So other photographs are asked
 (`witnesses`), and what they do not confirm goes as far back as the photograph sees at all: there it
-hides nothing, and leaves no hole for a cloud to grow into. Where no other photograph looks, the
-guess stands.
+hides nothing, and leaves no hole for a cloud to grow into.
 
 Beyond its rim a photograph is continued a little in the colours of the rim, but only to where no
 photograph looks: what none shows is better guessed than left as a hole, and what one shows is not
@@ -99,9 +98,7 @@ def _fill(
     if margin:
         free = ~_in_a_picture(unprojected(camera, empty, depth), views)
     else:
-        others = [other for other in views if other is not view]
-        alone = ~_in_a_picture(unprojected(camera, empty, depth), others)
-        depth, free = _believed(view, camera, empty, depth, measured[1], witnesses, alone)
+        depth, free = _believed(view, camera, empty, depth, measured[1], witnesses)
     places = unprojected(camera, empty, depth)
     for centre, distance in filling.clear:
         free &= np.linalg.norm(places - centre, axis=1) > distance
@@ -123,17 +120,15 @@ def _believed(
     depth: NDArray[np.float64],
     measured: NDArray[np.float64],
     witnesses: Witnesses,
-    alone: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(depth [K], whether to fill [K]): what nothing confirms is moved back to where the
-    photograph's view ends, if no other contradicts that. Where a photograph looks alone [K] its
-    guess stands: it hides nothing from others, and a hole would be filled by something worse."""
+    photograph's view ends, unless it lies farther already, if no other contradicts that."""
     places = unprojected(camera, at, depth)
-    believed = alone | (witnesses.confirm(places, view.name) & witnesses.anchored(places))
+    believed = witnesses.confirm(places, view.name) & witnesses.anchored(places)
     end = float(np.percentile(measured, FARTHEST))
     behind = np.where(believed, depth, np.maximum(depth, end))
     _, before = witnesses.ask(unprojected(camera, at, behind), view.name)
-    return behind, believed | ((before == 0) & (behind > depth))
+    return behind, believed | (before == 0)
 
 
 def _in_a_picture(places: NDArray[np.float64], views: list[View]) -> NDArray[np.bool_]:
