@@ -105,7 +105,7 @@ def done(job: Job, scene: Scene) -> dict[str, Any]:
     more = ["--json"] if verb in ("edit", "convert") else []
     measured = folder / "measured.json"
     command = processes.python(_MEASURED, str(measured), verb, *files, *options, *more)
-    with processes.running(command, stderr=subprocess.PIPE) as process:
+    with processes.running(command, stderr=subprocess.PIPE, preexec_fn=_hears_ctrl_c) as process:
         if verb == "view":
             processes.line_of(process)  # its address: the page is there
             process.send_signal(signal.SIGINT)
@@ -115,6 +115,11 @@ def done(job: Job, scene: Scene) -> dict[str, Any]:
     found = json.loads(measured.read_text())
     measured.unlink()
     return found | (json.loads(out.splitlines()[-1]) if verb != "view" else {})
+
+
+def _hears_ctrl_c() -> None:
+    """Also where this script runs in a shell's background, which ignores it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def written(job: Job, scene: Scene) -> int:
