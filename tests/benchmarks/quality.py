@@ -34,9 +34,9 @@ from stages.cameras.table import read_cameras
 from stages.measure.bootstrap import paired_difference
 from stages.measure.judge import Photograph, drawing_of, load_photographs, scores
 from stages.run.pipeline import Pipeline
-from stages.scene import Look, Reconstruction, Splats, near_plane, split_held_out
+from stages.scene import Reconstruction, Splats, look_of, split_held_out
 from stages.sfm import SfmSettings
-from stages.train import PRESETS
+from stages.train import PRESETS, TrainSettings, light_wanted
 from tests.benchmarks.sample_judges import judges_in, render_judges
 from tests.sample import PHOTOS
 
@@ -69,7 +69,8 @@ class Capture:
         self.judges = self._judges(out, side)
 
     def _judges(self, out: Path, side: int) -> tuple[Photograph, ...]:
-        look = Look(near_plane(self.reconstruction.views), side)
+        light = light_wanted(self.reconstruction, TrainSettings().light, Report())
+        look = look_of(self.reconstruction.views, side, light)
         _, held = split_held_out(self.reconstruction.views)
         found = tuple(load_photographs(self.reconstruction.folder, held, look))
         if self.name != SAMPLE:
