@@ -457,5 +457,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=13, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=14, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

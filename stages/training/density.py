@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.definition import OPACITY
 from stages.scene import logit
 from stages.scene.rotations import matrices_of
-from stages.training.optimiser import OPACITY_STEPS, Model
+from stages.training.optimiser import Model
 from stages.training.strategy import Strategy
 
 SPLIT_FACTOR = 1.6  # children of a split are that much smaller
@@ -18,7 +17,6 @@ LARGE = 0.01  # of the scene's extent: above it a splat is split, below it clone
 GIANT = 0.1  # of the scene's extent
 THRESHOLD = 2e-4  # of the mean gradient, see `AdaptiveDensity`
 OPACITY_MIN = 0.005
-OPACITY_RESET = 0.01
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 
 BASE_MIB = 2048.0  # libraries, and photographs of which at most 1 GiB is kept
@@ -77,15 +75,6 @@ class AdaptiveDensity:
         grown.forget_gradients()
         return grown
 
-    def reset(self, model: Model) -> Model:
-        reset = model.take(np.arange(len(model)))
-        faint = np.float32(logit(OPACITY_RESET))
-        np.minimum(reset.opacity_logits, faint, out=reset.opacity_logits)
-        reset.moment1[:, OPACITY] = 0.0
-        reset.moment2[:, OPACITY] = 0.0
-        reset.steps[:, OPACITY_STEPS] = 0
-        return reset
-
 
 @dataclass(frozen=True)
 class Within:
@@ -105,9 +94,6 @@ class Within:
         there = model.take(~inside)
         there.forget_gradients()
         return self.rule.grow(model.take(inside), budget - len(there), rng).joined(there)
-
-    def reset(self, model: Model) -> Model:
-        return self.rule.reset(model)
 
     def _inside(self, model: Model) -> NDArray[np.bool_]:
         at = model.means[:, [0, 2]]

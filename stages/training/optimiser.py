@@ -2,8 +2,7 @@
 
 A splat out of view keeps its moments and its own counts of steps, and its bias correction follows
 those counts: the first step of a splat first seen late is lr, not 3 lr. There is a count for each
-group of columns that begins by itself: opacity begins anew at a reset, a band of SH when it is
-switched on.
+group of columns that may begin by itself: the opacity, and a band of SH when it is switched on.
 """
 
 from __future__ import annotations

@@ -51,9 +51,6 @@ class Relocation:
         grown.forget_gradients()
         return grown
 
-    def reset(self, model: Model) -> Model:
-        return model
-
 
 def shared(
     opacities: NDArray[np.float64], copies: NDArray[np.int64]

@@ -14,7 +14,6 @@ GROWTH_ENDS = 0.5  # share of the run in which the model grows
 BOOST_POWER, BOOST_MAX = 0.6, 6.0
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1  # share of the run; share of the rate at its end
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer do not see enough of the scene to judge a splat by
-MIN_STEPS_FOR_RESET = 15_000  # a shorter run does not recover from an opacity reset
 # (share of the run, scale of the picture): coarse pictures first, they are cheap and smooth
 RESOLUTIONS = ((0.2, 0.5), (1.0, 1.0))
 
@@ -94,14 +93,6 @@ class Schedule:
         not spend what later, better ones will want."""
         share = min(1.0, self.share(step + 1) / GROWTH_ENDS)
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
-
-    def resets_after(self, step: int) -> bool:
-        """Whether to reset opacities once `step` is done: only while growth goes on for as long
-        again, for what stays faint is pruned by growth."""
-        if self.steps < MIN_STEPS_FOR_RESET:
-            return False
-        done, interval = step + 1, self._scaled(3000)
-        return done % interval == 0 and self.share(done) <= GROWTH_ENDS - 3000 / RECIPE_STEPS
 
     def prunes_giants(self, step: int) -> bool:
         return self.share(step) >= 3000 / RECIPE_STEPS

@@ -1,4 +1,4 @@
-"""How many splats there are, and where they are: three verbs, whatever the rule behind them.
+"""How many splats there are, and where they are: two verbs, whatever the rule behind them.
 
 A strategy is a small object without a memory: models go in and come out, and what a verb needs to
 know of the run it is told. To add one: write the class, and name it in `strategies.STRATEGIES` and
@@ -23,6 +23,3 @@ class Strategy(Protocol):
     def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
         """With more splats where the photographs ask for them, at most `budget` in all; what was
         added up since the last time is forgotten."""
-
-    def reset(self, model: Model) -> Model:
-        """Nearly transparent, so that only what photographs need comes back; or as it is."""

@@ -103,8 +103,6 @@ class Trainer:
             if self.schedule.passes(step, EVALUATIONS):
                 self._record(step)
             self._replan(step)
-            if self.schedule.resets_after(step - 1):  # once its pictures have been judged
-                self._reset_opacities()
             if self.report.stop_requested.is_set() and step < self.schedule.steps:
                 self._save(step)
                 raise Interrupted(f"train stopped after step {step} of {self.schedule.steps}")
@@ -266,9 +264,6 @@ class Trainer:
         if self.smooth:
             model.smoothing[:] = self.widths(model.means)
         self.stepper.load(model)
-
-    def _reset_opacities(self) -> None:
-        self.stepper.load(self._strategy.reset(self.model))
 
     def _tick(self, step: int, loss: float) -> None:
         numbers: dict[str, float | int | str] = {

@@ -6,8 +6,7 @@ import numpy as np
 
 from stages.kernels.pool import Pool
 from stages.raster.definition import OPACITY, SH_REST, Backward, gradient_columns, used_columns
-from stages.training.density import AdaptiveDensity
-from stages.training.optimiser import LearningRates, apply_gradients, new_model
+from stages.training.optimiser import OPACITY_STEPS, LearningRates, apply_gradients, new_model
 from tests.extremes.measured import Measured, broken, worst
 from tests.tolerances import FIRST_STEP
 
@@ -47,13 +46,14 @@ def out_of_range(backend):
 
 
 def switched_on_late(backend):
-    """At step 1000: a band that had no part before; the opacity, after a reset."""
+    """At step 1000: a band that had no part before; the opacity, begun anew."""
     r = np.random.default_rng(0)
     model, pool = _model(r), Pool(1)
     for _ in range(999):
         _step(pool, model, 0, r.normal(size=used_columns(1)), bands=1)
     band = _strides(pool, model, 0, _strong(r))[SH_REST:]
-    model = AdaptiveDensity(1.0).reset(model)
+    model.moment1[:, OPACITY] = model.moment2[:, OPACITY] = 0.0
+    model.steps[:, OPACITY_STEPS] = 0
     opacity = _strides(pool, model, 0, _strong(r))[OPACITY]
     what = "over its rate, less 1"
     return [

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from stages.raster.definition import OPACITY
 from stages.scene import logit
 from stages.training.density import BYTES_PER_SPLAT, AdaptiveDensity, splat_cap
-from stages.training.optimiser import BASIC_STEPS, OPACITY_STEPS, new_model
+from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
 
 EXTENT = 10.0
@@ -69,21 +68,6 @@ def test_the_cap_is_kept_and_the_strongest_go_first(room):
         np.testing.assert_array_equal(grown.means[10:], m.means[10 - room :])
 
 
-def test_a_reset_only_ever_lowers_opacity():
-    m = model(4)
-    m.opacity_logits[:2] = logit(0.006)
-    m.moment1[:] = 1.0
-    m.steps[:] = 7
-    before = m.opacity_logits.copy()
-    m = AdaptiveDensity(EXTENT).reset(m)
-    np.testing.assert_array_equal(m.opacity_logits[:2], before[:2])
-    np.testing.assert_allclose(m.opacity_logits[2:], logit(0.01), rtol=1e-6)
-    assert not m.moment1[:, OPACITY].any()
-    assert m.moment1[:, :OPACITY].all()
-    assert not m.steps[:, OPACITY_STEPS].any()
-    assert m.steps[:, BASIC_STEPS].all()
-
-
 def test_the_cap_takes_half_of_the_free_memory():
     assert splat_cap(8192.0) == pytest.approx(4096 * 1024 * 1024 / BYTES_PER_SPLAT, rel=1e-3)
     assert splat_cap(1.0) == 10_000
@@ -122,13 +106,3 @@ def test_the_full_recipe_has_its_published_events():
     assert s.densifies_after(599)
     assert not s.densifies_after(550)
     assert not s.densifies_after(399)
-    assert [k + 1 for k in range(30_000) if s.resets_after(k)] == [3000, 6000, 9000, 12_000]
-
-
-@pytest.mark.parametrize("steps", [15_000, 20_000, 30_000, 47_111])
-def test_after_a_reset_growth_goes_on_and_prunes_what_stayed_faint(steps):
-    s = schedule(steps)
-    resets = [step for step in range(steps) if s.resets_after(step)]
-    last = max(step for step in range(steps) if s.densifies_after(step))
-    assert len(resets) >= 3
-    assert last - max(resets) >= 0.09 * steps

@@ -250,21 +250,6 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     assert np.abs(seen[0] - levels).mean() > 5  # the first step looked different
 
 
-def test_quality_is_judged_before_an_opacity_reset(tmp_path, monkeypatch):
-    steps = 2 * EVALUATIONS
-    histories = []
-    for name, reset in (("without", 0), ("with", 4)):
-        monkeypatch.setattr(Schedule, "resets_after", lambda _, step, at=reset: step + 1 == at)
-        view = view_of("a", disc_and_square(), camera(48, 48, 48.0))
-        (tmp_path / name).mkdir()
-        toy = trainer([view], grid(12), steps, tmp_path / name)
-        toy.run(grid(12))
-        histories.append({entry["step"]: entry["psnr_db"] for entry in toy.history})
-    without, after = histories
-    assert after[4] == without[4]
-    assert after[6] < without[6] - 1.0
-
-
 def test_a_torn_checkpoint_means_a_fresh_start(tmp_path):
     t, start = small_problem(tmp_path, "torn")
     (t.folder / "checkpoint.bin").write_bytes(MAGIC + b"\x00" * 5)
@@ -326,7 +311,7 @@ def test_nothing_at_all_can_be_taken_grown_and_pruned():
     empty = new_model(*splat_arrays(grid(2).take(np.zeros(4, bool))))
     strategy = AdaptiveDensity(1.0)
     assert len(strategy.grow(empty, 100, np.random.default_rng(0))) == 0
-    assert len(strategy.prune(empty, settled=True)) == len(strategy.reset(empty)) == 0
+    assert len(strategy.prune(empty, settled=True)) == 0
     assert len(empty.take(np.zeros(0, bool))) == 0
 
 
