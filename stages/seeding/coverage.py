@@ -122,13 +122,13 @@ def _believed(
     witnesses: Witnesses,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(depth [K], whether to fill [K]): what nothing confirms is moved back to where the
-    photograph's view ends, unless it lies farther already, if no other contradicts that."""
+    photograph's view ends, if no other contradicts that."""
     places = unprojected(camera, at, depth)
     believed = witnesses.confirm(places, view.name) & witnesses.anchored(places)
     end = float(np.percentile(measured, FARTHEST))
     behind = np.where(believed, depth, np.maximum(depth, end))
     _, before = witnesses.ask(unprojected(camera, at, behind), view.name)
-    return behind, believed | (before == 0)
+    return behind, believed | ((before == 0) & (behind > depth))
 
 
 def _in_a_picture(places: NDArray[np.float64], views: list[View]) -> NDArray[np.bool_]:

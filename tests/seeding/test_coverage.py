@@ -65,13 +65,6 @@ def test_most_cells_of_a_photograph_end_up_with_a_point(tmp_path: Path) -> None:
         assert cells_hit(view, np.concatenate([points, more])).mean() > 0.75
 
 
-def test_no_hole_is_left_in_what_one_photograph_alone_shows(tmp_path: Path) -> None:
-    """Nor where the floor runs on behind the farthest measured point."""
-    alone, points = views(tmp_path)[0], floor_points()
-    more, _, _ = fill_cells(tmp_path, (alone,), points)
-    assert cells_hit(alone, np.concatenate([points, more])).all()
-
-
 def test_nothing_is_added_where_points_already_are(tmp_path: Path) -> None:
     both, points = views(tmp_path), floor_points()
     more, _, _ = fill_cells(tmp_path, both[:1], points)
