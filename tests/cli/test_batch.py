@@ -18,6 +18,7 @@ from splatcli import cluster
 from splatcli.tasks import Need
 from stages.base.errors import SplatError
 from stages.run.lock import locked
+from tests.cli.pretence import failing_at
 
 NAMES = ("hill", "room", "well")
 
@@ -37,17 +38,6 @@ def rows() -> dict[str, dict[str, str]]:
 
 def manifests() -> dict[str, int]:
     return {str(p): p.stat().st_mtime_ns for p in Path("runs").glob("*/*/manifest.json")}
-
-
-def failing_at(name: str, error: Exception):
-    """Stage 1 of the capture `name` fails."""
-
-    def run(inputs, settings, folder, report) -> None:
-        if inputs["photos"].name == name:
-            raise error
-        (folder / "out.ply").write_text("made")
-
-    return run
 
 
 def test_each_capture_has_a_run_folder_and_a_row(splat, captures) -> None:

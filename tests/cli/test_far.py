@@ -18,7 +18,7 @@ import pytest
 from splatcli import far
 from stages.base.errors import SplatError
 from tests import processes, sample
-from tests.cli.test_batch import failing_at
+from tests.cli.pretence import failing_at
 
 fsspec = pytest.importorskip("fsspec", reason='pip install "splat[cluster]" brings it')
 
