@@ -12,14 +12,13 @@ import numpy as np
 from stages.base.atomic import replacing
 from stages.base.memory import available_mib
 from stages.scene import Camera
-from stages.training.density import splat_cap
+from stages.training.density import FEWEST, splat_cap
 from stages.training.optimiser import Model
 
 FILE_NAME = "cap.json"
 DEVICE_MEMORY = "the GPU's memory"
 PHOTOGRAPHS = "the photographs' pixels"
 GEOMETRY = 11  # numbers of a splat but its colour: place, rotation, scales, opacity
-FEWEST = 10_000  # splats that are allowed however few pixels there are
 
 
 @dataclass(frozen=True)

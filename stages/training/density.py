@@ -19,13 +19,14 @@ THRESHOLD = 2e-4  # of the mean gradient, see `AdaptiveDensity`
 OPACITY_MIN = 0.005
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 
+FEWEST = 10_000  # splats that are always allowed
 BASE_MIB = 2048.0  # libraries, and photographs of which at most 1 GiB is kept
 
 
 def splat_cap(available_mib: float | None) -> int:
     """How many splats may be trained in half of the free memory (of 4 GiB where unknown)."""
     mib = 4096.0 if available_mib is None else available_mib
-    return max(10_000, int(0.5 * mib * 1024 * 1024 / BYTES_PER_SPLAT))
+    return max(FEWEST, int(0.5 * mib * 1024 * 1024 / BYTES_PER_SPLAT))
 
 
 def needed_mib(splats: int) -> float:
