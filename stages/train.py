@@ -173,14 +173,14 @@ def run(
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
-    trained = TrainedSplats(splats, trainer.passed_on)
+    trained = TrainedSplats(splats, trainer.passed_on, trainer.by_heart)
     save(folder, trained)
     remove_checkpoint(folder)
     forget_cap(folder)
     report.metric("steps", trainer.schedule.steps)
     _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
-    report.metric("learnt_by_heart", trainer.by_heart > 0)
+    report.metric("learnt_by_heart", trainer.by_heart)
     report.metric("passed_on", round(trainer.passed_on, 3))
     if trainer.ended:
         report.metric("ended_early", trainer.ended)
@@ -434,7 +434,8 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _LEARNT) as temporary:
-        temporary.write_text(json.dumps({"passed_on": trained.passed_on}) + "\n", encoding="utf-8")
+        learnt = {"passed_on": trained.passed_on, "by_heart": trained.by_heart}
+        temporary.write_text(json.dumps(learnt) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:
@@ -445,7 +446,7 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     try:
         learnt = json.loads((folder / _LEARNT).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, float(learnt["passed_on"]))
+        return TrainedSplats(splats, float(learnt["passed_on"]), bool(learnt["by_heart"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "train-folder-damaged",
@@ -457,5 +458,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=14, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=15, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -39,7 +39,7 @@ class Tuner:
         extent: float,
         backend: str,
         report: Report,
-        by_heart: float = 0.0,
+        by_heart: bool = False,
     ) -> None:
         self.photographs, self.extent, self.report = photographs, extent, report
         self.by_heart = by_heart
@@ -94,7 +94,7 @@ class Tuner:
         if not self.by_heart:
             return None
         key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
-        return Dropout(len(self.photographs), key, self.by_heart)
+        return Dropout(len(self.photographs), key)
 
     def _level(self) -> Level:
         """Every photograph once in each round, in a new order each round."""

@@ -107,32 +107,17 @@ class Splats:
         return replace(self, sh=sh, sh_degrees=np.minimum(self.sh_degrees, degree))
 
 
-# Of what photographs in training gain. Measured where growth ends, by one to four photographs: 0.0
-# to 0.23 on a carpet that is learnt by heart, 0.34 on a toy and 0.5 to 0.9 on a scene that are not.
-# To take one for by heart that is not costs 0.3 dB, the other way round 1.2, so doubt counts.
-ALL_BY_HEART, NOT_BY_HEART = 0.1, 0.4
-
-
 @dataclass(frozen=True)
 class TrainedSplats:
     """Splats as trained, and what is known of their training.
 
     passed_on: of each dB that photographs in training gained towards its end, how much those gained
-    that were lent, 0 to 1.
+    that were lent, 0 to 1. by_heart: whether those came out better where splats sat steps out.
     """
 
     splats: Splats
     passed_on: float = 1.0
-
-    @property
-    def by_heart(self) -> float:
-        """See `by_heart`."""
-        return by_heart(self.passed_on)
-
-
-def by_heart(passed_on: float) -> float:
-    """How much of what was learnt towards the end helps those photographs alone, 0 to 1."""
-    return min(1.0, max(0.0, (NOT_BY_HEART - passed_on) / (NOT_BY_HEART - ALL_BY_HEART)))
+    by_heart: bool = False
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
@@ -15,9 +15,10 @@ from numpy.lib import format as npy
 from stages.training.clock import Spent
 from stages.training.optimiser import Model
 from stages.training.pace import Mark
+from stages.training.trial import BEFORE, PLAIN, Trial
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP7"
+MAGIC = b"SPLATCP8"
 
 
 @dataclass(frozen=True)
@@ -33,14 +34,17 @@ class Maker:
 class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
     done by then), see `schedule.Schedule`. history: as logged. marks: of the
-    photographs that decide. passed_on: what they told. times: of each entry of the history, and,
-    last, now. makers: one after the other."""
+    photographs that decide. passed_on: what they told. trial, by_heart: whether they are being
+    asked more, and what came out. times: of each entry of the history, and, last, now. makers: one
+    after the other."""
 
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
     marks: list[Mark]
     passed_on: float
+    trial: Trial | None
+    by_heart: bool | None
     times: list[Spent]
     makers: list[Maker]
 
@@ -54,10 +58,7 @@ def save_checkpoint(folder: Path, model: Model, saved: Saved) -> None:
     with temporary.open("wb") as file:
         header = json.dumps(dataclasses.asdict(saved)).encode()
         file.write(MAGIC + len(header).to_bytes(8, "little") + header)
-        for array in vars(model).values():
-            npy.write_array(file, array, allow_pickle=False)
-        file.flush()
-        os.fsync(file.fileno())
+        _write(file, model)
     os.replace(temporary, folder / FILE_NAME)
 
 
@@ -68,10 +69,9 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
             if file.read(8) != MAGIC:
                 return None
             header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-            arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
+            model = _read(file)
     except (OSError, ValueError, EOFError, MemoryError):
         return None
-    model = Model(*(np.ascontiguousarray(a) for a in arrays))
     steps, since, share = header["plan"]
     saved = Saved(
         int(header["step"]),
@@ -79,13 +79,42 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         header["history"],
         [Mark(**mark) for mark in header["marks"]],
         float(header["passed_on"]),
+        Trial(**header["trial"]) if header["trial"] else None,
+        header["by_heart"],
         [Spent(**t) for t in header["times"]],
         [Maker(**maker) for maker in header["makers"]],
     )
     return model, saved
 
 
+def keep_model(folder: Path, name: str, model: Model) -> None:
+    """Put a model aside until the stage is finished."""
+    temporary = folder / f"{name}.bin.tmp"
+    with temporary.open("wb") as file:
+        _write(file, model)
+    os.replace(temporary, folder / f"{name}.bin")
+
+
+def kept_model(folder: Path, name: str) -> Model:
+    """What `keep_model` put aside."""
+    with (folder / f"{name}.bin").open("rb") as file:
+        return _read(file)
+
+
+def _write(file: BinaryIO, model: Model) -> None:
+    for array in vars(model).values():
+        npy.write_array(file, array, allow_pickle=False)
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _read(file: BinaryIO) -> Model:
+    arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
+    return Model(*(np.ascontiguousarray(a) for a in arrays))
+
+
 def remove_checkpoint(folder: Path) -> None:
     """A finished stage keeps its result, not its way there."""
-    for name in (FILE_NAME, FILE_NAME + ".tmp"):
+    for name in (FILE_NAME, f"{BEFORE}.bin", f"{PLAIN}.bin"):
         (folder / name).unlink(missing_ok=True)
+        (folder / f"{name}.tmp").unlink(missing_ok=True)

@@ -24,19 +24,16 @@ _UINT32 = 2.0**32
 
 @dataclass(frozen=True)
 class Dropout:
-    """Of one step. views: photographs in training. key: of its random numbers, 32 bits. strength:
-    0 to 1, that all shares are multiplied by."""
+    """Of one step. views: photographs in training. key: of its random numbers, 32 bits."""
 
     views: int
     key: int
-    strength: float = 1.0
 
     def resting(self, seen: NDArray[np.int32]) -> NDArray[np.bool_]:
         """[N] which splats sit out. seen [N]: in how many steps each was in the picture, since they
         were last counted together; before anything was counted, all are taken to be seen by all."""
         photographs = self.views * ((seen + 1.0) / (int(seen.max(initial=0)) + 1.0))
         share = np.minimum(LARGEST_SHARE, np.square(FEW / np.maximum(photographs, 1.0)))
-        share *= self.strength
         return np.asarray(noise(len(seen), self.key) < share * _UINT32)
 
 

@@ -17,7 +17,7 @@ def resting(dropout: Dropout, seen: Tensor) -> Tensor:
         return torch.zeros(0, dtype=torch.bool, device=seen.device)
     photographs = dropout.views * ((seen.double() + 1.0) / (seen.max() + 1.0))
     share = torch.square(FEW / photographs.clamp(min=1.0)).clamp(max=LARGEST_SHARE)
-    return _noise(n, dropout.key, seen.device) < share * dropout.strength * 2.0**32
+    return _noise(n, dropout.key, seen.device) < share * 2.0**32
 
 
 def _noise(n: int, key: int, device: torch.device) -> Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 PLANS = 50  # times, at most, that a run with a time limit is planned anew
 PLAN_STEPS = 10  # fewer do not show a pace
 PLATEAU_POINTS = 10  # the line is laid through as many marks
+BY_HEART = 0.25  # of each dB gained: where less is passed on, hardly anybody else gains
 SURE = 1.0  # standard errors of its slope that are added to what is expected
 
 
@@ -35,6 +36,10 @@ class Pace:
         self._last = step, spent
         left = self.seconds - self.reserve - spent
         return step + max(1, int(left * since / lasted))
+
+    def restart(self) -> None:
+        """Look at the pace anew: steps were made that do not count."""
+        self._last = None
 
 
 @dataclass(frozen=True)

@@ -19,20 +19,28 @@ from stages.measure.judge import Photograph, scores, spread
 from stages.raster.backends import AUTO, backend_of, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import TRANSPARENT, Camera, Look, Splats, by_heart, morton
+from stages.scene import TRANSPARENT, Camera, Look, Splats, morton
 from stages.training.cap import fitted, lower_cap
-from stages.training.checkpoint import Maker, Saved, load_checkpoint, save_checkpoint
+from stages.training.checkpoint import (
+    Maker,
+    Saved,
+    keep_model,
+    kept_model,
+    load_checkpoint,
+    save_checkpoint,
+)
 from stages.training.clock import Clock, Spent
 from stages.training.colours import Recolouring, worth_settling
 from stages.training.density import Within
 from stages.training.dropout import Dropout
 from stages.training.frugal_step import FrugalStep
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
-from stages.training.pace import Mark, Pace, remaining_gain_db, share_passed_on
+from stages.training.pace import BY_HEART, Mark, Pace, remaining_gain_db, share_passed_on
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.step import TrainingStep, step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
+from stages.training.trial import BEFORE, PLAIN, SURE_DB, Trial, trial_at
 from stages.training.views import Level, TrainingView
 
 CHECKPOINT_SECONDS = 30.0
@@ -79,6 +87,8 @@ class Trainer:
         self.ended = ""  # why before all steps, if it did
         self.marks: list[Mark] = []  # of the photographs lent
         self.passed_on = 1.0 if self.lent else 0.0  # so few photographs are learnt by heart
+        self.trial: Trial | None = None
+        self._verdict: bool | None = None if self.lent else True
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
         self._onlookers = [self.held_out[i] for i in spread(len(self.held_out))]
@@ -100,9 +110,11 @@ class Trainer:
             step += 1
             if step == self.schedule.steps and worth_settling(self.by_heart, len(self.train)):
                 self._recolour()
-            if self.schedule.passes(step, EVALUATIONS):
-                self._record(step)
-            self._replan(step)
+            if not self.trial:
+                if self.schedule.passes(step, EVALUATIONS):
+                    self._record(step)
+                self._replan(step)
+            step = self._tried(step)
             if self.report.stop_requested.is_set() and step < self.schedule.steps:
                 self._save(step)
                 raise Interrupted(f"train stopped after step {step} of {self.schedule.steps}")
@@ -126,9 +138,9 @@ class Trainer:
         return (view.levels[-1] for view in self.train)
 
     @property
-    def by_heart(self) -> float:
-        """See `scene.by_heart`."""
-        return by_heart(self.passed_on)
+    def by_heart(self) -> bool:
+        """Whether photographs are learnt by heart, as lent ones told once they were asked."""
+        return bool(self._verdict)
 
     @property
     def model(self) -> Model:
@@ -141,7 +153,8 @@ class Trainer:
         if saved is not None:
             model, told = saved
             step, self.history, self.marks = told.step, told.history, told.marks
-            self.passed_on = told.passed_on
+            self.passed_on, self.trial = told.passed_on, told.trial
+            self._verdict = told.by_heart
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock, self.makers = Clock(spent), told.makers
@@ -171,7 +184,8 @@ class Trainer:
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        saved = Saved(step, plan, self.history, self.marks, self.passed_on, times, self.makers)
+        told = self.marks, self.passed_on, self.trial, self._verdict
+        saved = Saved(step, plan, self.history, *told, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
     def _first(self, start: Splats) -> Model:
@@ -206,15 +220,16 @@ class Trainer:
         return self.stepper.step(level, settings, rates, self.smooth, self._dropout(step))
 
     def _dropout(self, step: int) -> Dropout | None:
-        """Once the model grows no more, if by then it is learnt by heart: before that, who sits out
-        would be pulled at less than it deserves."""
-        if not self.by_heart or self.schedule.share(step) < GROWTH_ENDS:
+        """Once the model grows no more, if it is learnt by heart: before that, who sits out would
+        be pulled at less than it deserves."""
+        sits_out = self.trial.sits_out if self.trial else self.by_heart
+        if not sits_out or self.schedule.share(step) < GROWTH_ENDS:
             return None
-        return Dropout(len(self.train), self.schedule.key(step), self.by_heart)
+        return Dropout(len(self.train), self.schedule.key(step))
 
     def _row(self, step: int) -> int:
-        """Which photograph is trained on in `step`: while the model grows, none that is lent."""
-        lent = self.lent if self.schedule.share(step) < GROWTH_ENDS else ()
+        """Which photograph is trained on in `step`: none that is lent, while they are asked."""
+        lent = self.lent if self.trial or self.schedule.share(step) < GROWTH_ENDS else ()
         rows = [row for row in range(len(self.train)) if row not in lent]
         return rows[self.schedule.view(step, len(rows))]
 
@@ -235,9 +250,32 @@ class Trainer:
         self.marks.append(Mark(step, self._mean_db(self.lent), self._mean_db(self._told())))
         self.passed_on = share_passed_on(self.marks)
         promised = remaining_gain_db(self.marks, round(GROWTH_ENDS * self.schedule.steps))
-        if self.by_heart > 0.5 and self.patience_db and promised < self.patience_db:
+        if self.passed_on < BY_HEART and self.patience_db and promised < self.patience_db:
             self.schedule = self.schedule.grown(step)
             self.ended = f"after {step} steps growth promised no more than {self.patience_db} dB"
+
+    def _tried(self, step: int) -> int:
+        """The step to go on from after `step` steps: where growth ends, two ways are gone from the
+        same model, see `trial`."""
+        if not self.trial:
+            if self._verdict is None and (trial := trial_at(step, self.schedule)):
+                keep_model(self.folder, BEFORE, self.model)
+                self.trial = trial
+            return step
+        if step < self.trial.ends:
+            return step
+        came_to = self._mean_db(self.lent)
+        if self.trial.plain_db is None:
+            keep_model(self.folder, PLAIN, self.model)
+            self.stepper.load(kept_model(self.folder, BEFORE))
+            self.trial = replace(self.trial, plain_db=came_to)
+            return self.trial.begun
+        self._verdict = came_to > self.trial.plain_db + SURE_DB
+        if not self._verdict:
+            self.stepper.load(kept_model(self.folder, PLAIN))
+        self.trial = None
+        self._pace.restart()
+        return step
 
     def _told(self) -> list[int]:
         """As many photographs as are lent, of those that are not, spread over the capture."""

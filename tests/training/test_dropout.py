@@ -19,10 +19,10 @@ from tests.scenes import camera, cloud
 VIEWS = 20
 
 
-def shares(seen, steps=400, strength=1.0):
+def shares(seen, steps=400):
     """How often each splat rests, seen in so many of `VIEWS` steps."""
     seen = np.asarray(seen, np.int32)
-    return np.mean([Dropout(VIEWS, key, strength).resting(seen) for key in range(steps)], axis=0)
+    return np.mean([Dropout(VIEWS, key).resting(seen) for key in range(steps)], axis=0)
 
 
 def test_what_few_photographs_see_rests_often_and_what_many_see_hardly_ever():
@@ -32,15 +32,6 @@ def test_what_few_photographs_see_rests_often_and_what_many_see_hardly_ever():
     few = [LARGEST_SHARE] * 3
     wanted = [*few, 4 * (9 / 5) ** 2 / n**2, 4 / n**2, 0.01]
     np.testing.assert_allclose(found, wanted, atol=0.004)
-
-
-def test_half_the_strength_is_half_as_often():
-    seen = np.repeat([0, 4], 500)
-    whole, half = (shares(seen, strength=strength) for strength in (1.0, 0.5))
-    np.testing.assert_allclose(
-        half.reshape(2, -1).mean(1), whole.reshape(2, -1).mean(1) / 2, atol=0.003
-    )
-    assert not shares(seen, steps=20, strength=0.0).any()
 
 
 def test_steps_and_splats_draw_lots_that_know_nothing_of_each_other():
@@ -59,8 +50,8 @@ def test_before_anything_was_counted_and_without_splats_there_is_an_answer():
 def test_a_device_lets_the_same_splats_rest():
     seen = np.random.default_rng(2).integers(0, 40, 5000).astype(np.int32)
     for key in (0, 1, 0xFFFFFFFF):
-        wanted = Dropout(VIEWS, key, 0.7).resting(seen)
-        found = gpu_dropout.resting(Dropout(VIEWS, key, 0.7), torch.tensor(seen))
+        wanted = Dropout(VIEWS, key).resting(seen)
+        found = gpu_dropout.resting(Dropout(VIEWS, key), torch.tensor(seen))
         np.testing.assert_array_equal(found.numpy(), wanted)
     assert len(gpu_dropout.resting(Dropout(VIEWS, 1), torch.zeros(0, dtype=torch.int32))) == 0
 

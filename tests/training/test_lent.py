@@ -1,5 +1,7 @@
 """Photographs that training lends: they tell whether it learns the others by heart."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -7,10 +9,13 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
-from stages.scene import Look, by_heart
+from stages.scene import Look
 from stages.train import lent_rows
+from stages.training import trainer as training
+from stages.training.checkpoint import remove_checkpoint
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.trainer import Trainer
+from stages.training.trial import LASTS
 from tests.scenes import camera, cloud
 from tests.training.pictures import view_of
 
@@ -55,15 +60,59 @@ def test_few_are_lent_and_of_too_few_none(n, wanted):
     assert all(0 <= row < n for row in rows)
 
 
-def test_in_doubt_splats_sit_out_half():
-    shares = [by_heart(passed_on) for passed_on in (0.0, 0.1, 0.25, 0.4, 1.0)]
-    assert shares == pytest.approx([1, 1, 0.5, 0, 0])
+def watched(made):
+    """What becomes of each step: (which photograph, whether splats sat out), and the models that
+    steps began from where the trainer loaded one."""
+    steps, loads, (step, load) = [], [], (made.stepper.step, made.stepper.load)
+
+    def stepping(level, settings, rates, smooth, dropout):
+        row = [view.levels[0] is level or view.levels[1] is level for view in made.train].index(
+            True
+        )
+        steps.append((row, dropout is not None))
+        return step(level, settings, rates, smooth, dropout)
+
+    def loading(model):
+        loads.append((len(steps), [array.tobytes() for array in vars(model).values()]))
+        load(model)
+
+    made.stepper.step, made.stepper.load = stepping, loading
+    return steps, loads
+
+
+@pytest.mark.parametrize(("sure_db", "by_heart"), [(-99.0, True), (99.0, False)])
+def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_one_is_kept(
+    tmp_path, monkeypatch, sure_db, by_heart
+):
+    monkeypatch.setattr(training, "SURE_DB", sure_db)
+    made, start = trainer(tmp_path / "a", contradicting=False, patience_db=0.0)
+    steps, loads = watched(made)
+    made.run(start)
+    half, lasts = int(GROWTH_ENDS * STEPS), round(LASTS * STEPS)
+    plain, other, rest = (slice(half + k * lasts, half + (k + 1) * lasts) for k in range(3))
+    assert not any(sat_out for _, sat_out in steps[: plain.stop])
+    assert all(sat_out for _, sat_out in steps[other])
+    assert all(sat_out == by_heart for _, sat_out in steps[rest.start :])
+    assert len(steps) == STEPS + lasts
+    assert [row for row, _ in steps[plain]] == [row for row, _ in steps[other]]
+    assert LENT not in {row for row, _ in steps[: rest.start]}
+    assert LENT in {row for row, _ in steps[rest.start :]}
+    at = dict(loads)
+    assert at[other.start] == at[plain.start]
+    assert (rest.start in at) is not by_heart  # what sat out goes on as it is
+    assert made.by_heart is by_heart
+
+
+def test_what_the_trial_puts_aside_goes_with_the_checkpoint(tmp_path):
+    made, start = trainer(tmp_path / "a", contradicting=False)
+    made.run(start)
+    remove_checkpoint(tmp_path / "a")
+    assert not list((tmp_path / "a").iterdir())
 
 
 def test_what_is_learnt_by_heart_is_cut_short_and_says_so(tmp_path):
     made, start = trainer(tmp_path / "a", contradicting=True)
     made.run(start)
-    assert made.by_heart
     assert "promised no more" in made.ended
     assert made.schedule.steps < 0.8 * STEPS
     assert made.schedule.share(made.schedule.steps) == 1.0
@@ -72,7 +121,6 @@ def test_what_is_learnt_by_heart_is_cut_short_and_says_so(tmp_path):
 def test_what_others_gain_from_goes_its_whole_way(tmp_path):
     made, start = trainer(tmp_path / "a", contradicting=False)
     made.run(start)
-    assert not made.by_heart
     assert (made.ended, made.schedule.steps) == ("", STEPS)
 
 
@@ -82,14 +130,15 @@ def test_without_patience_nothing_is_cut_short(tmp_path):
     assert (made.ended, made.schedule.steps) == ("", STEPS)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.9])
+@pytest.mark.parametrize("share", [0.3, 0.53, 0.58, 0.9])
 def test_a_stopped_run_keeps_its_plan_and_what_was_told(tmp_path, share):
     whole, start = trainer(tmp_path / "whole", contradicting=True)
     wanted = whole.run(start)
     stop_at, report = int(share * whole.schedule.steps), Report()
+    count = itertools.count(1)
 
     def stop(label, done, total, numbers):
-        if done == stop_at:
+        if label == "training" and next(count) == stop_at:
             report.stop_requested.set()
 
     report.listener = stop
