@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.measure.worth import Worth, beside_pictures, floaters
-from stages.scene import SH_C0, Camera, Splats, morton
+from stages.scene import SH_C0, Camera, Splats, morton, numbers_of
 
 SPLATS_A_ROUND = 0.10  # predictions for single splats add up only while few go at once,
 NEIGHBOURS = 4  # and of so many side by side only one: they stand in for each other
 BANDS = 2.5  # times as many splats may lose bands: colours hardly depend on each other
-_SHAPE_NUMBERS = 11  # of a splat without its colour
 
 
 @dataclass(frozen=True)
@@ -36,11 +35,6 @@ class Cut:
         sh = np.where(kept, splats.sh, splats.sh.dtype.type(0))
         sh[:, 0] += (self.colour / SH_C0).astype(sh.dtype)
         return replace(splats, sh=sh, sh_degrees=self.degrees).take(~self.gone)
-
-
-def numbers_of(degrees: NDArray[np.integer]) -> NDArray[np.int64]:
-    """[N] how many numbers a splat of each degree is."""
-    return _SHAPE_NUMBERS + 3 * (degrees.astype(np.int64) + 1) ** 2
 
 
 def choose(

@@ -27,6 +27,7 @@ from stages.scene.splats import (
     TrainedSplats,
     dc_to_rgb,
     logit,
+    numbers_of,
     rgb_to_dc,
 )
 from stages.scene.storage import load_splats, save_splats
@@ -53,6 +54,7 @@ __all__ = [
     "look_at",
     "look_of",
     "near_plane",
+    "numbers_of",
     "rgb_to_dc",
     "save_splats",
     "scene_extent",

@@ -136,6 +136,12 @@ class QuantisedSplats:
     flat_dc: NDArray[np.floating] | None = None
 
 
+def numbers_of(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
+    """[N] how many numbers a splat of each degree is: place, rotation, scales and opacity, and
+    three for each term of its colour."""
+    return np.asarray(3 + 4 + 3 + 1 + 3 * (sh_degrees.astype(np.int64) + 1) ** 2)
+
+
 def rgb_to_dc(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
     """DC coefficients whose colour is `rgb` (0..1)."""
     return (rgb - 0.5) / SH_C0

@@ -11,14 +11,13 @@ import numpy as np
 
 from stages.base.atomic import replacing
 from stages.base.memory import available_mib
-from stages.scene import Camera
+from stages.scene import Camera, numbers_of
 from stages.training.density import FEWEST, splat_cap
 from stages.training.optimiser import Model
 
 FILE_NAME = "cap.json"
 DEVICE_MEMORY = "the GPU's memory"
 PHOTOGRAPHS = "the photographs' pixels"
-GEOMETRY = 11  # numbers of a splat but its colour: place, rotation, scales, opacity
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def splats_told(cameras: Sequence[Camera], sh_degree: int) -> int:
     """How many splats of `sh_degree` have no more numbers than the photographs of `cameras`: with
     more, some are told by nothing."""
     numbers = sum(3 * camera.width * camera.height for camera in cameras)
-    return max(FEWEST, numbers // (GEOMETRY + 3 * (sh_degree + 1) ** 2))
+    return max(FEWEST, numbers // int(numbers_of(np.array(sh_degree))))
 
 
 def lower_cap(folder: Path, splats: int) -> Cap:
