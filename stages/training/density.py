@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from stages.scene import logit
 from stages.scene.rotations import matrices_of
 from stages.training.optimiser import Model
-from stages.training.strategy import Strategy
+from stages.training.strategy import Strategy, photographs_that_see
 
 SPLIT_FACTOR = 1.6  # children of a split are that much smaller
 LARGE = 0.01  # of the scene's extent: above it a splat is split, below it cloned
 GIANT = 0.1  # of the scene's extent
 THRESHOLD = 2e-4  # of the mean gradient, see `AdaptiveDensity`
+ENOUGH = 4.0  # photographs: what fewer of them see grows later, and what hangs in the air is such
 OPACITY_MIN = 0.005
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
 
@@ -46,14 +47,15 @@ def sound(model: Model, settled: bool, extent: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class AdaptiveDensity:
-    """Clones small splats and splits large ones where the picture pulls at them hardest; see
-    `strategy.Strategy`.
+    """Clones small splats and splits large ones where the picture pulls at them hardest, and enough
+    photographs see them; see `strategy.Strategy`.
 
-    extent: of the scene, world units. threshold: of the mean gradient by the position on the
-    picture (NDC units of the mean loss).
+    extent: of the scene, world units. photographs: in training. threshold: of the mean gradient by
+    the position on the picture (NDC units of the mean loss).
     """
 
     extent: float
+    photographs: int
     threshold: float = THRESHOLD
 
     def prune(self, model: Model, settled: bool) -> Model:
@@ -64,9 +66,10 @@ class AdaptiveDensity:
         pull = model.gradient_sum / np.maximum(model.gradient_count, 1)
         wanted = np.flatnonzero(pull >= self.threshold)
         room = max(0, budget - len(model))
-        if len(wanted) > room:  # the strongest gradients go first
-            strongest = np.argsort(-pull[wanted], kind="stable")[:room]
-            wanted = np.sort(wanted[strongest])
+        if len(wanted) > room:
+            see = photographs_that_see(model.gradient_count[wanted], self.photographs)
+            first = np.argsort(-pull[wanted] * np.minimum(1.0, see / ENOUGH), kind="stable")
+            wanted = np.sort(wanted[first[:room]])
         large = np.exp(model.log_scales[wanted].max(1)) > LARGE * self.extent
         clones = model.take(wanted[~large]).fresh()
         parents = model.take(wanted[large])

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.training.strategy import photographs_that_see
+
 FEW = 2.0  # photographs: the share of steps is (FEW / n)^2
 LARGEST_SHARE = 0.3  # of the steps, however few photographs see a splat
 INVISIBLE = -20.0  # opacity's logit of what sits out
@@ -30,9 +32,8 @@ class Dropout:
     key: int
 
     def resting(self, seen: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """[N] which splats sit out. seen [N]: in how many steps each was in the picture, since they
-        were last counted together; before anything was counted, all are taken to be seen by all."""
-        photographs = self.views * ((seen + 1.0) / (int(seen.max(initial=0)) + 1.0))
+        """[N] which splats sit out. seen [N]: see `photographs_that_see`."""
+        photographs = photographs_that_see(seen, self.views)
         share = np.minimum(LARGEST_SHARE, np.square(FEW / np.maximum(photographs, 1.0)))
         return np.asarray(noise(len(seen), self.key) < share * _UINT32)
 

@@ -8,8 +8,8 @@ from stages.training.density import AdaptiveDensity
 from stages.training.relocation import Relocation
 from stages.training.strategy import Strategy
 
-# Each is made from the scene's extent, world units.
-STRATEGIES: dict[str, Callable[[float], Strategy]] = {
+# Each is made from the scene's extent, world units, and the number of photographs in training.
+STRATEGIES: dict[str, Callable[[float, int], Strategy]] = {
     "adaptive": AdaptiveDensity,
-    "relocation": Relocation,
+    "relocation": lambda extent, photographs: Relocation(extent),
 }

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.training.optimiser import Model
 
@@ -23,3 +24,10 @@ class Strategy(Protocol):
     def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
         """With more splats where the photographs ask for them, at most `budget` in all; what was
         added up since the last time is forgotten."""
+
+
+def photographs_that_see(counts: NDArray[np.int32], photographs: int) -> NDArray[np.float64]:
+    """[N] of so many in training, by `counts` [N]: in how many steps each splat was in the picture,
+    since they were last counted together; before anything was counted, all."""
+    most = int(counts.max(initial=0))
+    return np.asarray(photographs * ((counts + 1.0) / (most + 1.0)))

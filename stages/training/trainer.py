@@ -81,7 +81,7 @@ class Trainer:
         if self.backend == AUTO:
             self.stepper = FrugalStep(self.stepper, self._memory_full)
         self.makers: list[Maker] = []
-        self._strategy = STRATEGIES[self.growth](self.schedule.extent)
+        self._strategy = STRATEGIES[self.growth](self.schedule.extent, len(self.train))
         if self.within:
             self._strategy = Within(self._strategy, self.within)
         self.ended = ""  # why before all steps, if it did

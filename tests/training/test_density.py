@@ -9,6 +9,7 @@ from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
 
 EXTENT = 10.0
+PHOTOGRAPHS = 8
 
 
 def model(n, scale=0.01, opacity=0.5):
@@ -29,7 +30,7 @@ def pulled(m, rows, by=1.0):
 
 
 def grow(m, cap=10**6):
-    return AdaptiveDensity(EXTENT).grow(m, cap, np.random.default_rng(0))
+    return AdaptiveDensity(EXTENT, PHOTOGRAPHS).grow(m, cap, np.random.default_rng(0))
 
 
 def test_small_splats_that_are_pulled_are_cloned_in_place():
@@ -54,8 +55,8 @@ def test_faint_giant_and_broken_splats_go():
     m.opacity_logits[0] = logit(0.004)
     m.log_scales[1] = np.log(0.11 * EXTENT)
     m.means[2, 1] = np.nan
-    assert len(AdaptiveDensity(EXTENT).prune(m, settled=True)) == 7
-    assert len(AdaptiveDensity(EXTENT).prune(m, settled=False)) == 8
+    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, settled=True)) == 7
+    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, settled=False)) == 8
 
 
 @pytest.mark.parametrize("room", [0, 1, 3])
@@ -66,6 +67,15 @@ def test_the_cap_is_kept_and_the_strongest_go_first(room):
     assert len(grown) == 10 + room
     if room:
         np.testing.assert_array_equal(grown.means[10:], m.means[10 - room :])
+
+
+def test_what_one_photograph_sees_grows_after_what_many_see_though_it_is_pulled_at_harder():
+    m = pulled(model(3), range(3))
+    m.gradient_count[:] = [1, 30, 60]  # of 60 steps: about 1, 4 and 8 of the 8 photographs
+    m.gradient_sum[:] = m.gradient_count * np.array([3.0, 1.0, 1.1], np.float32)
+    np.testing.assert_array_equal(grow(m, cap=4).means[3], m.means[2])
+    np.testing.assert_array_equal(grow(m, cap=5).means[3:], m.means[1:])
+    assert len(grow(m)) == 6  # while there is room, all do
 
 
 def test_the_cap_takes_half_of_the_free_memory():

@@ -26,7 +26,7 @@ def model() -> Model:
     return found
 
 
-BLOCK = Within(AdaptiveDensity(extent=1.0), (0.0, -9.0, 9.0, 9.0))
+BLOCK = Within(AdaptiveDensity(extent=1.0, photographs=8), (0.0, -9.0, 9.0, 9.0))
 
 
 def test_a_block_grows_in_its_own_rectangle_alone(model) -> None:
