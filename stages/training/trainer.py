@@ -310,7 +310,9 @@ class Trainer:
         }
         if self.history and "psnr_db" in self.history[-1]:
             numbers["held_out_psnr_db"] = round(self.history[-1]["psnr_db"], 2)
-        self.report.progress(step, self.schedule.steps, "training", **numbers)
+        again = self.trial and self.trial.sits_out
+        label = "training again, splats sitting steps out" if again else "training"
+        self.report.progress(step, self.schedule.steps, label, **numbers)
 
     def _record(self, step: int) -> None:
         began = self.clock.spent().seconds
