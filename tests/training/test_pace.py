@@ -47,6 +47,15 @@ def test_steps_that_take_a_second_each_still_end_in_time():
     assert 30 < took < 66
 
 
+def test_steps_that_do_not_count_are_not_taken_for_a_slow_machine():
+    pace = Pace(100.0)
+    assert pace.steps(10, 1.0) is None
+    assert pace.steps(110, 11.0) == 110 + 890  # a tenth of a second each
+    pace.restart()  # ten seconds went into what did not count
+    assert pace.steps(110, 21.0) is None
+    assert pace.steps(210, 31.0) == 210 + 690
+
+
 def test_a_plan_that_is_never_changed_is_the_share_of_steps():
     plan = schedule(400)
     assert [plan.share(step) for step in (0, 100, 400)] == [0.0, 0.25, 1.0]
