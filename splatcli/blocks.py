@@ -254,11 +254,7 @@ class _Scene:
         degree, backend = self.settings.sh_degree, drawn_by(self.settings)
         given = [part.splats.with_sh_degree(degree) for part in parts]
         splats, counts = merge.merged(given, cells, look)
-        found = TrainedSplats(
-            splats,
-            float(np.mean([part.passed_on for part in parts])),
-            bool(np.mean([part.by_heart for part in parts]) > 0.5),
-        )
+        found = TrainedSplats(splats, bool(np.mean([part.by_heart for part in parts]) > 0.5))
         seam = merge.at_seams(splats, counts, cells)
         gone = np.zeros(len(splats), bool)
         if crossing:

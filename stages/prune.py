@@ -112,7 +112,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     aim = Aim(
         settings.price,
         settings.max_loss_db,
-        felt_share(trained.passed_on),
+        felt_share(trained.by_heart),
         settings.max_splats,
         settings.max_mb * 1e6,
         settings.min_psnr,
@@ -204,5 +204,10 @@ def load(folder: Path) -> Splats:
 
 
 STAGE = Stage(
-    name="prune", version=9, reads=("sfm", "train"), settings_type=PruneSettings, run=run, load=load
+    name="prune",
+    version=10,
+    reads=("sfm", "train"),
+    settings_type=PruneSettings,
+    run=run,
+    load=load,
 )

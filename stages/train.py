@@ -173,7 +173,7 @@ def run(
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
-    trained = TrainedSplats(splats, trainer.passed_on, trainer.by_heart)
+    trained = TrainedSplats(splats, trainer.by_heart)
     save(folder, trained)
     remove_checkpoint(folder)
     forget_cap(folder)
@@ -181,7 +181,6 @@ def run(
     _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
     report.metric("learnt_by_heart", trainer.by_heart)
-    report.metric("passed_on", round(trainer.passed_on, 3))
     if trainer.ended:
         report.metric("ended_early", trainer.ended)
     report.metric("splats", len(splats))
@@ -434,8 +433,7 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _LEARNT) as temporary:
-        learnt = {"passed_on": trained.passed_on, "by_heart": trained.by_heart}
-        temporary.write_text(json.dumps(learnt) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps({"by_heart": trained.by_heart}) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:
@@ -446,7 +444,7 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     try:
         learnt = json.loads((folder / _LEARNT).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, float(learnt["passed_on"]), bool(learnt["by_heart"]))
+        return TrainedSplats(splats, bool(learnt["by_heart"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "train-folder-damaged",

@@ -33,7 +33,7 @@ def said(before: TrainedSplats, found: Outcome, dial: float, tune_steps: int) ->
         f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
         f"{counted(len(kept), 'round')} with {counted(tune_steps, 'step')} of fine-tuning in all: "
         f"{found.end_db - found.start_db:+.2f} dB on the photographs of training; other views "
-        f"feel at most {felt_share(before.passed_on):.0%} of that."
+        f"feel at most {felt_share(before.by_heart):.0%} of that."
     )
     why = _WHY.get(found.stopped_by, "the rounds that were asked for were done")
     return [*told, f"It stopped since {why}."]

@@ -109,14 +109,10 @@ class Splats:
 
 @dataclass(frozen=True)
 class TrainedSplats:
-    """Splats as trained, and what is known of their training.
-
-    passed_on: of each dB that photographs in training gained towards its end, how much those gained
-    that were lent, 0 to 1. by_heart: whether those came out better where splats sat steps out.
-    """
+    """Splats as trained. by_heart: whether photographs were learnt by heart, see `training.trial`;
+    splats sat steps out if so, and what those photographs lose hardly any other view feels."""
 
     splats: Splats
-    passed_on: float = 1.0
     by_heart: bool = False
 
 

@@ -34,15 +34,13 @@ class Maker:
 class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
     done by then), see `schedule.Schedule`. history: as logged. marks: of the
-    photographs that decide. passed_on: what they told. trial, by_heart: whether they are being
-    asked more, and what came out. times: of each entry of the history, and, last, now. makers: one
-    after the other."""
+    photographs that decide. trial, by_heart: whether they are being asked, and what came out.
+    times: of each entry of the history, and, last, now. makers: one after the other."""
 
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
     marks: list[Mark]
-    passed_on: float
     trial: Trial | None
     by_heart: bool | None
     times: list[Spent]
@@ -78,7 +76,6 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         (int(steps), int(since), float(share)),
         header["history"],
         [Mark(**mark) for mark in header["marks"]],
-        float(header["passed_on"]),
         Trial(**header["trial"]) if header["trial"] else None,
         header["by_heart"],
         [Spent(**t) for t in header["times"]],

@@ -47,7 +47,7 @@ CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
-MARKS = 50  # as often the photographs that were lent are looked at
+MARKS = 50  # as often, where patience is asked for, the photographs that were lent are looked at
 
 
 @dataclass
@@ -86,8 +86,8 @@ class Trainer:
             self._strategy = Within(self._strategy, self.within)
         self.ended = ""  # why before all steps, if it did
         self.marks: list[Mark] = []  # of the photographs lent
-        self.passed_on = 1.0 if self.lent else 0.0  # so few photographs are learnt by heart
         self.trial: Trial | None = None
+        # Where none can be lent, so few photographs are learnt by heart.
         self._verdict: bool | None = None if self.lent else True
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
@@ -153,8 +153,7 @@ class Trainer:
         if saved is not None:
             model, told = saved
             step, self.history, self.marks = told.step, told.history, told.marks
-            self.passed_on, self.trial = told.passed_on, told.trial
-            self._verdict = told.by_heart
+            self.trial, self._verdict = told.trial, told.by_heart
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock, self.makers = Clock(spent), told.makers
@@ -184,7 +183,7 @@ class Trainer:
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        told = self.marks, self.passed_on, self.trial, self._verdict
+        told = self.marks, self.trial, self._verdict
         saved = Saved(step, plan, self.history, *told, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
@@ -243,14 +242,13 @@ class Trainer:
             return  # its course is run, whatever time is left
         if self.seconds and (steps := self._pace.steps(step, self.clock.spent().seconds)):
             self.schedule = self.schedule.replanned(step, steps)
-        if not self.lent or not self.schedule.passes(step, MARKS):
+        if not self.lent or not self.patience_db or not self.schedule.passes(step, MARKS):
             return
         if self.schedule.share(step) > GROWTH_ENDS:
             return
         self.marks.append(Mark(step, self._mean_db(self.lent), self._mean_db(self._told())))
-        self.passed_on = share_passed_on(self.marks)
         promised = remaining_gain_db(self.marks, round(GROWTH_ENDS * self.schedule.steps))
-        if self.passed_on < BY_HEART and self.patience_db and promised < self.patience_db:
+        if share_passed_on(self.marks) < BY_HEART and promised < self.patience_db:
             self.schedule = self.schedule.grown(step)
             self.ended = f"after {step} steps growth promised no more than {self.patience_db} dB"
 

@@ -148,6 +148,6 @@ def test_a_stopped_run_keeps_its_plan_and_what_was_told(tmp_path, share):
     second, start = trainer(tmp_path / "parts", contradicting=True)
     found = second.run(start)
     assert second.schedule == whole.schedule
-    assert (second.marks, second.passed_on) == (whole.marks, whole.passed_on)
+    assert (second.marks, second.by_heart) == (whole.marks, whole.by_heart)
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
