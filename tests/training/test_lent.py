@@ -130,7 +130,7 @@ def test_without_patience_nothing_is_cut_short(tmp_path):
     assert (made.ended, made.schedule.steps) == ("", STEPS)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.53, 0.58, 0.9])
+@pytest.mark.parametrize("share", [0.3, 0.55, 0.63, 0.9])
 def test_a_stopped_run_keeps_its_plan_and_what_was_told(tmp_path, share):
     whole, start = trainer(tmp_path / "whole", contradicting=True)
     wanted = whole.run(start)
