@@ -46,11 +46,12 @@ console = Console(width=150)
 
 @dataclass(frozen=True)
 class Cell:
-    """One capture, preset and seed. scores: of each judge."""
+    """One capture, preset and seed. side: at which it was judged, pixels. scores: of each judge."""
 
     capture: str
     preset: str
     seed: int
+    side: int
     splats: int
     cpu_seconds: float
     wall_seconds: float
@@ -104,11 +105,25 @@ def named(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def measured(capture: Capture, preset: str, seed: int, side: int) -> Cell:
-    """Train, prune and quantise, and judge what came out; kept on disk."""
+    """Train, prune and quantise, and judge what came out; kept on disk. What was judged at another
+    size is judged again."""
     folder = capture.folder / f"{preset}-{seed}"
     kept = folder / "cell.json"
     if kept.is_file():
-        return Cell(**json.loads(kept.read_text(encoding="utf-8")))
+        cell = Cell(**json.loads(kept.read_text(encoding="utf-8")))
+        if cell.side != side:
+            splats = load_stage("quantise").load(folder / "quantise").splats
+            cell = replace(cell, side=side, scores=judged(splats, capture.judges, side))
+    else:
+        splats, cpu, wall = made(capture, preset, seed, folder)
+        found = judged(splats, capture.judges, side)
+        cell = Cell(capture.name, preset, seed, side, len(splats), cpu, wall, found)
+    kept.write_text(json.dumps(asdict(cell), indent=1), encoding="utf-8")
+    return cell
+
+
+def made(capture: Capture, preset: str, seed: int, folder: Path) -> tuple[Splats, float, float]:
+    """(what came out, CPU seconds, wall seconds)."""
     console.print(f"{capture.name}, {preset}, seed {seed}")
     started, cpu = time.monotonic(), _cpu_seconds()
     outputs: dict[str, Any] = {"sfm": capture.reconstruction, "seed": capture.seeds}
@@ -120,15 +135,14 @@ def measured(capture: Capture, preset: str, seed: int, side: int) -> Cell:
         place = folder / name
         place.mkdir(parents=True, exist_ok=True)
         outputs[name] = stage.run(outputs, settings, place, Report())
-    splats = outputs["quantise"].splats
     wall, cpu = time.monotonic() - started, _cpu_seconds() - cpu
-    judged = replace(splats, look=replace(splats.look, side=side))
-    found = scores(drawing_of(judged, "auto"), capture.judges, with_flip=True)
-    cell = Cell(
-        capture.name, preset, seed, len(splats), cpu, wall, [asdict(score) for score in found]
-    )
-    kept.write_text(json.dumps(asdict(cell), indent=1), encoding="utf-8")
-    return cell
+    return outputs["quantise"].splats, cpu, wall
+
+
+def judged(splats: Splats, judges: Sequence[Photograph], side: int) -> list[dict[str, Any]]:
+    """What each judge says of them at a size."""
+    draw = drawing_of(replace(splats, look=replace(splats.look, side=side)), "auto")
+    return [asdict(score) for score in scores(draw, judges, with_flip=True)]
 
 
 def _cpu_seconds() -> float:
@@ -170,7 +184,10 @@ def grouped(cells: list[Cell]) -> dict[tuple[str, str], list[Cell]]:
 
 
 def compare(now: list[Cell], before: list[Cell]) -> None:
-    """A line for each capture and preset that both have, over the seeds that both have."""
+    """A line for each capture and preset that both have, over the seeds that both have. Raises
+    SystemExit where they were not judged at one size."""
+    if sides := {cell.side for cell in [*now, *before]} - {now[0].side}:
+        raise SystemExit(f"Judged at {now[0].side} px, and before at {sides.pop()}: give --side.")
     earlier = grouped(before)
     for key, group in grouped(now).items():
         seeds = {cell.seed: cell for cell in earlier.get(key, [])}
