@@ -254,14 +254,16 @@ class _Scene:
         degree, backend = self.settings.sh_degree, drawn_by(self.settings)
         given = [part.splats.with_sh_degree(degree) for part in parts]
         splats, counts = merge.merged(given, cells, look)
-        found = TrainedSplats(splats, bool(np.mean([part.by_heart for part in parts]) > 0.5))
+        sat_out = np.mean([part.sat_out for part in parts]) > 0.5
+        by_heart = np.mean([part.by_heart for part in parts]) > 0.5
+        found = TrainedSplats(splats, bool(sat_out), bool(by_heart))
         seam = merge.at_seams(splats, counts, cells)
         gone = np.zeros(len(splats), bool)
         if crossing:
             self.report.progress(0, 1, "seams")
             photographs = load_photographs(self.whole.folder, crossing, look)
             extent = seen_extent(self.whole)
-            tuner = Tuner(photographs, extent, backend, self.report, found.by_heart)
+            tuner = Tuner(photographs, extent, backend, self.report, found.sat_out)
             splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
         ends = np.cumsum([0, *counts])
         left = [int((~gone[i:j]).sum()) for i, j in pairwise(ends)]

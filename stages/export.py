@@ -172,11 +172,11 @@ def _fitting(
     training = split_held_out(reconstruction.views)[0]
     if not (settings.fit_steps and training and any(FORMATS[name].rounds for name in wanted)):
         return None
-    by_heart, backend, folder = inputs["train"].by_heart, drawn_by(settings), reconstruction.folder
+    sat_out, backend, folder = inputs["train"].sat_out, drawn_by(settings), reconstruction.folder
     photographs = load_photographs(folder, training, splats.look)
-    tuner = Tuner(photographs, seen_extent(reconstruction), backend, report, by_heart)
+    tuner = Tuner(photographs, seen_extent(reconstruction), backend, report, sat_out)
     seen = np.zeros(len(splats), np.int32)
-    if by_heart:  # only then it matters
+    if sat_out:  # only then it matters
         seen = measure_worth(splats, photographs, backend).photographs
     deciding = load_photographs(folder, spread_over(training, DECIDING), splats.look)
     return Fitting(tuner, deciding, backend, settings.fit_steps, seen)

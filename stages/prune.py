@@ -107,7 +107,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     backend = drawn_by(settings)
     before = mean_psnr_db(splats, judges, backend)
     extent = seen_extent(reconstruction)
-    tuner = Tuner(photographs, extent, backend, report, trained.by_heart)
+    tuner = Tuner(photographs, extent, backend, report, trained.sat_out)
     size_bytes = _sizes(settings, splats, photographs, reconstruction)
     aim = Aim(
         settings.price,

@@ -173,7 +173,7 @@ def run(
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
-    trained = TrainedSplats(splats, trainer.by_heart)
+    trained = TrainedSplats(splats, trainer.sits_out, trainer.by_heart)
     save(folder, trained)
     remove_checkpoint(folder)
     forget_cap(folder)
@@ -181,6 +181,8 @@ def run(
     _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
     report.metric("learnt_by_heart", trainer.by_heart)
+    if trainer.lent and trainer.gain_db is not None:
+        report.metric("sitting_out_gain_db", round(trainer.gain_db, 3))
     if trainer.ended:
         report.metric("ended_early", trainer.ended)
     report.metric("splats", len(splats))
@@ -433,7 +435,8 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _LEARNT) as temporary:
-        temporary.write_text(json.dumps({"by_heart": trained.by_heart}) + "\n", encoding="utf-8")
+        learnt = {"sat_out": trained.sat_out, "by_heart": trained.by_heart}
+        temporary.write_text(json.dumps(learnt) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:
@@ -444,7 +447,7 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     try:
         learnt = json.loads((folder / _LEARNT).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, bool(learnt["by_heart"]))
+        return TrainedSplats(splats, bool(learnt["sat_out"]), bool(learnt["by_heart"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "train-folder-damaged",

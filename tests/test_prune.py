@@ -35,7 +35,7 @@ def run(
 ) -> tuple[Splats, Report]:
     """Without fine-tuning unless it is asked for: splats that stay are then the same."""
     report = Report()
-    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained, by_heart)}
+    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained, by_heart=by_heart)}
     wanted = prune.PruneSettings(**{"tune_steps": 0, **settings})
     return prune.run(inputs, wanted, folder, report), report
 

@@ -29,9 +29,9 @@ MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 
 
 class Tuner:
-    """Goes on with splats where training left them. extent: of the scene, world units. by_heart:
-    see `scene.by_heart`; splats sit steps out here as they did in training, and colours are settled
-    for the whole after it."""
+    """Goes on with splats where training left them. extent: of the scene, world units. sits_out:
+    whether splats sit steps out here, as they did in training, and colours are settled for the
+    whole after it."""
 
     def __init__(
         self,
@@ -39,10 +39,10 @@ class Tuner:
         extent: float,
         backend: str,
         report: Report,
-        by_heart: bool = False,
+        sits_out: bool = False,
     ) -> None:
         self.photographs, self.extent, self.report = photographs, extent, report
-        self.by_heart = by_heart
+        self.sits_out = sits_out
         self.cameras = [photograph.camera for photograph in photographs]
         self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
         self.stepper, self.rasteriser = step_of(backend), rasteriser_of(backend)
@@ -75,7 +75,7 @@ class Tuner:
             rates = replace(rates, **dict.fromkeys(still, 0.0))
             self.stepper.step(self._level(), settings, rates, False, self._dropout())
         tuned = _with(self._finished(self.stepper.model(), splats), splats, still)
-        if worth_settling(self.by_heart, len(self.photographs)):
+        if worth_settling(self.sits_out, len(self.photographs)):
             return self._recoloured(tuned, settings, still)
         return tuned
 
@@ -91,7 +91,7 @@ class Tuner:
         return replace(splats, sh=Recolouring(*where).of(model).sh)
 
     def _dropout(self) -> Dropout | None:
-        if not self.by_heart:
+        if not self.sits_out:
             return None
         key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
         return Dropout(len(self.photographs), key)

@@ -109,10 +109,12 @@ class Splats:
 
 @dataclass(frozen=True)
 class TrainedSplats:
-    """Splats as trained. by_heart: whether photographs were learnt by heart, see `training.trial`;
-    splats sat steps out if so, and what those photographs lose hardly any other view feels."""
+    """Splats as trained. sat_out: whether splats sat steps out towards the end, see
+    `training.trial`. by_heart: whether photographs were learnt by heart: what these lose hardly any
+    other view feels."""
 
     splats: Splats
+    sat_out: bool = False
     by_heart: bool = False
 
 

@@ -34,7 +34,7 @@ class Maker:
 class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
     done by then), see `schedule.Schedule`. history: as logged. marks: of the
-    photographs that decide. trial, by_heart: whether they are being asked, and what came out.
+    photographs that decide. trial, gain_db: whether they are being asked, and what came out.
     times: of each entry of the history, and, last, now. makers: one after the other."""
 
     step: int
@@ -42,7 +42,7 @@ class Saved:
     history: list[dict[str, Any]]
     marks: list[Mark]
     trial: Trial | None
-    by_heart: bool | None
+    gain_db: float | None
     times: list[Spent]
     makers: list[Maker]
 
@@ -77,7 +77,7 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         header["history"],
         [Mark(**mark) for mark in header["marks"]],
         Trial(**header["trial"]) if header["trial"] else None,
-        header["by_heart"],
+        header["gain_db"],
         [Spent(**t) for t in header["times"]],
         [Maker(**maker) for maker in header["makers"]],
     )

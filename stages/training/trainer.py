@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -40,7 +41,7 @@ from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.step import TrainingStep, step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
-from stages.training.trial import BEFORE, PLAIN, SURE_DB, Trial, trial_at
+from stages.training.trial import BEFORE, DOUBT_DB, PLAIN, SURE_DB, Trial, trial_at
 from stages.training.views import Level, TrainingView
 
 CHECKPOINT_SECONDS = 30.0
@@ -88,7 +89,7 @@ class Trainer:
         self.marks: list[Mark] = []  # of the photographs lent
         self.trial: Trial | None = None
         # Where none can be lent, so few photographs are learnt by heart.
-        self._verdict: bool | None = None if self.lent else True
+        self.gain_db: float | None = None if self.lent else math.inf  # by sitting out
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
         self._onlookers = [self.held_out[i] for i in spread(len(self.held_out))]
@@ -108,7 +109,7 @@ class Trainer:
             loss = self.step(step)
             self._adapt(step)
             step += 1
-            if step == self.schedule.steps and worth_settling(self.by_heart, len(self.train)):
+            if step == self.schedule.steps and worth_settling(self.sits_out, len(self.train)):
                 self._recolour()
             if not self.trial:
                 if self.schedule.passes(step, EVALUATIONS):
@@ -138,9 +139,14 @@ class Trainer:
         return (view.levels[-1] for view in self.train)
 
     @property
+    def sits_out(self) -> bool:
+        """Whether splats sit steps out from where growth ends, as lent photographs told."""
+        return self.gain_db is not None and self.gain_db > DOUBT_DB
+
+    @property
     def by_heart(self) -> bool:
-        """Whether photographs are learnt by heart, as lent ones told once they were asked."""
-        return bool(self._verdict)
+        """Whether photographs are learnt by heart, as lent ones told."""
+        return self.gain_db is not None and self.gain_db > SURE_DB
 
     @property
     def model(self) -> Model:
@@ -153,7 +159,7 @@ class Trainer:
         if saved is not None:
             model, told = saved
             step, self.history, self.marks = told.step, told.history, told.marks
-            self.trial, self._verdict = told.trial, told.by_heart
+            self.trial, self.gain_db = told.trial, told.gain_db
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock, self.makers = Clock(spent), told.makers
@@ -183,7 +189,7 @@ class Trainer:
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        told = self.marks, self.trial, self._verdict
+        told = self.marks, self.trial, self.gain_db
         saved = Saved(step, plan, self.history, *told, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
@@ -219,9 +225,9 @@ class Trainer:
         return self.stepper.step(level, settings, rates, self.smooth, self._dropout(step))
 
     def _dropout(self, step: int) -> Dropout | None:
-        """Once the model grows no more, if it is learnt by heart: before that, who sits out would
-        be pulled at less than it deserves."""
-        sits_out = self.trial.sits_out if self.trial else self.by_heart
+        """Once the model grows no more: before that, who sits out would be pulled at less than it
+        deserves."""
+        sits_out = self.trial.sits_out if self.trial else self.sits_out
         if not sits_out or self.schedule.share(step) < GROWTH_ENDS:
             return None
         return Dropout(len(self.train), self.schedule.key(step))
@@ -256,7 +262,7 @@ class Trainer:
         """The step to go on from after `step` steps: where growth ends, two ways are gone from the
         same model, see `trial`."""
         if not self.trial:
-            if self._verdict is None and (trial := trial_at(step, self.schedule)):
+            if self.gain_db is None and (trial := trial_at(step, self.schedule)):
                 keep_model(self.folder, BEFORE, self.model)
                 self.trial = trial
             return step
@@ -268,8 +274,8 @@ class Trainer:
             self.stepper.load(kept_model(self.folder, BEFORE))
             self.trial = replace(self.trial, plain_db=came_to)
             return self.trial.begun
-        self._verdict = came_to > self.trial.plain_db + SURE_DB
-        if not self._verdict:
+        self.gain_db = came_to - self.trial.plain_db
+        if not self.sits_out:
             self.stepper.load(kept_model(self.folder, PLAIN))
         self.trial = None
         self._pace.restart()

@@ -80,11 +80,11 @@ def watched(made):
     return steps, loads
 
 
-@pytest.mark.parametrize(("sure_db", "by_heart"), [(-99.0, True), (99.0, False)])
+@pytest.mark.parametrize(("doubt_db", "sits_out"), [(-99.0, True), (99.0, False)])
 def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_one_is_kept(
-    tmp_path, monkeypatch, sure_db, by_heart
+    tmp_path, monkeypatch, doubt_db, sits_out
 ):
-    monkeypatch.setattr(training, "SURE_DB", sure_db)
+    monkeypatch.setattr(training, "DOUBT_DB", doubt_db)
     made, start = trainer(tmp_path / "a", contradicting=False, patience_db=0.0)
     steps, loads = watched(made)
     made.run(start)
@@ -92,15 +92,15 @@ def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_one_is_kep
     plain, other, rest = (slice(half + k * lasts, half + (k + 1) * lasts) for k in range(3))
     assert not any(sat_out for _, sat_out in steps[: plain.stop])
     assert all(sat_out for _, sat_out in steps[other])
-    assert all(sat_out == by_heart for _, sat_out in steps[rest.start :])
+    assert all(sat_out == sits_out for _, sat_out in steps[rest.start :])
     assert len(steps) == STEPS + lasts
     assert [row for row, _ in steps[plain]] == [row for row, _ in steps[other]]
     assert LENT not in {row for row, _ in steps[: rest.start]}
     assert LENT in {row for row, _ in steps[rest.start :]}
     at = dict(loads)
     assert at[other.start] == at[plain.start]
-    assert (rest.start in at) is not by_heart  # what sat out goes on as it is
-    assert made.by_heart is by_heart
+    assert (rest.start in at) is not sits_out  # what sat out goes on as it is
+    assert made.sits_out is sits_out
 
 
 def test_what_the_trial_puts_aside_goes_with_the_checkpoint(tmp_path):
@@ -148,6 +148,6 @@ def test_a_stopped_run_keeps_its_plan_and_what_was_told(tmp_path, share):
     second, start = trainer(tmp_path / "parts", contradicting=True)
     found = second.run(start)
     assert second.schedule == whole.schedule
-    assert (second.marks, second.by_heart) == (whole.marks, whole.by_heart)
+    assert (second.marks, second.gain_db) == (whole.marks, whole.gain_db)
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
