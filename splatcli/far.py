@@ -27,7 +27,7 @@ from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Listener
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
-from stages.training.checkpoint import FILE_NAME
+from stages.training.checkpoint import FILE_NAME, checkpoint_files
 
 
 def place_of(text: str) -> Place:
@@ -246,18 +246,27 @@ class PutBack(Listener):
     def __init__(self, run_folder: Path, far: Folder) -> None:
         self._here, self._far = run_folder, far
         self._partial, self._saved_ns = "", 0
+        self._there: dict[str, int] = {}  # when what was put there was made
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._far.put(self._here, [RUN_FILE])
         self._partial = f".{number}-{stage.name}.partial"
+        self._there.clear()
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        checkpoint = self._here / self._partial / FILE_NAME
+        folder = self._here / self._partial
         with suppress(OSError, SplatError):  # without it, more is done again
-            saved_ns = checkpoint.stat().st_mtime_ns
+            saved_ns = (folder / FILE_NAME).stat().st_mtime_ns
             if saved_ns != self._saved_ns:
                 self._saved_ns = saved_ns
-                (self._far / self._partial).put(checkpoint.parent, [REQUEST, FILE_NAME])
+                for name in (REQUEST, *checkpoint_files(folder)):
+                    self._put(folder, name)
+
+    def _put(self, folder: Path, name: str) -> None:
+        made_ns = (folder / name).stat().st_mtime_ns
+        if self._there.get(name) != made_ns:
+            (self._far / self._partial).put(folder, [name])
+            self._there[name] = made_ns
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         label = f"{number}-{stage.name}"

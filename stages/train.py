@@ -63,10 +63,11 @@ class TrainSettings:
         },
     )
     patience: float = field(
-        default=0.0,
+        default=0.05,
         metadata={
-            "help": "Cut training short once it learns its photographs by heart, and growing on "
-            "promises those that it lends less than this (dB); 0: never.",
+            "help": "What growing on for as long again must give photographs that are not trained "
+            "on (dB), in a run of many steps: where it gives less, growth ends there, and training "
+            "with it. 0: never.",
             "min": 0,
             "max": 10,
         },
@@ -181,10 +182,16 @@ def run(
     _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
     report.metric("learnt_by_heart", trainer.by_heart)
-    if trainer.lent and trainer.gain_db is not None:
+    if trainer.answers and trainer.gain_db is not None:
         report.metric("sitting_out_gain_db", round(trainer.gain_db, 3))
+        report.metric("photographs_lent_said", [asdict(answer) for answer in trainer.answers])
     if trainer.ended:
         report.metric("ended_early", trainer.ended)
+        report.warn(
+            "train-holds-no-more",
+            f"Ended after {trainer.schedule.steps:,} of {settings.steps:,} steps: {trainer.ended}. "
+            "These photographs hold no more; --patience 0 trains on all the same.",
+        )
     report.metric("splats", len(splats))
     if len(splats) >= 0.98 * trainer.cap:
         _warn_of_cap(trainer.cap, report)
@@ -459,5 +466,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=15, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=16, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

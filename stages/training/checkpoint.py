@@ -12,13 +12,14 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.lib import format as npy
 
+from stages.base.atomic import replacing
 from stages.training.clock import Spent
 from stages.training.optimiser import Model
-from stages.training.pace import Mark
-from stages.training.trial import BEFORE, PLAIN, Trial
+from stages.training.trial import Answer, Trial
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP8"
+MAGIC = b"SPLATCP9"
+KEPT = "model-{}.bin"  # after so many steps
 
 
 @dataclass(frozen=True)
@@ -33,16 +34,16 @@ class Maker:
 @dataclass(frozen=True)
 class Saved:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
-    done by then), see `schedule.Schedule`. history: as logged. marks: of the
-    photographs that decide. trial, gain_db: whether they are being asked, and what came out.
-    times: of each entry of the history, and, last, now. makers: one after the other."""
+    done by then), see `schedule.Schedule`. history: as logged. trial, answers, stopped: whether
+    lent photographs are being asked, what they said, and whether growth ended for it. times: of
+    each entry of the history, and, last, now. makers: one after the other."""
 
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
-    marks: list[Mark]
     trial: Trial | None
-    gain_db: float | None
+    answers: list[Answer]
+    stopped: bool
     times: list[Spent]
     makers: list[Maker]
 
@@ -61,7 +62,7 @@ def save_checkpoint(folder: Path, model: Model, saved: Saved) -> None:
 
 
 def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
-    """What was saved, or None where there is none or it cannot be read."""
+    """What was saved, or None where there is none, or something of it is missing or damaged."""
     try:
         with (folder / FILE_NAME).open("rb") as file:
             if file.read(8) != MAGIC:
@@ -75,26 +76,33 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         int(header["step"]),
         (int(steps), int(since), float(share)),
         header["history"],
-        [Mark(**mark) for mark in header["marks"]],
         Trial(**header["trial"]) if header["trial"] else None,
-        header["gain_db"],
+        [Answer(**answer) for answer in header["answers"]],
+        header["stopped"],
         [Spent(**t) for t in header["times"]],
         [Maker(**maker) for maker in header["makers"]],
     )
+    asked_of = [saved.trial.begun] if saved.trial else []
+    asked_of += [answer.step for answer in saved.answers]
+    if not all((folder / KEPT.format(step)).exists() for step in asked_of):
+        return None
     return model, saved
 
 
-def keep_model(folder: Path, name: str, model: Model) -> None:
-    """Put a model aside until the stage is finished."""
-    temporary = folder / f"{name}.bin.tmp"
-    with temporary.open("wb") as file:
+def checkpoint_files(folder: Path) -> list[str]:
+    """Names of all that `load_checkpoint` and `kept_model` read, the checkpoint itself last."""
+    return [*sorted(path.name for path in folder.glob(KEPT.format("*"))), FILE_NAME]
+
+
+def keep_model(folder: Path, step: int, model: Model) -> None:
+    """Put the model after `step` steps aside until the stage is finished. Raises SplatError."""
+    with replacing(folder / KEPT.format(step)) as temporary, temporary.open("wb") as file:
         _write(file, model)
-    os.replace(temporary, folder / f"{name}.bin")
 
 
-def kept_model(folder: Path, name: str) -> Model:
+def kept_model(folder: Path, step: int) -> Model:
     """What `keep_model` put aside."""
-    with (folder / f"{name}.bin").open("rb") as file:
+    with (folder / KEPT.format(step)).open("rb") as file:
         return _read(file)
 
 
@@ -112,6 +120,5 @@ def _read(file: BinaryIO) -> Model:
 
 def remove_checkpoint(folder: Path) -> None:
     """A finished stage keeps its result, not its way there."""
-    for name in (FILE_NAME, f"{BEFORE}.bin", f"{PLAIN}.bin"):
+    for name in (*checkpoint_files(folder), f"{FILE_NAME}.tmp"):
         (folder / name).unlink(missing_ok=True)
-        (folder / f"{name}.tmp").unlink(missing_ok=True)

@@ -59,8 +59,15 @@ class Schedule:
         """A run that grows no more: what is left takes as long as if that had been the plan."""
         if self.share(step) >= GROWTH_ENDS:
             return self
-        steps = max(step + 1, round(step / GROWTH_ENDS))
-        return replace(self, steps=steps, since=(step, GROWTH_ENDS))
+        return self.settling(step, max(step + 1, round(step / GROWTH_ENDS)))
+
+    def settling(self, step: int, end: int) -> Schedule:
+        """How the run would end if it grew no more from `step` on, and ended at `end`."""
+        return replace(self, steps=end, since=(step, GROWTH_ENDS))
+
+    def grows(self, step: int) -> bool:
+        """Whether the model is to grow further after `step` steps."""
+        return self.share(step) < GROWTH_ENDS
 
     @property
     def boost(self) -> float:

@@ -36,19 +36,25 @@ from stages.training.density import Within
 from stages.training.dropout import Dropout
 from stages.training.frugal_step import FrugalStep
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
-from stages.training.pace import BY_HEART, Mark, Pace, remaining_gain_db, share_passed_on
-from stages.training.schedule import GROWTH_ENDS, Schedule
+from stages.training.pace import Pace
+from stages.training.schedule import Schedule
 from stages.training.step import TrainingStep, step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
-from stages.training.trial import BEFORE, DOUBT_DB, PLAIN, SURE_DB, Trial, trial_at
+from stages.training.trial import (
+    DOUBT_DB,
+    SURE_DB,
+    Answer,
+    Trial,
+    gives_too_little,
+    trial_at,
+)
 from stages.training.views import Level, TrainingView
 
 CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
-MARKS = 50  # as often, where patience is asked for, the photographs that were lent are looked at
 
 
 @dataclass
@@ -57,7 +63,8 @@ class Trainer:
     judges it. look: how they are drawn. cap: splats at most. folder: where checkpoints go. smooth:
     under the 3D smoothing filter. over_any: over another background at each step, as cut-out
     photographs always are. backend: what draws and steps. lent: rows of `train` that decide, and
-    are trained on only once it grows no more. patience_db: what going on must promise to give.
+    are trained on only once it grows no more. patience_db: what growing for as long again must give
+    them, or else its growth ends where it began; 0: nothing.
     seconds: of wall time in all, 0 for as long as the steps take. within: where it grows, see
     `density.Within`; () for everywhere. growth: by which of STRATEGIES."""
 
@@ -85,11 +92,9 @@ class Trainer:
         self._strategy = STRATEGIES[self.growth](self.schedule.extent, len(self.train))
         if self.within:
             self._strategy = Within(self._strategy, self.within)
-        self.ended = ""  # why before all steps, if it did
-        self.marks: list[Mark] = []  # of the photographs lent
         self.trial: Trial | None = None
-        # Where none can be lent, so few photographs are learnt by heart.
-        self.gain_db: float | None = None if self.lent else math.inf  # by sitting out
+        self.answers: list[Answer] = []  # of the photographs lent
+        self.stopped = False  # by the last of them: training went back to the one before
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
         self._onlookers = [self.held_out[i] for i in spread(len(self.held_out))]
@@ -107,7 +112,8 @@ class Trainer:
         last_saved = time.monotonic()
         while step < self.schedule.steps:
             loss = self.step(step)
-            self._adapt(step)
+            if not self.trial:
+                self._adapt(step)
             step += 1
             if step == self.schedule.steps and worth_settling(self.sits_out, len(self.train)):
                 self._recolour()
@@ -115,7 +121,7 @@ class Trainer:
                 if self.schedule.passes(step, EVALUATIONS):
                     self._record(step)
                 self._replan(step)
-            step = self._tried(step)
+            step = self._asked(step)
             if self.report.stop_requested.is_set() and step < self.schedule.steps:
                 self._save(step)
                 raise Interrupted(f"train stopped after step {step} of {self.schedule.steps}")
@@ -139,6 +145,25 @@ class Trainer:
         return (view.levels[-1] for view in self.train)
 
     @property
+    def gain_db(self) -> float | None:
+        """What lent photographs gain by splats sitting steps out; None before they were asked."""
+        if not self.lent:
+            return math.inf  # so few photographs are learnt by heart
+        told = self.answers[:-1] if self.stopped else self.answers
+        return told[-1].gain_db if told else None
+
+    @property
+    def ended(self) -> str:
+        """Why training ended before all of its steps, if it did."""
+        if not self.stopped:
+            return ""
+        kept, last = self.answers[-2:]
+        return (
+            f"growing on from {kept.splats:,} to {last.splats:,} splats gave photographs not "
+            f"trained on {last.best_db - kept.best_db:+.2f} dB"
+        )
+
+    @property
     def sits_out(self) -> bool:
         """Whether splats sit steps out from where growth ends, as lent photographs told."""
         return self.gain_db is not None and self.gain_db > DOUBT_DB
@@ -158,8 +183,8 @@ class Trainer:
         saved = load_checkpoint(self.folder)
         if saved is not None:
             model, told = saved
-            step, self.history, self.marks = told.step, told.history, told.marks
-            self.trial, self.gain_db = told.trial, told.gain_db
+            step, self.history, self.trial = told.step, told.history, told.trial
+            self.answers, self.stopped = told.answers, told.stopped
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock, self.makers = Clock(spent), told.makers
@@ -189,7 +214,7 @@ class Trainer:
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        told = self.marks, self.trial, self.gain_db
+        told = self.trial, self.answers, self.stopped
         saved = Saved(step, plan, self.history, *told, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
@@ -213,28 +238,34 @@ class Trainer:
         """One step of Adam on one photograph; the loss before it."""
         if self.smooth and step % SMOOTHING_INTERVAL == 0:
             self._smooth_anew(self.model)
+        course = self._course
         view = self.train[self._row(step)]
-        level = view.levels[self.schedule.level(step)]
-        if step + 1 < self.schedule.steps:
-            self.train[self._row(step + 1)].expect(self.schedule.level(step + 1))
-        settings = self.settings(self.schedule.active_sh_degree(step))
+        level = view.levels[course.level(step)]
+        if step + 1 < course.steps:
+            self.train[self._row(step + 1)].expect(course.level(step + 1))
+        settings = self.settings(course.active_sh_degree(step))
         if self.over_any:
-            settings = replace(settings, background=self.schedule.background(step))
-        factor = self.schedule.rate_factor(step)
-        rates = LearningRates().scaled(self.schedule.means_lr(step), factor)
+            settings = replace(settings, background=course.background(step))
+        rates = LearningRates().scaled(course.means_lr(step), course.rate_factor(step))
         return self.stepper.step(level, settings, rates, self.smooth, self._dropout(step))
+
+    @property
+    def _course(self) -> Schedule:
+        """What steps go by: the schedule, or how it would end from where a trial began."""
+        trial = self.trial
+        return self.schedule.settling(trial.begun, trial.ends) if trial else self.schedule
 
     def _dropout(self, step: int) -> Dropout | None:
         """Once the model grows no more: before that, who sits out would be pulled at less than it
         deserves."""
         sits_out = self.trial.sits_out if self.trial else self.sits_out
-        if not sits_out or self.schedule.share(step) < GROWTH_ENDS:
+        if not sits_out or self._course.grows(step):
             return None
         return Dropout(len(self.train), self.schedule.key(step))
 
     def _row(self, step: int) -> int:
         """Which photograph is trained on in `step`: none that is lent, while they are asked."""
-        lent = self.lent if self.trial or self.schedule.share(step) < GROWTH_ENDS else ()
+        lent = self.lent if self.trial or self.schedule.grows(step) else ()
         rows = [row for row in range(len(self.train)) if row not in lent]
         return rows[self.schedule.view(step, len(rows))]
 
@@ -243,48 +274,46 @@ class Trainer:
         self.stepper.load(model)
 
     def _replan(self, step: int) -> None:
-        """Change the plan after `step` steps, if time or a plateau asks for it."""
-        if step == self.schedule.steps:
-            return  # its course is run, whatever time is left
-        if self.seconds and (steps := self._pace.steps(step, self.clock.spent().seconds)):
+        """Change the plan after `step` steps, if there is a time to keep to."""
+        if not self.seconds or step == self.schedule.steps:
+            return  # once its course is run, whatever time is left
+        if steps := self._pace.steps(step, self.clock.spent().seconds):
             self.schedule = self.schedule.replanned(step, steps)
-        if not self.lent or not self.patience_db or not self.schedule.passes(step, MARKS):
-            return
-        if self.schedule.share(step) > GROWTH_ENDS:
-            return
-        self.marks.append(Mark(step, self._mean_db(self.lent), self._mean_db(self._told())))
-        promised = remaining_gain_db(self.marks, round(GROWTH_ENDS * self.schedule.steps))
-        if share_passed_on(self.marks) < BY_HEART and promised < self.patience_db:
-            self.schedule = self.schedule.grown(step)
-            self.ended = f"after {step} steps growth promised no more than {self.patience_db} dB"
 
-    def _tried(self, step: int) -> int:
-        """The step to go on from after `step` steps: where growth ends, two ways are gone from the
-        same model, see `trial`."""
-        if not self.trial:
-            if self.gain_db is None and (trial := trial_at(step, self.schedule)):
-                keep_model(self.folder, BEFORE, self.model)
-                self.trial = trial
+    def _asked(self, step: int) -> int:
+        """The step to go on from after `step` steps, as far as photographs lent have a say in it:
+        see `trial`."""
+        if not self.lent or self.stopped:
             return step
+        if not self.trial:
+            self.trial = trial_at(step, self.schedule)
+            if self.trial:
+                keep_model(self.folder, step, self.model)
+            return step
+        begun = self.trial.begun
         if step < self.trial.ends:
             return step
         came_to = self._mean_db(self.lent)
+        self.stepper.load(kept_model(self.folder, begun))
         if self.trial.plain_db is None:
-            keep_model(self.folder, PLAIN, self.model)
-            self.stepper.load(kept_model(self.folder, BEFORE))
             self.trial = replace(self.trial, plain_db=came_to)
-            return self.trial.begun
-        self.gain_db = came_to - self.trial.plain_db
-        if not self.sits_out:
-            self.stepper.load(kept_model(self.folder, PLAIN))
+            return begun
+        self.answers.append(Answer(begun, len(self.stepper), self.trial.plain_db, came_to))
         self.trial = None
         self._pace.restart()
-        return step
+        if gives_too_little(self.answers, self.patience_db):
+            return self._gone_back(self.answers[-2].step)
+        return begun
 
-    def _told(self) -> list[int]:
-        """As many photographs as are lent, of those that are not, spread over the capture."""
-        others = [row for row in range(len(self.train)) if row not in self.lent]
-        return others[:: max(1, len(others) // len(self.lent))]
+    def _gone_back(self, step: int) -> int:
+        """As it was after `step` steps, and from there on it grows no more."""
+        self.stopped = True
+        self.stepper.load(kept_model(self.folder, step))
+        self.schedule = self.schedule.grown(step)
+        said = [entry["step"] <= step for entry in self.history]
+        self.history = [h for h, kept in zip(self.history, said, strict=True) if kept]
+        self.times = [t for t, kept in zip(self.times, said, strict=True) if kept]
+        return step
 
     def _mean_db(self, rows: Sequence[int]) -> float:
         """Mean PSNR of these photographs, as the model is."""
@@ -314,8 +343,7 @@ class Trainer:
         }
         if self.history and "psnr_db" in self.history[-1]:
             numbers["held_out_psnr_db"] = round(self.history[-1]["psnr_db"], 2)
-        again = self.trial and self.trial.sits_out
-        label = "training again, splats sitting steps out" if again else "training"
+        label = "training: asking photographs that were lent" if self.trial else "training"
         self.report.progress(step, self.schedule.steps, label, **numbers)
 
     def _record(self, step: int) -> None:

@@ -6,17 +6,21 @@ import csv
 import hashlib
 import io
 import json
+import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pytest
 
 from splatcli import far
+from stages import train
 from stages.base.errors import SplatError
+from stages.run.request import REQUEST
+from stages.run.runfile import RUN_FILE
 from tests import processes, sample
 from tests.cli.pretence import failing_at
 
@@ -97,6 +101,40 @@ def test_a_manifest_comes_last_and_goes_first(splat, store, monkeypatch) -> None
     own = [name.replace("/runs/hill/4-train/", "") for name in order if "hill/4-train" in name]
     assert own[:3] == ["out.ply", "manifest.json", "no manifest.json"]
     assert own[-2:] == ["out.ply", "manifest.json"]
+
+
+def test_a_checkpoint_goes_with_the_models_put_aside_for_it_each_once(store, tmp_path) -> None:
+    partial = tmp_path / ".4-train.partial"
+    put: list[str] = []
+    partial.mkdir()
+    run = far.Folder.at("memory://runs/hill")
+    (tmp_path / RUN_FILE).write_text("{}")
+    back = far.PutBack(tmp_path, run)
+    back.started(train.STAGE, 4, "", False)
+    system_put = store.put_file
+
+    def putting(source: str, target: str) -> None:
+        put.append(target)
+        system_put(source, target)
+
+    store.put_file = putting
+    try:
+        for steps, aside in ((1, []), (2, ["model-2.bin"]), (3, ["model-2.bin", "model-3.bin"])):
+            for name in (REQUEST, *aside[-1:]):
+                if not (partial / name).exists():
+                    (partial / name).write_text(name)
+            (partial / "checkpoint.bin").write_text(f"after {steps}")
+            os.utime(partial / "checkpoint.bin", ns=(steps, steps))
+            for _ in range(3):
+                back.progressed(train.STAGE, "training", steps, 9, {})
+    finally:
+        del store.put_file
+    assert [PurePosixPath(path).name for path in put] == [
+        *(REQUEST, "checkpoint.bin"),
+        *("model-2.bin", "checkpoint.bin"),
+        *("model-3.bin", "checkpoint.bin"),
+    ]
+    assert store.cat("/runs/hill/.4-train.partial/checkpoint.bin") == b"after 3"
 
 
 def test_what_fails_at_a_url_is_said_of_the_url(splat, store, pretend) -> None:

@@ -12,10 +12,11 @@ from stages.raster.draw import render
 from stages.scene import Look
 from stages.train import lent_rows
 from stages.training import trainer as training
-from stages.training.checkpoint import remove_checkpoint
+from stages.training import trial
+from stages.training.checkpoint import checkpoint_files, load_checkpoint, remove_checkpoint
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.trainer import Trainer
-from stages.training.trial import LASTS
+from stages.training.trial import LASTS, Answer, gives_too_little, trial_at
 from tests.scenes import camera, cloud
 from tests.training.pictures import view_of
 
@@ -81,7 +82,7 @@ def watched(made):
 
 
 @pytest.mark.parametrize(("doubt_db", "sits_out"), [(-99.0, True), (99.0, False)])
-def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_one_is_kept(
+def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_forgotten(
     tmp_path, monkeypatch, doubt_db, sits_out
 ):
     monkeypatch.setattr(training, "DOUBT_DB", doubt_db)
@@ -89,65 +90,143 @@ def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_one_is_kep
     steps, loads = watched(made)
     made.run(start)
     half, lasts = int(GROWTH_ENDS * STEPS), round(LASTS * STEPS)
-    plain, other, rest = (slice(half + k * lasts, half + (k + 1) * lasts) for k in range(3))
+    plain, other = (slice(half + k * lasts, half + (k + 1) * lasts) for k in range(2))
+    assert len(steps) == STEPS + 2 * lasts
     assert not any(sat_out for _, sat_out in steps[: plain.stop])
     assert all(sat_out for _, sat_out in steps[other])
-    assert all(sat_out == sits_out for _, sat_out in steps[rest.start :])
-    assert len(steps) == STEPS + lasts
+    assert all(sat_out == sits_out for _, sat_out in steps[other.stop :])
     assert [row for row, _ in steps[plain]] == [row for row, _ in steps[other]]
-    assert LENT not in {row for row, _ in steps[: rest.start]}
-    assert LENT in {row for row, _ in steps[rest.start :]}
+    assert LENT not in {row for row, _ in steps[: other.stop]}
+    assert LENT in {row for row, _ in steps[other.stop :]}
     at = dict(loads)
-    assert at[other.start] == at[plain.start]
-    assert (rest.start in at) is not sits_out  # what sat out goes on as it is
+    assert at[plain.start] == at[other.start] == at[other.stop]
     assert made.sits_out is sits_out
 
 
-def test_what_the_trial_puts_aside_goes_with_the_checkpoint(tmp_path):
-    made, start = trainer(tmp_path / "a", contradicting=False)
-    made.run(start)
-    remove_checkpoint(tmp_path / "a")
-    assert not list((tmp_path / "a").iterdir())
+def test_a_trial_settles_as_the_end_of_a_run_does():
+    schedule = Schedule(steps=4000, extent=10.0, sh_degree=2, n_start=9, seed=0)
+    course = schedule.settling(1000, 1200)
+    end, last = schedule.steps - 1, 1199
+    assert course.means_lr(last) / course.boost == pytest.approx(
+        schedule.means_lr(end) / schedule.boost, rel=0.05
+    )
+    assert course.level(1000) == schedule.level(end)
+    assert course.active_sh_degree(1000) == schedule.active_sh_degree(end) == 2
+    assert not any(course.grows(step) or course.densifies_after(step) for step in range(1000, 1200))
 
 
-def test_what_is_learnt_by_heart_is_cut_short_and_says_so(tmp_path):
+def trials(steps):
+    schedule = Schedule(steps=steps, extent=1.0, sh_degree=0, n_start=1, seed=0)
+    return [step for step in range(1, steps) if trial_at(step, schedule)]
+
+
+def test_lent_photographs_are_asked_where_growth_ends_and_in_long_runs_at_each_doubling():
+    assert trials(30_000) == [1875, 3750, 7500, 15_000]
+    assert trials(7000) == [1750, 3500]
+    assert trials(3000) == [1500]
+    assert trials(2) == []  # nothing is left to be decided
+
+
+def test_a_run_that_is_planned_anew_asks_at_the_same_places_of_its_course():
+    before = Schedule(steps=7000, extent=1.0, sh_degree=0, n_start=1, seed=0)
+    after = before.replanned(1000, 15_000)
+    asked = [step for step in range(1001, 15_000) if trial_at(step, after)]
+    assert [round(after.share(step), 3) for step in asked] == [0.25, 0.5]
+
+
+def answers(*best_db):
+    return [Answer(k, k, db - 1.0, db) for k, db in enumerate(best_db)]
+
+
+def test_growth_ends_where_growing_on_gave_less_than_was_wished():
+    assert not gives_too_little(answers(25.0), 0.05)
+    assert not gives_too_little(answers(25.0, 25.1), 0.05)
+    assert gives_too_little(answers(25.0, 25.04), 0.05)
+    assert gives_too_little(answers(24.0, 25.0, 24.0), 0.05)
+    assert not gives_too_little(answers(25.0, 24.0), 0.0)  # nothing is wished
+
+
+@pytest.fixture
+def early(monkeypatch):
+    """Lent photographs are asked in short runs, too: at 75, 150 and 300 of 600 steps."""
+    monkeypatch.setattr(trial, "EARLIEST", 70)
+
+
+@pytest.mark.usefixtures("early")
+def test_what_gives_others_nothing_is_taken_back_and_says_so(tmp_path):
     made, start = trainer(tmp_path / "a", contradicting=True)
-    made.run(start)
-    assert "promised no more" in made.ended
-    assert made.schedule.steps < 0.8 * STEPS
+    steps, loads = watched(made)
+    model = made.run(start)
+    *_, kept, last = made.answers
+    assert last.best_db - kept.best_db < 0.05
+    assert f"from {kept.splats:,} to {last.splats:,} splats" in made.ended
+    assert made.schedule.steps == 2 * kept.step
     assert made.schedule.share(made.schedule.steps) == 1.0
+    assert len(model) <= kept.splats < last.splats
+    assert len(steps) > last.step  # it did go on
+    loaded = [models for _, models in loads]
+    assert max(map(loaded.count, loaded)) == 4  # grown, after either way of the trial, going back
+    assert made.gain_db == kept.gain_db
+    assert all(entry["step"] <= made.schedule.steps for entry in made.history)
+    assert sorted(h["step"] for h in made.history) == [h["step"] for h in made.history]
 
 
+@pytest.mark.usefixtures("early")
 def test_what_others_gain_from_goes_its_whole_way(tmp_path):
     made, start = trainer(tmp_path / "a", contradicting=False)
     made.run(start)
     assert (made.ended, made.schedule.steps) == ("", STEPS)
+    assert len(made.answers) == 3
 
 
+@pytest.mark.usefixtures("early")
 def test_without_patience_nothing_is_cut_short(tmp_path):
     made, start = trainer(tmp_path / "a", contradicting=True, patience_db=0.0)
     made.run(start)
     assert (made.ended, made.schedule.steps) == ("", STEPS)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.55, 0.63, 0.9])
-def test_a_stopped_run_keeps_its_plan_and_what_was_told(tmp_path, share):
-    whole, start = trainer(tmp_path / "whole", contradicting=True)
-    wanted = whole.run(start)
-    stop_at, report = int(share * whole.schedule.steps), Report()
-    count = itertools.count(1)
+def stopped_at(steps, folder):
+    """A run that was stopped after so many of its steps, trials counted."""
+    report, count = Report(), itertools.count(1)
 
     def stop(label, done, total, numbers):
-        if label.startswith("training") and next(count) == stop_at:
+        if label.startswith("training") and next(count) == steps:
             report.stop_requested.set()
 
     report.listener = stop
-    first, start = trainer(tmp_path / "parts", True, report=report)
+    made, start = trainer(folder, contradicting=True, report=report)
     with pytest.raises(Interrupted):
-        first.run(start)
+        made.run(start)
+
+
+@pytest.mark.usefixtures("early")
+@pytest.mark.parametrize("steps", [60, 90, 130, 170, 200, 240, 280, 320, 380])
+def test_a_stopped_run_keeps_its_plan_and_what_was_told(tmp_path, steps):
+    whole, start = trainer(tmp_path / "whole", contradicting=True)
+    wanted = whole.run(start)
+    assert whole.ended
+    stopped_at(steps, tmp_path / "parts")
     second, start = trainer(tmp_path / "parts", contradicting=True)
     found = second.run(start)
     assert second.schedule == whole.schedule
-    assert (second.marks, second.gain_db) == (whole.marks, whole.gain_db)
+    assert (second.answers, second.ended) == (whole.answers, whole.ended)
     for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
         assert a.tobytes() == b.tobytes()
+
+
+def test_what_a_trial_puts_aside_goes_with_the_checkpoint(tmp_path):
+    made, start = trainer(tmp_path / "a", contradicting=False)
+    made.run(start)
+    remove_checkpoint(tmp_path / "a")
+    assert not list((tmp_path / "a").iterdir())
+
+
+def test_a_checkpoint_without_the_model_that_was_put_aside_is_none(tmp_path):
+    stopped_at(STEPS // 2 + 10, tmp_path)
+    *aside, checkpoint = checkpoint_files(tmp_path)
+    assert load_checkpoint(tmp_path) is not None
+    assert aside
+    assert (tmp_path / checkpoint).exists()
+    (tmp_path / aside[0]).unlink()
+    assert load_checkpoint(tmp_path) is None

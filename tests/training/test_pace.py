@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.training.pace import PLATEAU_POINTS, Mark, Pace, remaining_gain_db, share_passed_on
+from stages.training.pace import Pace
 from stages.training.schedule import GROWTH_ENDS, RESOLUTIONS, SETTLE_TO, Schedule
 
 
@@ -85,42 +85,3 @@ def test_a_run_that_grows_no_more_is_as_long_as_if_that_had_been_the_plan():
     assert not any(plan.densifies_after(step) for step in range(600, plan.steps))
     late = schedule(3000)
     assert late.grown(2500) is late
-
-
-def marks(steps, lent_db, told_db=None):
-    told_db = lent_db if told_db is None else told_db
-    return [Mark(int(s), a, b) for s, a, b in zip(steps, lent_db, told_db, strict=True)]
-
-
-STEPS = np.linspace(1000, 2000, PLATEAU_POINTS)
-LINE = np.linspace(0.0, 1.0, PLATEAU_POINTS)
-
-
-def test_what_rises_with_every_doubling_promises_that_much_more():
-    steps = 100 * 2 ** np.arange(PLATEAU_POINTS)
-    found = marks(steps, 20 + 0.5 * np.arange(PLATEAU_POINTS))
-    assert remaining_gain_db(found, 2 * steps[-1]) == pytest.approx(0.5)
-    assert remaining_gain_db(found, 4 * steps[-1]) == pytest.approx(1.0)
-
-
-def test_a_flat_course_promises_nothing_and_a_noisy_one_is_not_believed():
-    assert abs(remaining_gain_db(marks(STEPS, 25 + 0 * LINE), 4000)) < 1e-9
-    noise = 0.4 * (-1.0) ** np.arange(PLATEAU_POINTS)
-    assert remaining_gain_db(marks(STEPS, 25 + noise), 4000) > 0.1
-    assert remaining_gain_db(marks(STEPS, 25 - LINE), 4000) < 0
-
-
-def test_too_few_marks_promise_everything_and_tell_nothing():
-    few = marks(STEPS[1:], 20 + 0 * LINE[1:], 20 + LINE[1:])
-    assert remaining_gain_db(few, 4000) == float("inf")
-    assert share_passed_on(few) == 1.0
-
-
-@pytest.mark.parametrize(
-    ("lent", "told", "wanted"),
-    [(0.0, 1.0, 0.0), (-0.5, 1.0, 0.0), (0.1, 1.0, 0.1), (2.0, 1.0, 1.0), (0.0, 0.0, 1.0)],
-)
-def test_what_is_passed_on_is_a_share_of_what_training_gains(lent, told, wanted):
-    for level in (20.0, 30.0):  # how hard the photographs lent are tells nothing
-        found = share_passed_on(marks(STEPS, level + lent * LINE, 25 + told * LINE))
-        assert found == pytest.approx(wanted)
