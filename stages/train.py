@@ -132,6 +132,8 @@ class TrainSettings:
 _LEARNT = "learnt.json"
 MOST_LENT = 4  # photographs: what more of them would tell is not worth what each is missed
 MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
+# At each photograph, on the average: what more of them teach is that photograph (docs/quality.md).
+MOST_LOOKS = 500
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
@@ -185,11 +187,11 @@ def run(
     if trainer.answers and trainer.gain_db is not None:
         report.metric("sitting_out_gain_db", round(trainer.gain_db, 3))
         report.metric("photographs_lent_said", [asdict(answer) for answer in trainer.answers])
-    if trainer.ended:
-        report.metric("ended_early", trainer.ended)
+    if ended := trainer.ended or _looked_enough(settings, len(trainer.train)):
+        report.metric("ended_early", ended)
         report.warn(
             "train-holds-no-more",
-            f"Ended after {trainer.schedule.steps:,} of {settings.steps:,} steps: {trainer.ended}. "
+            f"Ended after {trainer.schedule.steps:,} of {settings.steps:,} steps: {ended}. "
             "These photographs hold no more; --patience 0 trains on all the same.",
         )
     report.metric("splats", len(splats))
@@ -197,6 +199,19 @@ def run(
         _warn_of_cap(trainer.cap, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
+
+
+def steps_for(settings: TrainSettings, photographs: int) -> int:
+    """How many steps are worth training on so many photographs."""
+    if not settings.patience or settings.seconds:
+        return settings.steps
+    return min(settings.steps, MOST_LOOKS * photographs)
+
+
+def _looked_enough(settings: TrainSettings, photographs: int) -> str:
+    if steps_for(settings, photographs) == settings.steps:
+        return ""
+    return f"each of {counted(photographs, 'photograph')} was looked at {MOST_LOOKS} times"
 
 
 def _warn_of_cap(cap: int, report: Report) -> None:
@@ -269,7 +284,7 @@ def make_trainer(
     report.metric("splat_cap_free_mib", cap.free_mib)
     return Trainer(
         schedule=Schedule(
-            steps=settings.steps,
+            steps=steps_for(settings, len(train)),
             extent=seen_extent(reconstruction),
             sh_degree=settings.sh_degree,
             n_start=min(n_start, cap.splats),

@@ -15,7 +15,7 @@ from stages.training.strategy import Strategy, photographs_that_see
 SPLIT_FACTOR = 1.6  # children of a split are that much smaller
 LARGE = 0.01  # of the scene's extent: above it a splat is split, below it cloned
 GIANT = 0.1  # of the scene's extent
-THRESHOLD = 2e-4  # of the mean gradient, see `AdaptiveDensity`
+THRESHOLD = 1e-4  # of the mean gradient, see `AdaptiveDensity`; what grows first is ranked anyway
 ENOUGH = 4.0  # photographs: what fewer of them see grows later, and what hangs in the air is such
 OPACITY_MIN = 0.005
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections

@@ -1,6 +1,7 @@
 """Photographs that training lends: they tell whether it learns the others by heart."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Look
-from stages.train import lent_rows
+from stages.train import MOST_LOOKS, PRESETS, lent_rows, steps_for
 from stages.training import trainer as training
 from stages.training import trial
 from stages.training.checkpoint import checkpoint_files, load_checkpoint, remove_checkpoint
@@ -230,3 +231,11 @@ def test_a_checkpoint_without_the_model_that_was_put_aside_is_none(tmp_path):
     assert (tmp_path / checkpoint).exists()
     (tmp_path / aside[0]).unlink()
     assert load_checkpoint(tmp_path) is None
+
+
+def test_a_photograph_is_not_looked_at_for_ever():
+    best = PRESETS["best"]
+    assert steps_for(best, 20) == 20 * MOST_LOOKS < best.steps
+    assert steps_for(best, 100) == best.steps
+    for forced in (replace(best, patience=0.0), replace(best, seconds=60.0)):
+        assert steps_for(forced, 20) == best.steps
