@@ -30,7 +30,12 @@ if TYPE_CHECKING:
 class TrainSettings:
     steps: int = field(
         default=7000,
-        metadata={"help": "Steps of training, one photograph each.", "min": 1, "max": 1_000_000},
+        metadata={
+            "help": "Steps of training, one photograph each; 0: 500 for each photograph, at most "
+            "30,000.",
+            "min": 0,
+            "max": 1_000_000,
+        },
     )
     train_side: int = field(
         default=800,
@@ -63,11 +68,11 @@ class TrainSettings:
         },
     )
     patience: float = field(
-        default=0.05,
+        default=0.0,
         metadata={
-            "help": "What growing on for as long again must give photographs that are not trained "
-            "on (dB), in a run of many steps: where it gives less, growth ends there, and training "
-            "with it. 0: never.",
+            "help": "What growing on for as long again must give one at least of the photographs "
+            "that are lent for it (dB): where it gives less, training goes back, and ends its "
+            "growth there. 0: never.",
             "min": 0,
             "max": 10,
         },
@@ -132,13 +137,12 @@ class TrainSettings:
 _LEARNT = "learnt.json"
 MOST_LENT = 4  # photographs: what more of them would tell is not worth what each is missed
 MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
-# At each photograph, on the average: what more of them teach is that photograph (docs/quality.md).
-MOST_LOOKS = 500
+LOOKS = 500  # at each photograph, where nobody says how many: more teach no more (docs/quality.md)
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
     "standard": TrainSettings(steps=7000, train_side=800, sh_degree=2, max_splats=250_000),
-    "best": TrainSettings(steps=30_000, train_side=1600, sh_degree=3),
+    "best": TrainSettings(steps=0, train_side=1600, sh_degree=3),
 }
 
 
@@ -187,12 +191,12 @@ def run(
     if trainer.answers and trainer.gain_db is not None:
         report.metric("sitting_out_gain_db", round(trainer.gain_db, 3))
         report.metric("photographs_lent_said", [asdict(answer) for answer in trainer.answers])
-    if ended := trainer.ended or _looked_enough(settings, len(trainer.train)):
-        report.metric("ended_early", ended)
+    if trainer.ended:
+        report.metric("ended_early", trainer.ended)
         report.warn(
             "train-holds-no-more",
-            f"Ended after {trainer.schedule.steps:,} of {settings.steps:,} steps: {ended}. "
-            "These photographs hold no more; --patience 0 trains on all the same.",
+            f"Ended after {trainer.schedule.steps:,} steps: {trainer.ended}. --patience 0 goes the "
+            "whole way.",
         )
     report.metric("splats", len(splats))
     if len(splats) >= 0.98 * trainer.cap:
@@ -202,16 +206,10 @@ def run(
 
 
 def steps_for(settings: TrainSettings, photographs: int) -> int:
-    """How many steps are worth training on so many photographs."""
-    if not settings.patience or settings.seconds:
-        return settings.steps
-    return min(settings.steps, MOST_LOOKS * photographs)
+    """How many steps are planned with so many photographs to train on."""
+    from stages.training.schedule import RECIPE_STEPS
 
-
-def _looked_enough(settings: TrainSettings, photographs: int) -> str:
-    if steps_for(settings, photographs) == settings.steps:
-        return ""
-    return f"each of {counted(photographs, 'photograph')} was looked at {MOST_LOOKS} times"
+    return settings.steps or max(1, min(LOOKS * photographs, RECIPE_STEPS))
 
 
 def _warn_of_cap(cap: int, report: Report) -> None:

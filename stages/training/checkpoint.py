@@ -76,8 +76,8 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
         int(header["step"]),
         (int(steps), int(since), float(share)),
         header["history"],
-        Trial(**header["trial"]) if header["trial"] else None,
-        [Answer(**answer) for answer in header["answers"]],
+        Trial(**_with_tuples(header["trial"])) if header["trial"] else None,
+        [Answer(**_with_tuples(answer)) for answer in header["answers"]],
         header["stopped"],
         [Spent(**t) for t in header["times"]],
         [Maker(**maker) for maker in header["makers"]],
@@ -87,6 +87,11 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
     if not all((folder / KEPT.format(step)).exists() for step in asked_of):
         return None
     return model, saved
+
+
+def _with_tuples(told: dict[str, Any]) -> dict[str, Any]:
+    """As it was: JSON knows lists alone."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
 
 
 def checkpoint_files(folder: Path) -> list[str]:

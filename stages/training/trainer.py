@@ -64,7 +64,7 @@ class Trainer:
     under the 3D smoothing filter. over_any: over another background at each step, as cut-out
     photographs always are. backend: what draws and steps. lent: rows of `train` that decide, and
     are trained on only once it grows no more. patience_db: what growing for as long again must give
-    them, or else its growth ends where it began; 0: nothing.
+    one of them, or else its growth ends where it began; 0: nothing.
     seconds: of wall time in all, 0 for as long as the steps take. within: where it grows, see
     `density.Within`; () for everywhere. growth: by which of STRATEGIES."""
 
@@ -159,8 +159,8 @@ class Trainer:
             return ""
         kept, last = self.answers[-2:]
         return (
-            f"growing on from {kept.splats:,} to {last.splats:,} splats gave photographs not "
-            f"trained on {last.best_db - kept.best_db:+.2f} dB"
+            f"growing on from {kept.splats:,} to {last.splats:,} splats gave none of the "
+            f"photographs lent more than {last.gained_db(kept):.2f} dB"
         )
 
     @property
@@ -286,16 +286,16 @@ class Trainer:
         if not self.lent or self.stopped:
             return step
         if not self.trial:
-            self.trial = trial_at(step, self.schedule)
+            self.trial = trial_at(step, self.schedule, often=self.patience_db > 0)
             if self.trial:
                 keep_model(self.folder, step, self.model)
             return step
         begun = self.trial.begun
         if step < self.trial.ends:
             return step
-        came_to = self._mean_db(self.lent)
+        came_to = tuple(self._db(row) for row in self.lent)
         self.stepper.load(kept_model(self.folder, begun))
-        if self.trial.plain_db is None:
+        if not self.trial.sits_out:
             self.trial = replace(self.trial, plain_db=came_to)
             return begun
         self.answers.append(Answer(begun, len(self.stepper), self.trial.plain_db, came_to))
@@ -315,15 +315,12 @@ class Trainer:
         self.times = [t for t, kept in zip(self.times, said, strict=True) if kept]
         return step
 
-    def _mean_db(self, rows: Sequence[int]) -> float:
-        """Mean PSNR of these photographs, as the model is."""
-        values = []
-        for row in rows:
-            level = self.train[row].levels[-1]
-            image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
-            asked = target_of(level, image, (self.look.background,) * 3)
-            values.append(psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1)))
-        return float(np.mean(values))
+    def _db(self, row: int) -> float:
+        """PSNR of a photograph, as the model is."""
+        level = self.train[row].levels[-1]
+        image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
+        asked = target_of(level, image, (self.look.background,) * 3)
+        return psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1))
 
     def _adapt(self, step: int) -> None:
         if not self.schedule.densifies_after(step):

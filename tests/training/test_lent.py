@@ -11,11 +11,11 @@ from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Look
-from stages.train import MOST_LOOKS, PRESETS, lent_rows, steps_for
+from stages.train import LOOKS, PRESETS, lent_rows, steps_for
 from stages.training import trainer as training
 from stages.training import trial
 from stages.training.checkpoint import checkpoint_files, load_checkpoint, remove_checkpoint
-from stages.training.schedule import GROWTH_ENDS, Schedule
+from stages.training.schedule import GROWTH_ENDS, RECIPE_STEPS, Schedule
 from stages.training.trainer import Trainer
 from stages.training.trial import LASTS, Answer, gives_too_little, trial_at
 from tests.scenes import camera, cloud
@@ -116,9 +116,9 @@ def test_a_trial_settles_as_the_end_of_a_run_does():
     assert not any(course.grows(step) or course.densifies_after(step) for step in range(1000, 1200))
 
 
-def trials(steps):
+def trials(steps, often=True):
     schedule = Schedule(steps=steps, extent=1.0, sh_degree=0, n_start=1, seed=0)
-    return [step for step in range(1, steps) if trial_at(step, schedule)]
+    return [step for step in range(1, steps) if trial_at(step, schedule, often)]
 
 
 def test_lent_photographs_are_asked_where_growth_ends_and_in_long_runs_at_each_doubling():
@@ -126,25 +126,36 @@ def test_lent_photographs_are_asked_where_growth_ends_and_in_long_runs_at_each_d
     assert trials(7000) == [1750, 3500]
     assert trials(3000) == [1500]
     assert trials(2) == []  # nothing is left to be decided
+    assert trials(30_000, often=False) == [15_000]
 
 
 def test_a_run_that_is_planned_anew_asks_at_the_same_places_of_its_course():
     before = Schedule(steps=7000, extent=1.0, sh_degree=0, n_start=1, seed=0)
     after = before.replanned(1000, 15_000)
-    asked = [step for step in range(1001, 15_000) if trial_at(step, after)]
+    asked = [step for step in range(1001, 15_000) if trial_at(step, after, often=True)]
     assert [round(after.share(step), 3) for step in asked] == [0.25, 0.5]
 
 
 def answers(*best_db):
-    return [Answer(k, k, db - 1.0, db) for k, db in enumerate(best_db)]
+    """Of two photographs each time, better where splats sit out."""
+    return [Answer(k, k, (a - 1.0, b - 1.0), (a, b)) for k, (a, b) in enumerate(best_db)]
 
 
-def test_growth_ends_where_growing_on_gave_less_than_was_wished():
-    assert not gives_too_little(answers(25.0), 0.05)
-    assert not gives_too_little(answers(25.0, 25.1), 0.05)
-    assert gives_too_little(answers(25.0, 25.04), 0.05)
-    assert gives_too_little(answers(24.0, 25.0, 24.0), 0.05)
-    assert not gives_too_little(answers(25.0, 24.0), 0.0)  # nothing is wished
+def test_growth_ends_where_growing_on_gave_no_photograph_what_was_wished():
+    assert not gives_too_little(answers((25.0, 28.0)), 0.05)
+    assert not gives_too_little(answers((25.0, 28.0), (25.1, 28.1)), 0.05)
+    assert gives_too_little(answers((25.0, 28.0), (25.04, 28.0)), 0.05)
+    assert not gives_too_little(answers((25.0, 28.0), (25.06, 27.0)), 0.05)  # one is enough
+    assert gives_too_little(answers((24.0, 27.0), (25.0, 28.0), (24.0, 27.5)), 0.05)
+
+
+def test_what_counts_is_the_better_way_by_all_photographs():
+    plain = Answer(1, 1, (25.0, 28.0), (24.0, 27.0))
+    mixed = Answer(2, 2, (25.0, 28.0), (27.0, 27.0))
+    assert plain.best_db == (25.0, 28.0)
+    assert mixed.best_db == (27.0, 27.0)
+    assert mixed.gain_db == pytest.approx(0.5)
+    assert mixed.gained_db(plain) == pytest.approx(2.0)
 
 
 @pytest.fixture
@@ -159,7 +170,7 @@ def test_what_gives_others_nothing_is_taken_back_and_says_so(tmp_path):
     steps, loads = watched(made)
     model = made.run(start)
     *_, kept, last = made.answers
-    assert last.best_db - kept.best_db < 0.05
+    assert last.gained_db(kept) < 0.05
     assert f"from {kept.splats:,} to {last.splats:,} splats" in made.ended
     assert made.schedule.steps == 2 * kept.step
     assert made.schedule.share(made.schedule.steps) == 1.0
@@ -233,9 +244,8 @@ def test_a_checkpoint_without_the_model_that_was_put_aside_is_none(tmp_path):
     assert load_checkpoint(tmp_path) is None
 
 
-def test_a_photograph_is_not_looked_at_for_ever():
+def test_a_photograph_is_not_looked_at_for_ever_unless_somebody_says_how_often():
     best = PRESETS["best"]
-    assert steps_for(best, 20) == 20 * MOST_LOOKS < best.steps
-    assert steps_for(best, 100) == best.steps
-    for forced in (replace(best, patience=0.0), replace(best, seconds=60.0)):
-        assert steps_for(forced, 20) == best.steps
+    assert steps_for(best, 20) == 20 * LOOKS < RECIPE_STEPS
+    assert steps_for(best, 100) == RECIPE_STEPS
+    assert steps_for(replace(best, steps=RECIPE_STEPS), 20) == RECIPE_STEPS
