@@ -220,7 +220,7 @@ def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
     ("words", "said"),
     [
         (["process", "photos", "--steps", "-4"], "--steps -4 cannot be used"),
-        (["process", "photos", "--steps", "many"], "A whole number from 1 to 1,000,000."),
+        (["process", "photos", "--steps", "many"], "A whole number from 0 to 1,000,000."),
         (["process", "photos", "--preset", "fast"], "One of preview, standard, best."),
         (["process", "photos", "--backend", "cuda"], "One of auto, gpu, cpu, reference."),
         (["process", "photos", "--device", "cuda"], "--device goes with --backend reference."),
@@ -274,7 +274,7 @@ def test_cameras_that_cannot_be_read_are_refused_before_anything_is_made(splat) 
 
 
 def test_wrong_words_are_json_where_json_is_asked_for(splat) -> None:
-    for words in (["--steps", "0"], ["--stepz", "0"]):
+    for words in (["--steps", "-1"], ["--stepz", "0"]):
         (event,) = events(splat("process", "photos", "--json", *words))
         assert (event["event"], event["family"]) == ("error", 2)
 
