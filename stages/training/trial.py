@@ -24,8 +24,8 @@ MOST_STEPS = 200  # either way
 LASTS = 1 / 15  # of the run at most, either way
 EARLIEST = 1500  # steps: fewer are cheap, and say little of what more would give
 TIMES = 4  # at most, each at twice the steps of the one before
-# From DOUBT_DB on, that is in doubt, splats sit out: to do so where it is not wanted costs 0.3 dB at
-# most, and to miss it 2 dB. From SURE_DB on it is by heart, and `prune` may take what only these
+# From DOUBT_DB on, that is in doubt, splats sit out: to do so where it is not wanted costs 0.3 dB,
+# and to miss it 2 dB. From SURE_DB on it is by heart, and `prune` may take what only these
 # photographs show.
 DOUBT_DB, SURE_DB = -0.05, 0.05
 
