@@ -90,14 +90,13 @@ class _Scene:
         """The merged splats, written to `folder` as training writes them."""
         from stages.blocks import ground, sight
         from stages.scene import look_of, split_held_out
-        from stages.train import light_wanted, save, steps_for, write_quality
+        from stages.train import light_wanted, save, write_quality
 
         started = time.monotonic()
         light = light_wanted(self.whole, self.settings.light, self.report)
         self.settings = replace(self.settings, light="on" if light else "off")
+        coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
-        steps = steps_for(self.settings, len(training))
-        coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS), steps)
         places, weights = ground.looked_at(replace(self.whole, views=training))
         cells = ground.cut(places, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
@@ -118,10 +117,10 @@ class _Scene:
         self.report.metric("train_seconds", round(time.monotonic() - started, 1))
         return trained
 
-    def _coarse(self, seeds: Splats, fewer: int, steps: int) -> Splats:
+    def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(
             self.settings,
-            steps=max(1, steps // COARSE_STEPS),
+            steps=max(1, self.settings.steps // COARSE_STEPS),
             train_side=max(16, self.settings.train_side // COARSE_SIDE),
             max_splats=max(1, self.settings.max_splats // fewer),
         )

@@ -30,12 +30,7 @@ if TYPE_CHECKING:
 class TrainSettings:
     steps: int = field(
         default=7000,
-        metadata={
-            "help": "Steps of training, one photograph each; 0: 500 for each photograph, at most "
-            "30,000.",
-            "min": 0,
-            "max": 1_000_000,
-        },
+        metadata={"help": "Steps of training, one photograph each.", "min": 1, "max": 1_000_000},
     )
     train_side: int = field(
         default=800,
@@ -137,12 +132,11 @@ class TrainSettings:
 _LEARNT = "learnt.json"
 MOST_LENT = 4  # photographs: what more of them would tell is not worth what each is missed
 MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
-LOOKS = 500  # at each photograph, where nobody says how many: more teach no more (docs/quality.md)
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
     "standard": TrainSettings(steps=7000, train_side=800, sh_degree=2, max_splats=250_000),
-    "best": TrainSettings(steps=0, train_side=1600, sh_degree=3),
+    "best": TrainSettings(steps=30_000, train_side=1600, sh_degree=3),
 }
 
 
@@ -203,13 +197,6 @@ def run(
         _warn_of_cap(trainer.cap, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
-
-
-def steps_for(settings: TrainSettings, photographs: int) -> int:
-    """How many steps are planned with so many photographs to train on."""
-    from stages.training.schedule import RECIPE_STEPS
-
-    return settings.steps or max(1, min(LOOKS * photographs, RECIPE_STEPS))
 
 
 def _warn_of_cap(cap: int, report: Report) -> None:
@@ -282,7 +269,7 @@ def make_trainer(
     report.metric("splat_cap_free_mib", cap.free_mib)
     return Trainer(
         schedule=Schedule(
-            steps=steps_for(settings, len(train)),
+            steps=settings.steps,
             extent=seen_extent(reconstruction),
             sh_degree=settings.sh_degree,
             n_start=min(n_start, cap.splats),

@@ -1,7 +1,6 @@
 """Photographs that training lends: they tell whether it learns the others by heart."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,11 +10,11 @@ from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Look
-from stages.train import LOOKS, PRESETS, lent_rows, steps_for
+from stages.train import lent_rows
 from stages.training import trainer as training
 from stages.training import trial
 from stages.training.checkpoint import checkpoint_files, load_checkpoint, remove_checkpoint
-from stages.training.schedule import GROWTH_ENDS, RECIPE_STEPS, Schedule
+from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.trainer import Trainer
 from stages.training.trial import LASTS, Answer, gives_too_little, trial_at
 from tests.scenes import camera, cloud
@@ -242,10 +241,3 @@ def test_a_checkpoint_without_the_model_that_was_put_aside_is_none(tmp_path):
     assert (tmp_path / checkpoint).exists()
     (tmp_path / aside[0]).unlink()
     assert load_checkpoint(tmp_path) is None
-
-
-def test_a_photograph_is_not_looked_at_for_ever_unless_somebody_says_how_often():
-    best = PRESETS["best"]
-    assert steps_for(best, 20) == 20 * LOOKS < RECIPE_STEPS
-    assert steps_for(best, 100) == RECIPE_STEPS
-    assert steps_for(replace(best, steps=RECIPE_STEPS), 20) == RECIPE_STEPS
