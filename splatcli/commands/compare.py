@@ -78,8 +78,8 @@ def _side(run: Pipeline, name: str) -> Side:
     trained = run.manifest("train")
     if trained is not None:
         told["training"] = console.duration(trained.seconds)
-        if steps := trained.metrics.get("steps", trained.settings["steps"]):
-            told["steps"] = f"{steps:,}"
+        steps = trained.metrics.get("steps", trained.settings["steps"])
+        told["steps"] = f"{steps:,}"
         told["seed"] = str(trained.settings["seed"])
     for ending, figures in sources.exported_formats(run).items():
         told[f".{ending}"] = console.size(figures["size_bytes"])

@@ -9,7 +9,7 @@ without and with splats sitting out, and looks at them; then all of that is forg
 where growth ends; and in a long run, if somebody wants no more than pays, wherever growth has gone
 on for as long again. Where that gave none of them what was wished, training goes back to the model
 of the last time, and ends its growth there. One that gained is enough to go on: those lent lie
-between others, and gain a fifth of what views from elsewhere do.
+between others, and gain far less than views from elsewhere.
 """
 
 from __future__ import annotations

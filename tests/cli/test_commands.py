@@ -274,7 +274,7 @@ def test_cameras_that_cannot_be_read_are_refused_before_anything_is_made(splat) 
 
 
 def test_wrong_words_are_json_where_json_is_asked_for(splat) -> None:
-    for words in (["--steps", "-1"], ["--stepz", "0"]):
+    for words in (["--steps", "0"], ["--stepz", "0"]):
         (event,) = events(splat("process", "photos", "--json", *words))
         assert (event["event"], event["family"]) == ("error", 2)
 
