@@ -35,6 +35,7 @@ from stages.training.colours import Recolouring, worth_settling
 from stages.training.density import Within
 from stages.training.dropout import Dropout
 from stages.training.frugal_step import FrugalStep
+from stages.training.open_air import open_air
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
 from stages.training.pace import Pace
 from stages.training.schedule import Schedule
@@ -54,6 +55,7 @@ from stages.training.views import Level, TrainingView
 CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
 EVALUATIONS = 10  # during a run, evenly spaced
+CLEARINGS = 20  # likewise: how often what hangs in the open air is taken away
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
 
 
@@ -109,6 +111,8 @@ class Trainer:
         self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
         self.clock, self._pace = Clock(), Pace(self.seconds)
         step = self._begin(start)
+        backend = backend_of(self.backend).name
+        self._open_air = open_air(start, self._full_cameras, self.look.near, backend)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
             loss = self.step(step)
@@ -231,8 +235,11 @@ class Trainer:
 
     def widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
         """[N] of the smoothing filter, from all training photographs at full size."""
-        cameras = [view.levels[-1].camera for view in self.train]
-        return smoothing_widths(means, cameras, self.look.near)
+        return smoothing_widths(means, self._full_cameras, self.look.near)
+
+    @property
+    def _full_cameras(self) -> list[Camera]:
+        return [view.levels[-1].camera for view in self.train]
 
     def step(self, step: int) -> float:
         """One step of Adam on one photograph; the loss before it."""
@@ -323,15 +330,24 @@ class Trainer:
         return psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1))
 
     def _adapt(self, step: int) -> None:
-        if not self.schedule.densifies_after(step):
+        clears = self.schedule.passes(step + 1, CLEARINGS)
+        grows = self.schedule.densifies_after(step)
+        if not (clears or grows):
             return
-        model = self._strategy.prune(self.model, self.schedule.prunes_giants(step))
-        budget = min(self.schedule.budget(step, self.cap), self.cap)  # which may have been lowered
-        model = self._strategy.grow(model, budget, self.schedule.rng(step))
-        model = model.take(morton.order_of(model.means))
+        model = self.model
+        if clears:
+            model = model.take(~self._open_air.holds(model.means))
+        if grows:
+            model = self._grown(model, step)
         if self.smooth:
             model.smoothing[:] = self.widths(model.means)
         self.stepper.load(model)
+
+    def _grown(self, model: Model, step: int) -> Model:
+        model = self._strategy.prune(model, self.schedule.prunes_giants(step))
+        budget = min(self.schedule.budget(step, self.cap), self.cap)  # which may have been lowered
+        model = self._strategy.grow(model, budget, self.schedule.rng(step))
+        return model.take(morton.order_of(model.means))
 
     def _tick(self, step: int, loss: float) -> None:
         numbers: dict[str, float | int | str] = {
