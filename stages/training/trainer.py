@@ -111,8 +111,7 @@ class Trainer:
         self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
         self.clock, self._pace = Clock(), Pace(self.seconds)
         step = self._begin(start)
-        backend = backend_of(self.backend).name
-        self._open_air = open_air(start, self._full_cameras, self.look.near, backend)
+        self._open_air = open_air(start.means, self._full_cameras)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
             loss = self.step(step)

@@ -7,7 +7,7 @@ import pytest
 
 from stages.base.stage import Report
 from stages.scene import Look, look_at
-from stages.training.open_air import ENOUGH, SIDE, open_air
+from stages.training.open_air import ENOUGH, open_air
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
 from stages.training.trainer import CLEARINGS, Trainer
@@ -28,13 +28,13 @@ def cameras(n):
     """Beside each other, a tenth of a unit apart, all of them before the wall."""
     straight = camera(64, 48)
     return [
-        replace(straight, world_to_camera=look_at(np.array(eye), np.array(eye) + (0, 0, 1.0)))
-        for eye in ((0.1 * k, 0.0, 0.0) for k in range(n))
+        replace(straight, world_to_camera=look_at(np.array([x, 0, 0]), np.array([x, 0, 1.0])))
+        for x in 0.1 * np.arange(n)
     ]
 
 
 def held(means, n=2, start=None):
-    air = open_air(wall() if start is None else start, cameras(n), 0.1, "cpu")
+    air = open_air((wall() if start is None else start).means, cameras(n))
     return air.holds(np.array(means, np.float32).reshape(-1, 3)).tolist()
 
 
@@ -66,23 +66,24 @@ def test_what_enough_photographs_look_past_and_keep_is_there_though_the_start_mi
 
 
 def test_what_one_photograph_has_a_surface_at_stays_whatever_others_look_past():
-    post = splats([[0.0, 0.0, 4.8]], scales=0.2, opacities=0.1, rgb=(0.5, 0.5, 0.5))
-    joined = replace(
-        wall(),
-        **{
-            name: np.concatenate([getattr(wall(), name), getattr(post, name)])
-            for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
-        },
-    )
-    beside, at_the_post = (1.0, 0.0, 4.8), (0.0, 0.0, 4.9)
-    assert held([beside, at_the_post], start=joined) == [True, False]
+    post = np.concatenate([wall().means, np.array([[0.0, 0.0, 4.8]], np.float32)])
+    beside, at_the_post = (2.0, 0.0, 4.8), (0.0, 0.0, 4.9)
+    air = open_air(post, cameras(2))
+    assert air.holds(np.array([beside, at_the_post])).tolist() == [True, False]
 
 
-def test_depths_are_taken_from_small_pictures_whatever_the_photographs_size():
-    large = camera(4000, 3000, focal=4000.0)
-    air = open_air(wall(), [large], 0.1, "cpu")
-    assert max(air.depths[0].shape) == SIDE
-    np.testing.assert_allclose(air.depths[0], FAR, rtol=1e-3)
+def test_depths_are_of_cells_whatever_the_photographs_size():
+    for photograph in (camera(4000, 3000, focal=4000.0), camera(64, 48)):
+        (depths,) = open_air(wall().means, [photograph]).depths
+        assert depths.shape == (24, 32)
+        np.testing.assert_allclose(depths, FAR)
+
+
+def test_a_start_with_rows_that_are_no_numbers_is_as_good_without_them():
+    start = wall()
+    start.means[::7] = np.nan
+    start.means[3] = np.inf
+    assert held([(0, 0, 4.8), (0, 0, FAR)], start=start) == [True, False]
 
 
 class Clouds:
