@@ -16,7 +16,6 @@ SPLIT_FACTOR = 1.6  # children of a split are that much smaller
 LARGE = 0.01  # of the scene's extent: above it a splat is split, below it cloned
 GIANT = 0.1  # of the scene's extent
 THRESHOLD = 2e-4  # of the mean gradient, see `AdaptiveDensity`
-LEAST = 0.5  # of the threshold: what pulls no less grows where room is left
 ENOUGH = 4.0  # photographs: what fewer of them see grows later, and what hangs in the air is such
 OPACITY_MIN = 0.005
 BYTES_PER_SPLAT = 1600  # parameters, moments, gradients, footprint and about 6 intersections
@@ -65,12 +64,11 @@ class AdaptiveDensity:
 
     def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
         pull = model.gradient_sum / np.maximum(model.gradient_count, 1)
-        wanted = np.flatnonzero(pull >= LEAST * self.threshold)
+        wanted = np.flatnonzero(pull >= self.threshold)
         room = max(0, budget - len(model))
         if len(wanted) > room:
             see = photographs_that_see(model.gradient_count[wanted], self.photographs)
-            counts = pull[wanted] * np.minimum(1.0, see / ENOUGH)
-            first = np.lexsort((-counts, pull[wanted] < self.threshold))
+            first = np.argsort(-pull[wanted] * np.minimum(1.0, see / ENOUGH), kind="stable")
             wanted = np.sort(wanted[first[:room]])
         large = np.exp(model.log_scales[wanted].max(1)) > LARGE * self.extent
         clones = model.take(wanted[~large]).fresh()

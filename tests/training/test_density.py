@@ -78,14 +78,6 @@ def test_what_one_photograph_sees_grows_after_what_many_see_though_it_is_pulled_
     assert len(grow(m)) == 6  # while there is room, all do
 
 
-def test_what_is_pulled_at_less_grows_where_there_is_room():
-    m = pulled(model(4), range(4))
-    m.gradient_count[:] = [60, 1, 60, 60]  # the second is seen by one photograph
-    m.gradient_sum[:] = m.gradient_count * np.array([1.9, 2.1, 0.9, 2.2], np.float32) * 1e-4
-    np.testing.assert_array_equal(grow(m, cap=6).means[4:], m.means[[1, 3]])
-    np.testing.assert_array_equal(grow(m, cap=9).means[4:], m.means[[0, 1, 3]])
-
-
 def test_the_cap_takes_half_of_the_free_memory():
     assert splat_cap(8192.0) == pytest.approx(4096 * 1024 * 1024 / BYTES_PER_SPLAT, rel=1e-3)
     assert splat_cap(1.0) == 10_000
