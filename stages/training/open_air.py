@@ -19,6 +19,7 @@ from stages.scene import Camera
 CELLS = 32  # along the longer side of a photograph, as the start fills it
 BEFORE = 0.5  # of the depth: nearer than that is before the surface
 BEHIND = 1.15  # of the depth: farther than that, a photograph cannot see it
+WITNESSES = 2  # photographs that look past it: where few look at all, one depth is a guess
 ENOUGH = 4  # photographs that look past it: they would have contradicted what is not there
 
 
@@ -32,8 +33,8 @@ class OpenAir:
     depths: tuple[NDArray[np.float64], ...]
 
     def holds(self, means: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """[N] which of these places [N, 3] at least one and fewer than ENOUGH photographs look
-        past, at something twice as far away, while none has a surface there."""
+        """[N] which of these places [N, 3] at least WITNESSES and fewer than ENOUGH photographs
+        look past, at something twice as far away, while none has a surface there."""
         passed = np.zeros(len(means), np.int32)
         asked = np.flatnonzero(np.isfinite(means).all(1))
         for camera, depths in zip(self.cameras, self.depths, strict=True):
@@ -42,7 +43,7 @@ class OpenAir:
             passed[asked[rows[before]]] += 1
             passed[asked[rows[~before & (of_depth <= BEHIND)]]] = ENOUGH
             asked = asked[passed[asked] < ENOUGH]
-        return (passed > 0) & (passed < ENOUGH)
+        return (passed >= WITNESSES) & (passed < ENOUGH)
 
 
 def open_air(start: NDArray[np.floating], cameras: Sequence[Camera]) -> OpenAir:
