@@ -3,7 +3,7 @@
 Growth creeps out of what stands near by. Where many photographs look, the others pull it back; at
 the rims of three or four, nothing does, and a handful of splats dresses in what those photographs
 show behind it. They lose nothing by it, and the next view past them looks into a cloud. The start
-remembers better: its points were confirmed by several photographs before anything grew.
+remembers better: its points lie where photographs agree, or as far back as one of them sees.
 """
 
 from __future__ import annotations
