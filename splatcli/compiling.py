@@ -45,7 +45,7 @@ class Compiling(Listener):
         self._wait()
 
     def _start(self) -> None:
-        from stages.kernels import cache  # which makes a folder
+        from stages.raster.kernels import cache  # which makes a folder
 
         if cache.are_compiled(_LAST):
             return

@@ -18,11 +18,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from stages.base.errors import Interrupted, SplatError
+from stages.base.errors import CRASHED, STOPPED, Interrupted, SplatError
 from stages.run.failures import as_splat_error
-
-STOPPED = 130  # what shells expect after Ctrl-C
-CRASHED = 1
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)

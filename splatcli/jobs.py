@@ -10,16 +10,18 @@ from typing import Any
 
 import typer
 
-from splatcli import blocks, cluster, console, options, progress, sharing, summary
+from splatcli import console, options, progress, summary
 from splatcli import live_view as watching
 from splatcli.compiling import Compiling
 from splatcli.folders import DEFAULT, find_run_folder
-from splatcli.tasks import Engine
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
 from stages.base.settings import Setting, settings_of
+from stages.distributed import blocks, cluster, sharing
+from stages.distributed.tasks import Engine
 from stages.raster.backends import backend_of, drawn_by
 from stages.run import runfolder
+from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
 
 DEFAULT_PRESET = "standard"
@@ -200,9 +202,9 @@ def run(
     """Run the pipeline and show what came of it. view: on a page too, while it trains."""
     listener = progress.listener_for(quiet, as_json)
     if until is None:
-        listener = watching.Together(Compiling(settings["train"].backend), listener)
+        listener = Listeners(Compiling(settings["train"].backend), listener)
     if view:
-        listener = watching.Together(watching.Watching(pipeline, as_json), listener)
+        listener = Listeners(watching.Watching(pipeline, as_json), listener)
     pipeline.run(settings, until=until, may_run=may_run, listener=listener)
     summary.show(pipeline, until, quiet=quiet, as_json=as_json)
 

@@ -35,7 +35,7 @@ class Watching(Listener):
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         if stage.name != WATCHED:
             return
-        from stages.page.shots import shots_of
+        from stages.formats.page.shots import shots_of
         from stages.viewer.live import LivePage
         from stages.viewer.server import LocalServer
 
@@ -95,38 +95,3 @@ class Watching(Listener):
         deadline = time.monotonic() + _FAREWELL_S
         while page.pictures.watched() and not page.told and time.monotonic() < deadline:
             time.sleep(0.05)
-
-
-class Together(Listener):
-    """Several listeners as one."""
-
-    def __init__(self, *listeners: Listener) -> None:
-        self._listeners = listeners
-
-    def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        for one in self._listeners:
-            one.started(stage, number, reason, resumed)
-
-    def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        for one in self._listeners:
-            one.progressed(stage, label, done, total, numbers)
-
-    def drawable(self, stage: Stage, draw: Draw) -> None:
-        for one in self._listeners:
-            one.drawable(stage, draw)
-
-    def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        for one in self._listeners:
-            one.finished(stage, number, manifest)
-
-    def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        for one in self._listeners:
-            one.skipped(stage, number, manifest)
-
-    def stopping(self) -> None:
-        for one in self._listeners:
-            one.stopping()
-
-    def ended(self) -> None:
-        for one in self._listeners:
-            one.ended()

@@ -61,8 +61,8 @@ def along(
     path: "orbit", "capture", or a camera file: its cameras as they are, or a smooth path through
     them if a length is given. Raises SplatError.
     """
-    from stages.film import orbit, travel
     from stages.scene.framing import in_front_of
+    from stages.viewer import orbit, travel
 
     cameras = [view.camera for view in views]
     if path == "orbit":
@@ -92,7 +92,7 @@ def along(
 
 
 def _travel(cameras: list[Camera], splats: Splats, length: Length) -> list[Camera]:
-    from stages.film import travel
+    from stages.viewer import travel
 
     usual = _TURN_S * travel.length_in_turns(cameras, splats)
     frames = _frames(length, min(max(usual, _SHORTEST_S), _LONGEST_S))

@@ -101,7 +101,7 @@ def _with_agreed(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.seeding.sweep import agreed_points
+    from stages.structure.seeding.sweep import agreed_points
 
     training, _ = split_held_out(reconstruction.views)
     more, more_colours = agreed_points(reconstruction.folder, training, points)
@@ -120,7 +120,7 @@ def _filled(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.seeding.coverage import fill_cells
+    from stages.structure.seeding.coverage import fill_cells
 
     training, _ = split_held_out(reconstruction.views)
     cameras = tuple(view.camera for view in reconstruction.views)
@@ -146,7 +146,7 @@ def _outliers(
     """[P] masks of points not to start from, by reason."""
     import numpy as np
 
-    from stages.seeding.neighbours import nearest_distance
+    from stages.structure.seeding.neighbours import nearest_distance
 
     points = np.where(finite[:, None], reconstruction.points, 0.0)
     errors = np.nan_to_num(reconstruction.errors_px, nan=np.inf, posinf=np.inf)
@@ -177,7 +177,7 @@ def _scales(
     """
     import numpy as np
 
-    from stages.seeding.neighbours import mean_neighbour_distance, nearest_distance
+    from stages.structure.seeding.neighbours import mean_neighbour_distance, nearest_distance
 
     raw = mean_neighbour_distance(points, NEIGHBOURS)
     positive = raw[raw > 0]

@@ -152,7 +152,7 @@ def run(
     from stages.training.checkpoint import remove_checkpoint
 
     if settings.blocks != "1":
-        raise ValueError("blocks are runs of their own: splatcli.blocks trains them")
+        raise ValueError("blocks are runs of their own: stages.distributed.blocks trains them")
     started = time.monotonic()
     reconstruction: Reconstruction = inputs["sfm"]
     start: Splats = inputs["seed"]

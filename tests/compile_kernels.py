@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from stages.kernels import cache
+from stages.raster.kernels import cache
 
 
 def main() -> None:

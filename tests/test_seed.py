@@ -14,7 +14,7 @@ from stages import seed
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
 from stages.scene import Camera, Reconstruction, Splats, View, dc_to_rgb, look_at
-from stages.seeding.neighbours import mean_neighbour_distance, nearest_distance
+from stages.structure.seeding.neighbours import mean_neighbour_distance, nearest_distance
 
 BARE = seed.SeedSettings(fill=False)  # the scenes below have no photographs
 

@@ -16,11 +16,12 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from splatcli import cluster, console, far, jobs, options
-from splatcli.tasks import Ending, Place, need_of
+from splatcli import console, jobs, options
 from stages import STAGE_NAMES
 from stages.base.atomic import replacing
 from stages.base.errors import Family, SplatError
+from stages.distributed import cluster, far
+from stages.distributed.tasks import Ending, Place, need_of
 from stages.run.manifest import Manifest
 
 TABLE = "batch.csv"

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from splatcli import console, sources
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
-from stages.kernels import cache
+from stages.raster.kernels import cache
 from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
 if TYPE_CHECKING:
-    from stages.trade.pair import Side
+    from stages.measure.tradeoff.pair import Side
 
 
 def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
@@ -22,8 +22,8 @@ def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) ->
     Raises SplatError: stage-not-finished, run-half-anew, compare-other-photographs,
     compare-nothing-in-common, and what keeps files from being written."""
     from stages.base.atomic import make_folder
-    from stages.trade.pair import default_name, pair, verdict
-    from stages.trade.pair_report import facts, write_pair
+    from stages.measure.tradeoff.pair import default_name, pair, verdict
+    from stages.measure.tradeoff.pair_report import facts, write_pair
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [
@@ -71,7 +71,7 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 
 
 def _side(run: Pipeline, name: str) -> Side:
-    from stages.trade.pair import Side
+    from stages.measure.tradeoff.pair import Side
 
     splats = sources.finished_splats(run)
     told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}

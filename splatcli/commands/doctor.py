@@ -100,7 +100,7 @@ def _disk() -> Check:
 
 def _kernel_cache() -> Check:
     try:
-        from stages.kernels import cache
+        from stages.raster.kernels import cache
 
         own, others = cache.folder(), cache.others()
         value = f"{own}, {console.size(cache.size_bytes(own))}"

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from splatcli import console
 from splatcli.sources import backend_of, newest_with_splats, pipeline_around, splats_of
 from splatcli.viewpoints import views_of
-from stages.kernels import cache
 from stages.raster.backends import backend_of as chosen_backend
+from stages.raster.kernels import cache
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from splatcli import console, sources, viewpoints
 from splatcli.progress import counting
 from stages.base import memory
 from stages.base.errors import Family, SplatError
-from stages.kernels import cache
+from stages.raster.kernels import cache
 
 if TYPE_CHECKING:
     from stages.raster.definition import Rendering
@@ -44,10 +44,10 @@ class Wanted:
 
 def render(target: Path | None, wanted: Wanted) -> None:
     """Draw what was asked for. Raises SplatError."""
-    from stages.film import sinks
     from stages.raster.backends import AUTO, asked_for
     from stages.raster.draw import renderer
     from stages.raster.torch_device import PROCESSOR
+    from stages.viewer import sinks
 
     kind = _kind_of(wanted)
     splats, pipeline = sources.splats_of(target)
@@ -105,7 +105,7 @@ def _draw_all(
 
 def _tell(wanted: Wanted, kind: str, facts: dict[str, Any]) -> None:
     if kind == "folder" and not wanted.quiet:
-        from stages.film.sinks import frames_beyond
+        from stages.viewer.sinks import frames_beyond
 
         left = frames_beyond(wanted.out, facts["frames"])
         if left:

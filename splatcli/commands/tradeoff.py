@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from splatcli import console, sources
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
-from stages.kernels import cache
+from stages.raster.kernels import cache
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.trade.measuring import Material
+    from stages.measure.tradeoff.measuring import Material
 
 
 def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> None:
@@ -21,8 +21,8 @@ def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> 
     Raises SplatError: stage-not-finished, run-half-anew, nothing-held-out, and what keeps files
     from being written."""
     from stages.base.atomic import make_folder
-    from stages.trade.measuring import measure_trade
-    from stages.trade.report import sentences, write_report
+    from stages.measure.tradeoff.measuring import measure_trade
+    from stages.measure.tradeoff.report import sentences, write_report
 
     pipeline = Pipeline(find_run_folder(run))
     material = material_of(pipeline)
@@ -55,8 +55,8 @@ def material_of(pipeline: Pipeline) -> Material:
     nothing-held-out)."""
     from stages.export import fitted_in
     from stages.measure.judge import load_photographs
+    from stages.measure.tradeoff.measuring import Material, deciding
     from stages.scene import split_held_out
-    from stages.trade.measuring import Material, deciding
 
     splats = sources.finished_splats(pipeline)
     reconstruction = pipeline.load("sfm")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatcli import console, sources
 from stages.base.errors import Family, SplatError
-from stages.kernels import cache
+from stages.raster.kernels import cache
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+CRASHED = 1  # exit status after an unexpected failure
+STOPPED = 130  # exit status after Ctrl-C, as shells expect it
+
 
 class Family(IntEnum):
-    """Exit status of each family of errors (1 is left to crashes, 130 to Ctrl-C)."""
+    """Exit status of each family of errors (see also `CRASHED` and `STOPPED`)."""
 
     USAGE = 2  # wrong option, wrong order of commands
     INPUT = 3  # photographs or files that cannot be used

@@ -18,9 +18,9 @@ from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import tell
 from stages.formats import ply, streamed_sog
+from stages.formats.page import document
+from stages.formats.page.shots import shots_of
 from stages.formats.rows import kept_rows
-from stages.page import document
-from stages.page.shots import shots_of
 from stages.scene import Splats, View
 
 _GZIP = 31  # zlib's name for the gzip container; its header holds no time then

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.kernels.simd import kernel
+from stages.raster.kernels.simd import kernel
 from stages.structure.words import Sorted
 
 RATIO = 0.8  # of the angles to the nearest and to the second (Lowe 2004), as COLMAP has it

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.memory import MIB, available_mib
-from stages.kernels.pool import default_pool
+from stages.raster.kernels.pool import default_pool
 from stages.surface.depth_maps import DepthMap
 from stages.surface.fuse_kernels import CAMERA_ROW, integrate
 

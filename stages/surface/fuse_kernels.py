@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.kernels.simd import kernel, take_ticket
+from stages.raster.kernels.simd import kernel, take_ticket
 
 # Columns of a camera's row: world_to_camera (3 x 4, row by row), fx, fy, cx, cy, width, height,
 # where its pixels start.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.kernels.pool import Pool
+from stages.raster.kernels.pool import Pool
 from stages.training.loss_kernels import band_count, loss_bands
 
 SSIM_WEIGHT = 0.2  # Kerbl et al. 2023

@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from stages.kernels.simd import (
+from stages.raster.kernels.simd import (
     kernel,
     splat16,
     take_ticket,

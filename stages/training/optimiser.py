@@ -13,20 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.kernels.pool import Pool
-from stages.kernels.simd import (
-    kernel,
-    splat16,
-    take_ticket,
-    vabs,
-    vany,
-    vfma,
-    vge,
-    vload,
-    vnot,
-    vsqrt,
-    vstore,
-)
 from stages.raster.definition import (
     LOG_SCALE,
     MEAN,
@@ -38,6 +24,20 @@ from stages.raster.definition import (
     Backward,
     gradient_columns,
     used_columns,
+)
+from stages.raster.kernels.pool import Pool
+from stages.raster.kernels.simd import (
+    kernel,
+    splat16,
+    take_ticket,
+    vabs,
+    vany,
+    vfma,
+    vge,
+    vload,
+    vnot,
+    vsqrt,
+    vstore,
 )
 
 BETA1, BETA2 = 0.9, 0.999

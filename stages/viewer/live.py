@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.stage import Numbers
-from stages.page import document
-from stages.page.shots import Shot
+from stages.formats.page import document
+from stages.formats.page.shots import Shot
 from stages.scene import Camera, View
 from stages.scene.framing import depth_of_interest
 from stages.viewer.onlookers import Picture, Pictures

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from stages.formats import format_of, streamed_sog
-from stages.page import document
-from stages.page.shots import Shot, shots_of
+from stages.formats.page import document
+from stages.formats.page.shots import Shot, shots_of
 from stages.scene import Splats, View
 from stages.viewer.server import Item
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sample_captures.render import Lens, Shape
-from stages.kernels.simd import kernel
+from stages.raster.kernels.simd import kernel
 
 _PARTS = 2  # sub-samples of a pixel, each way
 

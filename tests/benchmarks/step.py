@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from stages.base.stage import Report
-from stages.kernels.pool import Pool
 from stages.raster.definition import gradient_columns
+from stages.raster.kernels.pool import Pool
 from stages.scene import Camera, Look, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import Model, new_model

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.kernels.pool import Pool
+from stages.raster.kernels.pool import Pool
 
 Job = Callable[[], Any]
 

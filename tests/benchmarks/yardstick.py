@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.kernels.pool import Pool
-from stages.kernels.simd import kernel
 from stages.raster.cpu.binning import TILE
 from stages.raster.cpu.projection import (
     GA,
@@ -27,6 +25,8 @@ from stages.raster.cpu.projection import (
     GY,
 )
 from stages.raster.cpu.rasteriser import Forward
+from stages.raster.kernels.pool import Pool
+from stages.raster.kernels.simd import kernel
 from tests.benchmarks.timing import Job
 
 COMPILER = os.environ.get("SPLAT_CXX")

@@ -11,7 +11,7 @@ import pytest
 
 from splatcli.compiling import Compiling
 from stages import load_stage
-from stages.kernels import cache
+from stages.raster.kernels import cache
 from tests import processes
 
 # What training, pruning and judging still compile.
@@ -19,7 +19,7 @@ MISSING = """
 import sys
 from pathlib import Path
 from numba.core import event
-from stages.kernels import cache
+from stages.raster.kernels import cache
 
 names = set()
 

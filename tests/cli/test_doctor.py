@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from splatcli.app import app
 from splatcli.commands import doctor
 from stages.base import libraries
-from stages.kernels import cache
+from stages.raster.kernels import cache
 
 
 def checks() -> dict[str, dict]:

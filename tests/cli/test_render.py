@@ -16,9 +16,9 @@ from splatcli import viewpoints
 from stages import formats
 from stages.base import memory
 from stages.cameras import nerfstudio
-from stages.film.image_files import eight_bits
 from stages.raster.draw import render
 from stages.scene import Camera, View, look_at
+from stages.viewer.image_files import eight_bits
 from tests import processes, scenes
 from tests.processes import line_of, running
 from tests.tolerances import FILM_LEVELS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from stages.kernels.pool import Pool
+from stages.raster.kernels.pool import Pool
 from stages.training.loss import image_loss
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import relative

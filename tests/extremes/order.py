@@ -9,10 +9,10 @@ import numpy as np
 
 from stages import train
 from stages.base.stage import Report
-from stages.kernels.pool import Pool
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
+from stages.raster.kernels.pool import Pool
 from stages.training.cpu_step import CpuStep
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from stages.kernels.pool import Pool
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
+from stages.raster.kernels.pool import Pool
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
 from tests.tolerances import FLOAT32_GRADIENT, FLOAT32_IMAGE
 

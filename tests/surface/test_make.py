@@ -9,7 +9,7 @@ import pytest
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.kernels.pool import Pool
+from stages.raster.kernels.pool import Pool
 from stages.scene import Reconstruction, Splats
 from stages.surface import fuse
 from stages.surface.make import MadeMesh, make

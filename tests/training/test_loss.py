@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.kernels.pool import Pool
 from stages.measure.images import psnr, ssim
+from stages.raster.kernels.pool import Pool
 from stages.training.loss import image_loss
 from tests.tolerances import LOSS_GRADIENT
 from tests.training.float64_loss import reference

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.kernels.pool import Pool
 from stages.raster.definition import Backward, gradient_columns, used_columns
+from stages.raster.kernels.pool import Pool
 from stages.training.optimiser import (
     EPSILON,
     LearningRates,

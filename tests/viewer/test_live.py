@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.page.shots import Shot, shots_of
+from stages.formats.page.shots import Shot, shots_of
 from stages.scene import Camera
 from stages.viewer.live import SIDES, LivePage
 from stages.viewer.server import LocalServer

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stages.formats.page.shots import shots_of
 from stages.measure.images import psnr
-from stages.page.shots import shots_of
 from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Splats

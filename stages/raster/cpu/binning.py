@@ -10,18 +10,6 @@ import math
 
 import numpy as np
 
-from stages.kernels.simd import kernel, prefetch, take_ticket
-from stages.kernels.simd64 import (
-    dceil,
-    dfloor,
-    dgt,
-    dload,
-    dmax,
-    dmin,
-    dselect,
-    dsqrt,
-    istore,
-)
 from stages.raster.cpu.projection import (
     GB,
     GK,
@@ -32,6 +20,18 @@ from stages.raster.cpu.projection import (
     GY,
 )
 from stages.raster.definition import ALPHA_MIN
+from stages.raster.kernels.simd import kernel, prefetch, take_ticket
+from stages.raster.kernels.simd64 import (
+    dceil,
+    dfloor,
+    dgt,
+    dload,
+    dmax,
+    dmin,
+    dselect,
+    dsqrt,
+    istore,
+)
 
 TILE = 16  # pixels across and down
 BLOCK = 4  # a tile is 4x4 blocks of 4x4 pixels

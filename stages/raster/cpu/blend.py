@@ -13,28 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.kernels.simd import (
-    bits16,
-    kernel,
-    lowest_bit,
-    prefetch,
-    splat16,
-    store_sums8,
-    take_ticket,
-    vand,
-    vany,
-    vexp2,
-    vfma,
-    vfnma,
-    vge,
-    vgt,
-    vload,
-    vmax,
-    vmin,
-    vselect,
-    vstore,
-    vsum,
-)
 from stages.raster.cpu.binning import BLOCK, TILE
 from stages.raster.cpu.projection import (
     GA,
@@ -57,6 +35,28 @@ from stages.raster.cpu.tile import (
     store_plane,
 )
 from stages.raster.definition import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from stages.raster.kernels.simd import (
+    bits16,
+    kernel,
+    lowest_bit,
+    prefetch,
+    splat16,
+    store_sums8,
+    take_ticket,
+    vand,
+    vany,
+    vexp2,
+    vfma,
+    vfnma,
+    vge,
+    vgt,
+    vload,
+    vmax,
+    vmin,
+    vselect,
+    vstore,
+    vsum,
+)
 
 # Planes of a tile's work, forward and backward.
 RED, GREEN, BLUE, ALPHA, DEPTH, MEDIAN, LIGHT, LAST = (k * PIXELS for k in range(8))

@@ -14,22 +14,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.kernels.simd import (
-    bits16,
-    kernel,
-    lowest_bit,
-    splat16,
-    take_ticket,
-    vand,
-    vfma,
-    vge,
-    vload,
-    vmax,
-    vmin,
-    vselect,
-    vstore,
-    vsum,
-)
 from stages.raster.cpu.binning import COUNT, SLOT, TILE
 from stages.raster.cpu.blend import alpha_of, tile_frame
 from stages.raster.cpu.tile import (
@@ -47,6 +31,22 @@ from stages.raster.definition import (
     PULL,
     SQUARES,
     WEIGHT,
+)
+from stages.raster.kernels.simd import (
+    bits16,
+    kernel,
+    lowest_bit,
+    splat16,
+    take_ticket,
+    vand,
+    vfma,
+    vge,
+    vload,
+    vmax,
+    vmin,
+    vselect,
+    vstore,
+    vsum,
 )
 
 _F = np.float32

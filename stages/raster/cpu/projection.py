@@ -11,26 +11,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.kernels.simd import kernel
-from stages.kernels.simd64 import (
-    LANES,
-    at,
-    bits8,
-    dand,
-    deq,
-    dexp,
-    dge,
-    dgt,
-    dlog,
-    dmax,
-    dmin,
-    dselect,
-    dsqrt,
-    gather8,
-    put,
-    scatter8,
-    spread8,
-)
 from stages.raster.camera_row import (
     ANTIALIAS,
     CX,
@@ -58,6 +38,26 @@ from stages.raster.definition import (
     ROTATION,
     SCALE_MAX,
     SH,
+)
+from stages.raster.kernels.simd import kernel
+from stages.raster.kernels.simd64 import (
+    LANES,
+    at,
+    bits8,
+    dand,
+    deq,
+    dexp,
+    dge,
+    dgt,
+    dlog,
+    dmax,
+    dmin,
+    dselect,
+    dsqrt,
+    gather8,
+    put,
+    scatter8,
+    spread8,
 )
 
 # Work of eight splats (float64[WORK_ROW x 8], one a thread): entry k of all lanes lies at 8 k.

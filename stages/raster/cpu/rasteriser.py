@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.kernels.pool import Pool, default_pool
 from stages.raster.camera_row import camera_row
 from stages.raster.cpu import binning, blend, contributions
 from stages.raster.cpu.projection import GEOMETRY_ROW
@@ -27,6 +26,7 @@ from stages.raster.definition import (
     RasterSettings,
     gradient_columns,
 )
+from stages.raster.kernels.pool import Pool, default_pool
 from stages.scene import Camera
 
 CHUNK = 512  # splats a ticket; whole vectors

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from stages.kernels.simd import kernel
-from stages.kernels.simd64 import at, put
+from stages.raster.kernels.simd import kernel
+from stages.raster.kernels.simd64 import at, put
 from stages.raster.sh import C0, C1, C2, C3
 
 

@@ -6,29 +6,6 @@ import math
 
 import numpy as np
 
-from stages.kernels.simd import (
-    kernel,
-    splat16,
-    take_ticket,
-    vstore,
-)
-from stages.kernels.simd64 import (
-    LANES,
-    at,
-    bits8,
-    dand,
-    dgt,
-    dload,
-    dmax,
-    dmin,
-    dselect,
-    dsqrt,
-    dstore,
-    gather8,
-    put,
-    scatter8,
-    spread8,
-)
 from stages.raster.camera_row import CX, CY, DILATION, HEIGHT, STAND, WIDTH, R, T
 from stages.raster.cpu.binning import COUNT, SLOT
 from stages.raster.cpu.blend import S_1, S_RED, S_T, S_TT, S_U, S_UT, S_UU, SUMS
@@ -54,6 +31,29 @@ from stages.raster.cpu.projection import (
 )
 from stages.raster.cpu.sh_kernels import sh_basis, sh_direction_gradient
 from stages.raster.definition import COLOUR_MAX, MEAN, SH
+from stages.raster.kernels.simd import (
+    kernel,
+    splat16,
+    take_ticket,
+    vstore,
+)
+from stages.raster.kernels.simd64 import (
+    LANES,
+    at,
+    bits8,
+    dand,
+    dgt,
+    dload,
+    dmax,
+    dmin,
+    dselect,
+    dsqrt,
+    dstore,
+    gather8,
+    put,
+    scatter8,
+    spread8,
+)
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
 LARGEST = 3.4e38  # what float32 holds: no gradient is handed on as infinite

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.kernels.simd import (
+from stages.raster.cpu.binning import BLOCK, TILE
+from stages.raster.kernels.simd import (
     kernel,
     vload,
     vload4x4,
     vstore,
     vstore4x4,
 )
-from stages.raster.cpu.binning import BLOCK, TILE
 
 PIXELS = TILE * TILE
 BLOCKS = 16

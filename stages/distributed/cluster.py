@@ -1,0 +1,294 @@
+"""Ray, the one place that knows it: tasks on the workers of a cluster, or of this machine.
+
+Nothing but paths and figures travels: photographs and run folders lie where all workers see them.
+A worker that is lost takes nothing with it: its task is placed again, and goes on from the stage's
+checkpoint in the run folder.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import socket
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from stages import STAGE_NAMES, load_stage
+from stages.base.errors import Family, Interrupted, SplatError
+from stages.distributed.tasks import Ending, Engine, InTurn, Need, Place, Task, work_on
+from stages.run.pipeline import Listener
+
+LOCAL = re.compile(r"local:([1-9]\d{0,3})")
+_PLACE = re.compile(r"(?:ray://)?([^/:\s]+):(\d{1,5})")
+_ANSWER_S, _KNOCK_S = 120.0, 5.0
+_LOOK_UP_S = 1.0  # whether to stop
+_LOST_AT_MOST = 20  # times that one task may lose its worker
+_MIB = 1024 * 1024
+
+
+def edition() -> str:
+    """What must be the same everywhere for the bytes to be: splat's version and its stages'."""
+    stages = ".".join(str(load_stage(name).version) for name in STAGE_NAMES)
+    return f"{version('splat')} (stages {stages})"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a worker says of itself. edition: "" where there is no splat. unseen: of the paths asked
+    for, those that it does not see. cpus, memory_mib: of its machine, for tasks."""
+
+    host: str
+    edition: str
+    unseen: tuple[str, ...]
+    cpus: int
+    memory_mib: float
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Workers that were asked and can do the work."""
+
+    ray: Any
+    workers: tuple[Answer, ...]
+
+    def results(
+        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
+    ) -> Iterator[tuple[int, Ending]]:
+        """See `tasks.Engine`. Raises SplatError "cluster-too-small"."""
+        cpus, memory_mib = self.share(len(tasks), need)
+        do = self.ray.remote(_with_threads).options(
+            num_cpus=cpus,
+            num_gpus=need.gpus,
+            memory=int(memory_mib * _MIB),
+            max_retries=_LOST_AT_MOST,
+            retry_exceptions=[Interrupted],  # a worker that was asked to go
+        )
+        waiting = {do.remote(task, cpus): number for number, task in enumerate(tasks)}
+        while waiting:
+            ready, _ = self.ray.wait(list(waiting), num_returns=1, timeout=_LOOK_UP_S)
+            if stop is not None and stop.is_set():
+                raise Interrupted("the cluster's workers go on from their checkpoints")
+            for reference in ready:
+                yield waiting.pop(reference), self._ending(reference)
+
+    def share(self, tasks: int, need: Need) -> tuple[int, float]:
+        """(CPUs, MiB) for each of as many tasks: processors are shared, memory is what it takes.
+        Raises SplatError "cluster-too-small": Ray would wait for ever."""
+        least = min(worker.memory_mib for worker in self.workers)
+        memory_mib = least if need.memory_mib is None else need.memory_mib
+        largest = max(worker.memory_mib for worker in self.workers)
+        if memory_mib > largest:
+            raise SplatError(
+                "cluster-too-small",
+                given=f"One task may take {memory_mib:,.0f} MiB, and no worker has more than "
+                f"{largest:,.0f}.",
+                wanted="A worker with memory for the splats and photographs of one run.",
+                hint="Ask for less: --max-splats, --train-side; or add a larger worker.",
+                family=Family.RESOURCES,
+            )
+        every = sum(worker.cpus for worker in self.workers)
+        fewest = min(worker.cpus for worker in self.workers)
+        return max(1, min(fewest, every // tasks)), memory_mib
+
+    def _ending(self, reference: Any) -> Ending:
+        try:
+            found: Ending = self.ray.get(reference)
+            return found
+        except self.ray.exceptions.RayError as error:
+            said = str(error).strip().splitlines()[0]
+            return Ending(int(Family.RESOURCES), "worker-lost", f"Its worker was lost: {said}")
+
+
+def _with_threads(task: Task, threads: int) -> Ending:
+    os.environ["SPLAT_THREADS"] = str(threads)
+    ending = work_on(task)
+    where = f" (On {socket.gethostname()}.)"  # whose disk is full, say
+    return replace(ending, said=ending.said + where) if ending.status else ending
+
+
+@contextmanager
+def engine_at(
+    address: str | None, folder: Place, paths: Iterable[Place], listener: Listener | None = None
+) -> Iterator[Engine]:
+    """What does the work in `folder`: a cluster, or without an address this process, which tells
+    the listener. Raises as `opened`."""
+    if address is None:
+        yield InTurn(listener)
+        return
+    with opened(address, folder, paths) as found:
+        yield found
+
+
+@contextmanager
+def opened(address: str, folder: Place, paths: Iterable[Place]) -> Iterator[Cluster]:
+    """The cluster at `address` ("local:N": N workers of this machine, started and ended here).
+
+    Each of its machines must have this splat, and see `folder` (which exists, and may be written
+    to, or is a URL) and what exists of `paths`. Raises SplatError: cluster-not-installed,
+    cluster-not-found, cluster-other-splat, cluster-folder-unseen.
+    """
+    ray = _ray()
+    _start(ray, address)
+    try:
+        with _token(folder) as token:
+            paths = list(paths)
+            local = (p.absolute() for p in paths if isinstance(p, Path) and p.exists())
+            far = [path for path in (*paths, folder) if isinstance(path, str)]
+            here = [path for path in (token, *local) if path is not None]
+            answers = _asked(ray, [*map(str, here), *far])
+            check(answers, edition(), token)
+        yield Cluster(ray, tuple(answers))
+    finally:
+        ray.shutdown()
+
+
+@contextmanager
+def _token(folder: Place) -> Iterator[Path | None]:
+    """A file that is new there; none at a URL."""
+    if isinstance(folder, str):
+        yield None
+        return
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".seen-") as file:
+        yield Path(file.name)
+
+
+def check(answers: Sequence[Answer], ours: str, token: Path | None = None) -> None:
+    """Raises SplatError (cluster-other-splat, cluster-folder-unseen) for workers that cannot."""
+    for answer in answers:
+        if answer.edition != ours:
+            theirs = f"splat {answer.edition}" if answer.edition else "no splat"
+            raise SplatError(
+                "cluster-other-splat",
+                given=f"The worker {answer.host} has {theirs}; here it is splat {ours}.",
+                wanted="The same splat everywhere: another one makes other bytes.",
+                hint='Install the same on all of them: pip install "splat[cluster]"',
+                family=Family.USAGE,
+            )
+        if answer.unseen:
+            new = token is not None and str(token) in answer.unseen
+            folder = token.parent if token is not None and new else answer.unseen[0]
+            raise SplatError(
+                "cluster-folder-unseen",
+                given=f"The worker {answer.host} does not see {folder}.",
+                wanted="Photographs and run folders where all workers see them, at the same path.",
+                hint="Put them on a folder that is shared, and name that; or at a URL that all of "
+                "them can read.",
+                family=Family.USAGE,
+            )
+
+
+def _ray() -> Any:
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # A cluster asks for the token where there is one; who joins it does not show it by itself.
+    token = Path.home() / ".ray" / "auth_token"
+    if token.is_file() or os.environ.keys() & {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}:
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
+    try:
+        return importlib.import_module("ray")
+    except ImportError:
+        raise SplatError(
+            "cluster-not-installed",
+            given="--cluster needs Ray, which is not installed.",
+            wanted="The extra that brings it.",
+            hint='pip install "splat[cluster]"; or leave --cluster away: the result is the same.',
+            family=Family.USAGE,
+        ) from None
+
+
+def _start(ray: Any, address: str) -> None:
+    quiet = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
+    if local := LOCAL.fullmatch(address):
+        store = {"object_store_memory": 100 * _MIB}  # paths and figures need no more
+        ray.init(address="local", num_cpus=int(local[1]), **store, **quiet)
+        return
+    place = _PLACE.fullmatch(address)
+    if place is None and address != "auto":
+        raise _not_found(address, "it is no address")
+    try:
+        if place is not None:
+            socket.create_connection((place[1], int(place[2])), _KNOCK_S).close()
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (OSError, OverflowError, RuntimeError, ValueError) as error:
+        raise _not_found(address, str(error).strip().splitlines()[0]) from error
+
+
+def _not_found(address: str, why: str) -> SplatError:
+    return SplatError(
+        "cluster-not-found",
+        given=f"No cluster answers at {address}: {why.rstrip('.')}.",
+        wanted="The address of a Ray cluster (HOST:PORT, ray://HOST:PORT, auto), or local:N.",
+        hint="Start one with `ray start --head`, or use --cluster local:4 for this machine.",
+        family=Family.USAGE,
+    )
+
+
+def _asked(ray: Any, paths: list[str]) -> list[Answer]:
+    """What each machine of the cluster that takes tasks says. Raises SplatError."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
+    ask = ray.remote(question())
+    asked = [
+        ask.options(
+            num_cpus=0,
+            scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
+        ).remote(paths)
+        for node in nodes
+    ]
+    if not nodes:
+        raise _not_found("this address", "none of its machines takes tasks")
+    try:
+        told = ray.get(asked, timeout=_ANSWER_S)
+    except (ray.exceptions.RayError, TimeoutError) as error:
+        raise _not_found("this address", str(error).strip().splitlines()[0]) from error
+    return [
+        Answer(
+            f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})",
+            *(found, tuple(unseen)),
+            cpus=int(node["Resources"]["CPU"]),
+            memory_mib=node["Resources"].get("memory", 0) / _MIB,
+        )
+        for node, (found, unseen) in zip(nodes, told, strict=True)
+    ]
+
+
+def question() -> Callable[[list[str]], tuple[str, list[str]]]:
+    """(edition, paths that are not seen), for a worker that may have no splat: a function of a
+    function, so that it travels as itself and not as a name to import."""
+
+    def seen(path: str) -> bool:
+        import os
+
+        if "://" not in path:
+            return os.path.exists(path)
+        try:
+            import fsspec
+
+            system, root = fsspec.core.url_to_fs(path)
+            system.exists(root)
+        except Exception:  # whatever is missing there: a package, a right, a network
+            return False
+        return True
+
+    def ask(paths: list[str]) -> tuple[str, list[str]]:
+        import importlib.metadata
+
+        try:
+            from stages.distributed import cluster
+
+            found = cluster.edition()
+        except (ImportError, AttributeError):
+            try:
+                found = importlib.metadata.version("splat")
+            except importlib.metadata.PackageNotFoundError:
+                found = ""
+        return found, [path for path in paths if not seen(path)]
+
+    return ask

@@ -1,1 +1,0 @@
-"""Paths through a scene, and the pictures and films drawn along them."""

@@ -1,5 +1,0 @@
-"""What compiled kernels stand on: vectors, threads, and where they are kept."""
-
-from stages.kernels import cache
-
-cache.prepare()  # before Numba, which is told by the environment

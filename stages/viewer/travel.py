@@ -1,0 +1,185 @@
+"""A path from camera to camera: in which order, how smoothly, how level.
+
+The world is ours: y down, so up is -Y. All cameras of a path share one lens.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Camera, Splats
+from stages.scene.rotations import matrices_of, quaternions_of
+from stages.viewer.orbit import common_lens, focus
+
+_STEEPEST_DEG = 80.0  # beyond, a horizon is nothing to be level with
+_SAMPLES = 64  # of each stretch between two cameras, to measure its length
+_STANDSTILL = 1e-6  # of a path's length: two cameras in one place
+_DETOUR = 1.5  # times the shorter tour: an order that long was not the way someone walked
+
+
+def tour(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.int64]:
+    """[V] an order in which neighbours are near: as given, unless that way is half as long again
+    as a tour found by going to the nearest that is left, improved by reversing stretches (2-opt).
+    """
+    keys = _keys(cameras)
+    apart = _lengths(keys[:, None], keys[None], _reach(cameras, splats))
+    given = np.arange(len(keys))
+    found = _untangled(_by_nearest(apart), apart)
+    return given if _way(given, apart) <= _DETOUR * _way(found, apart) else found
+
+
+def through(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
+    """On from the first camera to the last at constant speed, through every one between.
+
+    Positions and quaternions follow one centripetal Catmull-Rom spline (Yuksel, Schaefer & Keyser,
+    "Parameterization and applications of Catmull-Rom curves", 2011), which neither overshoots nor
+    loops where cameras are unevenly spaced. Speed counts turning too: by what it moves the subject.
+    """
+    keys = _keys(cameras)
+    _shorter_way_round(keys)
+    reach = _reach(cameras, splats)
+    steps = _lengths(keys[:-1], keys[1:], reach)
+    moved = np.concatenate([[True], steps > _STANDSTILL * max(steps.sum(), 1e-12)])
+    keys = keys[moved]
+    lens = common_lens(cameras)
+    if len(keys) == 1:
+        return (_posed(lens, keys[0]),) * frames
+    curve = _spline(keys, np.sqrt(_lengths(keys[:-1], keys[1:], reach)))
+    travelled = np.concatenate([[0.0], np.cumsum(_lengths(curve[:-1], curve[1:], reach))])
+    wanted = np.linspace(0.0, travelled[-1], frames)
+    rows = [np.interp(wanted, travelled, column) for column in curve.T]
+    return tuple(_posed(lens, row) for row in np.stack(rows, axis=1))
+
+
+def steadied(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
+    """A path without the jerks of a hand: positions and quaternions averaged over neighbours with
+    Gaussian weights of standard deviation `frames`. Ends stay near their places."""
+    keys = _keys(cameras)
+    _shorter_way_round(keys)
+    reach = min(int(np.ceil(3 * frames)), len(keys) - 1)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
+    # Mirrored through the end itself, so that the path still ends there.
+    before, after = 2 * keys[0] - keys[reach:0:-1], 2 * keys[-1] - keys[-2 : -2 - reach : -1]
+    padded = np.vstack([before, keys, after])
+    rows = [np.convolve(column, weights / weights.sum(), "valid") for column in padded.T]
+    steady = zip(cameras, np.stack(rows, axis=1), strict=True)
+    return tuple(_posed(camera, pose) for camera, pose in steady)
+
+
+def levelled(camera: Camera) -> Camera:
+    """The camera turned about its own axis until the horizon is level: all the way up to a slope
+    of 70 degrees, and gradually less up to 80."""
+    right, down, forward = camera.world_to_camera[:3, :3]
+    slope = np.degrees(np.arcsin(min(1.0, abs(forward[1]))))
+    share = np.clip((_STEEPEST_DEG - slope) / 10.0, 0.0, 1.0)
+    roll = -share * np.arctan2(right[1], down[1])
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]]
+    return replace(camera, world_to_camera=turn @ camera.world_to_camera)
+
+
+def length_in_turns(cameras: Sequence[Camera], splats: Splats) -> float:
+    """How long the way from the first to the last is, in turns around what they look at."""
+    keys = _keys(cameras)
+    reach = _reach(cameras, splats)
+    return float(_lengths(keys[:-1], keys[1:], reach).sum() / (2 * np.pi * max(reach, 1e-12)))
+
+
+def _reach(cameras: Sequence[Camera], splats: Splats) -> float:
+    """The median distance from the cameras to what they look at."""
+    middle = focus(cameras, splats)
+    return float(np.median([np.linalg.norm(camera.centre - middle) for camera in cameras]))
+
+
+def _keys(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """[V, 7] positions and quaternions."""
+    rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
+    return np.hstack([[camera.centre for camera in cameras], quaternions_of(rotations)])
+
+
+def _shorter_way_round(keys: NDArray[np.float64]) -> None:
+    """Choose of q and -q, which are the same rotation, the one nearer to that before."""
+    for before, key in itertools.pairwise(keys):
+        key[3:] *= np.sign(before[3:] @ key[3:]) or 1.0
+
+
+def _lengths(a: NDArray[np.float64], b: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    """[...] between poses [..., 7] (position, quaternion): how far the camera moves and, at
+    distance `reach`, its axis turns; world units."""
+    cosines = np.abs(np.sum(a[..., 3:] * b[..., 3:], axis=-1))
+    turns = 2 * np.arccos(np.clip(cosines, 0.0, 1.0))
+    found: NDArray[np.float64] = np.hypot(
+        np.linalg.norm(a[..., :3] - b[..., :3], axis=-1), reach * turns
+    )
+    return found
+
+
+def _spline(keys: NDArray[np.float64], spans: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[M, 7] dense samples of the Catmull-Rom spline through keys [K, 7] with knots `spans` [K - 1]
+    apart, quaternions of length 1."""
+    slopes = np.diff(keys, axis=0) / spans[:, None]
+    tangents = np.concatenate([slopes[:1], np.empty_like(keys[1:-1]), slopes[-1:]])
+    both = (keys[2:] - keys[:-2]) / (spans[:-1] + spans[1:])[:, None]
+    tangents[1:-1] = slopes[:-1] - both + slopes[1:]
+    s = np.linspace(0.0, 1.0, _SAMPLES, endpoint=False)[:, None, None]
+    start, end = keys[:-1], keys[1:]
+    out, into = tangents[:-1] * spans[:, None], tangents[1:] * spans[:, None]
+    stretches = (
+        (1 + 2 * s) * (1 - s) ** 2 * start
+        + s * (1 - s) ** 2 * out
+        + s**2 * (3 - 2 * s) * end
+        + s**2 * (s - 1) * into
+    )
+    curve = np.vstack([stretches.transpose(1, 0, 2).reshape(-1, 7), keys[-1:]])
+    curve[:, 3:] /= np.linalg.norm(curve[:, 3:], axis=1, keepdims=True)
+    return curve
+
+
+def _posed(lens: Camera, pose: NDArray[np.float64]) -> Camera:
+    matrix = np.eye(4)
+    matrix[:3, :3] = matrices_of(pose[3:])
+    matrix[:3, 3] = -matrix[:3, :3] @ pose[:3]
+    return replace(lens, world_to_camera=matrix)
+
+
+def _way(order: NDArray[np.int64], apart: NDArray[np.float64]) -> float:
+    return float(apart[order[:-1], order[1:]].sum())
+
+
+def _by_nearest(apart: NDArray[np.float64]) -> NDArray[np.int64]:
+    order, left = [0], np.ones(len(apart), bool)
+    left[0] = False
+    while left.any():
+        order.append(int(np.argmin(np.where(left, apart[order[-1]], np.inf))))
+        left[order[-1]] = False
+    return np.array(order)
+
+
+def _untangled(order: NDArray[np.int64], apart: NDArray[np.float64]) -> NDArray[np.int64]:
+    """2-opt. A place as far from all others as it is near closes the tour, so that either end may
+    move too."""
+    n = len(apart)
+    closed = np.zeros((n + 1, n + 1))
+    closed[:n, :n] = apart
+    ring = np.append(order, n)
+    improved = True
+    while improved:
+        improved = False
+        for i in range(n):
+            a, b = ring[i], ring[i + 1]
+            c, d = ring[i + 1 :], np.append(ring[i + 2 :], ring[0])
+            gain = closed[a, b] + closed[c, d] - closed[a, c] - closed[b, d]
+            best = int(np.argmax(gain))
+            if gain[best] > 1e-9 * (1.0 + closed[a, b]):
+                ring[i + 1 : i + 2 + best] = ring[i + 1 : i + 2 + best][::-1].copy()
+                improved = True
+    end = int(np.flatnonzero(ring == n)[0])
+    path = np.concatenate([ring[end + 1 :], ring[:end]])
+    jumps = np.append(apart[path[:-1], path[1:]], apart[path[-1], path[0]])
+    path = np.roll(path, -1 - int(np.argmax(jumps)))  # begins and ends at the longest jump
+    return path if list(path).index(0) <= n // 2 else path[::-1]

@@ -1,0 +1,190 @@
+"""Many captures: one table, one worst status, and nothing done twice."""
+
+from __future__ import annotations
+
+import builtins
+import csv
+import errno
+import importlib.metadata
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stages.base.errors import SplatError
+from stages.distributed import cluster
+from stages.distributed.tasks import Need
+from stages.run.lock import locked
+from tests.cli.pretence import failing_at
+
+NAMES = ("hill", "room", "well")
+
+
+@pytest.fixture
+def captures(splat, tmp_path) -> list[str]:
+    for name in NAMES:
+        (tmp_path / "captures" / name).mkdir(parents=True)
+        (tmp_path / "captures" / name / "a.jpg").write_text(name)
+    return [f"captures/{name}" for name in NAMES]
+
+
+def rows() -> dict[str, dict[str, str]]:
+    with Path("runs/batch.csv").open(encoding="utf-8") as file:
+        return {row["capture"]: row for row in csv.DictReader(file)}
+
+
+def manifests() -> dict[str, int]:
+    return {str(p): p.stat().st_mtime_ns for p in Path("runs").glob("*/*/manifest.json")}
+
+
+def test_each_capture_has_a_run_folder_and_a_row(splat, captures) -> None:
+    result = splat("batch", *captures, "--steps", "12")
+    assert result.exit_code == 0, result.output
+    assert {name: row["status"] for name, row in rows().items()} == dict.fromkeys(NAMES, "done")
+    assert all(row["warnings"] == "pretend-careful" for row in rows().values())
+    made = json.loads(Path("runs/room/4-train/manifest.json").read_text())
+    assert made["settings"]["steps"] == 12
+    assert str(Path("runs") / "batch.csv") in result.stdout
+
+
+def test_what_is_finished_is_not_done_again(splat, captures) -> None:
+    splat("batch", *captures[:2])
+    before = manifests()
+    assert splat("batch", *captures).exit_code == 0
+    assert {path: manifests()[path] for path in before} == before
+    assert set(rows()) == set(NAMES)
+
+
+def test_a_capture_that_fails_does_not_keep_the_others(splat, captures, pretend) -> None:
+    blurred = SplatError("ingest-blurred", given="All blurred.", wanted="Sharp.", hint="Again.")
+    pretend["ingest"] = failing_at("room", blurred)
+    result = splat("batch", *captures)
+    assert result.exit_code == 3
+    assert {name: row["status"] for name, row in rows().items()} == {
+        "hill": "done",
+        "room": "ingest-blurred",
+        "well": "done",
+    }
+    assert "room: All blurred. (ingest-blurred)" in result.stderr
+
+
+def test_the_worst_status_is_the_batch_s(splat, captures, pretend) -> None:
+    pretend["ingest"] = failing_at("hill", OSError(errno.ENOSPC, "No space left on device"))
+    result = splat("batch", *captures, "missing")
+    assert result.exit_code == 6
+    assert rows()["hill"]["status"] == "disk-full"
+    assert rows()["missing"]["status"] == "photographs-missing"
+    assert rows()["well"]["status"] == "done"
+
+
+def test_a_bug_in_one_capture_is_its_own(splat, captures, pretend) -> None:
+    pretend["ingest"] = failing_at("hill", RuntimeError("unheard of"))
+    result = splat("batch", *captures, "--json")
+    assert result.exit_code == 1
+    ended = [json.loads(line) for line in result.stdout.splitlines()]
+    assert ended[0]["said"] == "RuntimeError: unheard of."
+    assert [e["status"] for e in ended if e["event"] == "ended"] == ["bug", "done", "done"]
+
+
+def test_two_captures_of_one_name_are_refused(splat, captures, tmp_path) -> None:
+    (tmp_path / "other" / "Room").mkdir(parents=True)
+    result = splat("batch", *captures, "other/Room")
+    assert result.exit_code == 2
+    assert "batch-same-name" in result.stderr
+    assert not Path("runs").exists()
+
+
+def test_two_batches_in_one_folder_are_refused(splat, captures) -> None:
+    Path("runs").mkdir()
+    with locked(Path("runs")):
+        result = splat("batch", *captures)
+    assert result.exit_code == 5
+    assert "run-folder-busy" in result.stderr
+
+
+def test_without_ray_a_cluster_is_refused_and_nothing_else(splat, captures, monkeypatch) -> None:
+    real = importlib.import_module
+
+    def without_ray(name: str, package: str | None = None):
+        if name == "ray":
+            raise ImportError(name)
+        return real(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", without_ray)
+    result = splat("batch", *captures, "--cluster", "local:2")
+    assert result.exit_code == 2
+    assert 'pip install "splat[cluster]"' in result.stderr
+    assert splat("batch", *captures).exit_code == 0
+
+
+def test_nothing_imports_ray_unless_a_cluster_is_asked_for() -> None:
+    code = (
+        "import sys\n"
+        "import splatcli.app, splatcli.commands.batch\n"
+        "import stages.distributed.cluster, stages.distributed.tasks\n"
+        "print('ray' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def answer(**changes) -> cluster.Answer:
+    return replace(cluster.Answer("b7", "2", (), 4, 9000.0), **changes)
+
+
+def test_a_worker_with_another_splat_is_refused_and_both_are_named(tmp_path) -> None:
+    with pytest.raises(SplatError, match="b7 has splat 1; here it is splat 2") as found:
+        cluster.check([answer(), answer(edition="1")], "2", tmp_path / "t")
+    assert found.value.code == "cluster-other-splat"
+    with pytest.raises(SplatError, match="b7 has no splat"):
+        cluster.check([answer(edition="")], "2", tmp_path / "t")
+
+
+def test_a_folder_that_a_worker_does_not_see_is_named(tmp_path) -> None:
+    token = tmp_path / "runs" / ".seen"
+    with pytest.raises(SplatError, match=r"b7 does not see .*runs\.") as found:
+        cluster.check([answer(unseen=(str(token),))], "2", token)
+    assert found.value.code == "cluster-folder-unseen"
+    with pytest.raises(SplatError, match="does not see /photos/x"):
+        cluster.check([answer(unseen=("/photos/x",))], "2", token)
+
+
+def test_a_worker_without_splat_can_answer(monkeypatch, tmp_path) -> None:
+    real = builtins.__import__
+
+    def without_splat(name, *others):
+        if name.startswith("splatcli"):
+            raise ImportError(name)
+        return real(name, *others)
+
+    def unknown(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    ask = cluster.question()
+    monkeypatch.setattr(builtins, "__import__", without_splat)
+    monkeypatch.setattr(importlib.metadata, "version", unknown)
+    assert ask([str(tmp_path), str(tmp_path / "gone")]) == ("", [str(tmp_path / "gone")])
+
+
+@pytest.mark.parametrize(
+    ("tasks", "workers", "memory_mib", "wanted"),
+    [
+        (100, [answer(), answer()], 3000.0, (1, 3000.0)),
+        (2, [answer(), answer(cpus=8, memory_mib=500.0)], 400.0, (4, 400.0)),
+        (1, [answer()], None, (4, 9000.0)),
+    ],
+)
+def test_tasks_share_the_processors_and_take_the_memory_they_need(
+    tasks, workers, memory_mib, wanted
+) -> None:
+    found = cluster.Cluster(None, tuple(workers))
+    assert found.share(tasks, Need(memory_mib)) == wanted
+
+
+def test_a_run_that_no_worker_has_the_memory_for_is_refused() -> None:
+    """Ray would wait for such a worker for ever."""
+    with pytest.raises(SplatError, match="20,000 MiB, and no worker has more than 9,000"):
+        cluster.Cluster(None, (answer(),)).share(1, Need(20_000.0))

@@ -1,0 +1,151 @@
+"""Imports run downward only. Read from the source, imports inside functions included."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+STAGE_FILES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
+
+# Lowest first; a module may import from its own layer (but not in a circle) and from those above it
+# in this list. Types that only a type checker reads may come from anywhere.
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("stages.base",),
+    ("stages.scene",),
+    ("stages.raster", "stages.formats", "stages.cameras", "stages.photos"),
+    ("stages.measure", "stages.structure"),
+    ("stages.training", "stages.editing", "stages.proof", "stages.surface", "stages.capacity"),
+    ("stages", *(f"stages.{name}" for name in STAGE_FILES)),
+    ("stages.run", "stages.viewer", "stages.distributed"),
+    ("splatcli",),
+)
+
+
+def sources() -> dict[str, Path]:
+    """Path by module name."""
+    found = {}
+    for top in ("stages", "splatcli"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = sources()
+
+
+def imports_of(name: str, source: str, when: str = "ever") -> set[str]:
+    """Our own modules that `source` imports, by absolute name.
+
+    when: "ever" (anywhere) or "running" (not those for type checkers alone).
+    """
+    tree = ast.parse(source)
+    skipped: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        typing = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if isinstance(node, ast.If) and typing and when != "ever":
+            skipped |= {child for line in node.body for child in ast.walk(line)}
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if node in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name}: relative imports hide where they lead"
+            base = node.module or ""
+            for alias in node.names:
+                whole = f"{base}.{alias.name}"
+                found.add(whole if whole in MODULES else base)
+    return {module for module in found if module.split(".")[0] in ("stages", "splatcli")}
+
+
+def package_of(module: str) -> str:
+    """ "stages.raster" for "stages.raster.cpu.blend"; stage files are packages of their own."""
+    top = module.split(".")
+    return top[0] if top[0] == "splatcli" else ".".join(top[:2])
+
+
+def layer_of(module: str) -> int:
+    """The row that names the module's package."""
+    rows = [number for number, packages in enumerate(LAYERS) if package_of(module) in packages]
+    assert len(rows) == 1, f"{module} has no layer, or several"
+    return rows[0]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_run_downward_only(name: str) -> None:
+    upward = {
+        other
+        for other in imports_of(name, MODULES[name].read_text(encoding="utf-8"), "running")
+        if layer_of(other) > layer_of(name)
+    }
+    assert not upward, f"{name} imports from a higher layer: {sorted(upward)}"
+
+
+def left_in_cycles(graph: dict[str, set[str]]) -> set[str]:
+    """What remains when everything that imports nothing of the rest is taken away."""
+    while True:
+        free = {name for name, wanted in graph.items() if not (wanted - {name}) & graph.keys()}
+        if not free:
+            return set(graph)
+        graph = {name: wanted for name, wanted in graph.items() if name not in free}
+
+
+def test_modules_have_no_cycles_inside_functions_either() -> None:
+    graph = {
+        name: {
+            other
+            for other in imports_of(name, path.read_text(encoding="utf-8"), "running")
+            if not name.startswith(other + ".")  # a package is loaded before its modules
+        }
+        for name, path in MODULES.items()
+    }
+    assert not left_in_cycles(graph)
+
+
+def test_packages_have_no_cycles_at_all() -> None:
+    graph: dict[str, set[str]] = {}
+    for name, path in MODULES.items():
+        reached = imports_of(name, path.read_text(encoding="utf-8"), "running")
+        graph.setdefault(package_of(name), set()).update(map(package_of, reached))
+    assert not left_in_cycles(graph)
+
+
+def test_cycle_is_found() -> None:
+    assert left_in_cycles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == set("abcd")
+    assert left_in_cycles({"a": {"b"}, "b": set()}) == set()
+
+
+def test_no_package_holds_more_than_its_share_of_the_lines() -> None:
+    """Vendored files do not count; what a page is made of does."""
+    lines: dict[str, int] = {}
+    for top in ("stages", "splatcli"):
+        for path in (ROOT / top).rglob("*"):
+            if path.suffix in (".py", ".js", ".css", ".html") and "vendor" not in path.parts:
+                package = package_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
+                lines[package] = lines.get(package, 0) + len(path.read_text("utf-8").splitlines())
+    package, most = max(lines.items(), key=lambda item: item[1])
+    share = most / sum(lines.values())
+    assert share <= 0.15, f"{package} holds {share:.1%} of the lines"
+
+
+@pytest.mark.parametrize("stage", STAGE_FILES)
+def test_stages_never_import_each_other(stage: str) -> None:
+    others = {f"stages.{other}" for other in STAGE_FILES if other != stage}
+    assert not imports_of(stage, MODULES[f"stages.{stage}"].read_text("utf-8")) & others
+
+
+def test_nothing_below_imports_the_command() -> None:
+    for name, path in MODULES.items():
+        if not name.startswith("splatcli"):
+            reached = imports_of(name, path.read_text(encoding="utf-8"))
+            assert not {m for m in reached if m.startswith("splatcli")}, name
+
+
+def test_reader_sees_imports_inside_functions() -> None:
+    source = "def f():\n    from stages.scene import Camera\n    import stages.raster.draw\n"
+    assert imports_of("x", source) == {"stages.scene", "stages.raster.draw"}
