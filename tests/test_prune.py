@@ -10,7 +10,7 @@ from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.capacity import rounds
-from stages.capacity.aim import FELT
+from stages.capacity.targets import FELT
 from stages.measure.judge import load_photographs, mean_psnr_db
 from stages.measure.worth import Worth, beside_pictures, floaters
 from stages.scene import Splats, TrainedSplats, split_held_out
@@ -121,14 +121,14 @@ def test_what_a_round_costs_is_foretold(scene, tmp_path) -> None:
 
 def test_fine_tuning_buys_back_what_cutting_lost(scene, tmp_path) -> None:
     cut, _ = run(scene, scene.splats, tmp_path, max_splats=150, rounds=0)
-    tuned, report = run(scene, scene.splats, tmp_path, max_splats=150, tune_steps=20)
+    tuned, report = run(scene, scene.splats, tmp_path, max_splats=150, finetune_steps=20)
     assert len(cut) == len(tuned) == 150
     assert training_db(scene, tuned) > training_db(scene, cut) + 0.5
     assert report.metrics["tune_steps"] <= 8 * 20
 
 
 def test_bands_that_were_cut_stay_cut_while_the_rest_learns(scene, tmp_path) -> None:
-    result, report = run(scene, scene.splats, tmp_path, price=20, tune_steps=10)
+    result, report = run(scene, scene.splats, tmp_path, price=20, finetune_steps=10)
     degrees = np.floor(np.sqrt(np.arange(result.sh.shape[1])))
     above = degrees[None] > result.sh_degrees[:, None]
     assert (result.sh_degrees < 2).any()
