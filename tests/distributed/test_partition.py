@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.distributed import merge
-from stages.distributed import partition
-from stages.distributed import block_views
+from stages.distributed import block_views, merge, partition
 from stages.measure.judge import Photograph
 from stages.raster.backends import AUTO
 from stages.scene import Camera, look_at
