@@ -37,7 +37,7 @@ class Backend:
     name: str
     rasteriser: str
     what: str
-    step: str = "stages.training.plain_step:PlainStep"
+    step: str = "stages.training.reference_step:ReferenceStep"
     obstacle: str = ""
     told: str = ""
     devices: tuple[str, ...] = ()

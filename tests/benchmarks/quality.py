@@ -36,7 +36,7 @@ from stages.measure.judge import Photograph, drawing_of, load_photographs, score
 from stages.run.pipeline import Pipeline
 from stages.scene import Reconstruction, Splats, look_of, split_held_out
 from stages.sfm import SfmSettings
-from stages.train import PRESETS, TrainSettings, light_wanted
+from stages.train import PRESETS, TrainSettings, corrects_light
 from tests.benchmarks.sample_judges import judges_in, render_judges
 from tests.sample import PHOTOS
 
@@ -70,7 +70,7 @@ class Capture:
         self.judges = self._judges(out, side)
 
     def _judges(self, out: Path, side: int) -> tuple[Photograph, ...]:
-        light = light_wanted(self.reconstruction, TrainSettings().light, Report())
+        light = corrects_light(self.reconstruction, TrainSettings().light, Report())
         look = look_of(self.reconstruction.views, side, light)
         _, held = split_held_out(self.reconstruction.views)
         found = tuple(load_photographs(self.reconstruction.folder, held, look))

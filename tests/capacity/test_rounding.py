@@ -29,9 +29,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
     return small_scene(tmp_path_factory.mktemp("photos"), noise=0.0)
 
 
-def tuner(scene: SmallScene, sits_out: bool = False) -> FineTuner:
+def tuner(scene: SmallScene, dropout: bool = False) -> FineTuner:
     return FineTuner(
-        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), sits_out
+        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), dropout
     )
 
 
@@ -45,11 +45,11 @@ def nothing_seen(splats: Splats) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sits_out", [False, True])
-def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, sits_out: bool) -> None:
+def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, dropout: bool) -> None:
     splats, everything = scene.splats, set(ORDER)
     for moving in ORDER:
         still = everything - {moving}
-        found = tuner(scene, sits_out).finetune(splats, 3, nothing_seen(splats), still)
+        found = tuner(scene, dropout).finetune(splats, 3, nothing_seen(splats), still)
         same = {
             "means": np.array_equal(found.means, splats.means),
             "quaternions": np.array_equal(found.quaternions, splats.quaternions),
