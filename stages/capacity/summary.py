@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.capacity.pruning import LOSS, PRICE, PruningResult
 from stages.capacity.targets import felt_share
 from stages.scene import TrainedSplats
@@ -21,7 +21,7 @@ def summarise(
     told = [
         f"Price: the photographs of training hold {price.samples:,} colour values, worth "
         f"{price.independent:,.0f} independent ones; so a number costs "
-        f"{price.bits_a_number:.1f} bits, and one dB is worth {price.bits_a_db / 8e3:,.0f} kB "
+        f"{price.bits_per_parameter:.1f} bits, and one dB is worth {price.bits_per_db / 8e3:,.0f} kB "
         f"(dial at {dial:g})."
     ]
     kept = [one for one in found.rounds if one.kept]
@@ -35,7 +35,7 @@ def summarise(
         f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
         f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning in all: "
         f"{found.end_db - found.start_db:+.2f} dB on the photographs of training; other views "
-        f"feel at most {felt_share(before.by_heart):.0%} of that."
+        f"feel at most {felt_share(before.overfitted):.0%} of that."
     )
     why = _WHY.get(found.stopped_by, "the rounds that were asked for were done")
     return [*told, f"It stopped since {why}."]

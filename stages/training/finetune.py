@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
 from stages.raster.draw import settings_of
@@ -35,7 +35,7 @@ class FineTuner:
 
     def __init__(
         self,
-        photographs: Sequence[Photograph],
+        photographs: Sequence[EvaluationView],
         extent: float,
         backend: str,
         report: Report,
@@ -108,7 +108,7 @@ class FineTuner:
     def _finished(self, model: Model, before: Splats) -> Splats:
         norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
         with np.errstate(divide="ignore"):
-            finest = np.log(smoothing_widths(before.means, self.cameras, before.look.near))
+            finest = np.log(smoothing_widths(before.means, self.cameras, before.draw_settings.near))
         least = np.minimum(before.log_scales, finest[:, None])
         return replace(
             before,
@@ -130,7 +130,7 @@ def _with(finetune: Splats, before: Splats, still: Collection[str]) -> Splats:
     return replace(finetune, sh=sh, **arrays)
 
 
-def _level(photograph: Photograph) -> Level:
+def _level(photograph: EvaluationView) -> Level:
     """In the light and over the background that it is judged in, without what is not judged."""
     planar: NDArray[np.uint8] = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
     kept = photograph.kept

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
+from stages.measure.evaluation import EvaluationView, evaluate, evaluation_subset
 from stages.measure.images import psnr
-from stages.measure.judge import Photograph, scores, spread
 from stages.raster.backends import AUTO, backend_of, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import TRANSPARENT, Camera, Look, Splats, morton
+from stages.scene import TRANSPARENT, Camera, DrawSettings, Splats, morton
 from stages.training.cap import lower_cap, most_opaque
 from stages.training.checkpoint import (
     Provenance,
@@ -72,8 +72,8 @@ class Trainer:
 
     schedule: Schedule
     train: list[TrainingView]
-    held_out: Sequence[Photograph]
-    look: Look
+    held_out: Sequence[EvaluationView]
+    draw_settings: DrawSettings
     cap: int
     folder: Path
     report: Report
@@ -99,7 +99,7 @@ class Trainer:
         self.stopped = False  # by the last of them: training went back to the one before
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
-        self._onlookers = [self.held_out[i] for i in spread(len(self.held_out))]
+        self._onlookers = [self.held_out[i] for i in evaluation_subset(len(self.held_out))]
         self.history: list[dict[str, Any]] = []
         self.times: list[
             Elapsed
@@ -174,7 +174,7 @@ class Trainer:
         return self.gain_db is not None and self.gain_db > DOUBT_DB
 
     @property
-    def by_heart(self) -> bool:
+    def overfitted(self) -> bool:
         """Whether photographs are learnt by heart, as lent ones told."""
         return self.gain_db is not None and self.gain_db > SURE_DB
 
@@ -231,12 +231,14 @@ class Trainer:
         return new_model(*(np.array(a, np.float32, order="C") for a in start.arrays))
 
     def settings(self, degree: int) -> RasterSettings:
-        grey = self.look.background
-        return RasterSettings(near=self.look.near, sh_degree=degree, background=(grey,) * 3)
+        grey = self.draw_settings.background
+        return RasterSettings(
+            near=self.draw_settings.near, sh_degree=degree, background=(grey,) * 3
+        )
 
     def widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
         """[N] of the smoothing filter, from all training photographs at full size."""
-        return smoothing_widths(means, self._full_cameras, self.look.near)
+        return smoothing_widths(means, self._full_cameras, self.draw_settings.near)
 
     @property
     def _full_cameras(self) -> list[Camera]:
@@ -327,7 +329,7 @@ class Trainer:
         """PSNR of a photograph, as the model is."""
         level = self.train[row].levels[-1]
         image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
-        asked = target_of(level, image, (self.look.background,) * 3)
+        asked = target_of(level, image, (self.draw_settings.background,) * 3)
         return psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1))
 
     def _adapt(self, step: int) -> None:
@@ -362,7 +364,7 @@ class Trainer:
 
     def _record(self, step: int) -> None:
         began = self.clock.spent().seconds
-        found = scores(self.drawn, self._onlookers)
+        found = evaluate(self.drawn, self._onlookers)
         entry: dict[str, Any] = {"step": step, "splats": len(self.model)}
         self._pace.reserve = LAST_WORDS * (self.clock.spent().seconds - began)
         if found:
