@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure import retrieval, vocabulary
+from stages.structure import retrieval
 from stages.structure.pairs import exhaustive_pairs
 
 

@@ -81,7 +81,7 @@ def watched(made):
     return steps, loads
 
 
-@pytest.mark.parametrize(("doubt_db", "sits_out"), [(-99.0, True), (99.0, False)])
+@pytest.mark.parametrize(("doubt_db", "dropout"), [(-99.0, True), (99.0, False)])
 def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_forgotten(
     tmp_path, monkeypatch, doubt_db, dropout
 ):
@@ -92,9 +92,9 @@ def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_forgotten(
     half, lasts = int(GROWTH_ENDS * STEPS), round(LASTS * STEPS)
     plain, other = (slice(half + k * lasts, half + (k + 1) * lasts) for k in range(2))
     assert len(steps) == STEPS + 2 * lasts
-    assert not any(dropout for _, dropout in steps[: plain.stop])
-    assert all(dropout for _, dropout in steps[other])
-    assert all(dropout == dropout for _, dropout in steps[other.stop :])
+    assert not any(out for _, out in steps[: plain.stop])
+    assert all(out for _, out in steps[other])
+    assert all(out == dropout for _, out in steps[other.stop :])
     assert [row for row, _ in steps[plain]] == [row for row, _ in steps[other]]
     assert LENT not in {row for row, _ in steps[: other.stop]}
     assert LENT in {row for row, _ in steps[other.stop :]}
