@@ -11,8 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
-from stages.raster.backends import backend_setting, device_setting, drawn_by, passed_over, tell
+from stages.base.text import counted
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+    unavailable_backends,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +26,7 @@ if TYPE_CHECKING:
 
     from stages.measure.evaluation import EvaluationView
     from stages.raster.definition import MemoryFull
-    from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats
+    from stages.scene import Camera, DrawSettings, Reconstruction, Splats, TrainedSplats
     from stages.training.clock import Spent
     from stages.training.optimiser import Model
     from stages.training.trainer import Trainer
@@ -159,29 +165,29 @@ def run(
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
     if settings.seconds:
         trainer.seconds = max(settings.seconds - (time.monotonic() - started), 1.0)
-    tell(report, trainer.backend)
+    report_backend(report, trainer.backend)
     report.metric("device", report.device)
-    report.metric("passed_over", passed_over(settings.backend))
+    report.metric("unavailable_backends", unavailable_backends(settings.backend))
     report.metric("train_photographs", len(trainer.train))
     report.metric("held_out_photographs", len(trainer.held_out))
     try:
         model = trainer.run(start)
     except MemoryFull as full:
         raise _does_not_fit(full, lower_cap(folder, full.fits).splats) from full
-    splats = finished(model, settings.sh_degree, start, trainer.look)
+    splats = finished(model, settings.sh_degree, start, trainer.draw_settings)
     if settings.smooth:
         splats = smoothed(splats, trainer.widths(splats.means))
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
-    trained = TrainedSplats(splats, trainer.sits_out, trainer.by_heart)
+    trained = TrainedSplats(splats, trainer.sits_out, trainer.overfitted)
     save(folder, trained)
     remove_checkpoint(folder)
     forget_cap(folder)
     report.metric("steps", trainer.schedule.steps)
     _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
-    report.metric("learnt_by_heart", trainer.by_heart)
+    report.metric("learnt_by_heart", trainer.overfitted)
     if trainer.answers and trainer.gain_db is not None:
         report.metric("sitting_out_gain_db", round(trainer.gain_db, 3))
         report.metric("photographs_lent_said", [asdict(answer) for answer in trainer.answers])
@@ -240,7 +246,7 @@ def make_trainer(
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import look_of, seen_extent, split_held_out
+    from stages.scene import draw_settings_of, seen_extent, split_held_out
     from stages.training.cap import cap_for, splats_told
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
@@ -249,8 +255,8 @@ def make_trainer(
     kept, held = split_held_out(reconstruction.views)
     light = light_wanted(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
-    look = look_of(reconstruction.views, settings.train_side, light)
-    held_out = load_evaluation_views(reconstruction.folder, held, look)
+    draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light)
+    held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     smaller = [
         v
         for v in reconstruction.views
@@ -277,13 +283,13 @@ def make_trainer(
         ),
         train=train,
         held_out=held_out,
-        look=look,
+        draw_settings=draw_settings,
         cap=cap.splats,
         folder=folder,
         report=report,
         smooth=settings.smooth,
         over_any=settings.background == "any",
-        backend=drawn_by(settings),
+        backend=backend_of_settings(settings),
         within=settings.within,
         growth=settings.growth,
         lent=lent_rows(len(train)),
@@ -316,7 +322,7 @@ def light_wanted(reconstruction: Reconstruction, wanted: str, report: Report) ->
     return chosen
 
 
-def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
+def finished(model: Model, sh_degree: int, start: Splats, draw_settings: DrawSettings) -> Splats:
     """The model as splats: unit quaternions, without rows that are not finite."""
     import numpy as np
 
@@ -335,7 +341,7 @@ def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
         model.sh[good],
         np.full(int(good.sum()), sh_degree, np.uint8),
         start.origin,
-        look,
+        draw_settings,
     )
 
 
@@ -343,7 +349,7 @@ class Judged(Protocol):
     """What `write_quality` asks of whoever trained; see `Trainer`."""
 
     held_out: Sequence[EvaluationView]
-    look: Look
+    draw_settings: DrawSettings
     history: list[dict[str, Any]]
     times: list[Spent]
 
@@ -377,9 +383,11 @@ def write_quality(
             "train-nothing-held-out",
             "Too few photographs to hold one out: quality was not measured.",
         )
-    if trainer.look.light and found:
+    if trainer.draw_settings.light and found:
         _, held = split_held_out(reconstruction.views)
-        plain, adapted = psnr_as_taken_db(trainer.drawn, reconstruction.folder, held, trainer.look)
+        plain, adapted = psnr_as_taken_db(
+            trainer.drawn, reconstruction.folder, held, trainer.draw_settings
+        )
         report.metric("psnr_as_taken_db", round(plain, 3))
         report.metric("psnr_adapted_db", round(adapted, 3))
     inside = psnr_inside_masks_db(trainer.drawn, trainer.held_out)
@@ -442,7 +450,7 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _LEARNT) as temporary:
-        learnt = {"sat_out": trained.sat_out, "by_heart": trained.by_heart}
+        learnt = {"dropout": trained.dropout, "overfitted": trained.overfitted}
         temporary.write_text(json.dumps(learnt) + "\n", encoding="utf-8")
 
 
@@ -454,7 +462,7 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     try:
         learnt = json.loads((folder / _LEARNT).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, bool(learnt["sat_out"]), bool(learnt["by_heart"]))
+        return TrainedSplats(splats, bool(learnt["dropout"]), bool(learnt["overfitted"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "train-folder-damaged",

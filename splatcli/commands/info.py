@@ -107,7 +107,9 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     views = views_of(pipeline)
     chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
-    cameras = [splats.look.camera(v.camera) for v in chosen] or around(splats, _TIMED_FRAMES, 0.9)
+    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or around(
+        splats, _TIMED_FRAMES, 0.9
+    )
     backend = backend_of(pipeline)
     seconds = seconds_per_frame(splats, cameras, backend)
     return {

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
 from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
@@ -103,7 +103,7 @@ class Prover:
         row = format_of(path)
         try:
             content = _drawable(second_readers.read_back(path))
-            said = named(row.validator)(path) if row.validator else []
+            said = load_object(row.validator)(path) if row.validator else []
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)

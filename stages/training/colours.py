@@ -88,9 +88,9 @@ class Recolouring:
         total[backward.rows] += np.abs(found) if of_size else found
 
 
-def worth_settling(sat_out: bool, photographs: int) -> bool:
+def worth_settling(dropout: bool, photographs: int) -> bool:
     """Whether splats sat steps out, and so few photographs were learnt that it shows."""
-    return sat_out and photographs <= MOST_PHOTOGRAPHS
+    return dropout and photographs <= MOST_PHOTOGRAPHS
 
 
 def _trust(error: NDArray[np.float32]) -> NDArray[np.float32]:

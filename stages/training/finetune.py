@@ -108,7 +108,7 @@ class FineTuner:
     def _finished(self, model: Model, before: Splats) -> Splats:
         norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
         with np.errstate(divide="ignore"):
-            finest = np.log(smoothing_widths(before.means, self.cameras, before.look.near))
+            finest = np.log(smoothing_widths(before.means, self.cameras, before.draw_settings.near))
         least = np.minimum(before.log_scales, finest[:, None])
         return replace(
             before,

@@ -20,7 +20,7 @@ from stages.measure.images import psnr
 from stages.raster.backends import AUTO, backend_of, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import TRANSPARENT, Camera, Look, Splats, morton
+from stages.scene import TRANSPARENT, Camera, DrawSettings, Splats, morton
 from stages.training.cap import fitted, lower_cap
 from stages.training.checkpoint import (
     Maker,
@@ -73,7 +73,7 @@ class Trainer:
     schedule: Schedule
     train: list[TrainingView]
     held_out: Sequence[EvaluationView]
-    look: Look
+    draw_settings: DrawSettings
     cap: int
     folder: Path
     report: Report
@@ -172,7 +172,7 @@ class Trainer:
         return self.gain_db is not None and self.gain_db > DOUBT_DB
 
     @property
-    def by_heart(self) -> bool:
+    def overfitted(self) -> bool:
         """Whether photographs are learnt by heart, as lent ones told."""
         return self.gain_db is not None and self.gain_db > SURE_DB
 
@@ -229,12 +229,14 @@ class Trainer:
         return new_model(*(np.array(a, np.float32, order="C") for a in start.arrays))
 
     def settings(self, degree: int) -> RasterSettings:
-        grey = self.look.background
-        return RasterSettings(near=self.look.near, sh_degree=degree, background=(grey,) * 3)
+        grey = self.draw_settings.background
+        return RasterSettings(
+            near=self.draw_settings.near, sh_degree=degree, background=(grey,) * 3
+        )
 
     def widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
         """[N] of the smoothing filter, from all training photographs at full size."""
-        return smoothing_widths(means, self._full_cameras, self.look.near)
+        return smoothing_widths(means, self._full_cameras, self.draw_settings.near)
 
     @property
     def _full_cameras(self) -> list[Camera]:
@@ -325,7 +327,7 @@ class Trainer:
         """PSNR of a photograph, as the model is."""
         level = self.train[row].levels[-1]
         image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
-        asked = target_of(level, image, (self.look.background,) * 3)
+        asked = target_of(level, image, (self.draw_settings.background,) * 3)
         return psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1))
 
     def _adapt(self, step: int) -> None:

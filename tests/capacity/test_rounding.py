@@ -37,7 +37,7 @@ def tuner(scene: SmallScene, sits_out: bool = False) -> FineTuner:
 
 def photographs(scene: SmallScene, held_out: bool = False):
     views = split_held_out(scene.reconstruction.views)[held_out]
-    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.look)
+    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.draw_settings)
 
 
 def nothing_seen(splats: Splats) -> np.ndarray:
@@ -112,7 +112,9 @@ def test_compact_files_hold_splats_that_were_fitted_to_them_if_that_helps(
         assert export.fitted_in(tmp_path / "plain", name) is None
         read = formats.read(tmp_path / "fitted" / f"scene.{name}")
         drawn = mean_psnr_db(
-            replace(read, look=scene.splats.look, origin=held.origin), photographs(scene), "cpu"
+            replace(read, draw_settings=scene.splats.draw_settings, origin=held.origin),
+            photographs(scene),
+            "cpu",
         )
         better = max(fitted[name]["plain_db"], fitted[name]["fitted_db"])
         assert drawn == pytest.approx(better, abs=0.02)

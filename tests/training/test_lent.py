@@ -9,7 +9,7 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
-from stages.scene import Look
+from stages.scene import DrawSettings
 from stages.train import lent_rows
 from stages.training import trainer as training
 from stages.training import trial
@@ -37,7 +37,7 @@ def trainer(folder, contradicting, patience_db=0.05, report=None):
     schedule = Schedule(steps=STEPS, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     folder.mkdir(exist_ok=True)
     made = Trainer(
-        *(schedule, views, [], Look(near=0.1), 200, folder, report or Report()),
+        *(schedule, views, [], DrawSettings(near=0.1), 200, folder, report or Report()),
         backend="cpu",
         lent=(LENT,),
         patience_db=patience_db,
@@ -92,9 +92,9 @@ def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_forgotten(
     half, lasts = int(GROWTH_ENDS * STEPS), round(LASTS * STEPS)
     plain, other = (slice(half + k * lasts, half + (k + 1) * lasts) for k in range(2))
     assert len(steps) == STEPS + 2 * lasts
-    assert not any(sat_out for _, sat_out in steps[: plain.stop])
-    assert all(sat_out for _, sat_out in steps[other])
-    assert all(sat_out == sits_out for _, sat_out in steps[other.stop :])
+    assert not any(dropout for _, dropout in steps[: plain.stop])
+    assert all(dropout for _, dropout in steps[other])
+    assert all(dropout == sits_out for _, dropout in steps[other.stop :])
     assert [row for row, _ in steps[plain]] == [row for row, _ in steps[other]]
     assert LENT not in {row for row, _ in steps[: other.stop]}
     assert LENT in {row for row, _ in steps[other.stop :]}

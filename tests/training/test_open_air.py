@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.base.stage import Report
-from stages.scene import Look, look_at
+from stages.scene import DrawSettings, look_at
 from stages.training.open_air import ENOUGH, WITNESSES, open_air
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
@@ -114,7 +114,7 @@ def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, steps):
     views = [view_of(f"{k}", pictures, one) for k, one in enumerate(cameras(3))]
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     made = Trainer(
-        *(schedule, views, [], Look(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
+        *(schedule, views, [], DrawSettings(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
     )
     made._strategy = Clouds()
     model = made.run(start)

@@ -17,7 +17,7 @@ from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import Look, Splats, look_at, split_held_out
+from stages.scene import DrawSettings, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training import cap
 from stages.training.checkpoint import MAGIC
@@ -41,7 +41,9 @@ def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, back
         for view in views
     ]
     report = report or Report()
-    return Trainer(schedule, views, judges, Look(near=0.1), cap, folder, report, backend=backend)
+    return Trainer(
+        schedule, views, judges, DrawSettings(near=0.1), cap, folder, report, backend=backend
+    )
 
 
 def psnr_of(trained):
@@ -220,13 +222,13 @@ def test_looking_on_does_not_change_what_is_trained(tmp_path):
     drawn: list[np.ndarray] = []
     report = Report()
 
-    def look(draw):
+    def keep(draw):
         width, height = (97, 61) if len(drawn) % 2 else (19, 23)
         where = camera(width, height, matrix=look_at(np.array([2.0, -1, -3]), np.zeros(3)))
         drawn.append(draw(where))
         assert drawn[-1].shape == (height, width, 3)
 
-    report.onlooker = look
+    report.onlooker = keep
     watched, start = small_problem(tmp_path, "watched", report, steps=150)
     found = watched.run(start)
     assert len(drawn) == 150
@@ -242,7 +244,7 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     where = camera(48, 36)
     seen = []
     report.onlooker = lambda draw: seen.append(draw(where))
-    trained = finished(t.run(start), 1, start, t.look)
+    trained = finished(t.run(start), 1, start, t.draw_settings)
     settings = t.settings(t.schedule.sh_degree)
     image = render(trained, where, settings, backend="reference").image
     levels = np.rint(np.clip(image, 0, 1) * 255)
@@ -294,7 +296,7 @@ def test_a_run_that_loses_every_splat_ends(tmp_path):
     faint = np.full(len(start), -12.0, np.float32)
     model = t.run(replace(start, opacity_logits=faint))
     assert len(model) == 0
-    assert len(finished(model, 1, start, t.look)) == 0
+    assert len(finished(model, 1, start, t.draw_settings)) == 0
     assert t.history[-1]["splats"] == 0
 
 
