@@ -145,8 +145,8 @@ def _camera_files() -> list[str]:
 def _backend(backend: Backend) -> Check:
     label = f"backend {backend.name}"
     try:
-        if why_not := backend.why_not():
-            return Check(label, f"not chosen: {why_not}", advice=_BACKEND_ADVICE)
+        if why := backend.why_unavailable():
+            return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
         load_object(backend.rasteriser)
     except Exception as error:
         return Check(label, f"not present ({_said(error)})", ok=False)
@@ -159,6 +159,6 @@ def _gpu() -> Check:
         from stages.raster.gpu import device
 
         missing = device.missing()
-        return Check("GPU", f"{missing}; {device.built()}" if missing else device.told())
+        return Check("GPU", f"{missing}; {device.built()}" if missing else device.describe())
     except Exception as error:  # a broken driver may raise anything
         return Check("GPU", _said(error))

@@ -39,7 +39,8 @@ from stages.training.open_air import open_air
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
 from stages.training.pace import Pace
 from stages.training.schedule import Schedule
-from stages.training.step import TrainingStep, step_of
+from stages.training.step import TrainingStep
+from stages.training.steps import step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
 from stages.training.trial import (
@@ -202,7 +203,7 @@ class Trainer:
     def _take_over(self, step: int) -> None:
         """Enter who makes the steps from here on, and say so where somebody else began."""
         chosen = backend_of(self.backend)
-        maker, before = Maker(step, chosen.name, chosen.where()), self.makers[-1:]
+        maker, before = Maker(step, chosen.name, chosen.describe()), self.makers[-1:]
         if any(replace(maker, step=one.step) == one for one in before):
             return
         self.makers.append(maker)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from stages.structure import database as sqlite
 from stages.structure import chunks
-from stages.structure.job import Job, chosen_path, shares_path
+from stages.structure import database as sqlite
 from stages.structure.chunks import Share
+from stages.structure.job import Job, chosen_path, shares_path
 from tests.structure import sample_jobs as jobs
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # a process for each share

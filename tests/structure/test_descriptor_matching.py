@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure import features
-from stages.structure import descriptor_matching
-from stages.structure import vocabulary
+from stages.structure import descriptor_matching, features, vocabulary
 from tests.structure.sample_jobs import SAMPLE
 
 
@@ -18,7 +16,9 @@ def compared_with_all(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> se
 
     def clear(table: NDArray[np.float64]) -> NDArray[np.int64]:
         best, next_best = np.sort(table, axis=1)[:, :2].T
-        good = (best <= descriptor_matching.LARGEST_ANGLE) & (best < descriptor_matching.RATIO * next_best)
+        good = (best <= descriptor_matching.LARGEST_ANGLE) & (
+            best < descriptor_matching.RATIO * next_best
+        )
         return np.where(good, table.argmin(axis=1), -1)
 
     there, back = clear(angles), clear(angles.T)
@@ -55,7 +55,11 @@ def test_no_features_match_nothing() -> None:
     vocabulary = vocabulary.vocabulary(none)
     empty = vocabulary.sort_by_word(none, vocabulary)
     some = vocabulary.sort_by_word(np.full((5, 128), 45, np.uint8), vocabulary)
-    assert descriptor_matching.matches(empty, some).shape == descriptor_matching.matches(some, empty).shape == (0, 2)
+    assert (
+        descriptor_matching.matches(empty, some).shape
+        == descriptor_matching.matches(some, empty).shape
+        == (0, 2)
+    )
 
 
 def test_the_vocabulary_of_few_features_is_small() -> None:

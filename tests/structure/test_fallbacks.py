@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from stages.structure.gates import Failure, Figures
 from stages.structure.fallbacks import LADDER, Attempt, Climb, Rung, climb
+from stages.structure.gates import Failure, Figures
 
 
 def failing(*codes: str) -> tuple[Failure, ...]:
