@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stages.measure.evaluation import EvaluationView
     from stages.raster.definition import MemoryFull
     from stages.scene import Camera, DrawSettings, Reconstruction, Splats, TrainedSplats
-    from stages.training.clock import Spent
+    from stages.training.clock import Elapsed
     from stages.training.optimiser import Model
     from stages.training.trainer import Trainer
 
@@ -136,8 +136,10 @@ class TrainSettings:
 
 
 _LEARNT = "learnt.json"
-MOST_LENT = 4  # photographs: what more of them would tell is not worth what each is missed
-MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
+MAX_VALIDATION_VIEWS = (
+    4  # photographs: what more of them would tell is not worth what each is missed
+)
+MIN_VIEWS_FOR_VALIDATION = 8  # photographs: of fewer, each is missed more than its advice is worth
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
@@ -154,7 +156,7 @@ def run(
     from stages.raster.definition import MemoryFull
     from stages.raster.smoothing import smoothed
     from stages.scene import TrainedSplats
-    from stages.training.cap import forget_cap, lower_cap
+    from stages.training.cap import lower_cap, remove_cap
     from stages.training.checkpoint import remove_checkpoint
 
     if settings.blocks != "1":
@@ -180,10 +182,10 @@ def run(
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
-    trained = TrainedSplats(splats, trainer.sits_out, trainer.overfitted)
+    trained = TrainedSplats(splats, trainer.dropout, trainer.overfitted)
     save(folder, trained)
     remove_checkpoint(folder)
-    forget_cap(folder)
+    remove_cap(folder)
     report.metric("steps", trainer.schedule.steps)
     _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
@@ -247,13 +249,13 @@ def make_trainer(
     """Load the photographs and compute the cap, before anything grows."""
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import draw_settings_of, seen_extent, split_held_out
-    from stages.training.cap import cap_for, splats_told
+    from stages.training.cap import cap_for, splats_determined
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
     from stages.training.views import load_views
 
     kept, held = split_held_out(reconstruction.views)
-    light = light_wanted(reconstruction, settings.light, report)
+    light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
     draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light)
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
@@ -268,7 +270,7 @@ def make_trainer(
             f"Used at their own size, smaller than --train-side {settings.train_side}: "
             f"{counted(len(smaller), 'photograph')}. --max-side sets how large ingest keeps them.",
         )
-    told = splats_told([view.levels[-1].camera for view in train], settings.sh_degree)
+    told = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
     cap = cap_for(folder, settings.max_splats, told)
     report.metric("splat_cap", cap.splats)
     report.metric("splat_cap_from", cap.origin)
@@ -292,19 +294,23 @@ def make_trainer(
         backend=backend_of_settings(settings),
         within=settings.within,
         growth=settings.growth,
-        lent=lent_rows(len(train)),
+        lent=validation_rows(len(train)),
         patience_db=settings.patience,
     )
 
 
-def lent_rows(n: int) -> tuple[int, ...]:
+def validation_rows(n: int) -> tuple[int, ...]:
     """Which of `n` training photographs decide while the model grows: the fifth of every eight, so
     that they lie between the judges, or of more where that would be more than four; none where
     there are too few to lend one."""
-    return tuple(range(4, n, max(8, -(-n // MOST_LENT)))) if n >= MIN_TO_LEND else ()
+    return (
+        tuple(range(4, n, max(8, -(-n // MAX_VALIDATION_VIEWS))))
+        if n >= MIN_VIEWS_FOR_VALIDATION
+        else ()
+    )
 
 
-def light_wanted(reconstruction: Reconstruction, wanted: str, report: Report) -> bool:
+def corrects_light(reconstruction: Reconstruction, wanted: str, report: Report) -> bool:
     """Whether photographs are brought to their median light, as `TrainSettings.light` says."""
     from stages.scene.light import NOISE_EV, spread_ev
 
@@ -345,19 +351,19 @@ def finished(model: Model, sh_degree: int, start: Splats, draw_settings: DrawSet
     )
 
 
-class Judged(Protocol):
+class TrainedResult(Protocol):
     """What `write_quality` asks of whoever trained; see `Trainer`."""
 
     held_out: Sequence[EvaluationView]
     draw_settings: DrawSettings
     history: list[dict[str, Any]]
-    times: list[Spent]
+    times: list[Elapsed]
 
     def drawn(self, camera: Camera) -> NDArray[np.float32]: ...
 
 
 def write_quality(
-    trainer: Judged, reconstruction: Reconstruction, folder: Path, report: Report
+    trainer: TrainedResult, reconstruction: Reconstruction, folder: Path, report: Report
 ) -> None:
     """Final held-out figures into the report; table, plot and contact sheet into the folder."""
     import numpy as np

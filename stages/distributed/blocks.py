@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from stages.distributed.partition import Cell
     from stages.measure.evaluation import EvaluationView
     from stages.scene import Camera, DrawSettings, Reconstruction, Splats, TrainedSplats, View
-    from stages.training.clock import Spent
+    from stages.training.clock import Elapsed
 
 FOLDER, COARSE = "blocks", "coarse"
 PHOTOGRAPHS_A_BLOCK = 250
@@ -90,10 +90,10 @@ class _Scene:
         """The merged splats, written to `folder` as training writes them."""
         from stages.distributed import block_views, partition
         from stages.scene import draw_settings_of, split_held_out
-        from stages.train import light_wanted, save, write_quality
+        from stages.train import corrects_light, save, write_quality
 
         started = time.monotonic()
-        light = light_wanted(self.whole, self.settings.light, self.report)
+        light = corrects_light(self.whole, self.settings.light, self.report)
         self.settings = replace(self.settings, light="on" if light else "off")
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
@@ -278,13 +278,13 @@ class _Scene:
 
 @dataclass
 class _Judged:
-    """See `stages.train.Judged`."""
+    """See `stages.train.TrainedResult`."""
 
     draw: Callable[[Camera], Any]
     held_out: Sequence[EvaluationView]
     draw_settings: DrawSettings
     history: list[dict[str, Any]]
-    times: list[Spent]
+    times: list[Elapsed]
 
     def drawn(self, camera: Camera) -> NDArray[np.float32]:
         image: NDArray[np.float32] = self.draw(camera)

@@ -11,7 +11,7 @@ _OWN_STEPS = {
     "gpu": "stages.training.gpu_step:GpuStep",
     "cpu": "stages.training.cpu_step:CpuStep",
 }
-_OTHER_BACKENDS = "stages.training.plain_step:PlainStep"
+_OTHER_BACKENDS = "stages.training.reference_step:ReferenceStep"
 
 
 def step_of(backend: str) -> TrainingStep:

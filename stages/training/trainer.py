@@ -16,34 +16,34 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView, evaluate, evaluation_subset
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.backends import AUTO, backend_of, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import TRANSPARENT, Camera, DrawSettings, Splats, morton
-from stages.training.cap import fitted, lower_cap
+from stages.training.cap import lower_cap, most_opaque
 from stages.training.checkpoint import (
-    Maker,
-    Saved,
+    Provenance,
+    TrainingState,
     keep_model,
     kept_model,
     load_checkpoint,
     save_checkpoint,
 )
-from stages.training.clock import Clock, Spent
-from stages.training.colours import Recolouring, worth_settling
+from stages.training.clock import Clock, Elapsed
+from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.density import Within
 from stages.training.dropout import Dropout
-from stages.training.frugal_step import FrugalStep
-from stages.training.open_air import open_air
+from stages.training.free_space import known_free_space
+from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
-from stages.training.pace import Pace
 from stages.training.schedule import Schedule
 from stages.training.step import TrainingStep
 from stages.training.steps import step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
-from stages.training.trial import (
+from stages.training.time_limit import TimeLimit
+from stages.training.validation import (
     DOUBT_DB,
     SURE_DB,
     Answer,
@@ -90,8 +90,8 @@ class Trainer:
     def __post_init__(self) -> None:
         self.stepper: TrainingStep = step_of(self.backend)
         if self.backend == AUTO:
-            self.stepper = FrugalStep(self.stepper, self._memory_full)
-        self.makers: list[Maker] = []
+            self.stepper = MemoryLimitedStep(self.stepper, self._memory_full)
+        self.makers: list[Provenance] = []
         self._strategy = STRATEGIES[self.growth](self.schedule.extent, len(self.train))
         if self.within:
             self._strategy = Within(self._strategy, self.within)
@@ -102,7 +102,9 @@ class Trainer:
         # The course is told by some of very many, so that judging does not outlast training.
         self._onlookers = [self.held_out[i] for i in evaluation_subset(len(self.held_out))]
         self.history: list[dict[str, Any]] = []
-        self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
+        self.times: list[
+            Elapsed
+        ] = []  # of each entry of the history, kept apart: no two runs agree
 
     def run(self, start: Splats) -> Model:
         """Train from `start`, or go on from the folder's checkpoint; the finished model.
@@ -110,16 +112,16 @@ class Trainer:
         Raises Interrupted at a step boundary, checkpoint written, when the report asks to stop.
         """
         self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
-        self.clock, self._pace = Clock(), Pace(self.seconds)
+        self.clock, self._pace = Clock(), TimeLimit(self.seconds)
         step = self._begin(start)
-        self._open_air = open_air(start.means, self._full_cameras)
+        self._open_air = known_free_space(start.means, self._full_cameras)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
             loss = self.step(step)
             if not self.trial:
                 self._adapt(step)
             step += 1
-            if step == self.schedule.steps and worth_settling(self.sits_out, len(self.train)):
+            if step == self.schedule.steps and needs_colour_refit(self.dropout, len(self.train)):
                 self._recolour()
             if not self.trial:
                 if self.schedule.passes(step, EVALUATIONS):
@@ -143,7 +145,7 @@ class Trainer:
         rasteriser = rasteriser_of(backend_of(self.backend).name)
         settings = self.settings(self.schedule.sh_degree)
         widths = model.smoothing if self.smooth else NO_SMOOTHING
-        self.stepper.load(Recolouring(rasteriser, settings, self._full_size, widths).of(model))
+        self.stepper.load(ColourRefit(rasteriser, settings, self._full_size, widths).of(model))
 
     def _full_size(self) -> Iterator[Level]:
         return (view.levels[-1] for view in self.train)
@@ -168,7 +170,7 @@ class Trainer:
         )
 
     @property
-    def sits_out(self) -> bool:
+    def dropout(self) -> bool:
         """Whether splats sit steps out from where growth ends, as lent photographs told."""
         return self.gain_db is not None and self.gain_db > DOUBT_DB
 
@@ -192,7 +194,7 @@ class Trainer:
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock, self.makers = Clock(spent), told.makers
-            model = fitted(model, self.cap)
+            model = most_opaque(model, self.cap)
             self.report.metric("resumed_from_step", step)
         else:
             model, step = self._first(start), 0
@@ -203,7 +205,7 @@ class Trainer:
     def _take_over(self, step: int) -> None:
         """Enter who makes the steps from here on, and say so where somebody else began."""
         chosen = backend_of(self.backend)
-        maker, before = Maker(step, chosen.name, chosen.describe()), self.makers[-1:]
+        maker, before = Provenance(step, chosen.name, chosen.describe()), self.makers[-1:]
         if any(replace(maker, step=one.step) == one for one in before):
             return
         self.makers.append(maker)
@@ -219,7 +221,7 @@ class Trainer:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
         told = self.trial, self.answers, self.stopped
-        saved = Saved(step, plan, self.history, *told, times, self.makers)
+        saved = TrainingState(step, plan, self.history, *told, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
     def _first(self, start: Splats) -> Model:
@@ -267,8 +269,8 @@ class Trainer:
     def _dropout(self, step: int) -> Dropout | None:
         """Once the model grows no more: before that, who sits out would be pulled at less than it
         deserves."""
-        sits_out = self.trial.sits_out if self.trial else self.sits_out
-        if not sits_out or self._course.grows(step):
+        dropout = self.trial.dropout if self.trial else self.dropout
+        if not dropout or self._course.grows(step):
             return None
         return Dropout(len(self.train), self.schedule.key(step))
 
@@ -304,7 +306,7 @@ class Trainer:
             return step
         came_to = tuple(self._db(row) for row in self.lent)
         self.stepper.load(kept_model(self.folder, begun))
-        if not self.trial.sits_out:
+        if not self.trial.dropout:
             self.trial = replace(self.trial, plain_db=came_to)
             return begun
         self.answers.append(Answer(begun, len(self.stepper), self.trial.plain_db, came_to))

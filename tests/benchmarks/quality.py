@@ -41,7 +41,7 @@ from stages.measure.evaluation import (
 from stages.run.pipeline import Pipeline
 from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
 from stages.sfm import SfmSettings
-from stages.train import PRESETS, TrainSettings, light_wanted
+from stages.train import PRESETS, TrainSettings, corrects_light
 from tests.benchmarks.sample_judges import judges_in, render_judges
 from tests.sample import PHOTOS
 
@@ -75,7 +75,7 @@ class Capture:
         self.judges = self._judges(out, side)
 
     def _judges(self, out: Path, side: int) -> tuple[EvaluationView, ...]:
-        light = light_wanted(self.reconstruction, TrainSettings().light, Report())
+        light = corrects_light(self.reconstruction, TrainSettings().light, Report())
         draw_settings = draw_settings_of(self.reconstruction.views, side, light)
         _, held = split_held_out(self.reconstruction.views)
         found = tuple(load_evaluation_views(self.reconstruction.folder, held, draw_settings))

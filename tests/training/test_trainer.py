@@ -12,7 +12,7 @@ from stages import train
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView, evaluate
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
@@ -21,7 +21,7 @@ from stages.scene import DrawSettings, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training import cap
 from stages.training.checkpoint import MAGIC
-from stages.training.clock import Clock, Spent
+from stages.training.clock import Clock, Elapsed
 from stages.training.density import AdaptiveDensity
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -175,7 +175,7 @@ def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path, mon
             self.steps = 0
 
         def spent(self):
-            return Spent(0.01 * self.steps)
+            return Elapsed(0.01 * self.steps)
 
     monkeypatch.setattr("stages.training.trainer.Clock", StepClock)
     timed, start = small_problem(tmp_path, "limited", steps=60)
@@ -199,7 +199,7 @@ def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its
 
     def stop(label, done, total, numbers):
         if done == 20:
-            t.clock = Clock(Spent(100.0, 300.0))  # as if it had taken so long
+            t.clock = Clock(Elapsed(100.0, 300.0))  # as if it had taken so long
             report.stop_requested.set()
 
     report.listener = stop
@@ -416,8 +416,8 @@ def test_no_more_is_modelled_than_the_photographs_tell(tmp_path, monkeypatch):
     """60 x 40 pixels of three numbers each; a splat of degree 1 has 23, one of degree 3 has 59."""
     small = camera(width=60, height=40)
     monkeypatch.setattr(cap, "FEWEST", 10)
-    assert cap.splats_told([small] * 5, 1) == 5 * 60 * 40 * 3 // 23
-    assert cap.splats_told([small] * 5, 3) == 5 * 60 * 40 * 3 // 59
+    assert cap.splats_determined([small] * 5, 1) == 5 * 60 * 40 * 3 // 23
+    assert cap.splats_determined([small] * 5, 3) == 5 * 60 * 40 * 3 // 59
     monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
     assert cap.cap_for(tmp_path, 0, 610) == cap.Cap(610, cap.PHOTOGRAPHS)
     assert cap.cap_for(tmp_path, 0, 10**9).splats == 610  # it stays as it began
