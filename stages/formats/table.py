@@ -82,11 +82,11 @@ class Format:
 @dataclass(frozen=True)
 class ByteBreakdown:
     """Where the bytes of a file are. parts: by attribute. unpacked: whether they are counted before
-    the compression that packs them all together. untold: why there are no parts."""
+    the compression that packs them all together. unknown: why there are no parts."""
 
     parts: dict[str, int]
     unpacked: bool = False
-    untold: str = ""
+    unknown: str = ""
 
 
 CHUNK = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number

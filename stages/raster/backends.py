@@ -148,7 +148,8 @@ def qualified_name(backend: str, device: str = CPU) -> str:
 
 
 def backend_of_settings(settings: Any) -> str:
-    """Full name of the backend that a stage's settings choose. Raises SplatError (option-device)."""
+    """Full name of the backend that a stage's settings choose. Raises
+    SplatError (option-device)."""
     return qualified_name(settings.backend, settings.device)
 
 
