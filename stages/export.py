@@ -163,10 +163,10 @@ def _fitting(
     import numpy as np
 
     from stages.capacity.rounding import Fitting
-    from stages.capacity.tuning import Tuner
     from stages.measure.judge import load_photographs
     from stages.measure.worth import measure_worth
     from stages.scene import seen_extent, split_held_out, spread_over
+    from stages.training.finetune import Tuner
 
     reconstruction: Reconstruction = inputs["sfm"]
     training = split_held_out(reconstruction.views)[0]

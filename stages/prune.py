@@ -14,7 +14,7 @@ from stages.formats.table import FORMATS
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
-    from stages.capacity.rounds import Outcome
+    from stages.capacity.pruning import Outcome
     from stages.measure.judge import Photograph
     from stages.scene import Reconstruction, Splats, TrainedSplats
 
@@ -90,13 +90,13 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report. Raises SplatError for targets that cannot be met."""
     import numpy as np
 
-    from stages.capacity import words
-    from stages.capacity.aim import Aim, felt_share
-    from stages.capacity.rounds import Shrinking
-    from stages.capacity.tuning import Tuner
+    from stages.capacity import summary
+    from stages.capacity.pruning import Shrinking
+    from stages.capacity.targets import Aim, felt_share
     from stages.measure.judge import load_photographs, mean_psnr_db
     from stages.scene import seen_extent, split_held_out
     from stages.scene.storage import save_splats
+    from stages.training.finetune import Tuner
 
     reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
@@ -130,8 +130,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report.metric("psnr_change_db", round(after - before, 3))
     report.metric("tune_steps", tuner.steps)
     _report_cuts(splats, found, report)
-    report.metric("said", words.said(trained, found, settings.price, tuner.steps))
-    if more := words.more_would_pay(found, settings.price):
+    report.metric("said", summary.said(trained, found, settings.price, tuner.steps))
+    if more := summary.more_would_pay(found, settings.price):
         report.warn("prune-more-would-pay", more)
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)

@@ -9,8 +9,8 @@ import pytest
 from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
-from stages.capacity import rounds
-from stages.capacity.aim import FELT
+from stages.capacity import pruning
+from stages.capacity.targets import FELT
 from stages.measure.judge import load_photographs, mean_psnr_db
 from stages.measure.worth import Worth, beside_pictures, floaters
 from stages.scene import Splats, TrainedSplats, split_held_out
@@ -90,7 +90,7 @@ def test_no_loss_allowed_is_no_loss_of_the_photographs_that_decide(scene, tmp_pa
 def test_the_loss_allowed_is_kept_and_the_price_moves_it(scene, tmp_path) -> None:
     start, sizes = training_db(scene, scene.splats), []
     for price in (1.0, 20.0):
-        result, report = run(scene, scene.splats, tmp_path, price=price, rounds=10)
+        result, report = run(scene, scene.splats, tmp_path, price=price, pruning=10)
         assert training_db(scene, result) >= start - 0.1 * price / FELT
         assert report.metrics["training_psnr_db"] == pytest.approx(
             training_db(scene, result), abs=2e-3
@@ -120,7 +120,7 @@ def test_what_a_round_costs_is_foretold(scene, tmp_path) -> None:
 
 
 def test_fine_tuning_buys_back_what_cutting_lost(scene, tmp_path) -> None:
-    cut, _ = run(scene, scene.splats, tmp_path, max_splats=150, rounds=0)
+    cut, _ = run(scene, scene.splats, tmp_path, max_splats=150, pruning=0)
     tuned, report = run(scene, scene.splats, tmp_path, max_splats=150, tune_steps=20)
     assert len(cut) == len(tuned) == 150
     assert training_db(scene, tuned) > training_db(scene, cut) + 0.5
@@ -137,11 +137,11 @@ def test_bands_that_were_cut_stay_cut_while_the_rest_learns(scene, tmp_path) -> 
 
 
 def test_a_size_in_megabytes_is_met_from_below(scene, tmp_path) -> None:
-    result, _ = run(scene, scene.splats, tmp_path, max_mb=0.02, mb_of="spz", rounds=0)
+    result, _ = run(scene, scene.splats, tmp_path, max_mb=0.02, mb_of="spz", pruning=0)
     path = tmp_path / "scene.spz"
     formats.write(path, result)
     assert path.stat().st_size <= 20_000
-    few, _ = run(scene, scene.splats, tmp_path, max_mb=0.016, rounds=0)
+    few, _ = run(scene, scene.splats, tmp_path, max_mb=0.016, pruning=0)
     path = tmp_path / "scene.ply"
     formats.write(path, few)
     assert 0.95 * 16_000 < path.stat().st_size <= 16_000
@@ -149,7 +149,7 @@ def test_a_size_in_megabytes_is_met_from_below(scene, tmp_path) -> None:
 
 def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
     wanted = training_db(scene, scene.splats) - 3
-    result, _ = run(scene, scene.splats, tmp_path, min_psnr=wanted, rounds=40)
+    result, _ = run(scene, scene.splats, tmp_path, min_psnr=wanted, pruning=40)
     assert wanted <= training_db(scene, result) < wanted + 0.5
     assert len(result) < len(scene.splats)
 
@@ -164,7 +164,7 @@ def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
 )
 def test_what_cannot_be_met_is_refused_with_what_can(scene, tmp_path, settings, code, named):
     with pytest.raises(SplatError) as caught:
-        run(scene, scene.splats, tmp_path, rounds=0, **settings)
+        run(scene, scene.splats, tmp_path, pruning=0, **settings)
     assert caught.value.code == code
     assert named in str(caught.value)
 
@@ -179,7 +179,7 @@ def test_the_report_says_what_was_cut_and_why(scene, tmp_path) -> None:
 
 def test_no_rounds_remove_nothing(scene, tmp_path) -> None:
     trained = join(scene.splats, unseen(5))
-    result, report = run(scene, trained, tmp_path, rounds=0)
+    result, report = run(scene, trained, tmp_path, pruning=0)
     assert len(result) == len(trained)
     assert report.metrics["psnr_change_db"] == 0
 
@@ -189,7 +189,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 ) -> None:
     trained = join(scene.splats, unseen(5), floater_before(scene, 1))
     usual, _ = run(scene, trained, tmp_path)
-    monkeypatch.setattr(rounds, "LOOKED_AT", 4)
+    monkeypatch.setattr(pruning, "LOOKED_AT", 4)
     result, report = run(scene, trained, tmp_path)
     assert len(result) == pytest.approx(len(usual), rel=0.15)
     assert training_db(scene, result) > training_db(scene, usual) - 0.3
@@ -202,7 +202,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 def test_what_only_a_photograph_sees_that_does_not_decide_stays(
     scene, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(rounds, "LOOKED_AT", 1)  # of nine, the first
+    monkeypatch.setattr(pruning, "LOOKED_AT", 1)  # of nine, the first
     result, _ = run(scene, scene.splats, tmp_path)
     far = scene.reconstruction.views[5].camera
     seen = [Splats.take(s, far.project(s.means)[1] < 3) for s in (scene.splats, result)]

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.lazy import named
-from stages.capacity.tuning import Tuner
 from stages.formats.axes import least_turned
 from stages.formats.coarse import Bits, held_by, on_grids
 from stages.formats.table import Format
 from stages.measure.judge import Photograph, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
+from stages.training.finetune import Tuner
 
 # Fields of `LearningRates`, what others can make up for least first; colour last, which is rounded
 # finely and in which the picture is linear.

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.capacity.tuning import Tuner
-from stages.distributed.ground import Cell
+from stages.distributed.partition import Cell
 from stages.measure.judge import Photograph
 from stages.measure.worth import measure_worth, squared_error
 from stages.scene import Look, Splats
+from stages.training.finetune import Tuner
 
 REACH = 3.0  # standard deviations: as far as a splat is there
 STEPS_A_PHOTOGRAPH, MOST_STEPS = 24, 1200  # of putting seams right

@@ -11,13 +11,13 @@ import pytest
 from stages import export, formats
 from stages.base.stage import Report
 from stages.capacity.rounding import ORDER, as_read, tuned_to
-from stages.capacity.tuning import Tuner
 from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import least_turned
 from stages.formats.coarse import Bits, on_grids
 from stages.measure.judge import load_photographs, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats, TrainedSplats, seen_extent, split_held_out
+from stages.training.finetune import Tuner
 from tests.small_scene import SmallScene, small_scene
 
 FEW = Bits(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.capacity.cutting import Cut
+from stages.capacity.selection import Cut
 from stages.measure.judge import drawing_of, load_photographs
 from stages.measure.worth import colours_by_degree, measure_worth, squared_error
 from stages.scene import Splats

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.base.stage import Report
-from stages.capacity.aim import Aim
-from stages.capacity.cutting import SPLATS_A_ROUND, Cut, choose
-from stages.capacity.tuning import Tuner
+from stages.capacity.selection import SPLATS_A_ROUND, Cut, choose
+from stages.capacity.targets import Aim
 from stages.measure.judge import Photograph, drawing_of
 from stages.measure.price import Price, price_of
 from stages.measure.worth import Worth, measure_worth, squared_error
 from stages.scene import Splats, spread_over
+from stages.training.finetune import Tuner
 
 BACK_OFFS = 3  # times that a round may ask for half as much
 # Splats that go together cost more than the sum of each alone, since they stood in for each other:
