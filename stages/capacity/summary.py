@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from stages.base.words import counted
-from stages.capacity.targets import felt_share
 from stages.capacity.pruning import LOSS, PRICE, Outcome
+from stages.capacity.targets import felt_share
 from stages.scene import TrainedSplats
 
 _WHY = {
