@@ -44,7 +44,7 @@ def nothing_seen(splats: Splats) -> np.ndarray:
     return np.zeros(len(splats), np.int32)
 
 
-@pytest.mark.parametrize("dropout", [False, True])
+@pytest.mark.parametrize("sits_out", [False, True])
 def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, dropout: bool) -> None:
     splats, everything = scene.splats, set(ORDER)
     for moving in ORDER:
