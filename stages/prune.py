@@ -32,6 +32,7 @@ class PruneSettings:
     price: float = field(
         default=1.0,
         metadata={
+            "panel": "Size",
             "help": "How much a splat must be worth to stay, 1 for what the photographs ask; the "
             "loss allowed grows with it.",
             "min": 0.001,
@@ -54,6 +55,7 @@ class PruneSettings:
     max_mb: float = field(
         default=0.0,
         metadata={
+            "panel": "Size",
             "help": "Size at most, whatever it costs, of the file that --mb-of names; 0 for any "
             "(megabytes).",
             "min": 0,
@@ -62,11 +64,16 @@ class PruneSettings:
     )
     mb_of: str = field(
         default="ply",
-        metadata={"help": "Format that --max-mb speaks of", "choices": tuple(FORMATS)},
+        metadata={
+            "panel": "Size",
+            "help": "Format that --max-mb speaks of",
+            "choices": tuple(FORMATS),
+        },
     )
     min_psnr: float = field(
         default=0.0,
         metadata={
+            "panel": "Size",
             "help": "As small as the training photographs allow at this PSNR, instead of by price; "
             "0 for none (dB).",
             "min": 0,
@@ -76,6 +83,7 @@ class PruneSettings:
     tune_steps: int = field(
         default=90,
         metadata={
+            "panel": "Advanced",
             "help": "Steps of fine-tuning after each round; 0 for none.",
             "min": 0,
             "max": 100_000,

@@ -158,10 +158,16 @@ def backend_setting() -> Any:
     """The `backend` field of a stage's settings: one checked choice everywhere."""
     words = ", ".join(f"{backend.name} ({backend.what})" for backend in BACKENDS)
     help = f"What draws: {AUTO} (the fastest), {words}."
-    return field(default=AUTO, metadata={"help": help, "choices": CHOICES, "midway": True})
+    return field(
+        default=AUTO,
+        metadata={"help": help, "choices": CHOICES, "midway": True, "panel": "Advanced"},
+    )
 
 
 def device_setting() -> Any:
     """The `device` field beside it."""
     help = f"What --backend reference runs on, as torch names it: {', '.join(DEVICES)}."
-    return field(default=PROCESSOR, metadata={"help": help, "choices": DEVICES, "midway": True})
+    return field(
+        default=PROCESSOR,
+        metadata={"help": help, "choices": DEVICES, "midway": True, "panel": "Advanced"},
+    )
