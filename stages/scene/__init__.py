@@ -19,7 +19,7 @@ from stages.scene.capture import (
     split_held_out,
     spread_over,
 )
-from stages.scene.look import Look, look_of, near_plane
+from stages.scene.draw_settings import DrawSettings, draw_settings_of, near_plane
 from stages.scene.splats import (
     SH_C0,
     QuantisedSplats,
@@ -38,9 +38,9 @@ __all__ = [
     "TRANSPARENT",
     "Camera",
     "Capture",
+    "DrawSettings",
     "ExportedAssets",
     "ExportedFile",
-    "Look",
     "Photo",
     "QuantisedSplats",
     "Reconstruction",
@@ -48,11 +48,11 @@ __all__ = [
     "TrainedSplats",
     "View",
     "dc_to_rgb",
+    "draw_settings_of",
     "fitted_size",
     "load_splats",
     "logit",
     "look_at",
-    "look_of",
     "near_plane",
     "numbers_of",
     "rgb_to_dc",

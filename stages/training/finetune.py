@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
 from stages.raster.draw import settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
-from stages.training.colours import Recolouring, worth_settling
+from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.dropout import Dropout
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.step import step_of
+from stages.training.steps import step_of
 from stages.training.views import Level
 
 # Of the rates that the recipe begins with: a round starts at the first and ends at the second.
@@ -28,27 +28,27 @@ RATE, RATE_END = 1.2, 0.6
 MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 
 
-class Tuner:
+class FineTuner:
     """Goes on with splats where training left them. extent: of the scene, world units. sits_out:
     whether splats sit steps out here, as they did in training, and colours are settled for the
     whole after it."""
 
     def __init__(
         self,
-        photographs: Sequence[Photograph],
+        photographs: Sequence[EvaluationView],
         extent: float,
         backend: str,
         report: Report,
-        sits_out: bool = False,
+        dropout: bool = False,
     ) -> None:
         self.photographs, self.extent, self.report = photographs, extent, report
-        self.sits_out = sits_out
+        self.dropout = dropout
         self.cameras = [photograph.camera for photograph in photographs]
         self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
         self.stepper, self.rasteriser = step_of(backend), rasteriser_of(backend)
         self.steps = 0  # made so far
 
-    def tuned(
+    def finetune(
         self,
         splats: Splats,
         steps: int,
@@ -74,10 +74,10 @@ class Tuner:
             )
             rates = replace(rates, **dict.fromkeys(still, 0.0))
             self.stepper.step(self._level(), settings, rates, False, self._dropout())
-        tuned = _with(self._finished(self.stepper.model(), splats), splats, still)
-        if worth_settling(self.sits_out, len(self.photographs)):
-            return self._recoloured(tuned, settings, still)
-        return tuned
+        finetune = _with(self._finished(self.stepper.model(), splats), splats, still)
+        if needs_colour_refit(self.dropout, len(self.photographs)):
+            return self._recoloured(finetune, settings, still)
+        return finetune
 
     def _recoloured(
         self, splats: Splats, settings: RasterSettings, still: Collection[str]
@@ -88,10 +88,10 @@ class Tuner:
         model = new_model(*splat_arrays(splats))
         model.sh_degrees[:] = 0 if "sh_rest" in still else splats.sh_degrees
         where = self.rasteriser, settings, lambda: map(_level, self.photographs), NO_SMOOTHING
-        return replace(splats, sh=Recolouring(*where).of(model).sh)
+        return replace(splats, sh=ColourRefit(*where).of(model).sh)
 
     def _dropout(self) -> Dropout | None:
-        if not self.sits_out:
+        if not self.dropout:
             return None
         key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
         return Dropout(len(self.photographs), key)
@@ -108,7 +108,7 @@ class Tuner:
     def _finished(self, model: Model, before: Splats) -> Splats:
         norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
         with np.errstate(divide="ignore"):
-            finest = np.log(smoothing_widths(before.means, self.cameras, before.look.near))
+            finest = np.log(smoothing_widths(before.means, self.cameras, before.draw_settings.near))
         least = np.minimum(before.log_scales, finest[:, None])
         return replace(
             before,
@@ -120,17 +120,17 @@ class Tuner:
         )
 
 
-def _with(tuned: Splats, before: Splats, still: Collection[str]) -> Splats:
+def _with(finetune: Splats, before: Splats, still: Collection[str]) -> Splats:
     """`tuned`, with `still` as it was: lengths of quaternions and clamped sizes were looked at."""
-    sh = tuned.sh.copy()
+    sh = finetune.sh.copy()
     for name, bands in (("sh_dc", slice(0, 1)), ("sh_rest", slice(1, None))):
         if name in still:
             sh[:, bands] = before.sh[:, bands]
     arrays = {name: getattr(before, name) for name in still if not name.startswith("sh_")}
-    return replace(tuned, sh=sh, **arrays)
+    return replace(finetune, sh=sh, **arrays)
 
 
-def _level(photograph: Photograph) -> Level:
+def _level(photograph: EvaluationView) -> Level:
     """In the light and over the background that it is judged in, without what is not judged."""
     planar: NDArray[np.uint8] = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
     kept = photograph.kept
