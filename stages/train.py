@@ -115,14 +115,6 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
-    growth: str = field(
-        default="adaptive",
-        metadata={
-            "help": "How splats become more: adaptive (cloned and split where photographs pull at "
-            "them), or relocation (those that do not show move to where others do).",
-            "choices": ("adaptive", "relocation"),
-        },
-    )
     blocks: str = field(
         default="1",
         metadata={
@@ -305,7 +297,6 @@ def make_trainer(
         over_any=settings.background == "any",
         backend=backend_of_settings(settings),
         within=settings.within,
-        growth=settings.growth,
         lent=validation_rows(len(train)),
         patience_db=settings.patience,
     )

@@ -32,7 +32,7 @@ from stages.training.checkpoint import (
 )
 from stages.training.clock import Clock, Elapsed
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
-from stages.training.density import Within
+from stages.training.density import AdaptiveDensity, BoundedDensity
 from stages.training.dropout import Dropout
 from stages.training.free_space import known_free_space
 from stages.training.memory_limited_step import MemoryLimitedStep
@@ -40,7 +40,6 @@ from stages.training.optimiser import LearningRates, Model, empty_model, new_mod
 from stages.training.schedule import Schedule
 from stages.training.step import TrainingStep
 from stages.training.steps import step_of
-from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
 from stages.training.time_limit import TimeLimit
 from stages.training.validation import (
@@ -69,7 +68,7 @@ class Trainer:
     are trained on only once it grows no more. patience_db: what growing for as long again must give
     one of them, or else its growth ends where it began; 0: nothing.
     seconds: of wall time in all, 0 for as long as the steps take. within: where it grows, see
-    `density.Within`; () for everywhere. growth: by which of STRATEGIES."""
+    `density.BoundedDensity`; () for everywhere."""
 
     schedule: Schedule
     train: list[TrainingView]
@@ -85,16 +84,14 @@ class Trainer:
     patience_db: float = 0.0
     seconds: float = 0.0
     within: tuple[float, ...] = ()
-    growth: str = "adaptive"
 
     def __post_init__(self) -> None:
         self.stepper: TrainingStep = step_of(self.backend)
         if self.backend == AUTO:
             self.stepper = MemoryLimitedStep(self.stepper, self._memory_full)
         self.makers: list[Provenance] = []
-        self._strategy = STRATEGIES[self.growth](self.schedule.extent, len(self.train))
-        if self.within:
-            self._strategy = Within(self._strategy, self.within)
+        density = AdaptiveDensity(self.schedule.extent, len(self.train))
+        self._strategy = BoundedDensity(density, self.within) if self.within else density
         self.trial: Trial | None = None
         self.answers: list[Answer] = []  # of the photographs lent
         self.stopped = False  # by the last of them: training went back to the one before
