@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.base.atomic import replacing
 from stages.base.memory import available_mib
-from stages.scene import Camera, numbers_of
+from stages.scene import Camera, parameters_per_splat
 from stages.training.optimiser import Model
 
 FILE_NAME = "cap.json"
@@ -77,7 +77,7 @@ def splats_determined(cameras: Sequence[Camera], sh_degree: int) -> int:
     """How many splats of `sh_degree` have no more parameters than the views of `cameras` have pixel
     values. Of more splats, some would be undetermined."""
     numbers = sum(3 * camera.width * camera.height for camera in cameras)
-    return max(MIN_CAP, numbers // int(numbers_of(np.array(sh_degree))))
+    return max(MIN_CAP, numbers // int(parameters_per_splat(np.array(sh_degree))))
 
 
 def lower_cap(folder: Path, splats: int) -> Cap:
