@@ -105,7 +105,7 @@ def stopped_at(psnrs, patience_db=0.05, rows=2):
     for step in range(1, 501):
         if step % 100 == 0 and schedule.densifying(step):
             current = list(next(found))
-        schedule = stopping.next_schedule(schedule, step, lambda row: current[row])
+        schedule = stopping.next_schedule(schedule, step, current.__getitem__)
     assert (stopping.stopped_at > 0) == (schedule.steps < 1000)
     return stopping.stopped_at
 
