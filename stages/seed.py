@@ -101,10 +101,10 @@ def _with_agreed(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.structure.seeding.sweep import agreed_points
+    from stages.structure.seeding.plane_sweep import plane_sweep_points
 
     training, _ = split_held_out(reconstruction.views)
-    more, more_colours = agreed_points(reconstruction.folder, training, points)
+    more, more_colours = plane_sweep_points(reconstruction.folder, training, points)
     report.metric("agreed", len(more))
     return np.concatenate([points, more]), np.concatenate([colours, more_colours])
 
