@@ -173,7 +173,7 @@ def run(
         out_of_time=bench.out_of_time,
     )
     best = climbed.best
-    report.metric("rungs", [_rung_figures(attempt) for attempt in climbed.attempts])
+    report.metric("attempts", [_rung_figures(attempt) for attempt in climbed.attempts])
     model = _accepted(best, settings, capture)
     _tell(best, climbed, capture, report)
     found = finish.finish(
@@ -182,7 +182,7 @@ def run(
     reconstruction = light.with_light(found, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
     _model_metrics(best, model, reconstruction, capture, report)
-    report.metric("pairs_looked_at", bench.pairs_looked_at())
+    report.metric("pairs_compared", bench.pairs_looked_at())
     report.metric("pairs_matched", best.pairs_matched)
     report.metric("pairs_verified", best.pairs_verified)
     _write_finished(folder, report)
@@ -220,11 +220,11 @@ def _with_known_cameras(
     reconstruction_files.save_reconstruction(folder, found)
     names = {view.name for view in found.views}
     report.metric("photographs", len(capture.photos))
-    report.metric("registered", len(found.views))
-    report.metric("left_out", [p.name for p in capture.photos if p.name not in names])
+    report.metric("registered_images", len(found.views))
+    report.metric("unregistered_images", [p.name for p in capture.photos if p.name not in names])
     report.metric("points", len(found.points))
     report.metric("mean_reprojection_error_px", round(float(np.mean(found.errors_px)), 4))
-    report.metric("rung", "cameras given")
+    report.metric("configuration", "cameras given")
     report.metric("levelled", found.levelled)
     report.metric("units", found.units)
     _write_finished(folder, report)
@@ -390,7 +390,7 @@ def _rung_figures(attempt: Attempt) -> dict[str, Any]:
         for name, value in asdict(attempt.figures).items()
     }
     return {
-        "rung": attempt.rung.name,
+        "configuration": attempt.rung.name,
         "passed": attempt.passed,
         "failures": [failure.code for failure in attempt.failures],
         "keypoints_median": attempt.keypoints_median,
@@ -408,8 +408,8 @@ def _model_metrics(
     registered = set(model.names)
     figures = best.figures
     report.metric("photographs", len(capture.photos))
-    report.metric("registered", len(model.names))
-    report.metric("left_out", [p.name for p in capture.photos if p.image not in registered])
+    report.metric("registered_images", len(model.names))
+    report.metric("unregistered_images", [p.name for p in capture.photos if p.image not in registered])
     report.metric("points", len(model.points))
     report.metric("mean_reprojection_error_px", round(figures.mean_reprojection_error_px, 4))
     report.metric("mean_track_length", round(figures.mean_track_length, 3))
@@ -420,7 +420,7 @@ def _model_metrics(
     report.metric("keypoints_median", best.keypoints_median)
     report.metric("focal_px", [round(float(f), 2) for f in model.camera_params[:, 0]])
     report.metric("distortion", [round(float(k), 5) for k in model.camera_params[:, 3]])
-    report.metric("rung", best.rung.name)
+    report.metric("configuration", best.rung.name)
     report.metric("levelled", reconstruction.levelled)
     report.metric("units", reconstruction.units)
     report.metric("origin", [float(value) for value in reconstruction.origin])

@@ -99,7 +99,7 @@ def reconstruct(
         source = "matches"
         if len(cloud.points) < POINTS_PER_VIEW * len(training):
             cloud, source = _with_random(cloud, seen, outside, seed, report), "chance"
-    report.metric("points_from", source)
+    report.metric("points_source", source)
     if found.ground.metres and not size.stated:
         size = replace(size, stated=found.ground.metres, stated_by=found.ground.said_by)
     axes = found.ground.axes
@@ -140,7 +140,7 @@ def _undistorted(
                 shutil.copyfile(source / one.photo.image, partial)
             write_mask(one.photo, source, folder, None)
     lost = 1.0 - float(np.mean(kept))
-    report.metric("lost_by_undistortion", round(lost, 4))
+    report.metric("area_lost_by_undistortion", round(lost, 4))
     if lost > _LOST_SHARE:
         report.warn(
             "sfm-edges-lost",
@@ -261,9 +261,9 @@ def _moved(cameras: list[Camera], path: Path, report: Report) -> list[Camera]:
     before = np.array([camera.world_to_camera for camera in cameras])
     cosines = np.einsum("vij,vij->v", poses[:, :3, :3], before[:, :3, :3]) / 2 - 0.5
     turns = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    report.metric("cameras_moved", {"centre": float(np.median(away)), "most": max(away)})
+    report.metric("cameras_moved", {"median": float(np.median(away)), "max": max(away)})
     report.metric(
-        "cameras_turned_deg", {"median": float(np.median(turns)), "most": float(turns.max())}
+        "cameras_turned_deg", {"median": float(np.median(turns)), "max": float(turns.max())}
     )
     return moved
 
@@ -273,10 +273,10 @@ def _judge(out: Path, report: Report, allow_partial: bool) -> None:
     found = json.loads((out / "agreement.json").read_text(encoding="utf-8"))
     given, roughly = found["given"], found["roughly"]
     if "refined" in found:
-        report.metric("matches_that_fitted_before", None if given is None else round(given, 4))
+        report.metric("epipolar_inlier_ratio_before", None if given is None else round(given, 4))
         given = found["refined"]
     report.metric("matched_pairs", found["pairs"])
-    report.metric("matches_that_fit", None if given is None else round(given, 4))
+    report.metric("epipolar_inlier_ratio", None if given is None else round(given, 4))
     if given is None or found["pairs"] < FEWEST_PAIRS:
         report.warn(
             "cameras-unchecked",
