@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base import threads
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
+from stages.base.text import counted
 
 if TYPE_CHECKING:
     from stages.scene import Capture, Reconstruction
@@ -409,7 +409,9 @@ def _model_metrics(
     figures = best.figures
     report.metric("photographs", len(capture.photos))
     report.metric("registered_images", len(model.names))
-    report.metric("unregistered_images", [p.name for p in capture.photos if p.image not in registered])
+    report.metric(
+        "unregistered_images", [p.name for p in capture.photos if p.image not in registered]
+    )
     report.metric("points", len(model.points))
     report.metric("mean_reprojection_error_px", round(figures.mean_reprojection_error_px, 4))
     report.metric("mean_track_length", round(figures.mean_track_length, 3))

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
-from stages.measure.judge import CAP_DB, decibels
-from stages.proof import diagnosis, second_readers
+from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
+from stages.proof import diagnosis, independent_readers
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows
@@ -102,8 +102,8 @@ class Prover:
         """
         row = format_of(path)
         try:
-            content = _drawable(second_readers.read_back(path))
-            said = named(row.validator)(path) if row.validator else []
+            content = _drawable(independent_readers.read_back(path))
+            said = load_object(row.validator)(path) if row.validator else []
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)
@@ -118,7 +118,7 @@ class Prover:
     def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:
         found = differences(self.splats, content, *names)
         by_camera = self._decibels(content, found.rows)
-        worst = min(by_camera, default=CAP_DB)
+        worst = min(by_camera, default=IDENTICAL_DB)
         figures = {
             "verify_db": round(worst, 2),
             "verify_mean_db": round(float(np.mean(by_camera)), 2) if by_camera else worst,
@@ -142,7 +142,7 @@ class Prover:
         draw = renderer(content.splats.take(drawn), settings_of(self.splats), self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
-            decibels(draw(camera).image, np.clip(picture, 0.0, 1.0))
+            capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))
             for camera, picture in zip(moved, self.pictures, strict=True)
         ]
 

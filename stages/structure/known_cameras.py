@@ -19,7 +19,7 @@ from stages.base import threads
 from stages.base.atomic import replacing
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.stage import Report
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.cameras.table import read_cameras, read_points

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import Lens
 from stages.photos.find import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
