@@ -151,7 +151,11 @@ def test_rough_cameras_are_moved_to_where_the_matches_want_them(tmp_path: Path) 
         off = scale * centres(have) @ turn.T + shift - centres(wanted)
         errors[name] = np.linalg.norm(off, axis=1)
     assert errors["refined"].mean() < 0.2 * errors["as given"].mean()
-    assert report.metrics["epipolar_inlier_ratio"] > 0.9 > report.metrics["epipolar_inlier_ratio_before"]
+    assert (
+        report.metrics["epipolar_inlier_ratio"]
+        > 0.9
+        > report.metrics["epipolar_inlier_ratio_before"]
+    )
     assert 0.001 < report.metrics["cameras_moved"]["median"] < 0.03
     back = np.array(report.metrics["file_from_world"])  # the file's world is kept
     file_centres = np.array([-p[:3, :3].T @ p[:3, 3] for p in rough.values()])
