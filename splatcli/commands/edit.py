@@ -41,7 +41,7 @@ def edit(
         )
     target = target or Path("scene.ply")
     row, chain = formats.format_of(target), operations.prepared(typed, target)
-    if row.levels and not dry_run:
+    if row.streamed and not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
         if target.parent.is_dir():  # `write` says so where it is not

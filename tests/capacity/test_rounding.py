@@ -21,7 +21,7 @@ from stages.training.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene
 
 FEW = BitDepths(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)
-ROUNDING = [name for name, row in FORMATS.items() if row.rounds]
+ROUNDING = [name for name, row in FORMATS.items() if row.needs_finetuning]
 
 
 @pytest.fixture(scope="module")
