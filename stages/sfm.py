@@ -251,7 +251,7 @@ def _check_duplicates(capture: Capture) -> None:
     """Refuse a capture of near-duplicates at once; matching would take minutes to find the same."""
     from stages.structure.gates import MOVE
 
-    different = len({photo.twin or photo.name for photo in capture.photos})
+    different = len({photo.duplicate_of or photo.name for photo in capture.photos})
     if different < _FEWEST_PHOTOGRAPHS:
         raise SplatError(
             "sfm-no-parallax",

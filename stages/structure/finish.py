@@ -134,7 +134,7 @@ def write_reconstruction(
             photo.name,
             f"{IMAGES}/{photo.picture}",
             camera,
-            photo.twin,
+            photo.duplicate_of,
             role,
             mask_file(photo),
             photo.outside,

@@ -18,10 +18,10 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import sog, streamed_sog
-from stages.formats.rows import drawable
+from stages.formats.values import drawable_rows
 from stages.measure.evaluation import capped_psnr_db
 from stages.proof import independent_readers
-from stages.raster.draw import renderer, settings_of
+from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at
 from tests.editing.walls import wall
 from tests.formats.truth import many_splats
@@ -108,7 +108,7 @@ def test_units_and_origin_are_told(tmp_path: Path) -> None:
 def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path) -> None:
     splats = many_splats(50)
     splats.means[3] = np.nan
-    assert drawable(splats).sum() == 49
+    assert drawable_rows(splats).sum() == 49
     assert formats.write(tmp_path / "lod-meta.json", splats) == 1
     assert len(formats.read(tmp_path / "lod-meta.json")) == 49
 
@@ -214,7 +214,7 @@ def test_a_level_looks_like_the_scene_where_its_splats_are_a_pixel() -> None:
     full = wall(8000)
     every = levels.levels_of(full)
     assert [len(level) for level in every] == [8000, 2000, 500, 125]
-    settings = replace(settings_of(full), antialias=True)
+    settings = replace(raster_settings_of(full), antialias=True)
     for level in every[1:]:
         camera = camera_at(at_one_pixel(level))
         picture = renderer(full, settings)(camera).image
