@@ -50,6 +50,7 @@ class ExportSettings:
     formats: tuple[str, ...] = field(
         default=("ply", "splat", "glb", "usdz"),
         metadata={
+            "panel": "Output",
             "help": "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
             "choices": _CHOICES,
         },
@@ -97,7 +98,7 @@ def run(
     file from being written.
     """
     from stages import formats
-    from stages.formats.values import drop_undrawable
+    from stages.formats.rows import kept_rows
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
@@ -107,7 +108,7 @@ def run(
     if not quantised.splats.origin.any():
         moved = replace(quantised.splats, origin=reconstruction.origin)
         quantised = replace(quantised, splats=moved)
-    splats, dropped = drop_undrawable(quantised.splats)
+    splats, dropped = kept_rows(quantised.splats)
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)

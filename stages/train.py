@@ -36,11 +36,17 @@ if TYPE_CHECKING:
 class TrainSettings:
     steps: int = field(
         default=7000,
-        metadata={"help": "Steps of training, one photograph each.", "min": 1, "max": 1_000_000},
+        metadata={
+            "panel": "Quality and time",
+            "help": "Steps of training, one photograph each.",
+            "min": 1,
+            "max": 1_000_000,
+        },
     )
     train_side: int = field(
         default=800,
         metadata={
+            "panel": "Quality and time",
             "help": "Longer side of the photographs in training (pixels).",
             "min": 16,
             "max": 8192,
@@ -53,6 +59,7 @@ class TrainSettings:
     max_splats: int = field(
         default=0,
         metadata={
+            "panel": "Size",
             "help": "Splats at most; 0: what free memory allows, and no more numbers than the "
             "photographs have.",
             "min": 0,
@@ -62,6 +69,7 @@ class TrainSettings:
     seconds: float = field(
         default=0.0,
         metadata={
+            "panel": "Quality and time",
             "help": "Seconds that training may take: as many steps as fit, whatever --steps says. "
             "0: as long as the steps take.",
             "min": 0,
@@ -71,6 +79,7 @@ class TrainSettings:
     patience: float = field(
         default=0.0,
         metadata={
+            "panel": "Advanced",
             "help": "What growing on for as long again must give one at least of the photographs "
             "that are lent for it (dB): where it gives less, training goes back, and ends its "
             "growth there. 0: never.",
@@ -91,6 +100,7 @@ class TrainSettings:
     background: str = field(
         default="black",
         metadata={
+            "panel": "Light and masks",
             "help": "What is behind photographs in training: black, which viewers have too, or any "
             "colour, for scenes that will be laid over others. Objects cut out always take any.",
             "choices": ("black", "any"),
@@ -99,6 +109,7 @@ class TrainSettings:
     light: str = field(
         default="auto",
         metadata={
+            "panel": "Light and masks",
             "help": "Bring photographs to the exposure and white balance of the median one first: "
             "auto (where they differ by more than a camera's noise), on or off.",
             "choices": ("auto", "on", "off"),
@@ -115,6 +126,7 @@ class TrainSettings:
     blocks: str = field(
         default="1",
         metadata={
+            "panel": "Advanced",
             "help": "Cut the scene into as many blocks, train each on the photographs that show "
             "it, and make them one again; auto: one for about every 250 photographs.",
             "pattern": r"auto|[1-9]\d{0,3}",
@@ -369,7 +381,12 @@ def write_quality(
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.measure.evaluation import evaluate, psnr_as_taken_db, psnr_inside_masks_db, spread
+    from stages.measure.evaluation import (
+        evaluate,
+        evaluation_subset,
+        psnr_as_taken_db,
+        psnr_inside_masks_db,
+    )
     from stages.scene import split_held_out
     from stages.training.charts import contact_sheet, training_plot
 
@@ -419,7 +436,7 @@ def write_quality(
     training_plot(folder / "training.png", trainer.history)
     rows = []
     worst_row = min(range(len(found)), key=lambda i: found[i].psnr_db, default=0)
-    for i in sorted({*spread(len(found)), worst_row}) if found else ():
+    for i in sorted({*evaluation_subset(len(found)), worst_row}) if found else ():
         photograph = trainer.held_out[i]
         image = np.clip(trainer.drawn(photograph.camera), 0.0, 1.0)
         rows.append((photograph.name, found[i].psnr_db, image, photograph.image))

@@ -20,14 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.formats.values import (
-    allows_nonfinite,
-    check_finite,
-    concatenate,
-    log_scales_of,
-    logits_of,
-    nonfinite_allowed,
-)
+from stages.formats.rows import checked, damage_kept, joined, keeps_damage, logits_of, logs_of
 from stages.scene import Splats, load_splats, save_splats
 from stages.scene.flip import flipped
 from stages.scene.recentring import recentred
@@ -55,7 +48,7 @@ def read(path: Path) -> Splats:
             "stages.formats.usd_read",
             str(path.resolve()),
             str(output),
-            *(["keep-damage"] if allows_nonfinite() else []),
+            *(["keep-damage"] if keeps_damage() else []),
         ]
         try:
             child = subprocess.run(
@@ -82,10 +75,10 @@ def parse(path: Path) -> Splats:
     parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
     if not parts:
         raise BadFileError(f"it holds no {_TYPE}")
-    splats = concatenate(parts)
+    splats = joined(parts)
     del parts
     means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
-    return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+    return checked(flipped(replace(splats, means=means, origin=origin), reuse=True))
 
 
 def _open(path: Path) -> Any:
@@ -128,7 +121,7 @@ def _splats(prim: Any) -> Splats:
     return Splats(
         means=means.astype(np.float64) * scale + offset,  # `parse` brings them near zero
         quaternions=orientations[:, [3, 0, 1, 2]],
-        log_scales=log_scales_of(scales, scale),
+        log_scales=logs_of(scales, scale),
         opacity_logits=logits_of(opacities),
         sh=coefficients.reshape(n, (degree + 1) ** 2, 3).copy(),
         sh_degrees=np.full(n, degree, np.uint8),
@@ -136,7 +129,7 @@ def _splats(prim: Any) -> Splats:
 
 
 def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
-    """[N, width] float32, not to be changed: the attribute, or its duplicate_of in half precision where
+    """[N, width] float32, not to be changed: the attribute, or its twin in half precision where
     only that is set."""
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
         value = attribute.Get() if attribute else None
@@ -172,7 +165,7 @@ def main(arguments: list[str]) -> int:
     source, output = map(Path, arguments[:2])
     _limit_memory(source)
     try:
-        with nonfinite_allowed() if arguments[2:] else nullcontext():
+        with damage_kept() if arguments[2:] else nullcontext():
             splats = parse(source)
     except BadFileError as error:
         print(error)

@@ -89,7 +89,7 @@ def undistorted_px(
 ) -> NDArray[np.float64]:
     """[N, 2] where photograph pixels `xy` lie in the pinhole picture (NaN if nowhere)."""
     xy = _from_principal_point(xy, camera, lens)
-    return np.asarray(xy + (pinhole.cx, pinhole.cy))
+    return xy + np.array([pinhole.cx, pinhole.cy])
 
 
 def _from_principal_point(

@@ -27,7 +27,7 @@ _keeps_damage: ContextVar[bool] = ContextVar("keeps_damage", default=False)
 
 
 @contextmanager
-def nonfinite_allowed() -> Iterator[None]:
+def damage_kept() -> Iterator[None]:
     """Inside, readers hand out values that are not finite instead of refusing the file: for who
     wants to know what is in it."""
     token = _keeps_damage.set(True)
@@ -37,11 +37,11 @@ def nonfinite_allowed() -> Iterator[None]:
         _keeps_damage.reset(token)
 
 
-def allows_nonfinite() -> bool:
+def keeps_damage() -> bool:
     return _keeps_damage.get()
 
 
-def drawable_rows(splats: Splats) -> NDArray[np.bool_]:
+def drawable(splats: Splats) -> NDArray[np.bool_]:
     """[N] true where every value is finite, the scales can be squared in float32 and the
     quaternion has a direction: the rule of our rasteriser. The others no viewer can draw."""
     good = np.empty(len(splats), bool)
@@ -64,13 +64,13 @@ def _drawable(splats: Splats) -> NDArray[np.bool_]:
     return np.asarray(good, bool)
 
 
-def drop_undrawable(splats: Splats) -> tuple[Splats, int]:
+def kept_rows(splats: Splats) -> tuple[Splats, int]:
     """(the drawable splats, how many were dropped)."""
-    kept = select_rows(splats, drawable_rows(splats))
+    kept = chosen(splats, drawable(splats))
     return kept, len(splats) - len(kept)
 
 
-def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
+def chosen(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
     """The rows where `keep` [N] is true, in their order."""
     if keep.all():
         return splats
@@ -120,27 +120,27 @@ def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
     logits = np.empty(len(opacities), np.float32)
     for rows in blocks(len(opacities)):
         p = opacities[rows].astype(np.float64)
-        if not ((p >= 0) & (p <= 1)).all() and not allows_nonfinite():
+        if not ((p >= 0) & (p <= 1)).all() and not keeps_damage():
             raise BadFileError("opacities lie outside 0..1")
         with np.errstate(divide="ignore", invalid="ignore"):
             logits[rows] = np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX)
     return logits
 
 
-def log_scales_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
+def logs_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
     """[N, 3] the inverse of `linear_scales`, of scales enlarged by `factor`; 0 (a flat splat)
     becomes the least scale that a float32 keeps. Raises BadFileError for negative scales."""
     logs = np.empty(scales.shape, np.float32)
     for rows in blocks(len(scales)):
         exact = scales[rows].astype(np.float64) * factor
-        if not (exact >= 0).all() and not allows_nonfinite():
+        if not (exact >= 0).all() and not keeps_damage():
             raise BadFileError("scales are negative or not numbers")
         with np.errstate(divide="ignore", invalid="ignore"):
             logs[rows] = np.maximum(np.log(exact), LOG_SCALE_MIN)
     return logs
 
 
-def allocate(count: int, degree: int) -> Splats:
+def allocated(count: int, degree: int) -> Splats:
     """`count` splats for a reader to fill, float32; what they hold is not defined."""
     return Splats(
         means=scratch.empty((count, 3)),
@@ -152,7 +152,7 @@ def allocate(count: int, degree: int) -> Splats:
     )
 
 
-def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
+def degrees_in_use(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[N] the highest degree with a coefficient that is not 0, of `sh` [N, (L + 1)^2, 3]."""
     degrees = np.zeros(len(sh), np.uint8)
     for rows in blocks(len(sh)):
@@ -162,7 +162,7 @@ def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
     return degrees
 
 
-def check_finite(splats: Splats) -> Splats:
+def checked(splats: Splats) -> Splats:
     """What a reader hands out: infinite opacity and scale logarithms made finite in their place
     (files hold them for opaque and for flat splats), and the degree of each splat found.
 
@@ -175,22 +175,22 @@ def check_finite(splats: Splats) -> Splats:
         logs[flat] = LOG_SCALE_MIN
         logits[opaque] = np.clip(logits[opaque], LOGIT_MIN, LOGIT_MAX)
         np.clip(logits, -1e30, 1e30, out=logits)
-    clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
+    clean = replace(splats, sh_degrees=degrees_in_use(splats.sh))
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
-        bad = count_nonfinite(getattr(clean, name))
-        if bad and not allows_nonfinite():
+        bad = not_finite(getattr(clean, name))
+        if bad and not keeps_damage():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")
     return clean
 
 
-def count_nonfinite(values: NDArray[np.floating]) -> int:
+def not_finite(values: NDArray[np.floating]) -> int:
     """How many of `values` are NaN or infinite."""
     return sum(
         int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)) if values.size
     )
 
 
-def concatenate(parts: list[Splats]) -> Splats:
+def joined(parts: list[Splats]) -> Splats:
     """All rows of all parts, at the highest degree among them; the origin is left at 0."""
     if len(parts) == 1:
         return replace(parts[0], origin=np.zeros(3))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene import Camera, Splats, View, split_held_out
-from stages.scene.framing import median_depth, front_camera
+from stages.scene.framing import front_camera, median_depth
 from stages.scene.rotations import quaternions_of
 
 _VIEWER_FROM_WORLD = np.diag([-1.0, -1.0, 1.0])
@@ -22,7 +22,7 @@ _CAMERA_FROM_VIEWERS = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class PageCamera:
+class Shot:
     """A place to look from. photo: the address of its photograph; "" without one. held_out:
     whether training never saw it."""
 
@@ -32,16 +32,16 @@ class PageCamera:
     held_out: bool = False
 
 
-def page_cameras(views: Sequence[View], splats: Splats) -> tuple[PageCamera, ...]:
+def shots_of(views: Sequence[View], splats: Splats) -> tuple[Shot, ...]:
     """The capture's cameras by name, without photographs; or one in front of the splats."""
     if not views:
-        return (PageCamera("in front", front_camera(splats)),)
+        return (Shot("in front", front_camera(splats)),)
     held = {view.name for view in split_held_out(tuple(views))[1]}
     ordered = sorted(views, key=lambda view: view.name)
-    return tuple(PageCamera(view.name, view.camera, held_out=view.name in held) for view in ordered)
+    return tuple(Shot(view.name, view.camera, held_out=view.name in held) for view in ordered)
 
 
-def as_plain(shot: PageCamera, means: NDArray[np.floating]) -> dict[str, Any]:
+def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
     """A shot as plain data. means [N, 3]: what it looks at, for the distance to turn around.
 
     position, target: the viewer's world. rotation: x, y, z, w, from the viewer's camera to its
