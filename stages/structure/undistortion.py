@@ -88,8 +88,9 @@ def undistorted_px(
     xy: NDArray[np.float64], camera: Camera, lens: AnyLens, pinhole: Camera
 ) -> NDArray[np.float64]:
     """[N, 2] where photograph pixels `xy` lie in the pinhole picture (NaN if nowhere)."""
-    xy = _from_principal_point(xy, camera, lens)
-    return xy + np.array([pinhole.cx, pinhole.cy])
+    found: NDArray[np.float64] = _from_principal_point(xy, camera, lens)
+    found = found + np.array([pinhole.cx, pinhole.cy])
+    return found
 
 
 def _from_principal_point(
