@@ -15,6 +15,7 @@ from splatcli.folders import find_run_folder
 from splatcli.options import number, option, with_parameters
 from splatcli.usage import Commands
 from stages import STAGE_NAMES
+from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.settings import Setting
 from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
@@ -26,7 +27,6 @@ app = typer.Typer(
     cls=Commands,
     help="Turn a folder of photographs into a 3D Gaussian splat that opens everywhere.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -43,7 +43,13 @@ Photos = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option("--out", "-o", help="Run folder to make or continue.", show_default="run"),
+    typer.Option(
+        "--out",
+        "-o",
+        help="Run folder to make or continue.",
+        show_default="run",
+        rich_help_panel="Output",
+    ),
 ]
 Run = Annotated[
     Path | None, typer.Argument(help="Run folder; by default the one in the current folder.")
@@ -67,8 +73,9 @@ Cluster = Annotated[
         metavar="ADDRESS",
         help="Ray cluster that takes runs, or one run's blocks and shares of its matching "
         "(HOST:PORT, ray://HOST:PORT, auto), or local:N for N workers of this machine: "
-        'pip install "splat\\[cluster]".',
+        f"{install_command('cluster').replace('[', chr(92) + '[')}.",
         show_default="this process",
+        rich_help_panel="Advanced",
     ),
 ]
 Device = Annotated[
@@ -84,8 +91,18 @@ Device = Annotated[
         shown=False,
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Events and results as lines of JSON.")]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", help="Print only warnings and results.", rich_help_panel="Output"
+    ),
+]
+AsJson = Annotated[
+    bool,
+    typer.Option(
+        "--json", help="Print events and results as lines of JSON.", rich_help_panel="Output"
+    ),
+]
 
 _ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
 _STAGE_HELP = {
@@ -93,8 +110,8 @@ _STAGE_HELP = {
     "sfm": "Find where each photograph was taken from.",
     "seed": "Turn the sparse points into first splats.",
     "train": "Fit the splats to the photographs.",
-    "prune": "Remove floaters.",
-    "quantise": "Decide what to keep at which precision.",
+    "prune": "Remove floaters and splats that do not improve the pictures.",
+    "quantise": "Choose the precision at which each value is kept.",
     "export": "Write the files that other programs open.",
 }
 _STAGE_EXAMPLES = {
@@ -106,6 +123,24 @@ _STAGE_EXAMPLES = {
 
 def _example(line: str) -> str:
     return f"Example: {line}"
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"{NAME} {VERSION}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    pass
 
 
 def process(

@@ -17,46 +17,14 @@ from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
 from stages.base.settings import Setting, settings_of
-from stages.distributed import blocks, cluster, sharing
-from stages.distributed.tasks import Engine
-from stages.raster.backends import backend_of, drawn_by
+from stages.distributed import blocks, cluster, sfm_chunks
+from stages.distributed.tasks import Executor
+from stages.raster.backends import backend_of, backend_of_settings
 from stages.run import runfolder
 from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
 
 DEFAULT_PRESET = "standard"
-PROCESS_OPTIONS = (
-    "backend",
-    "device",
-    "max_side",
-    "masks",
-    "invert_masks",
-    "mask_means",
-    "frames",
-    "train_side",
-    "steps",
-    "seconds",
-    "patience",
-    "max_splats",
-    "blocks",
-    "price",
-    "max_mb",
-    "mb_of",
-    "min_psnr",
-    "tune_steps",
-    "light",
-    "background",
-    "formats",
-    "cameras",
-    "split",
-    "refine_cameras",
-    "metres",
-    "scale",
-    "marker",
-    "allow_partial",
-    "seed",
-)
-
 # What speaks of one capture and no other: a batch gives the same options to all of its runs.
 _OF_ONE_CAPTURE = ("masks", "cameras", "split", "refine_cameras", "scale", "blocks", "view")
 
@@ -69,13 +37,18 @@ def preset_parameter(shown: str) -> Parameter:
         str,
         choices=tuple(presets()),
         help="How much training: preview (minutes), standard, or best (the full recipe).",
+        panel="Quality and time",
     )
     return options.keyword("preset", str | None, options.option(setting, shown))
 
 
 def view_parameter() -> Parameter:
     """`--view`, of the commands that train."""
-    option = typer.Option("--view", help="Show the scene in the browser while it is trained.")
+    option = typer.Option(
+        "--view",
+        help="Show the scene in the browser while it is trained.",
+        rich_help_panel="Output",
+    )
     return options.keyword("view", bool, option, default=False)
 
 
@@ -92,11 +65,10 @@ def process_parameters() -> list[Parameter]:
     found: dict[str, Parameter] = {}
     for name in STAGE_NAMES:
         kind = load_stage(name).settings_type
-        for parameter in options.parameters(kind, PROCESS_OPTIONS, _shown):
+        for parameter in options.parameters(kind, _shown, only_in_process=True):
             found.setdefault(parameter.name, parameter)
-    chosen = (found[name] for name in PROCESS_OPTIONS if name in found)
     shown = f"{DEFAULT_PRESET}; as before where a run goes on"
-    return [preset_parameter(shown), *chosen, view_parameter()]
+    return [preset_parameter(shown), *found.values(), view_parameter()]
 
 
 def batch_parameters() -> list[Parameter]:
@@ -136,7 +108,9 @@ def settings_for(
         chosen["train"] = presets()[preset]
     found = {name: options.changed(settings, typed) for name, settings in chosen.items()}
     if typed.keys() & {"backend", "device"}:  # said now, not after an hour of other work
-        for asked in {drawn_by(each) for each in found.values() if hasattr(each, "backend")}:
+        for asked in {
+            backend_of_settings(each) for each in found.values() if hasattr(each, "backend")
+        }:
             backend_of(asked).require()
     return found
 
@@ -271,11 +245,11 @@ def in_blocks(pipeline: Pipeline, address: str | None) -> Pipeline:
     """The pipeline; if it has blocks, the cluster at `address` trains them, or this process. A
     cluster does shares of structure from motion, too."""
 
-    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Engine]:
+    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Executor]:
         seen = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
-        return cluster.engine_at(address, folder, seen, listener)
+        return cluster.open_executor(address, folder, seen, listener)
 
-    shared = pipeline if address is None else sharing.with_shares(pipeline, opened)
+    shared = pipeline if address is None else sfm_chunks.with_shares(pipeline, opened)
     return blocks.in_blocks(shared, opened)
 
 

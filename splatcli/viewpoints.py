@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from splatcli import console
 from stages.base.errors import Family, SplatError
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ def views_of(pipeline: Pipeline | None) -> tuple[View, ...]:
 def one_camera(splats: Splats, views: Sequence[View], wanted: str | None) -> Camera:
     """The camera of a photograph by name or number; the first, or one in front of the splats, if
     none is named. Raises SplatError "render-camera"."""
-    from stages.scene.framing import in_front_of
+    from stages.scene.framing import front_camera
 
     if wanted is None:
-        return views[0].camera if views else in_front_of(splats)
+        return views[0].camera if views else front_camera(splats)
     by_name = {view.name: view.camera for view in views}
     if wanted in by_name:
         return by_name[wanted]
@@ -61,12 +61,12 @@ def along(
     path: "orbit", "capture", or a camera file: its cameras as they are, or a smooth path through
     them if a length is given. Raises SplatError.
     """
-    from stages.scene.framing import in_front_of
-    from stages.viewer import orbit, travel
+    from stages.scene.framing import front_camera
+    from stages.viewer import camera_paths, orbit
 
     cameras = [view.camera for view in views]
     if path == "orbit":
-        cameras = cameras or [in_front_of(splats)]
+        cameras = cameras or [front_camera(splats)]
         half = orbit.arc_seen(cameras, splats)[1]
         if half < math.pi:
             _tell_swing(2 * math.degrees(half))
@@ -82,9 +82,9 @@ def along(
                 hint="Name the run folder, or choose --path orbit.",
                 family=Family.USAGE,
             )
-        cameras = [cameras[i] for i in travel.tour(cameras, splats)]
-        steady = travel.steadied(_travel(cameras, splats, length), _STEADY_S * length[2])
-        return [travel.levelled(camera) for camera in steady], False
+        cameras = [cameras[i] for i in camera_paths.tour(cameras, splats)]
+        steady = camera_paths.steadied(_travel(cameras, splats, length), _STEADY_S * length[2])
+        return [camera_paths.levelled(camera) for camera in steady], False
     cameras = _from_file(path)
     if length[0] is None and length[1] is None:
         return cameras, True
@@ -92,11 +92,11 @@ def along(
 
 
 def _travel(cameras: list[Camera], splats: Splats, length: Length) -> list[Camera]:
-    from stages.viewer import travel
+    from stages.viewer import camera_paths
 
-    usual = _TURN_S * travel.length_in_turns(cameras, splats)
+    usual = _TURN_S * camera_paths.length_in_turns(cameras, splats)
     frames = _frames(length, min(max(usual, _SHORTEST_S), _LONGEST_S))
-    return list(travel.through(cameras, splats, frames))
+    return list(camera_paths.through(cameras, splats, frames))
 
 
 def _frames(length: Length, usual_s: float) -> int:

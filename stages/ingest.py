@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base import threads
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
+from stages.base.text import counted
 
 if TYPE_CHECKING:
     from stages.photos.decode import Decoded, PixelBudget
@@ -34,6 +34,7 @@ class IngestSettings:
     max_side: int = field(
         default=1600,
         metadata={
+            "panel": "Quality and time",
             "help": "Longer side of the photographs used for structure from motion and, at most, "
             "for training (px).",
             "min": 64,
@@ -43,6 +44,7 @@ class IngestSettings:
     masks: Path | None = field(
         default=None,
         metadata={
+            "panel": "Light and masks",
             "help": "Folder of masks, white where a photograph counts, named as the photographs "
             "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside the "
             "photographs' is found without.",
@@ -51,11 +53,15 @@ class IngestSettings:
     )
     invert_masks: bool = field(
         default=False,
-        metadata={"help": "Masks are black where a photograph counts, not white."},
+        metadata={
+            "panel": "Light and masks",
+            "help": "Masks are black where a photograph counts, not white.",
+        },
     )
     mask_means: str = field(
         default="auto",
         metadata={
+            "panel": "Light and masks",
             "help": "What is outside a mask: ignore (something that does not count), transparent "
             "(nothing, as around an object cut out) or auto (nothing where pictures themselves are "
             "transparent, ignored where masks are files).",
@@ -65,6 +71,7 @@ class IngestSettings:
     frames: int = field(
         default=0,
         metadata={
+            "panel": "Input",
             "help": "Frames to take from each video, at most; 0 takes as many as its motion asks "
             "for.",
             "min": 0,
@@ -272,7 +279,7 @@ def _film_key(film: str, width: int, height: int) -> str:
 def _with_twins(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
     """The photographs, each of a group of near-duplicates knowing the group's first."""
     first = {index: photos[group[0]].name for group in groups for index in group}
-    return tuple(replace(photo, twin=first.get(i, "")) for i, photo in enumerate(photos))
+    return tuple(replace(photo, duplicate_of=first.get(i, "")) for i, photo in enumerate(photos))
 
 
 def _report_capture(

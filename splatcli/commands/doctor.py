@@ -12,16 +12,17 @@ from pathlib import Path
 
 from splatcli import console
 from stages.base import threads
+from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
 
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
-_BACKEND_ADVICE = "docs/gpu.md says what it takes."
+_BACKEND_ADVICE = "docs/guide/gpu.md says what it takes."
 _VIDEO_CODECS = ("h264", "hevc", "av1", "vp9", "vp8", "mpeg4", "prores", "mjpeg", "gif")
 
 
@@ -50,7 +51,7 @@ def show(as_json: bool = False) -> int:
 
 def checks() -> Iterator[Check]:
     """Every check, in the order shown."""
-    yield Check("splat", versions().get("splat", "not installed as a package"))
+    yield Check(NAME, VERSION)
     yield Check("python", f"{platform.python_version()} on {platform.platform()}")
     yield from map(_library, needed())
     yield Check("threads", f"{threads.count()} of {os.cpu_count()} cores (SPLAT_THREADS sets it)")
@@ -68,7 +69,7 @@ def checks() -> Iterator[Check]:
 
 
 def _library(distribution: str) -> Check:
-    modules, advice = modules_of(distribution), "Install splat again: pip install ."
+    modules, advice = modules_of(distribution), f"Install {NAME} again: {install_command()}"
     if not modules:
         return Check(distribution, "not installed", ok=False, advice=advice)
     try:
@@ -145,9 +146,9 @@ def _camera_files() -> list[str]:
 def _backend(backend: Backend) -> Check:
     label = f"backend {backend.name}"
     try:
-        if why_not := backend.why_not():
-            return Check(label, f"not chosen: {why_not}", advice=_BACKEND_ADVICE)
-        named(backend.rasteriser)
+        if why := backend.why_unavailable():
+            return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
+        load_object(backend.rasteriser)
     except Exception as error:
         return Check(label, f"not present ({_said(error)})", ok=False)
     return Check(label, "present")
@@ -159,6 +160,6 @@ def _gpu() -> Check:
         from stages.raster.gpu import device
 
         missing = device.missing()
-        return Check("GPU", f"{missing}; {device.built()}" if missing else device.told())
+        return Check("GPU", f"{missing}; {device.built()}" if missing else device.describe())
     except Exception as error:  # a broken driver may raise anything
         return Check("GPU", _said(error))

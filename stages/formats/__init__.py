@@ -13,7 +13,7 @@ A new format, in five steps:
    What each takes and gives is said at `table.Format`.
 4. A row in `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the fuzzer
    and the tests of every format know it from then on.
-5. README's table: `pytest tests/formats/test_table.py` prints the line that is missing.
+5. `python -m tests.docs_tables` writes the tables of the documentation.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.atomic import clear_left
-from stages.base.lazy import named
-from stages.formats.table import BY_ENDING, FORMATS, MESHES, TABLE, Anatomy, Format, format_of
+from stages.base.atomic import remove_abandoned_files
+from stages.base.lazy import load_object
+from stages.formats.table import BY_ENDING, FORMATS, MESHES, TABLE, ByteBreakdown, Format, format_of
 from stages.formats.units import units_of
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ __all__ = [
     "FORMATS",
     "MESHES",
     "TABLE",
-    "Anatomy",
+    "ByteBreakdown",
     "Format",
     "format_of",
     "read",
@@ -55,9 +55,9 @@ def write(
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
     row = format_of(path)
-    clear_left(Path(path).parent)
+    remove_abandoned_files(Path(path).parent)
     more: dict[str, Any] = {"views": views} if row.wants_views else {}
-    dropped: int = named(row.writer)(Path(path), splats, units=units, **more)
+    dropped: int = load_object(row.writer)(Path(path), splats, units=units, **more)
     return dropped
 
 
@@ -69,7 +69,7 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     """
     from stages.formats.rows import damage_kept
 
-    reader = named(format_of(path).reader)
+    reader = load_object(format_of(path).reader)
     with nullcontext() if strict else damage_kept():
         splats: Splats = reader(Path(path))
     return splats

@@ -16,18 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
-from stages.measure.judge import CAP_DB, decibels
-from stages.proof import diagnosis, second_readers
+from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
+from stages.proof import diagnosis, independent_readers
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
-from stages.raster.draw import renderer, settings_of
-from stages.scene import Camera, Splats, View, split_held_out, spread_over
-from stages.scene.framing import around
+from stages.raster.draw import raster_settings_of, renderer
+from stages.scene import Camera, Splats, View, evenly_spaced, split_held_out
+from stages.scene.framing import orbit_cameras
 
 _SIDE_PX = 480
 _CAMERAS = 3
@@ -60,8 +60,8 @@ def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...
     training, held = split_held_out(tuple(views))
     chosen = held or training
     if not chosen:
-        return tuple(camera.fitted(_SIDE_PX) for camera in around(splats, _CAMERAS, _MIDDLE))
-    return tuple(view.camera.fitted(_SIDE_PX) for view in spread_over(chosen, _CAMERAS))
+        return tuple(camera.fitted(_SIDE_PX) for camera in orbit_cameras(splats, _CAMERAS, _MIDDLE))
+    return tuple(view.camera.fitted(_SIDE_PX) for view in evenly_spaced(chosen, _CAMERAS))
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Prover:
         came_as: str = "",
     ) -> Prover:
         drawn = _middle(splats)
-        draw = renderer(splats.take(drawn), settings_of(splats), backend)
+        draw = renderer(splats.take(drawn), raster_settings_of(splats), backend)
         pictures = tuple(draw(camera).image for camera in cameras)
         return cls(splats, drawn, cameras, pictures, backend, came_as)
 
@@ -102,8 +102,8 @@ class Prover:
         """
         row = format_of(path)
         try:
-            content = _drawable(second_readers.read_back(path))
-            said = named(row.validator)(path) if row.validator else []
+            content = _drawable(independent_readers.read_back(path))
+            said = load_object(row.validator)(path) if row.validator else []
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)
@@ -118,7 +118,7 @@ class Prover:
     def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:
         found = differences(self.splats, content, *names)
         by_camera = self._decibels(content, found.rows)
-        worst = min(by_camera, default=CAP_DB)
+        worst = min(by_camera, default=IDENTICAL_DB)
         figures = {
             "verify_db": round(worst, 2),
             "verify_mean_db": round(float(np.mean(by_camera)), 2) if by_camera else worst,
@@ -139,10 +139,10 @@ class Prover:
         file's splats into ours: so the turn of positions, rotations and SH is checked by something
         other than itself."""
         drawn = self.drawn if isinstance(self.drawn, slice) else self.drawn[rows]
-        draw = renderer(content.splats.take(drawn), settings_of(self.splats), self.backend)
+        draw = renderer(content.splats.take(drawn), raster_settings_of(self.splats), self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
-            decibels(draw(camera).image, np.clip(picture, 0.0, 1.0))
+            capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))
             for camera, picture in zip(moved, self.pictures, strict=True)
         ]
 

@@ -14,12 +14,12 @@ from stages.scene.capture import (
     Photo,
     Reconstruction,
     View,
+    evenly_spaced,
     scene_extent,
-    seen_extent,
     split_held_out,
-    spread_over,
+    training_extent,
 )
-from stages.scene.look import Look, look_of, near_plane
+from stages.scene.draw_settings import DrawSettings, draw_settings_of, near_plane
 from stages.scene.splats import (
     SH_C0,
     QuantisedSplats,
@@ -27,7 +27,7 @@ from stages.scene.splats import (
     TrainedSplats,
     dc_to_rgb,
     logit,
-    numbers_of,
+    parameters_per_splat,
     rgb_to_dc,
 )
 from stages.scene.storage import load_splats, save_splats
@@ -38,9 +38,9 @@ __all__ = [
     "TRANSPARENT",
     "Camera",
     "Capture",
+    "DrawSettings",
     "ExportedAssets",
     "ExportedFile",
-    "Look",
     "Photo",
     "QuantisedSplats",
     "Reconstruction",
@@ -48,17 +48,17 @@ __all__ = [
     "TrainedSplats",
     "View",
     "dc_to_rgb",
+    "draw_settings_of",
+    "evenly_spaced",
     "fitted_size",
     "load_splats",
     "logit",
     "look_at",
-    "look_of",
     "near_plane",
-    "numbers_of",
+    "parameters_per_splat",
     "rgb_to_dc",
     "save_splats",
     "scene_extent",
-    "seen_extent",
     "split_held_out",
-    "spread_over",
+    "training_extent",
 ]

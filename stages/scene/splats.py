@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
-from stages.scene.look import Look
+from stages.scene.draw_settings import DrawSettings
 
 SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
@@ -36,7 +36,7 @@ class Splats:
     sh: NDArray[np.floating]
     sh_degrees: NDArray[np.uint8]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    look: Look = field(default_factory=Look)
+    draw_settings: DrawSettings = field(default_factory=DrawSettings)
 
     def __post_init__(self) -> None:
         n = len(self.means)
@@ -109,13 +109,16 @@ class Splats:
 
 @dataclass(frozen=True)
 class TrainedSplats:
-    """Splats as trained. sat_out: whether splats sat steps out towards the end, see
-    `training.trial`. by_heart: whether photographs were learnt by heart: what these lose hardly any
-    other view feels."""
+    """The result of training.
+
+    dropout: whether some splats were dropped from each of the last steps (`training.dropout`).
+    overfitted: whether training views are reproduced much better than other views. Other views
+        then hardly change when splats are removed that the training views need.
+    """
 
     splats: Splats
-    sat_out: bool = False
-    by_heart: bool = False
+    dropout: bool = False
+    overfitted: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ class QuantisedSplats:
     flat_dc: NDArray[np.floating] | None = None
 
 
-def numbers_of(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
+def parameters_per_splat(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
     """[N] how many numbers a splat of each degree is: place, rotation, scales and opacity, and
     three for each term of its colour."""
     return np.asarray(3 + 4 + 3 + 1 + 3 * (sh_degrees.astype(np.int64) + 1) ** 2)

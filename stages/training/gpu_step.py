@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import OPACITY, SH, RasterSettings, gradient_columns
-from stages.raster.gpu.device import failures_told, interpreted
+from stages.raster.gpu.device import gpu_errors_explained, interpreted
 from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
 from stages.scene import Camera
 from stages.training import gpu_kernels
 from stages.training.dropout import INVISIBLE, Dropout
-from stages.training.gpu_dropout import resting
-from stages.training.gpu_photograph import Resident, resident
+from stages.training.gpu_dropout import dropped
+from stages.training.gpu_target import GpuTarget, gpu_target_of
 from stages.training.loss import SSIM_WEIGHT
 from stages.training.optimiser import (
     LearningRates,
@@ -73,7 +73,7 @@ class GpuStep:
         self._arrivals = Arrivals(
             self.device, (0 if interpreted() else LAG) if lag is None else lag
         )
-        self._photographs: dict[int, Resident] = {}
+        self._photographs: dict[int, GpuTarget] = {}
         self._corrections = self._on_device(bias_corrections())
         self._unsmoothed = torch.zeros(0, device=self.device)
         self._on_host: Model | None = None
@@ -86,7 +86,7 @@ class GpuStep:
         """See `step.TrainingStep`."""
         self._room = int(self._room * len(model) / max(1, self._splats))
         self._splats, self._on_host = len(model), model  # known even if there is no room for it
-        with failures_told(len(model)):
+        with gpu_errors_explained(len(model)):
             self._scene = self.rasteriser.scene(model.arrays)
             self._smoothing = self._on_device(model.smoothing)
             self._sh_degrees, self._own = model.sh_degrees, self._own_columns(model)
@@ -117,7 +117,7 @@ class GpuStep:
         dropout: Dropout | None = None,
     ) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
-        with failures_told(len(self)):
+        with gpu_errors_explained(len(self)):
             known = id(level.means) in self._photographs
             photograph = self._resident(level)
             view = photograph.view(self.rasteriser, settings)
@@ -151,13 +151,13 @@ class GpuStep:
         widths, rows = self._smoothing if smooth else self._unsmoothed, self._scene.rows
         if dropout is not None:
             rows = rows.clone()
-            rows[:, OPACITY].masked_fill_(resting(dropout, self._gradient_count), INVISIBLE)
+            rows[:, OPACITY].masked_fill_(dropped(dropout, self._gradient_count), INVISIBLE)
         return Scene(rows, self._scene.bands, widths)
 
-    def _resident(self, level: Level) -> Resident:
+    def _resident(self, level: Level) -> GpuTarget:
         key = id(level.means)  # which stay the same object, however often a level is read
         if key not in self._photographs:
-            self._photographs[key] = resident(level, self.device)
+            self._photographs[key] = gpu_target_of(level, self.device)
         return self._photographs[key]
 
     def _adam(

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from splatcli.app import app
 from stages import STAGE_NAMES
+from stages.base.settings import PANELS
 from tests import processes
 from tests.cli.help_text import help_of
 
@@ -110,33 +112,24 @@ def test_process_has_the_promised_options() -> None:
         assert flag in text, flag
 
 
-def readme_commands() -> list[list[str]]:
-    """Every line of a README code block, or inline code, that calls `splat`."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = []
-    for block in re.findall(r"```(?:bash|sh|console)\n(.*?)```", text, re.S):
-        for line in block.splitlines():
-            for command in line.removeprefix("$ ").split("#")[0].split("&&"):
-                if command.strip().startswith("splat "):
-                    found.append(shlex.split(command))
-    for inline in re.findall(r"`(splat [^`]+)`", text):
-        found.append(shlex.split(inline))
-    return found
+def test_process_groups_its_options_and_lists_the_common_ones_first() -> None:
+    text = help_of("process")
+    found = re.findall(r"─ (.+?) ─+╮", text)
+    assert found == ["Arguments", "Options", *PANELS]
+    between = text[text.index("Quality and time") : text.index("─ Size ─")]
+    assert all(flag in between for flag in ("--preset", "--steps", "--train-side"))
+    assert text.index("--preset") < text.index("--cameras") < text.index("--backend")
 
 
-@pytest.mark.parametrize("words", readme_commands(), ids=" ".join)
-def test_readme_command_exists(words: list[str]) -> None:
-    command = next((w for w in words[1:] if not w.startswith("-")), None)
-    if command is None:
-        assert words == ["splat", "--help"]
-        return
-    assert command in COMMANDS
-    text = help_of(command)
-    for word in words[2:]:
-        if word.startswith("--"):
-            assert re.search(rf"{re.escape(word.split('=')[0])}\b", text), word
-
-
-def test_readme_names_every_command() -> None:
-    named = {word for words in readme_commands() for word in words[1:]}
-    assert set(COMMANDS) <= named
+@pytest.mark.parametrize(
+    ("line", "completed"),
+    [("splat pro", ["process"]), ("splat process --preset s", ["standard"])],
+)
+def test_shell_completion_knows_commands_and_choices(
+    line: str, completed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("_SPLAT_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
+    result = CliRunner().invoke(app, [], prog_name="splat")
+    assert result.stdout.split() == completed

@@ -4,8 +4,8 @@ python -m tests.extremes.gpu [--row 3 --row 4] [--float32]
 
 A row takes the interpreter seconds or minutes, so what was measured is kept in gpu.json beside
 this file, and the table's column "gpu" is made of that: with a GPU at hand run this, then
-`python -m tests.extremes --write docs/extremes.md`. --float32: with footprints in float32, kept
-apart; what that costs is in docs/gpu.md.
+`python -m tests.extremes --write docs/experiments/extremes.md`. --float32: with footprints in float32, kept
+apart; what that costs is in docs/experiments/gpu.md.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def keep(row: Row, found: list[Measured], real: str) -> None:
     """Put one row's numbers in the place of those kept before."""
     every = _read()
     numbers = [[m.what, float(f"{m.error:.3g}"), m.bound, m.note] for m in found]
-    told = {"where": device.told(), "numbers": numbers}
+    told = {"where": device.describe(), "numbers": numbers}
     column = {**every.get(real, {}), str(row.number): told}
     every[real] = {number: column[number] for number in sorted(column, key=int)}
     _write(every)

@@ -19,9 +19,9 @@ from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import sog, streamed_sog
 from stages.formats.rows import drawable
-from stages.measure.judge import decibels
-from stages.proof import second_readers
-from stages.raster.draw import renderer, settings_of
+from stages.measure.evaluation import capped_psnr_db
+from stages.proof import independent_readers
+from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at
 from tests.editing.walls import wall
 from tests.formats.truth import many_splats
@@ -65,7 +65,7 @@ def test_the_finest_level_comes_back_in_the_order_that_is_told(asset: Path) -> N
 
 
 def test_a_second_reader_finds_the_same(asset: Path) -> None:
-    first, second = formats.read(asset), second_readers.read_back(asset).splats
+    first, second = formats.read(asset), independent_readers.read_back(asset).splats
     np.testing.assert_allclose(second.means, first.means, atol=1e-5)
     np.testing.assert_allclose(second.sh, first.sh, atol=1e-6)
 
@@ -214,12 +214,12 @@ def test_a_level_looks_like_the_scene_where_its_splats_are_a_pixel() -> None:
     full = wall(8000)
     every = levels.levels_of(full)
     assert [len(level) for level in every] == [8000, 2000, 500, 125]
-    settings = replace(settings_of(full), antialias=True)
+    settings = replace(raster_settings_of(full), antialias=True)
     for level in every[1:]:
         camera = camera_at(at_one_pixel(level))
         picture = renderer(full, settings)(camera).image
         assert picture.max() > 0.3
-        found = decibels(renderer(level, settings)(camera).image, np.clip(picture, 0, 1))
+        found = capped_psnr_db(renderer(level, settings)(camera).image, np.clip(picture, 0, 1))
         assert found > 40, len(level)
         share = len(level) / len(full)
         assert math.log(share, 4) <= -1

@@ -19,9 +19,9 @@ from stages.base.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.raster.definition import MemoryFull
 
-INSTALL = "docs/gpu.md says which build of torch brings what is missing."
+INSTALL = "docs/guide/gpu.md says which build of torch brings what is missing."
 _OLDEST = (7, 0)  # compute capability that Triton compiles for
-BYTES_A_SPLAT = 1500  # of training, with degree 3 and 4 tiles a splat: docs/gpu.md
+BYTES_A_SPLAT = 1500  # of training, with degree 3 and 4 tiles a splat: docs/experiments/gpu.md
 _NVIDIA, _AMD = Path("/proc/driver/nvidia/version"), Path("/dev/kfd")  # there with their drivers
 _COMPILERS = ("cc", "gcc", "clang")
 
@@ -31,7 +31,7 @@ def interpreted() -> bool:
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 
-def obstacle() -> str:
+def why_unavailable() -> str:
     """Why the backend "gpu" is not to be chosen here by itself; "" where it is."""
     return "Triton's interpreter is on, for tests" if interpreted() else missing()
 
@@ -97,7 +97,7 @@ def _no_triton() -> str:
     return "" if importlib.util.find_spec("triton") else "Triton is not installed"
 
 
-def told() -> str:
+def describe() -> str:
     """Card, memory, driver, torch and Triton, in one line; of the interpreter as well."""
     import torch
 
@@ -123,7 +123,7 @@ def built() -> str:
 
 
 @contextmanager
-def failures_told(splats: int) -> Iterator[None]:
+def gpu_errors_explained(splats: int) -> Iterator[None]:
     """What a device refuses while it works on so many splats, as SplatError."""
     import torch
 
