@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages import STAGE_NAMES, load_stage
-from stages.raster.backends import drawn_by
+from stages.raster.backends import backend_of_settings
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
@@ -82,5 +82,5 @@ def process(
         splats=pipeline.load("quantise").splats,
         assets=pipeline.load("export"),
         metrics={manifest.stage: manifest.metrics for manifest in manifests},
-        backend=drawn_by(settings["train"]),
+        backend=backend_of_settings(settings["train"]),
     )

@@ -116,7 +116,7 @@ def backends() -> str:
     rows: list[tuple[str, ...]] = [("`auto`", "the fastest that runs here", "")]
     for backend in BACKENDS:
         devices = ", ".join(f"`{device}`" for device in backend.devices)
-        rows.append((f"`{backend.name}`", backend.what, devices))
+        rows.append((f"`{backend.name}`", backend.summary, devices))
     return _table(("`--backend`", "is", "`--device`"), rows)
 
 
@@ -132,10 +132,10 @@ def presets() -> str:
 
 
 def operations() -> str:
-    from stages.editing.words import WORDS
+    from stages.editing.syntax import OPERATIONS
 
     rows: list[tuple[str, ...]] = []
-    for word in WORDS.values():
+    for word in OPERATIONS.values():
         takes = word.takes.replace("|", r"\|")
         rows.append((f"`--{word.name} {takes}".rstrip() + "`", word.help))
     return _table(("operation", "effect"), rows)

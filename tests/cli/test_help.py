@@ -1,4 +1,4 @@
-"""Help: quick, with examples, and true to the README."""
+"""Help: quick, and with examples."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from splatcli.app import app
 from stages import STAGE_NAMES
+from stages.base.distribution import NAME, VERSION
 from stages.base.settings import PANELS
 from tests import processes
 from tests.cli.help_text import help_of
@@ -133,3 +134,7 @@ def test_shell_completion_knows_commands_and_choices(
     monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
     result = CliRunner().invoke(app, [], prog_name="splat")
     assert result.stdout.split() == completed
+
+
+def test_version_is_the_distributions(splat) -> None:
+    assert splat("--version").stdout.strip() == f"{NAME} {VERSION}"
