@@ -88,8 +88,8 @@ def undistorted_px(
     xy: NDArray[np.float64], camera: Camera, lens: AnyLens, pinhole: Camera
 ) -> NDArray[np.float64]:
     """[N, 2] where photograph pixels `xy` lie in the pinhole picture (NaN if nowhere)."""
-    found: NDArray[np.float64] = _from_principal_point(xy, camera, lens)
-    found = found + np.array([pinhole.cx, pinhole.cy])
+    found = _from_principal_point(xy, camera, lens)
+    found += (pinhole.cx, pinhole.cy)
     return found
 
 
