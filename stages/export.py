@@ -177,7 +177,7 @@ def _fitting(
     tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, sat_out)
     seen = np.zeros(len(splats), np.int32)
     if sat_out:  # only then it matters
-        seen = measure_contributions(splats, photographs, backend).photographs
+        seen = measure_contributions(splats, photographs, backend).view_counts
     deciding = load_evaluation_views(folder, spread_over(training, DECIDING), splats.look)
     return Fitting(tuner, deciding, backend, settings.rounding_steps, seen)
 

@@ -9,10 +9,11 @@ import pytest
 from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
-from stages.capacity import rounds
+from stages.capacity import pruning
 from stages.capacity.targets import FELT
-from stages.measure.contribution import Contributions, floaters, near_view_frusta
+from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
+from stages.measure.floaters import near_camera_floaters
 from stages.scene import Splats, TrainedSplats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
@@ -189,7 +190,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 ) -> None:
     trained = join(scene.splats, unseen(5), floater_before(scene, 1))
     usual, _ = run(scene, trained, tmp_path)
-    monkeypatch.setattr(rounds, "LOOKED_AT", 4)
+    monkeypatch.setattr(pruning, "LOOKED_AT", 4)
     result, report = run(scene, trained, tmp_path)
     assert len(result) == pytest.approx(len(usual), rel=0.15)
     assert training_db(scene, result) > training_db(scene, usual) - 0.3
@@ -202,7 +203,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 def test_what_only_a_photograph_sees_that_does_not_decide_stays(
     scene, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(rounds, "LOOKED_AT", 1)  # of nine, the first
+    monkeypatch.setattr(pruning, "LOOKED_AT", 1)  # of nine, the first
     result, _ = run(scene, scene.splats, tmp_path)
     far = scene.reconstruction.views[5].camera
     seen = [Splats.take(s, far.project(s.means)[1] < 3) for s in (scene.splats, result)]
@@ -227,7 +228,7 @@ def test_the_origin_stays(scene, tmp_path) -> None:
 
 
 def worth_of(photographs, sse_change, scene_depth=(4.0,)) -> Contributions:
-    """A Worth with what the rules read; a splat in no photograph has no weight."""
+    """Contributions with what the rules read; a splat in no photograph has no weight."""
     seen = np.asarray(photographs, np.int32)
     weight = (seen > 0).astype(np.float64)
     change, depth = np.asarray(sse_change, np.float64), np.asarray(scene_depth, np.float64)
@@ -241,12 +242,18 @@ def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
     """One camera at the origin that sees its scene 4 away: close is nearer than 1."""
     scene = splats([[0, 0, 0.9], [0, 0, 1.1], [0, 0, 0.9], [0, 0.9, 0.0], [0, 0, 0.5]])
     worth = worth_of([1, 1, 3, 2, 0], [1.0] * 5)
-    assert floaters(scene, worth, [camera()]).tolist() == [True, False, False, True, True]
+    assert near_camera_floaters(scene, worth, [camera()]).tolist() == [
+        True,
+        False,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:
     worth = worth_of([1], [1.0], scene_depth=[np.inf])
-    assert not floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
+    assert not near_camera_floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
 
 
 def test_beside_a_picture_is_a_quarter_of_its_longer_side_beyond_the_rim() -> None:

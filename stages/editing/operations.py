@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.atomic import partial_prefix
 from stages.base.errors import Family, SplatError
-from stages.editing import expression, floaters, regions, turning
+from stages.editing import expression, regions, turning
 from stages.editing.decimate import FAR, NEAR, decimated
 from stages.editing.joining import joined
 from stages.editing.scene import Edited
 from stages.editing.turning import Similarity
 from stages.editing.words import WORDS, Typed
 from stages.formats.rows import chosen, kept_rows
-from stages.measure.contribution import floaters as hanging
+from stages.measure import floaters
 from stages.scene import Splats
 
 Operation = Callable[[Edited], Edited]
@@ -112,9 +112,9 @@ def _placing(where: Similarity) -> Operation:
 
 def _without_floaters(scene: Edited) -> Edited:
     if len(scene.photographs):
-        gone = hanging(scene.splats, scene.worth(), scene.cameras())
+        gone = floaters.near_camera_floaters(scene.splats, scene.worth(), scene.cameras())
     else:
-        gone = floaters.alone(scene.splats)
+        gone = floaters.isolated_splats(scene.splats)
     return scene.but(chosen(scene.splats, ~gone))
 
 

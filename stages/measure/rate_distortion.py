@@ -57,7 +57,7 @@ def rate_distortion_of(
     samples, sse, tiles = 0, 0.0, []
     for photograph in photographs:
         residual = np.clip(draw(photograph.camera), 0.0, 1.0) - photograph.image
-        kept = photograph.kept
+        kept = photograph.valid
         if kept is not None:
             residual *= kept[..., None]
         samples += residual.size if kept is None else 3 * int(kept.sum())

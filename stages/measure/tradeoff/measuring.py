@@ -13,9 +13,15 @@ import numpy as np
 from stages import formats
 from stages.formats.coarse import held_by
 from stages.formats.rows import kept_rows
-from stages.measure.contribution import Contributions, floaters, measure_contributions
-from stages.measure.evaluation import EvaluationView, Score, evaluate, image_renderer
-from stages.measure.speed import seconds_per_frame
+from stages.measure.contribution import Contributions, measure_contributions
+from stages.measure.evaluation import (
+    EvaluationView,
+    Score,
+    evaluate,
+    image_renderer,
+    seconds_per_frame,
+)
+from stages.measure.floaters import near_camera_floaters
 from stages.measure.tradeoff.points import Moment, Point, Trade, change_db, mean_db
 from stages.measure.tradeoff.thin import Thin, measure_thin
 from stages.scene import Look, QuantisedSplats, Splats, View, split_held_out, spread_over
@@ -129,7 +135,7 @@ def _thin(material: Material, worth: Contributions, tell: Tell) -> Thin:
         split_held_out(material.views)[0],
         material.levelled,
         material.held_out,
-        floaters(material.splats, worth, cameras),
+        near_camera_floaters(material.splats, worth, cameras),
         material.backend,
     )
 
