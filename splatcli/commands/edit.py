@@ -13,13 +13,13 @@ from stages.base.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.editing.operations import Done
     from stages.editing.scene import Edited
-    from stages.editing.words import Typed
+    from stages.editing.syntax import ParsedOperation
 
 
 def edit(
     source: Path,
     target: Path | None,
-    typed: Sequence[Typed],
+    typed: Sequence[ParsedOperation],
     dry_run: bool,
     quiet: bool,
     as_json: bool,
@@ -41,7 +41,7 @@ def edit(
         )
     target = target or Path("scene.ply")
     row, chain = formats.format_of(target), operations.prepared(typed, target)
-    if row.levels and not dry_run:
+    if row.streamed and not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
         if target.parent.is_dir():  # `write` says so where it is not
@@ -84,8 +84,8 @@ def _opened(source: Path) -> Edited:
         return Edited(splats, units_of(source))
     found = pipeline.load("sfm")
     training, held = split_held_out(found.views)
-    photographs = load_evaluation_views(found.folder, training, splats.look)
-    judges = load_evaluation_views(found.folder, held, splats.look) or photographs
+    photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
+    judges = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
     return Edited(
         *(splats, found.units, photographs, judges, found.views),
         backend=backend_of(pipeline),

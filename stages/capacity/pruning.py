@@ -65,7 +65,7 @@ class Pruner:
     learns and what each splat is worth at first, as many as `LOOKED_AT` decide."""
 
     photographs: Sequence[EvaluationView]
-    aim: Targets
+    targets: Targets
     backend: str
     tuner: FineTuner
     rounds: int
@@ -84,7 +84,7 @@ class Pruner:
         worth = self._first_worth(splats)
         best = worth.psnr_db
         mean_db = float(best.mean())
-        self.aim.check_start(mean_db)
+        self.targets.check_start(mean_db)
         price = rate_distortion_of(
             image_renderer(splats, self.backend), self._pictures(self.decide)
         )
@@ -96,7 +96,7 @@ class Pruner:
             best = max(best, worth.psnr_db, key=np.mean)
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
-            excess = self.aim.excess(found.splats)
+            excess = self.targets.excess(found.splats)
             cut = self._cut(found, worth, excess, share)
             if cut is None:
                 found.stopped_by = PRICE
@@ -106,7 +106,7 @@ class Pruner:
             measured = (measured - _fresh_sse(worth)) * _told_by(worth)
             fewer = self.tuner.finetune(fewer, self.finetune_steps * self.rounds // planned, seen)
             after = self._worth(fewer, worth, cut)
-            kept = excess > 0 or self.aim.holds(after.psnr_db, best)
+            kept = excess > 0 or self.targets.holds(after.psnr_db, best)
             predicted = cut.predicted_sse * (overlap if cut.predicted_sse > 0 else 1)
             told = (predicted, measured, float(after.psnr_db.mean()), kept)
             found.rounds.append(_round(found.splats, cut, *told))
@@ -121,7 +121,7 @@ class Pruner:
             if share < SPLATS_A_ROUND / 2**BACK_OFFS:
                 break
         found.end_db = float(worth.psnr_db.mean())
-        self.aim.check_end(found.splats, found.end_db)
+        self.targets.check_end(found.splats, found.end_db)
         return found
 
     def _without_harm(self, found: PruningResult, worth: Contributions) -> Contributions:
@@ -162,7 +162,7 @@ class Pruner:
 
     def _planned(self, splats: Splats) -> int:
         """As many rounds as targets need, and a few for what they leave over."""
-        left = len(splats) - self.aim.excess(splats)
+        left = len(splats) - self.targets.excess(splats)
         if left == len(splats):
             return self.rounds
         needed = math.log(left / len(splats)) / math.log(1 - SPLATS_A_ROUND)
@@ -171,8 +171,8 @@ class Pruner:
     def _cut(
         self, found: PruningResult, worth: Contributions, excess: int, share: float
     ) -> Removal | None:
-        forced = excess > 0 or self.aim.min_psnr_db > 0
-        limit = math.inf if forced else self.aim.price * found.price.sse_per_parameter
+        forced = excess > 0 or self.targets.min_psnr_db > 0
+        limit = math.inf if forced else self.targets.price * found.price.sse_per_parameter
         most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
         most = min(most, excess, len(found.splats) - 1) if excess else most
         return choose(

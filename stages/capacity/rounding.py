@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages import formats
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats.axes import least_turned
-from stages.formats.coarse import Bits, held_by, on_grids
+from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
 from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
@@ -50,16 +50,18 @@ class Fitting:
         """(what a file of the format should hold, figures: PSNR of the photographs that decide, as
         the file would be drawn without fine-tuning and with it). Raises Interrupted."""
         self.tuner.steps = 0  # what a file holds does not depend on those written before it
-        plain = held_by(row, quantised)
-        exact = held_by(row, replace(quantised, decisions={}))
+        plain = splats_to_write(row, quantised)
+        exact = splats_to_write(row, replace(quantised, decisions={}))
         bits = quantised.decisions.get("bits")
 
         def read(splats: Splats) -> Splats:
             return as_read(row, splats)
 
         if row.coarse and isinstance(bits, dict):
-            exact, few = least_turned(exact), Bits(**bits)
-            found = tuned_to(lambda s: on_grids(s, few), exact, self.tuner, self.steps, self.seen)
+            exact, few = least_turned(exact), BitDepths(**bits)
+            found = tuned_to(
+                lambda s: quantise_splats(s, few), exact, self.tuner, self.steps, self.seen
+            )
         else:
             found = tuned_to(read, exact, self.tuner, self.steps, self.seen)
         before, after = (
@@ -94,9 +96,9 @@ def as_read(row: Format, splats: Splats) -> Splats:
         read = formats.read(path)
     found = read.with_sh_degree(splats.sh_degree)
     if row.order:
-        places = np.argsort(named(row.order)(splats))
+        places = np.argsort(load_object(row.order)(splats))
         found = found.take(places)
-    return replace(found, look=splats.look, origin=splats.origin)
+    return replace(found, draw_settings=splats.draw_settings, origin=splats.origin)
 
 
 def _only(name: str, coarse: Splats, splats: Splats) -> Splats:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stages.measure.image_metrics import capped_psnr_db, flip, ssim
 from stages.photos.load import load_image, mask_of
 from stages.raster.draw import renderer
-from stages.scene import IGNORE, TRANSPARENT, Camera, Look, Splats, View
+from stages.scene import IGNORE, TRANSPARENT, Camera, DrawSettings, Splats, View
 from stages.scene.light import BRIGHT, Light, gains_and_offsets
 
 IN_MEMORY_MIB = 512  # of photographs; further ones are read from disk each time
@@ -94,12 +94,12 @@ class Score:
 class _EvaluationViews(Sequence[EvaluationView]):
     """The first views in memory, the others on disk."""
 
-    def __init__(self, folder: Path, views: Iterable[View], look: Look) -> None:
-        self._folder, self._views, self._look = folder, tuple(views), look
+    def __init__(self, folder: Path, views: Iterable[View], draw_settings: DrawSettings) -> None:
+        self._folder, self._views, self._look = folder, tuple(views), draw_settings
         self._loaded: list[EvaluationView] = []
         free = IN_MEMORY_MIB * 2**20
         for number, view in enumerate(self._views):
-            camera = look.camera(view.camera)
+            camera = draw_settings.camera(view.camera)
             free -= 4 * camera.width * camera.height  # three colours and perhaps a mask
             if free < 0:
                 break
@@ -119,20 +119,22 @@ class _EvaluationViews(Sequence[EvaluationView]):
         return self._loaded[number] if number < len(self._loaded) else self._load(number)
 
     def _load(self, number: int) -> EvaluationView:
-        view, look = self._views[number], self._look
-        found = load_evaluation_view(self._folder, view, look.camera(view.camera))
-        return found.in_median_light(view.light if look.light else None).over(look.background)
+        view, draw_settings = self._views[number], self._look
+        found = load_evaluation_view(self._folder, view, draw_settings.camera(view.camera))
+        return found.in_median_light(view.light if draw_settings.light else None).over(
+            draw_settings.background
+        )
 
 
 def load_evaluation_views(
-    folder: Path, views: Iterable[View], look: Look
+    folder: Path, views: Iterable[View], draw_settings: DrawSettings
 ) -> Sequence[EvaluationView]:
     """The views with their photographs at the size of `look`, over its background and in its light.
 
     As many as fit into `IN_MEMORY_MIB` are read at once. Raises SplatError, now or when a view is
     used.
     """
-    return _EvaluationViews(folder, views, look)
+    return _EvaluationViews(folder, views, draw_settings)
 
 
 def load_evaluation_view(folder: Path, view: View, camera: Camera) -> EvaluationView:
@@ -174,7 +176,7 @@ def evaluate(
 
 
 def psnr_as_taken_db(
-    draw: ImageRenderer, folder: Path, views: Iterable[View], look: Look
+    draw: ImageRenderer, folder: Path, views: Iterable[View], draw_settings: DrawSettings
 ) -> tuple[float, float]:
     """Mean PSNR against photographs in the light that they were taken in, in two ways.
 
@@ -183,7 +185,7 @@ def psnr_as_taken_db(
         map of each channel that was fitted to the left halves.
     """
     plain, adapted = [], []
-    for view in load_evaluation_views(folder, views, replace(look, light=False)):
+    for view in load_evaluation_views(folder, views, replace(draw_settings, light=False)):
         image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
         half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
         valid = everywhere if view.valid is None else view.valid

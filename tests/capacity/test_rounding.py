@@ -14,14 +14,14 @@ from stages.capacity.rounding import ORDER, as_read, tuned_to
 from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import least_turned
-from stages.formats.coarse import Bits, on_grids
+from stages.formats.quantisation import BitDepths, quantise_splats
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats, TrainedSplats, seen_extent, split_held_out
 from stages.training.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene
 
-FEW = Bits(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)
-ROUNDING = [name for name, row in FORMATS.items() if row.rounds]
+FEW = BitDepths(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)
+ROUNDING = [name for name, row in FORMATS.items() if row.needs_finetuning]
 
 
 @pytest.fixture(scope="module")
@@ -29,15 +29,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
     return small_scene(tmp_path_factory.mktemp("photos"), noise=0.0)
 
 
-def tuner(scene: SmallScene, sits_out: bool = False) -> FineTuner:
+def tuner(scene: SmallScene, dropout: bool = False) -> FineTuner:
     return FineTuner(
-        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), sits_out
+        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), dropout
     )
 
 
 def photographs(scene: SmallScene, held_out: bool = False):
     views = split_held_out(scene.reconstruction.views)[held_out]
-    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.look)
+    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.draw_settings)
 
 
 def nothing_seen(splats: Splats) -> np.ndarray:
@@ -45,11 +45,11 @@ def nothing_seen(splats: Splats) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sits_out", [False, True])
-def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, sits_out: bool) -> None:
+def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, dropout: bool) -> None:
     splats, everything = scene.splats, set(ORDER)
     for moving in ORDER:
         still = everything - {moving}
-        found = tuner(scene, sits_out).finetune(splats, 3, nothing_seen(splats), still)
+        found = tuner(scene, dropout).finetune(splats, 3, nothing_seen(splats), still)
         same = {
             "means": np.array_equal(found.means, splats.means),
             "quaternions": np.array_equal(found.quaternions, splats.quaternions),
@@ -64,7 +64,7 @@ def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, sits_out:
 def test_the_others_make_up_for_what_is_rounded(scene: SmallScene) -> None:
     exact = least_turned(scene.splats)
     found = tuned_to(
-        lambda s: on_grids(s, FEW), exact, tuner(scene), 30, nothing_seen(scene.splats)
+        lambda s: quantise_splats(s, FEW), exact, tuner(scene), 30, nothing_seen(scene.splats)
     )
     rounded = as_read(FORMATS["sog"], found)
     for name in ("means", "log_scales", "opacity_logits"):
@@ -72,7 +72,7 @@ def test_the_others_make_up_for_what_is_rounded(scene: SmallScene) -> None:
     for held_out, gain in ((False, 1.0), (True, 0.5)):
         plain, fitted = (
             mean_psnr_db(splats, photographs(scene, held_out), "cpu")
-            for splats in (on_grids(exact, FEW), rounded)
+            for splats in (quantise_splats(exact, FEW), rounded)
         )
         assert fitted > plain + gain
 
@@ -112,7 +112,9 @@ def test_compact_files_hold_splats_that_were_fitted_to_them_if_that_helps(
         assert export.fitted_in(tmp_path / "plain", name) is None
         read = formats.read(tmp_path / "fitted" / f"scene.{name}")
         drawn = mean_psnr_db(
-            replace(read, look=scene.splats.look, origin=held.origin), photographs(scene), "cpu"
+            replace(read, draw_settings=scene.splats.draw_settings, origin=held.origin),
+            photographs(scene),
+            "cpu",
         )
         better = max(fitted[name]["plain_db"], fitted[name]["fitted_db"])
         assert drawn == pytest.approx(better, abs=0.02)

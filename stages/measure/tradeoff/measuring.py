@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stages import formats
-from stages.formats.coarse import held_by
+from stages.formats.quantisation import splats_to_write
 from stages.formats.rows import kept_rows
 from stages.measure.contribution import Contributions, measure_contributions
 from stages.measure.evaluation import (
@@ -24,7 +24,7 @@ from stages.measure.evaluation import (
 from stages.measure.floaters import near_camera_floaters
 from stages.measure.tradeoff.points import Moment, Point, Trade, change_db, mean_db
 from stages.measure.tradeoff.thin import Thin, measure_thin
-from stages.scene import Look, QuantisedSplats, Splats, View, split_held_out, spread_over
+from stages.scene import DrawSettings, QuantisedSplats, Splats, View, split_held_out, spread_over
 
 # Shares of the splats that are left, each taken from the one before: what single splats are worth
 # no longer adds up where many go at once.
@@ -106,11 +106,11 @@ def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, .
         for name, row in formats.FORMATS.items():
             tell(f"writing and judging .{name}")
             path = Path(folder) / f"scene.{name}"
-            held = held_by(row, material.quantised) if material.quantised else splats
+            held = splats_to_write(row, material.quantised) if material.quantised else splats
             held = material.fitted.get(name, held)
             formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)
-            read = replace(formats.read(path), look=splats.look)
+            read = replace(formats.read(path), draw_settings=splats.draw_settings)
             for file in row.files(path):
                 file.unlink()
             found = own if _same(read, splats) else _scores(material, read)
@@ -156,10 +156,10 @@ def _fewer(material: Material, own: list[Score], worth: Contributions, tell: Tel
     return points
 
 
-def deciding(views: Sequence[View], look: Look) -> list[View]:
+def deciding(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
     """Those photographs of training that decide, at the size that they are judged at."""
     if not views:
         return []
-    camera = look.camera(views[0].camera)
+    camera = draw_settings.camera(views[0].camera)
     most = round(DECIDING_PIXELS / (camera.width * camera.height))
     return spread_over(views, max(_LEAST_DECIDING, most))

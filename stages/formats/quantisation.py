@@ -1,0 +1,129 @@
+"""Splats whose values are told in fewer bits, for formats that pack what repeats.
+
+A format's writer stays as it is: values that lie on a coarser grid of its own take fewer bytes once
+they are compressed, and every reader reads them as it always did.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.lazy import load_object
+from stages.formats import codebook, smallest_three
+from stages.formats.axes import least_turned
+from stages.formats.rows import (
+    degrees_in_use,
+    kept_rows,
+    linear_opacities,
+    logits_of,
+    unit_quaternions,
+)
+from stages.formats.sog import LOG_SCALE_LIMIT, STEPS, palette_size, symmetric_exp, symmetric_log
+from stages.formats.table import Format
+from stages.scene import QuantisedSplats, Splats
+
+
+@dataclass(frozen=True)
+class BitDepths:
+    """How many each value is told in, and a row of the palette of view-dependent colours."""
+
+    position: int = 16
+    rotation: int = 8
+    scale: int = 8
+    colour: int = 8
+    opacity: int = 8
+    palette: int = 16
+
+
+def quantise_for_sog(splats: Splats, bits: BitDepths) -> Splats:
+    """What a .sog holds of them in so many bits, on the grids that its writer will find again."""
+    return quantise_splats(least_turned(splats), bits)
+
+
+def quantise_splats(splats: Splats, bits: BitDepths) -> Splats:
+    """The same, axes named as they are."""
+    exact = found = splats
+    for name, count in asdict(bits).items():
+        found = quantise_attribute(exact, found, name, count)
+    return found
+
+
+def quantise_attribute(exact: Splats, splats: Splats, name: str, bits: int) -> Splats:
+    """`splats` with one of the values of `Bits` told in so many, from what it is in `exact`."""
+    if not len(exact):
+        return splats
+    if name == "position":
+        return replace(splats, means=_positions(exact.means, bits))
+    if name == "rotation":
+        return replace(splats, quaternions=_rotations(exact.quaternions, bits))
+    if name == "scale":
+        logs = np.clip(exact.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+        return replace(splats, log_scales=_by_codebook(logs, bits))
+    if name == "opacity":
+        return replace(splats, opacity_logits=_opacities(exact, bits))
+    sh = splats.sh.copy()
+    if name == "colour":
+        sh[:, 0] = _by_codebook(exact.sh[:, 0], bits)
+    elif sh.shape[1] > 1:
+        sh[:, 1:] = _by_palette(exact.sh[:, 1:], bits)
+    return replace(splats, sh=sh, sh_degrees=degrees_in_use(sh))
+
+
+def palette_bits(count: int) -> int:
+    """The most that tell apart all that a palette of so many splats may hold."""
+    return (palette_size(count) - 1).bit_length()
+
+
+def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
+    """What a file of this format should hold: drawable splats, their mean colours where colours do
+    not change with the view, in as many bits as were decided on."""
+    splats = quantised.splats
+    if not row.sh_degree and quantised.flat_dc is not None:
+        sh = quantised.flat_dc[:, None].astype(splats.sh.dtype)
+        splats = replace(splats.with_sh_degree(0), sh=sh)
+    splats = kept_rows(splats)[0]
+    bits = quantised.decisions.get("bits")
+    if not row.coarse or not isinstance(bits, dict):
+        return splats
+    found: Splats = load_object(row.coarse)(splats, BitDepths(**bits))
+    return found
+
+
+def _positions(means: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
+    if bits >= 16:
+        return means.astype(np.float32)
+    curved = symmetric_log(means)
+    low, high = curved.min(axis=0), curved.max(axis=0)
+    span = np.where(high > low, high - low, 1.0)
+    coarse = 1 << (16 - bits)
+    steps = np.minimum(np.rint((curved - low) / span * (STEPS / coarse)) * coarse, STEPS)
+    found: NDArray[np.float32] = symmetric_exp(low + span * steps / STEPS).astype(np.float32)
+    return found
+
+
+def _rotations(quaternions: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
+    coarse, limit = 1 << (8 - bits), smallest_three.LIMIT
+    largest, others = smallest_three.split(unit_quaternions(quaternions))
+    steps = np.minimum(np.rint(255 * (0.5 + others / (2 * limit)) / coarse) * coarse, 255)
+    return smallest_three.join(largest, (steps / 255 - 0.5) * 2 * limit)
+
+
+def _by_codebook(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
+    book = codebook.of_numbers(values, 1 << bits)
+    found: NDArray[np.float32] = book[codebook.nearest(book, values)].astype(np.float32)
+    return found
+
+
+def _by_palette(rest: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
+    vectors = rest.reshape(len(rest), -1).astype(np.float32)
+    palette, labels = codebook.of_vectors(vectors, min(palette_size(len(rest)), 1 << bits))
+    return palette[labels].reshape(rest.shape)
+
+
+def _opacities(splats: Splats, bits: int) -> NDArray[np.float32]:
+    coarse = 1 << (8 - bits)
+    steps = np.rint(255 * linear_opacities(splats).astype(np.float64) / coarse) * coarse
+    return logits_of(np.clip(steps, 1, 255) / 255)

@@ -1,0 +1,253 @@
+"""Second readers, for checking what the writers wrote.
+
+None of them shares code with its writer: plyfile, pygltflib with raw accessors, usd-core's
+attributes, a byte-wise reading of .splat, and for .html the standard library's HTML parser. They
+leave the splats in the file's own axes, and the table of formats says how those lie in our world,
+so that a check can move the camera instead of the splats: then a wrong turn of positions,
+rotations or SH shows in the picture.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import tempfile
+import zlib
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base import scratch
+from stages.base.blocks import forget, passing
+from stages.base.lazy import load_object
+from stages.formats import format_of
+from stages.proof.content import (
+    Y_DOWN,
+    Y_UP,
+    FileContent,
+    logits,
+    splats_by_rows,
+    splats_of,
+)
+from stages.scene import Splats
+
+__all__ = ["FileContent", "read_back"]
+
+_PLY_ROWS = 1 << 14  # columns are gathered from the cache
+_PAGE_PIECE = 1 << 22  # characters: the parser goes over an unfinished element once a piece
+
+
+def read_back(path: Path) -> FileContent:
+    """What another program would find in the file. Raises whatever its parser raises: a file that
+    was just written has no excuse."""
+    with np.errstate(all="ignore"):  # flat splats have a logarithm of -infinity
+        row = format_of(path)
+        return FileContent(load_object(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
+
+
+def ply(path: Path) -> Splats:
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(path), mmap="c")["vertex"]
+    names = [item.name for item in vertex.properties]
+    per_channel = sum(name.startswith("f_rest_") for name in names) // 3
+    count = len(vertex.data)
+    arrays: dict[str, NDArray[np.float32]] = {
+        "means": scratch.empty((count, 3)),
+        "quaternions": scratch.empty((count, 4)),
+        "log_scales": scratch.empty((count, 3)),
+        "opacity_logits": scratch.empty((count,)),
+        "sh": scratch.empty((count, per_channel + 1, 3)),
+    }
+    for part in passing(count, _PLY_ROWS):
+        rows = vertex.data[part]
+        for i in range(3):
+            arrays["means"][part, i] = rows["xyz"[i]]
+            arrays["log_scales"][part, i] = rows[f"scale_{i}"]
+            arrays["sh"][part, 0, i] = rows[f"f_dc_{i}"]
+            for k in range(per_channel):
+                arrays["sh"][part, k + 1, i] = rows[f"f_rest_{i * per_channel + k}"]
+        for i in range(4):
+            arrays["quaternions"][part, i] = rows[f"rot_{i}"]
+        arrays["opacity_logits"][part] = rows["opacity"]
+        forget(vertex.data)
+    return splats_of(**arrays)
+
+
+class _Chunks(HTMLParser):
+    """Unpacks what a browser would find in the script elements of class "splats" into a file."""
+
+    def __init__(self, target: BinaryIO) -> None:
+        super().__init__()
+        self.target = target
+        self.wanted = False
+        self.held: list[str] = []
+        self.unpacker = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.wanted = tag == "script" and ("class", "splats") in attrs
+
+    def handle_data(self, data: str) -> None:
+        if self.wanted:
+            self.held.append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        packed = base64.b64decode("".join(self.held), validate=True)
+        self.target.write(self.unpacker.decompress(packed))
+        self.held.clear()
+        self.wanted = False
+
+
+def html(path: Path) -> Splats:
+    with tempfile.TemporaryDirectory(prefix="splat-") as folder:
+        inside = Path(folder) / "inside.ply"
+        with path.open(encoding="utf-8") as page, inside.open("wb") as target:
+            parser = _Chunks(target)
+            while piece := page.read(_PAGE_PIECE):
+                parser.feed(piece)
+            parser.close()
+        assert parser.unpacker.eof, "the splats in it are cut short"
+        return ply(inside)
+
+
+def splat(path: Path) -> Splats:
+    content, size = _Bytes(path), path.stat().st_size
+    assert size % 32 == 0, "its records are not all whole"
+
+    def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
+        part = np.frombuffer(content[32 * rows.start : 32 * rows.stop], np.uint8).reshape(-1, 32)
+        floats = np.ascontiguousarray(part[:, :24]).view("<f4")
+        colours = part[:, 24:28].astype(np.float32) / 255
+        return {
+            "means": floats[:, :3],
+            "quaternions": (part[:, 28:].astype(np.float32) - 128) / 128,
+            "log_scales": np.log(floats[:, 3:], dtype=np.float64),
+            "opacity_logits": logits(colours[:, 3]),
+            "sh": ((colours[:, :3] - 0.5) * math.sqrt(4 * math.pi))[:, None, :],
+        }
+
+    return splats_by_rows(size // 32, values_of)
+
+
+class _Bytes:
+    """A file's bytes from `start`, read where they are looked at."""
+
+    def __init__(self, path: Path, start: int = 0) -> None:
+        self.path, self.start = path, start
+
+    def __getitem__(self, part: slice) -> bytes:
+        with self.path.open("rb") as file:
+            file.seek(self.start + part.start)
+            return file.read(part.stop - part.start)
+
+
+def _gltf_parts(path: Path) -> tuple[Any, _Bytes]:
+    """(the document, the content of its first buffer)."""
+    from urllib.parse import unquote
+
+    from pygltflib import GLTF2
+
+    if path.suffix.lower() == ".gltf":
+        document = GLTF2.gltf_from_json(path.read_text(encoding="utf-8"))
+        name = unquote(document.buffers[0].uri) if document.buffers else path.name
+        return document, _Bytes(path.parent / name)
+    with path.open("rb") as file:
+        head = np.frombuffer(file.read(20), "<u4")
+        assert file.seek(0, 2) == head[2], "its length is not that of its header"
+        file.seek(20)
+        document = GLTF2.gltf_from_json(file.read(int(head[3])).decode("utf-8"))
+    return document, _Bytes(path, 20 + int(head[3]) + 8)
+
+
+def gltf(path: Path) -> Splats:
+    document, blob = _gltf_parts(path)
+    scale = 1.0
+    if document.nodes:
+        scale = (document.nodes[0].scale or [1.0])[0]
+
+    def values(primitive: Any, name: str) -> NDArray[np.floating]:
+        accessor = document.accessors[getattr(primitive.attributes, name)]
+        return _accessor_values(accessor, document.bufferViews[accessor.bufferView], blob)
+
+    prefix = "KHR_gaussian_splatting:"
+    parts = []
+    for primitive in document.meshes[0].primitives if document.meshes else []:
+        bands = [
+            f"{prefix}SH_DEGREE_{d}_COEF_{i}"
+            for d in range(4)
+            for i in range(2 * d + 1)
+            if hasattr(primitive.attributes, f"{prefix}SH_DEGREE_{d}_COEF_{i}")
+        ]
+        degree_0 = document.accessors[getattr(primitive.attributes, bands[0])]
+        sh = np.zeros((degree_0.count, 16, 3), np.float32)
+        for k, name in enumerate(bands):
+            sh[:, k] = values(primitive, name)
+        xyzw = values(primitive, f"{prefix}ROTATION")
+        parts.append(
+            splats_of(
+                means=scale * values(primitive, "POSITION"),
+                quaternions=np.roll(xyzw, 1, axis=1),
+                log_scales=np.log(scale * values(primitive, f"{prefix}SCALE").astype(np.float64)),
+                opacity_logits=logits(values(primitive, f"{prefix}OPACITY")[:, 0]),
+                sh=sh,
+            )
+        )
+    return _concatenated(parts)
+
+
+def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
+    """[count, components], one element after the other; c / (2^b - 1) or, signed,
+    c / (2^(b - 1) - 1) of normalised integers (glTF 2.0, section 3.6.2.2)."""
+    kind = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor.componentType]
+    largest = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535, 5126: 1}[accessor.componentType]
+    element = np.dtype((kind, ({"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type],)))
+    step = view.byteStride or element.itemsize
+    start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+    # a record with what lies between two elements as padding; the last need not have it
+    record = np.dtype({"names": ["v"], "formats": [element], "offsets": [0], "itemsize": step})
+    data = blob[start : start + accessor.count * step].ljust(accessor.count * step, b"\0")
+    values = np.frombuffer(data, record, accessor.count)["v"]
+    if not accessor.normalized:
+        return values
+    return np.clip(values.astype(np.float64) / largest, -1, 1)
+
+
+def usd(path: Path) -> Splats:
+    from pxr import Gf, Sdf, Usd, Vt
+
+    # In which column each of w, x, y, z arrives, found out and not assumed.
+    columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
+    # Without the library's cache, which may hold an older file of the same name.
+    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(str(path)))
+    parts = []
+    for prim in stage.Traverse():
+        if prim.GetTypeName() != "ParticleField3DGaussianSplat":
+            continue
+        get = prim.GetAttribute
+        degree = get("radiance:sphericalHarmonicsDegree").Get()
+        # Copied, because for arrays that cannot be written all drawing would be compiled anew.
+        coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
+        parts.append(
+            splats_of(
+                means=np.array(get("positions").Get(), np.float32),
+                quaternions=np.asarray(get("orientations").Get(), np.float32)[:, columns],
+                log_scales=np.log(np.asarray(get("scales").Get()), dtype=np.float64),
+                opacity_logits=logits(np.asarray(get("opacities").Get())),
+                sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
+            )
+        )
+    return _concatenated(parts)
+
+
+def _concatenated(parts: list[Splats]) -> Splats:
+    if len(parts) == 1:
+        return parts[0]
+    if not parts:
+        shapes = {"means": 3, "quaternions": 4, "log_scales": 3}
+        empty = {name: np.zeros((0, width)) for name, width in shapes.items()}
+        return splats_of(**empty, opacity_logits=np.zeros(0), sh=np.zeros((0, 1, 3)))
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    return splats_of(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})

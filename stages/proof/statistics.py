@@ -1,0 +1,159 @@
+"""What a set of splats is made of, and what in it will cause trouble in a viewer.
+
+What counts as trouble:
+- needle: the longest axis is more than 100 times the second. Its effective rank (Hyung et al. 2024,
+  "Effective Rank Analysis and Regularization for Enhanced 3D Gaussian Splatting") is then 1.001 of
+  3: a line, which stands out from views that training did not have. A flat splat is no needle.
+- giant: the longest standard deviation is more than a tenth of the scene's extent, beyond which the
+  reference trainer removes a splat (Kerbl et al. 2023).
+- outlier: the centre lies more than 5 times as far out as the box that holds the middle 98 % of the
+  coordinates on each axis. A viewer that frames everything then shows the scene as a dot.
+- transparent: the opacity is below 1/255, so that it is never drawn.
+- no rotation: the quaternion is 0, or too short to tell; too large: the square of the size is more
+  than a float32 holds. Neither can be drawn.
+- duplicate: equal to another in everything but its view-dependent colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.blocks import blocks
+from stages.raster.definition import ALPHA_MIN, LOG_SCALE_MAX, QUATERNION_MIN
+from stages.scene import Splats
+from stages.scene.quantiles import quantiles
+
+NEEDLE_ASPECT = 100.0
+GIANT_PART = 0.1  # of the extent
+OUTLIER_BOXES = 5.0
+_MIDDLE = (0.01, 0.5, 0.99)
+_VALUES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """count: of splats. by_degree: how many use each SH degree. not_finite: by attribute, how many
+    splats hold NaN or infinity there; all that follows is of the others (`whole` of them).
+
+    low, high [3]: box of the centres; middle_low, middle_high: of 98 % of their coordinates on each
+    axis. extent: its diagonal. All in world units, relative to the splats' origin. median_scale:
+    standard deviation in world units. The rest counts splats, see above.
+    """
+
+    count: int
+    by_degree: dict[int, int]
+    not_finite: dict[str, int]
+    whole: int
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    middle_low: NDArray[np.float64]
+    middle_high: NDArray[np.float64]
+    median_centre: NDArray[np.float64]
+    extent: float
+    median_scale: float
+    median_opacity: float
+    needles: int
+    giants: int
+    outliers: int
+    transparent: int
+    no_rotation: int
+    too_large: int
+    duplicates: int
+
+
+def statistics_of(splats: Splats) -> Statistics:
+    """Count everything. Values may be anything, NaN included."""
+    degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
+    by_degree = {int(d): int(n) for d, n in zip(degrees, counts, strict=True)}
+    whole, not_finite = _finite(splats)
+    box: dict[str, Any] = _box(splats.means[whole])
+    extent = float(np.linalg.norm(box["middle_high"] - box["middle_low"]))
+    found: dict[str, Any] = dict.fromkeys(
+        ("needles", "giants", "outliers", "transparent", "no_rotation", "too_large"), 0
+    )
+    keys = np.empty(len(splats), np.uint64)
+    for rows in blocks(len(splats)):
+        block = splats.take(rows)
+        keys[rows] = _fingerprints(block)
+        for name, marks in _marks(block.take(whole[rows]), box, extent).items():
+            found[name] += int(np.count_nonzero(marks))
+    keys = keys[whole]
+    return Statistics(
+        count=len(splats),
+        by_degree=by_degree,
+        not_finite=not_finite,
+        whole=len(keys),
+        **box,
+        extent=extent,
+        median_scale=float(np.exp(_median(splats.log_scales[whole]))),
+        median_opacity=1 / (1 + float(np.exp(-_median(splats.opacity_logits[whole])))),
+        **found,
+        duplicates=len(keys) - len(np.unique(keys)),
+    )
+
+
+def _finite(splats: Splats) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """([N] whether every value is finite; by attribute, how many splats fail)."""
+    whole = np.ones(len(splats), bool)
+    failed = dict.fromkeys(_VALUES, 0)
+    for rows in blocks(len(splats)):
+        for name in _VALUES:
+            values = getattr(splats, name)[rows]
+            good = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+            failed[name] += int(np.count_nonzero(~good))
+            whole[rows] &= good
+    return whole, {name: n for name, n in failed.items() if n}
+
+
+def _box(means: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
+    if not len(means):
+        nothing = np.zeros(3)
+        return dict.fromkeys(("low", "high", "middle_low", "middle_high", "median_centre"), nothing)
+    low, middle_low, centre, middle_high, high = quantiles(means, (0, *_MIDDLE, 1))
+    return {
+        "low": low,
+        "high": high,
+        "middle_low": middle_low,
+        "middle_high": middle_high,
+        "median_centre": centre,
+    }
+
+
+def _marks(
+    splats: Splats, box: dict[str, NDArray[np.float64]], extent: float
+) -> dict[str, NDArray[np.bool_]]:
+    """[N] which splats are what; all values finite."""
+    logs = np.sort(splats.log_scales, axis=1)
+    middle = (box["middle_low"] + box["middle_high"]) / 2
+    half = (box["middle_high"] - box["middle_low"]) / 2
+    with np.errstate(over="ignore", divide="ignore"):
+        return {
+            "needles": logs[:, 2] - logs[:, 1] > np.log(NEEDLE_ASPECT),
+            "giants": logs[:, 2] > np.log(GIANT_PART * extent or np.inf),
+            "outliers": (np.abs(splats.means - middle) > OUTLIER_BOXES * half).any(axis=1),
+            "transparent": splats.opacities < ALPHA_MIN,
+            "no_rotation": np.abs(splats.quaternions).max(axis=1, initial=0.0) < QUATERNION_MIN,
+            "too_large": logs[:, 2] > LOG_SCALE_MAX,
+        }
+
+
+def _fingerprints(splats: Splats) -> NDArray[np.uint64]:
+    """[N] equal for equal rows; that two of 10 million others meet has a chance of 3 in a
+    million."""
+    columns = (splats.means, splats.quaternions, splats.log_scales, splats.sh[:, 0])
+    table = np.concatenate([*columns, splats.opacity_logits[:, None]], axis=1, dtype=np.float32)
+    words = np.ascontiguousarray(table).view(np.uint32).astype(np.uint64)
+    key = np.zeros(len(words), np.uint64)
+    for column in words.T:  # FNV-1a's prime, and a shift that brings high bits down
+        key = (key ^ column) * np.uint64(0x100000001B3)
+        key ^= key >> np.uint64(29)
+        key *= np.uint64(0xBF58476D1CE4E5B9)
+    return key
+
+
+def _median(values: NDArray[np.floating]) -> np.float64:
+    return np.float64(np.median(values)) if values.size else np.float64(np.nan)
