@@ -110,7 +110,7 @@ class Splats:
 @dataclass(frozen=True)
 class TrainedSplats:
     """Splats as trained. dropout: whether splats sat steps out towards the end, see
-    `training.trial`. overfitted: whether photographs were learnt by heart: what these lose hardly any
+    `training.trial`. overfitted: whether training views were overfitted: what these lose hardly any
     other view feels."""
 
     splats: Splats

@@ -65,7 +65,9 @@ def test_a_half_turn_about_x_is_the_one_that_files_with_y_up_get() -> None:
 
 
 def test_the_origin_goes_along() -> None:
-    splats = replace(exact(5, 1), origin=np.array([100.0, 0, 0]), draw_settings=DrawSettings(near=0.5))
+    splats = replace(
+        exact(5, 1), origin=np.array([100.0, 0, 0]), draw_settings=DrawSettings(near=0.5)
+    )
     where = Similarity(2.0, about(np.array([0, 0, 1.0]), 90), np.array([1.0, 2, 3]))
     there = where.of_splats(splats)
     world = (splats.means + splats.origin) @ (2 * where.rotation.T) + where.offset
