@@ -20,7 +20,7 @@ def summarise(
     price, after, start = found.price, found.splats, before.splats
     told = [
         f"Price: the photographs of training hold {price.samples:,} colour values, worth "
-        f"{price.independent:,.0f} independent ones; so a number costs "
+        f"{price.independent_samples:,.0f} independent ones; so a number costs "
         f"{price.bits_per_parameter:.1f} bits, and one dB is worth "
         f"{price.bits_per_db / 8e3:,.0f} kB (dial at {dial:g})."
     ]
