@@ -1,5 +1,7 @@
-"""A compiled ray caster for `tests.structure.room_captures.picture`: it draws a thousand pictures of a
-hall of boxes in minutes instead of an hour."""
+"""A compiled ray caster for `tests.structure.room_captures.picture`.
+
+It draws a thousand pictures of a hall of boxes in minutes instead of an hour.
+"""
 
 from __future__ import annotations
 
