@@ -91,7 +91,7 @@ def test_no_loss_allowed_is_no_loss_of_the_photographs_that_decide(scene, tmp_pa
 def test_the_loss_allowed_is_kept_and_the_price_moves_it(scene, tmp_path) -> None:
     start, sizes = training_db(scene, scene.splats), []
     for price in (1.0, 20.0):
-        result, report = run(scene, scene.splats, tmp_path, price=price, pruning=10)
+        result, report = run(scene, scene.splats, tmp_path, price=price, rounds=10)
         assert training_db(scene, result) >= start - 0.1 * price / FELT
         assert report.metrics["training_psnr_db"] == pytest.approx(
             training_db(scene, result), abs=2e-3
@@ -138,11 +138,11 @@ def test_bands_that_were_cut_stay_cut_while_the_rest_learns(scene, tmp_path) -> 
 
 
 def test_a_size_in_megabytes_is_met_from_below(scene, tmp_path) -> None:
-    result, _ = run(scene, scene.splats, tmp_path, max_mb=0.02, mb_of="spz", pruning=0)
+    result, _ = run(scene, scene.splats, tmp_path, max_mb=0.02, mb_of="spz", rounds=0)
     path = tmp_path / "scene.spz"
     formats.write(path, result)
     assert path.stat().st_size <= 20_000
-    few, _ = run(scene, scene.splats, tmp_path, max_mb=0.016, pruning=0)
+    few, _ = run(scene, scene.splats, tmp_path, max_mb=0.016, rounds=0)
     path = tmp_path / "scene.ply"
     formats.write(path, few)
     assert 0.95 * 16_000 < path.stat().st_size <= 16_000
@@ -150,7 +150,7 @@ def test_a_size_in_megabytes_is_met_from_below(scene, tmp_path) -> None:
 
 def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
     wanted = training_db(scene, scene.splats) - 3
-    result, _ = run(scene, scene.splats, tmp_path, min_psnr=wanted, pruning=40)
+    result, _ = run(scene, scene.splats, tmp_path, min_psnr=wanted, rounds=40)
     assert wanted <= training_db(scene, result) < wanted + 0.5
     assert len(result) < len(scene.splats)
 
@@ -165,7 +165,7 @@ def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
 )
 def test_what_cannot_be_met_is_refused_with_what_can(scene, tmp_path, settings, code, named):
     with pytest.raises(SplatError) as caught:
-        run(scene, scene.splats, tmp_path, pruning=0, **settings)
+        run(scene, scene.splats, tmp_path, rounds=0, **settings)
     assert caught.value.code == code
     assert named in str(caught.value)
 
@@ -180,7 +180,7 @@ def test_the_report_says_what_was_cut_and_why(scene, tmp_path) -> None:
 
 def test_no_rounds_remove_nothing(scene, tmp_path) -> None:
     trained = join(scene.splats, unseen(5))
-    result, report = run(scene, trained, tmp_path, pruning=0)
+    result, report = run(scene, trained, tmp_path, rounds=0)
     assert len(result) == len(trained)
     assert report.metrics["psnr_change_db"] == 0
 
@@ -228,7 +228,7 @@ def test_the_origin_stays(scene, tmp_path) -> None:
 
 
 def worth_of(photographs, sse_change, scene_depth=(4.0,)) -> Contributions:
-    """Contributions with what the rules read; a splat in no photograph has no weight."""
+    """A Worth with what the rules read; a splat in no photograph has no weight."""
     seen = np.asarray(photographs, np.int32)
     weight = (seen > 0).astype(np.float64)
     change, depth = np.asarray(sse_change, np.float64), np.asarray(scene_depth, np.float64)

@@ -103,7 +103,8 @@ def _cost(splats: Splats) -> dict[str, Any]:
 def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
     around the splats where there are none."""
-    from stages.measure.evaluation import seconds_per_frame
+    from stages.measure.speed import seconds_per_frame
+
     from stages.scene.framing import around
 
     if not cache.are_compiled():

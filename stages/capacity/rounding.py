@@ -57,7 +57,7 @@ class Fitting:
         def read(splats: Splats) -> Splats:
             return as_read(row, splats)
 
-        if row.coarse and isinstance(bits, dict):
+        if row.quantiser and isinstance(bits, dict):
             exact, few = least_turned(exact), BitDepths(**bits)
             found = tuned_to(
                 lambda s: quantise_splats(s, few), exact, self.tuner, self.steps, self.seen

@@ -19,8 +19,8 @@ class Format:
     end of "the format ..."; "" if everything comes back as float32. sh_degree: the highest kept.
     y_up: whether its axes are y up, turned 180 degrees about x from ours. sidecar: the suffix of a
     file beside it that belongs to it. wants_views: whether the writer takes cameras too.
-    rounds: whether it rounds so much that splats should learn to live with it.
-    levels: of detail, which streams: the name is `ending` alone, its chunks lie in folders beside
+    needs_finetuning: whether it rounds so much that splats should learn to live with it.
+    streamed: of detail, which streams: the name is `ending` alone, its chunks lie in folders beside
     it, and a folder holds one such asset; `splat edit` writes it.
 
     Of splats:
@@ -51,8 +51,8 @@ class Format:
     y_up: bool = False
     sidecar: str = ""
     wants_views: bool = False
-    rounds: bool = False
-    levels: bool = False
+    needs_finetuning: bool = False
+    streamed: bool = False
 
     @property
     def is_mesh(self) -> bool:
@@ -60,17 +60,17 @@ class Format:
 
     def matches(self, name: str) -> bool:
         """Whether a file of this name, in small letters, is of this format."""
-        return name == self.ending if self.levels else name.endswith("." + self.ending)
+        return name == self.ending if self.streamed else name.endswith("." + self.ending)
 
     def name(self, stem: str) -> str:
         """What a file of this format is called."""
-        return self.ending if self.levels else f"{stem}.{self.ending}"
+        return self.ending if self.streamed else f"{stem}.{self.ending}"
 
     def files(self, path: Path) -> list[Path]:
         """`path` and what lies beside it and belongs to it."""
         page = path.with_suffix(self.sidecar) if self.sidecar else path
         beside = [path, page] if page != path and page.is_file() else [path]
-        if self.levels:
+        if self.streamed:
             every = sorted(path.parent.glob("*_*/*"))
             return [*beside, *(file for file in every if CHUNK.match(file.parent.name))]
         return beside
@@ -82,11 +82,11 @@ class Format:
 @dataclass(frozen=True)
 class ByteBreakdown:
     """Where the bytes of a file are. parts: by attribute. unpacked: whether they are counted before
-    the compression that packs them all together. untold: why there are no parts."""
+    the compression that packs them all together. unknown: why there are no parts."""
 
     parts: dict[str, int]
     unpacked: bool = False
-    untold: str = ""
+    unknown: str = ""
 
 
 CHUNK = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
@@ -140,7 +140,7 @@ TABLE = (
         order="stages.formats.splat32:order",
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
-        rounds=True,
+        needs_finetuning=True,
     ),
     _GLB,
     replace(_GLB, ending="gltf", sidecar=".bin"),
@@ -166,7 +166,7 @@ TABLE = (
         anatomy="stages.proof.byte_breakdown:ply",
         order="stages.scene.morton:order",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
-        rounds=True,
+        needs_finetuning=True,
     ),
     Format(
         "spz",
@@ -177,7 +177,7 @@ TABLE = (
         second_reader="stages.proof.independent_packed:spz",
         anatomy="stages.proof.byte_breakdown:spz",
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
-        rounds=True,
+        needs_finetuning=True,
         y_up=True,
     ),
     Format(
@@ -191,7 +191,7 @@ TABLE = (
         order="stages.scene.morton:order",
         quantiser="stages.formats.quantisation:quantise_for_sog",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
-        rounds=True,
+        needs_finetuning=True,
     ),
     Format(
         "lod-meta.json",
@@ -205,7 +205,7 @@ TABLE = (
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
         wants_views=True,
-        levels=True,
+        streamed=True,
     ),
     Format(
         "html",
@@ -228,7 +228,7 @@ TABLE = (
 )
 # By ending: all of them, the formats of one file of splats, and those of meshes.
 BY_ENDING = {row.ending: row for row in TABLE}
-FORMATS = {row.ending: row for row in TABLE if not row.is_mesh and not row.levels}
+FORMATS = {row.ending: row for row in TABLE if not row.is_mesh and not row.streamed}
 MESHES = {row.ending: row for row in TABLE if row.is_mesh}
 
 
