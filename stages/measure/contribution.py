@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.image_metrics import capped_psnr_db
 from stages.raster.backends import rasteriser_of
-from stages.raster.definition import CHANGE, LARGEST, PULL, SQUARES, WEIGHT, splat_arrays
-from stages.raster.draw import settings_of
+from stages.raster.definition import (
+    ERROR_CHANGE,
+    LARGEST_WEIGHT,
+    SQUARED_WEIGHT,
+    WEIGHT,
+    WEIGHTED_RESIDUAL,
+    splat_arrays,
+)
+from stages.raster.draw import raster_settings_of
 from stages.raster.reference import sh_basis
 from stages.scene import Camera, Splats
 
@@ -103,7 +110,7 @@ def measure_contributions(
         view_counts, sse = previous.view_counts.copy(), previous.sse
         depths = previous.scene_depth.tolist()
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
-    settings = settings_of(splats)
+    settings = raster_settings_of(splats)
     truncation = _ShTruncation(splats, previous.sh_sums if previous else ())
     for view in views:
         forward = rasteriser.forward(arrays, view.camera, settings, depths=True)
@@ -115,14 +122,16 @@ def measure_contributions(
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
         depths.append(float(np.median(solid)) if solid.size else np.inf)
-        without_residual = rasteriser.contributions(forward, np.zeros_like(residual))[:, CHANGE]
+        without_residual = rasteriser.contributions(forward, np.zeros_like(residual))[
+            :, ERROR_CHANGE
+        ]
         found = rasteriser.contributions(forward, residual)
         rows = forward.visible
-        change[rows] += found[:, CHANGE]
+        change[rows] += found[:, ERROR_CHANGE]
         picture[rows] += without_residual
         weight[rows] += found[:, WEIGHT]
-        largest[rows] = np.maximum(largest[rows], found[:, LARGEST])
-        view_counts[rows] += found[:, LARGEST] >= VISIBLE_WEIGHT
+        largest[rows] = np.maximum(largest[rows], found[:, LARGEST_WEIGHT])
+        view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
         truncation.add(view.camera.centre, rows, found)
     truncated_sse_change, truncated_picture_change, truncated_colour = truncation.figures()
     return Contributions(
@@ -168,7 +177,7 @@ class _ShTruncation:
             return
         every = colours_by_degree(self.splats.take(rows), centre)
         d = every[:, :-1] - every[:, -1:]
-        g, q = found[:, None, PULL:], found[:, SQUARES, None, None]
+        g, q = found[:, None, WEIGHTED_RESIDUAL:], found[:, SQUARED_WEIGHT, None, None]
         self.dg[rows] += d * g
         self.ddq[rows] += d * d * q
         self.dq[rows] += d * q
