@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import summary
-from splatcli.commands import process
+from splatcli.commands import process as work_of_process
 from splatcli.console import guarded
 from splatcli.folders import find_run_folder
 from splatcli.operation_options import Chain, chain_parameters, typed_in
@@ -28,7 +28,6 @@ app = typer.Typer(
     cls=Commands,
     help="Turn a folder of photographs into a 3D Gaussian splat that opens everywhere.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -45,7 +44,13 @@ Photos = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option("--out", "-o", help="Run folder to make or continue.", show_default="run"),
+    typer.Option(
+        "--out",
+        "-o",
+        help="Run folder to make or continue.",
+        show_default="run",
+        rich_help_panel="Output",
+    ),
 ]
 Run = Annotated[
     Path | None, typer.Argument(help="Run folder; by default the one in the current folder.")
@@ -71,6 +76,7 @@ Cluster = Annotated[
         "(HOST:PORT, ray://HOST:PORT, auto), or local:N for N workers of this machine: "
         f"{install_command('cluster').replace('[', chr(92) + '[')}.",
         show_default="this process",
+        rich_help_panel="Advanced",
     ),
 ]
 Device = Annotated[
@@ -86,8 +92,18 @@ Device = Annotated[
         shown=False,
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Events and results as lines of JSON.")]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", help="Print only warnings and results.", rich_help_panel="Output"
+    ),
+]
+AsJson = Annotated[
+    bool,
+    typer.Option(
+        "--json", help="Print events and results as lines of JSON.", rich_help_panel="Output"
+    ),
+]
 
 _ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
 _STAGE_HELP = {
@@ -95,8 +111,8 @@ _STAGE_HELP = {
     "sfm": "Find where each photograph was taken from.",
     "seed": "Turn the sparse points into first splats.",
     "train": "Fit the splats to the photographs.",
-    "prune": "Remove floaters.",
-    "quantise": "Decide what to keep at which precision.",
+    "prune": "Remove floaters and splats that do not improve the pictures.",
+    "quantise": "Choose the precision at which each value is kept.",
     "export": "Write the files that other programs open.",
 }
 _STAGE_EXAMPLES = {
@@ -141,7 +157,7 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
-    process.run_all(photos, out, cluster, given, quiet, as_json)
+    work_of_process.run_all(photos, out, cluster, given, quiet, as_json)
 
 
 def batch(
@@ -181,13 +197,13 @@ def _stage_command(name: str) -> Callable[..., None]:
         as_json: AsJson = False,
         **given: Any,
     ) -> None:
-        pipeline = Pipeline(*process.target_of(photos, out))
-        process.run_stage("ingest", pipeline, given, quiet, as_json)
+        pipeline = Pipeline(*work_of_process.target_of(photos, out))
+        work_of_process.run_stage("ingest", pipeline, given, quiet, as_json)
 
     def later(
         run: Run = None, *, quiet: Quiet = False, as_json: AsJson = False, **given: Any
     ) -> None:
-        process.run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
+        work_of_process.run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
 
     return ingest if name == "ingest" else later
 
@@ -420,13 +436,13 @@ def doctor(as_json: AsJson = False) -> None:
 
 def _register() -> None:
     example = _example("splat process photos/ --preset preview --out run/")
-    command = with_parameters(process, process.process_parameters())
+    command = with_parameters(process, work_of_process.process_parameters())
     app.command("process", epilog=example)(guarded(command))
-    many = with_parameters(batch, process.batch_parameters())
+    many = with_parameters(batch, work_of_process.batch_parameters())
     app.command("batch", epilog=_example("splat batch captures/* --out runs/"))(guarded(many))
     for name in STAGE_NAMES:
         line = _STAGE_EXAMPLES.get(name, f"splat {name}")
-        command = with_parameters(_stage_command(name), process.stage_parameters(name))
+        command = with_parameters(_stage_command(name), work_of_process.stage_parameters(name))
         app.command(name, help=_STAGE_HELP[name], epilog=_example(line))(guarded(command))
     line = "splat edit scene.ply chair.sog --crop box:-1,-1,-1,1,1,1 --decimate 50%"
     command = with_parameters(edit, chain_parameters())
