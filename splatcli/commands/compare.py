@@ -43,8 +43,8 @@ def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) ->
             "compared",
             verdict=change.verdict,
             psnr_change_db=change.mean,
-            interval_db=[change.low, change.high] if change.photographs > 1 else None,
-            photographs=change.photographs,
+            interval_db=[change.low, change.high] if change.views > 1 else None,
+            photographs=change.views,
             files=[str(file) for file in files],
         )
         return

@@ -98,10 +98,10 @@ def verdict(pairing: Pairing) -> list[str]:
     """What may be said of the two."""
     change, (a, b) = pairing.psnr, pairing.sides
     interval, ssim = (
-        f"95 %: {d.low:+.{digits}f} to {d.high:+.{digits}f}" if d.photographs > 1 else "one judge"
+        f"95 %: {d.low:+.{digits}f} to {d.high:+.{digits}f}" if d.views > 1 else "one judge"
         for d, digits in ((change, 2), (pairing.ssim, 4))
     )
-    judges = counted(change.photographs, "held-out photograph")
+    judges = counted(change.views, "held-out photograph")
     return [
         f"{b.name} against {a.name}: {change.mean:+.2f} dB ({interval}): {change.verdict}.",
         f"SSIM: {pairing.ssim.mean:+.4f} ({ssim}): {pairing.ssim.verdict}.",

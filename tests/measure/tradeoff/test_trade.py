@@ -161,7 +161,7 @@ def test_a_single_judge_makes_no_interval_and_no_fuss(scene, material, tmp_path)
     few = replace(scene.reconstruction, views=scene.reconstruction.views[:5])
     both = [replace(side(scene, name), reconstruction=few) for name in "ab"]
     told = verdict(pair(*both))
-    assert told[0] == "b against a: +0.00 dB (one judge): not told apart."
+    assert told[0] == "b against a: +0.00 dB (one judge): no significant difference."
     assert "1 held-out photograph," in told[-1]
 
 
@@ -179,7 +179,9 @@ def side(scene, name: str, splats=None) -> Side:
 def test_a_run_is_not_told_apart_from_itself(scene) -> None:
     found = pair(side(scene, "a"), side(scene, "b"))
     assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
-    assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): not told apart." in verdict(found)
+    assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): no significant difference." in verdict(
+        found
+    )
 
 
 def test_a_worse_run_is_told_as_worse_and_the_other_way_round_as_better(scene) -> None:
@@ -210,9 +212,9 @@ def test_the_comparison_shows_every_judge_three_times(scene, tmp_path) -> None:
     found = pair(side(scene, "a"), side(scene, "b"))
     report, table = write_pair(tmp_path, found)
     text = report.read_text(encoding="utf-8")
-    assert text.count("<img") == 3 * found.psnr.photographs
+    assert text.count("<img") == 3 * found.psnr.views
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
-    assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + found.psnr.photographs
+    assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + found.psnr.views
 
 
 def test_few_are_taken_from_all_over() -> None:
