@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.formats.quantisation import splats_to_write
-from stages.formats.rows import kept_rows
+from stages.formats.values import drop_undrawable
 from stages.measure.contribution import Contributions, measure_contributions
 from stages.measure.coverage import camera_layout, find_gaps, patches_of, poorly_covered_regions
 from stages.measure.evaluation import (
@@ -97,7 +97,7 @@ class TradeoffInputs:
 
 def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Tradeoff:
     """Measure everything; held-out views decide nothing. Raises SplatError, as writers do."""
-    splats = kept_rows(inputs.splats)[0]
+    splats = drop_undrawable(inputs.splats)[0]
     inputs = replace(inputs, splats=splats)
     progress("evaluating the run's splats")
     own_scores = _scores(inputs, splats)
