@@ -19,7 +19,7 @@ import pytest
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.memory import resident_mib
 from stages.run import manifest
-from stages.run.lock import locked
+from stages.run.lock import HOLDER, locked
 from stages.run.manifest import SCHEMA, Manifest
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.runfile import RunFile
@@ -378,12 +378,12 @@ def test_second_process_is_refused_and_named(finished: Pipeline, run_folder: Pat
 def test_lock_of_a_killed_process_does_not_count(finished: Pipeline, run_folder: Path) -> None:
     code = (
         "import os, sys, pathlib, signal\n"
-        "from stages.run.lock import locked\n"
+        "from stages.run.lock import HOLDER, locked\n"
         "with locked(pathlib.Path(sys.argv[1])):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", code, str(run_folder)], check=False, timeout=30)
-    assert (run_folder / ".lock").read_text().strip().isdigit()
+    assert (run_folder / HOLDER).read_text().strip().isdigit()
     assert finished.busy() is None
     assert ran(finished) == []
 

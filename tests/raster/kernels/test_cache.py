@@ -77,7 +77,9 @@ def test_old_folders_go_less_the_newest_few_and_those_in_use(tmp_path: Path) -> 
         (folder / "x.nbi").write_text("kernel")
         (folder / "in-use-1").write_text("")
         os.utime(folder / "in-use-1", (1e9 - age, 1e9 - age))
-    with FileLock(root / "kernels-5" / "in-use-2"):
+    held = root / "kernels-5" / "in-use-2"
+    with FileLock(held):
+        os.utime(held, (1e9 - 9, 1e9 - 9))
         own = python(f"import stages.raster.kernels; {SHOW}", tmp_path)
     kept = {"kernels-0", "kernels-1", "kernels-5", Path(own).name}
     assert {path.name for path in root.glob("kernels-*")} == kept
