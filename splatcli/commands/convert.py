@@ -25,7 +25,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     """
     from stages import formats
     from stages.base import scratch
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
@@ -35,7 +35,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
         say(f"writing {target}")
         dropped = formats.write(target, splats)
         say(f"comparing {target}")
-        found = _proven(source, target, kept_rows(splats)[0])
+        found = _proven(source, target, drop_undrawable(splats)[0])
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
@@ -66,9 +66,9 @@ def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
 
 def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     """What the proof found. Raises SplatError "convert-verify-failed"."""
-    from splatcli.sources import views_around
     from stages.formats import format_of
     from stages.proof.prover import Prover, cameras_for
+    from stages.run.results import views_around
 
     cameras = cameras_for(splats, views_around(source))
     proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)

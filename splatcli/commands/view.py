@@ -11,8 +11,9 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console, sources
+from splatcli import console
 from stages.base.errors import Family, SplatError
+from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -23,13 +24,13 @@ if TYPE_CHECKING:
 def show(target: Path | None, port: int, open_browser: bool) -> None:
     """Serve the page until Ctrl-C. Raises SplatError."""
     from stages.base import scratch
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.viewer.server import LocalServer
 
     with tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
-            splats, pipeline = sources.splats_of(target)
-            splats, _ = kept_rows(splats)
+            splats, pipeline = results.splats_of(target)
+            splats, _ = drop_undrawable(splats)
             count = len(splats)
             if not count:
                 raise SplatError(
@@ -56,7 +57,7 @@ def _items(
     from stages.formats import format_of, ply
     from stages.viewer.site import site
 
-    run = pipeline or sources.pipeline_around(target)
+    run = pipeline or results.pipeline_around(target)
     sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
     units = sfm.units if sfm else "arbitrary"
     if pipeline is None and target is not None and format_of(target).streamed:
