@@ -12,7 +12,7 @@ from stages.measure.tradeoff import html
 from stages.measure.tradeoff.comparison import Pairing, verdict_lines
 
 
-def write_pair(folder: Path, pairing: Pairing) -> list[Path]:
+def write_comparison(folder: Path, pairing: Pairing) -> list[Path]:
     """Both into `folder`, which is there. Raises SplatError."""
     a, b = (side.name for side in pairing.sides)
     table = folder / "compare.csv"
@@ -22,7 +22,7 @@ def write_pair(folder: Path, pairing: Pairing) -> list[Path]:
     parts = [
         html.paragraphs(verdict_lines(pairing)),
         html.heading("The runs"),
-        html.table(("", a, b), facts(pairing)),
+        html.table(("", a, b), fact_rows(pairing)),
         html.heading("Photograph by photograph"),
         html.table(
             ("photograph", f"{a}, PSNR", f"{b}, PSNR", "change"),
@@ -38,7 +38,7 @@ def write_pair(folder: Path, pairing: Pairing) -> list[Path]:
     return [report, table]
 
 
-def facts(pairing: Pairing) -> list[tuple[str, str, str]]:
+def fact_rows(pairing: Pairing) -> list[tuple[str, str, str]]:
     """(what, of the first, of the second)."""
     first, second = (side.facts for side in pairing.sides)
     means = [sum(s.psnr_db for s in found) / len(found) for found in pairing.scores]

@@ -14,9 +14,14 @@ from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.measure.evaluation import load_evaluation_views
 from stages.measure.tradeoff import summary
-from stages.measure.tradeoff.measurement import SHARES, TradeoffInputs, deciding_views, measure_tradeoff
 from stages.measure.tradeoff.comparison import Candidate, compare, verdict_lines
-from stages.measure.tradeoff.comparison import write_comparison
+from stages.measure.tradeoff.measurement import (
+    SHARES,
+    TradeoffInputs,
+    deciding_views,
+    measure_tradeoff,
+)
+from stages.measure.tradeoff.pair_report import write_comparison
 from stages.measure.tradeoff.report import write_report
 from stages.scene import Camera, DrawSettings, QuantisedSplats, View, evenly_spaced, split_held_out
 from tests.small_scene import small_scene
@@ -225,7 +230,8 @@ def test_all_photographs_decide_where_time_allows() -> None:
     assert len(deciding_views(views, DrawSettings(side=480))) == 60
     assert len(deciding_views(views, DrawSettings(side=800))) == 50
     assert (
-        len(deciding_views([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings())) == 24
+        len(deciding_views([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings()))
+        == 24
     )
 
 
