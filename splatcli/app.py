@@ -438,7 +438,7 @@ def _register() -> None:
     example = _example("splat process photos/ --preset preview --out run/")
     command = with_parameters(process, commands_process.process_parameters())
     app.command("process", epilog=example)(guarded(command))
-    many = with_parameters(batch, process.batch_parameters())
+    many = with_parameters(batch, commands_process.batch_parameters())
     app.command("batch", epilog=_example("splat batch captures/* --out runs/"))(guarded(many))
     for name in STAGE_NAMES:
         line = _STAGE_EXAMPLES.get(name, f"splat {name}")
