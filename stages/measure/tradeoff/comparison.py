@@ -57,7 +57,7 @@ class Pairing:
     side_px: int
 
 
-def compare(first: Candidate, second: Candidate) -> Pairing:
+def compare_runs(first: Candidate, second: Candidate) -> Pairing:
     """Judge both on the photographs that neither learnt from, at the smaller size of the two.
 
     Each photograph is seen as its own run undistorted and placed it. Raises SplatError

@@ -14,7 +14,7 @@ from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.measure.evaluation import load_evaluation_views
 from stages.measure.tradeoff import summary
-from stages.measure.tradeoff.comparison import Candidate, compare, verdict_lines
+from stages.measure.tradeoff.comparison import Candidate, compare_runs, verdict_lines
 from stages.measure.tradeoff.measurement import (
     SHARES,
     TradeoffInputs,
@@ -165,7 +165,7 @@ def test_a_single_judge_makes_no_interval_and_no_fuss(scene, material, tmp_path)
     assert "inf" not in re.sub(r"<[^>]*>", " ", text)
     few = replace(scene.reconstruction, views=scene.reconstruction.views[:5])
     both = [replace(side(scene, name), reconstruction=few) for name in "ab"]
-    told = verdict_lines(compare(*both))
+    told = verdict_lines(compare_runs(*both))
     assert told[0] == "b against a: +0.00 dB (one judge): not told apart."
     assert "1 held-out photograph," in told[-1]
 
@@ -182,15 +182,15 @@ def side(scene, name: str, splats=None) -> Candidate:
 
 
 def test_a_run_is_not_told_apart_from_itself(scene) -> None:
-    found = compare(side(scene, "a"), side(scene, "b"))
+    found = compare_runs(side(scene, "a"), side(scene, "b"))
     assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
     assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): not told apart." in verdict_lines(found)
 
 
 def test_a_worse_run_is_told_as_worse_and_the_other_way_round_as_better(scene) -> None:
     fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
-    assert compare(side(scene, "all"), fewer).psnr.verdict == WORSE
-    assert compare(fewer, side(scene, "all")).psnr.verdict == BETTER
+    assert compare_runs(side(scene, "all"), fewer).psnr.verdict == WORSE
+    assert compare_runs(fewer, side(scene, "all")).psnr.verdict == BETTER
 
 
 def test_both_are_judged_at_the_smaller_size(scene) -> None:
@@ -198,7 +198,7 @@ def test_both_are_judged_at_the_smaller_size(scene) -> None:
     small = replace(
         small, splats=replace(small.splats, draw_settings=DrawSettings(near=0.01, side=40))
     )
-    found = compare(side(scene, "large"), small)
+    found = compare_runs(side(scene, "large"), small)
     assert found.side_px == 40
     assert {max(p.pixels.shape[:2]) for seen in found.photographs for p in seen} == {40}
 
@@ -207,12 +207,12 @@ def test_a_photograph_that_one_has_learnt_from_judges_neither(scene) -> None:
     views = scene.reconstruction.views[1:]
     shifted = replace(scene.reconstruction, views=views)
     with pytest.raises(SplatError) as error:
-        compare(side(scene, "a"), replace(side(scene, "b"), reconstruction=shifted))
+        compare_runs(side(scene, "a"), replace(side(scene, "b"), reconstruction=shifted))
     assert error.value.code == "compare-nothing-in-common"
 
 
 def test_the_comparison_shows_every_judge_three_times(scene, tmp_path) -> None:
-    found = compare(side(scene, "a"), side(scene, "b"))
+    found = compare_runs(side(scene, "a"), side(scene, "b"))
     report, table = write_comparison(tmp_path, found)
     text = report.read_text(encoding="utf-8")
     assert text.count("<img") == 3 * found.psnr.photographs
