@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console
+from splatcli import console, sources
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
-from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
@@ -74,7 +73,7 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 def _side(run: Pipeline, name: str) -> Candidate:
     from stages.measure.tradeoff.comparison import Candidate
 
-    splats = results.finished_splats(run)
+    splats = sources.finished_splats(run)
     told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
     trained = run.manifest("train")
     if trained is not None:
@@ -82,6 +81,6 @@ def _side(run: Pipeline, name: str) -> Candidate:
         steps = trained.metrics.get("steps", trained.settings["steps"])
         told["steps"] = f"{steps:,}"
         told["seed"] = str(trained.settings["seed"])
-    for ending, figures in results.exported_formats(run).items():
+    for ending, figures in sources.exported_formats(run).items():
         told[f".{ending}"] = console.size(figures["size_bytes"])
-    return Candidate(name, splats, run.load("sfm"), results.backend_of(run), told)
+    return Candidate(name, splats, run.load("sfm"), sources.backend_of(run), told)

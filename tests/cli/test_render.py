@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from splatcli import viewpoints
 from stages import formats
 from stages.base import memory
 from stages.cameras import nerfstudio
 from stages.raster.draw import render
 from stages.scene import Camera, View, look_at
-from stages.viewer import render_cameras
 from stages.viewer.image_files import eight_bits
 from tests import processes, scenes
 from tests.processes import line_of, running

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from splatcli import sources
 from splatcli.app import app
 from splatcli.commands import verify as command
 from stages import formats
 from stages.base.errors import SplatError
-from stages.run import results
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Splats
 from stages.train import TrainSettings
 from tests.small_scene import SmallScene, small_scene
