@@ -26,7 +26,7 @@ TRAIN, PRUNE = (SimpleNamespace(name=name) for name in ("train", "prune"))
 def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     lines: list[str] = []
     monkeypatch.setattr(console, "note", lambda text, style="": lines.append(text))
-    monkeypatch.setattr(live_training, "open_page", lambda address: False)
+    monkeypatch.setattr(live_view, "open_page", lambda address: False)
     return lines
 
 

@@ -74,7 +74,7 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
             recorded_settings=lambda: {"train": TrainSettings()},
         )
 
-    monkeypatch.setattr(results, "Pipeline", pipeline)
+    monkeypatch.setattr(sources, "Pipeline", pipeline)
     monkeypatch.setattr(command, "Pipeline", pipeline)
     return folder
 
