@@ -88,5 +88,5 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,
         quantised=pipeline.load("quantise"),
-        fitted={name: splats for name, splats in fitted.items() if splats is not None},
+        finetuned={name: splats for name, splats in fitted.items() if splats is not None},
     )
