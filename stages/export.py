@@ -58,7 +58,7 @@ class ExportSettings:
             "folder, no suffix.",
         },
     )
-    fit_steps: int = field(
+    rounding_steps: int = field(
         default=45,
         metadata={
             "help": "Steps of fine-tuning after each kind of value that a format rounds (.splat, "
@@ -163,23 +163,23 @@ def _fitting(
     import numpy as np
 
     from stages.capacity.rounding import Fitting
-    from stages.capacity.tuning import Tuner
     from stages.measure.judge import load_photographs
     from stages.measure.worth import measure_worth
     from stages.scene import seen_extent, split_held_out, spread_over
+    from stages.training.finetune import FineTuner
 
     reconstruction: Reconstruction = inputs["sfm"]
     training = split_held_out(reconstruction.views)[0]
-    if not (settings.fit_steps and training and any(FORMATS[name].rounds for name in wanted)):
+    if not (settings.rounding_steps and training and any(FORMATS[name].rounds for name in wanted)):
         return None
     sat_out, backend, folder = inputs["train"].sat_out, drawn_by(settings), reconstruction.folder
     photographs = load_photographs(folder, training, splats.look)
-    tuner = Tuner(photographs, seen_extent(reconstruction), backend, report, sat_out)
+    tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, sat_out)
     seen = np.zeros(len(splats), np.int32)
     if sat_out:  # only then it matters
         seen = measure_worth(splats, photographs, backend).photographs
     deciding = load_photographs(folder, spread_over(training, DECIDING), splats.look)
-    return Fitting(tuner, deciding, backend, settings.fit_steps, seen)
+    return Fitting(tuner, deciding, backend, settings.rounding_steps, seen)
 
 
 def fitted_in(folder: Path, ending: str) -> Splats | None:

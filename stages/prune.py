@@ -14,7 +14,7 @@ from stages.formats.table import FORMATS
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
-    from stages.capacity.rounds import Outcome
+    from stages.capacity.pruning import PruningResult
     from stages.measure.judge import Photograph
     from stages.scene import Reconstruction, Splats, TrainedSplats
 
@@ -29,11 +29,10 @@ class PruneSettings:
             "max": 100,
         },
     )
-    price: float = field(
+    strength: float = field(
         default=1.0,
         metadata={
-            "help": "How much a splat must be worth to stay, 1 for what the photographs ask; the "
-            "loss allowed grows with it.",
+            "help": "Pruning strength: larger removes more, and allows more loss.",
             "min": 0.001,
             "max": 1000,
         },
@@ -42,7 +41,7 @@ class PruneSettings:
         default=0.1,
         metadata={
             "help": "PSNR that pruning may cost views that were not trained on, as far as training "
-            "can tell, at price 1 (dB).",
+            "can tell, at strength 1 (dB).",
             "min": 0,
             "max": 100,
         },
@@ -67,13 +66,13 @@ class PruneSettings:
     min_psnr: float = field(
         default=0.0,
         metadata={
-            "help": "As small as the training photographs allow at this PSNR, instead of by price; "
+            "help": "As small as the training photographs allow at this PSNR, instead of by --strength; "
             "0 for none (dB).",
             "min": 0,
             "max": 99,
         },
     )
-    tune_steps: int = field(
+    finetune_steps: int = field(
         default=90,
         metadata={
             "help": "Steps of fine-tuning after each round; 0 for none.",
@@ -90,13 +89,13 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report. Raises SplatError for targets that cannot be met."""
     import numpy as np
 
-    from stages.capacity import words
-    from stages.capacity.aim import Aim, felt_share
-    from stages.capacity.rounds import Shrinking
-    from stages.capacity.tuning import Tuner
+    from stages.capacity import summary
+    from stages.capacity.pruning import Pruner
+    from stages.capacity.targets import Targets, felt_share
     from stages.measure.judge import load_photographs, mean_psnr_db
     from stages.scene import seen_extent, split_held_out
     from stages.scene.storage import save_splats
+    from stages.training.finetune import FineTuner
 
     reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
@@ -107,10 +106,10 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     backend = drawn_by(settings)
     before = mean_psnr_db(splats, judges, backend)
     extent = seen_extent(reconstruction)
-    tuner = Tuner(photographs, extent, backend, report, trained.sat_out)
+    tuner = FineTuner(photographs, extent, backend, report, trained.sat_out)
     size_bytes = _sizes(settings, splats, photographs, reconstruction)
-    aim = Aim(
-        settings.price,
+    targets = Targets(
+        settings.strength,
         settings.max_loss_db,
         felt_share(trained.by_heart),
         settings.max_splats,
@@ -118,8 +117,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
         settings.min_psnr,
         size_bytes,
     )
-    shrinking = Shrinking(
-        *(photographs, aim, backend, tuner, settings.rounds, settings.tune_steps, report)
+    shrinking = Pruner(
+        *(photographs, targets, backend, tuner, settings.rounds, settings.finetune_steps, report)
     )
     found = shrinking.run(splats)
     after = mean_psnr_db(found.splats, judges, backend)
@@ -128,10 +127,10 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report.metric("psnr_before_db", round(before, 3))
     report.metric("psnr_db", round(after, 3))
     report.metric("psnr_change_db", round(after - before, 3))
-    report.metric("tune_steps", tuner.steps)
+    report.metric("finetune_steps", tuner.steps)
     _report_cuts(splats, found, report)
-    report.metric("said", words.said(trained, found, settings.price, tuner.steps))
-    if more := words.more_would_pay(found, settings.price):
+    report.metric("said", summary.summarise(trained, found, settings.strength, tuner.steps))
+    if more := summary.more_would_pay(found, settings.strength):
         report.warn("prune-more-would-pay", more)
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)
@@ -150,7 +149,7 @@ def _sizes(
 
     from stages import formats
     from stages.base.lazy import named
-    from stages.capacity.bits import fewest_bits
+    from stages.capacity.bits import choose_bits
     from stages.formats.coarse import Bits
     from stages.measure.judge import mean_psnr_db
     from stages.scene import spread_over
@@ -159,7 +158,7 @@ def _sizes(
     few: dict[str, int] = {}
     if settings.max_mb and row.coarse:
         deciding, backend = spread_over(photographs, DECIDING), drawn_by(settings)
-        few, _ = fewest_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
+        few, _ = choose_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
 
     def size_bytes(splats: Splats) -> int:
         held = named(row.coarse)(splats, Bits(**few)) if few else splats
@@ -171,7 +170,7 @@ def _sizes(
     return size_bytes
 
 
-def _report_cuts(before: Splats, found: Outcome, report: Report) -> None:
+def _report_cuts(before: Splats, found: PruningResult, report: Report) -> None:
     """Counts, the price and the rounds as metrics; a warning where much was in the air."""
     kept = [one for one in found.rounds if one.kept]
     floaters, start = sum(one.floaters for one in kept), len(before)

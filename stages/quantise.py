@@ -69,7 +69,7 @@ def run(
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.capacity.bits import fewest_bits
+    from stages.capacity.bits import choose_bits
     from stages.formats import FORMATS, splat32
     from stages.formats.coarse import held_by
     from stages.measure.flat import flat_dc
@@ -100,7 +100,7 @@ def run(
     }
 
     counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
-    bits, sog_db = fewest_bits(kept, decider.psnr, settings.sog_loss_db)
+    bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
     decisions: dict[str, object] = {
         "sh_degree": kept.sh_degree,
         "bits": bits,

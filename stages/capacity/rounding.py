@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.lazy import named
-from stages.capacity.tuning import Tuner
 from stages.formats.axes import least_turned
 from stages.formats.coarse import Bits, held_by, on_grids
 from stages.formats.table import Format
 from stages.measure.judge import Photograph, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
+from stages.training.finetune import FineTuner
 
 # Fields of `LearningRates`, what others can make up for least first; colour last, which is rounded
 # finely and in which the picture is linear.
@@ -40,7 +40,7 @@ class Fitting:
     """Fits splats to what files round. tuner: on the photographs of training; deciding: those of
     them that tell whether it was worth it. steps: see `tuned_to`; seen: see `Tuner.tuned`."""
 
-    tuner: Tuner
+    tuner: FineTuner
     deciding: Sequence[Photograph]
     backend: str
     steps: int
@@ -70,7 +70,7 @@ class Fitting:
 
 
 def tuned_to(
-    rounded: Rounded, splats: Splats, tuner: Tuner, steps: int, seen: NDArray[np.int32]
+    rounded: Rounded, splats: Splats, tuner: FineTuner, steps: int, seen: NDArray[np.int32]
 ) -> Splats:
     """Splats that `rounded` leaves nearly as they are. steps: after each kind of value that it
     changes. Raises Interrupted."""
@@ -82,7 +82,7 @@ def tuned_to(
         splats = coarse
         still.append(name)
         if name != ORDER[-1]:
-            splats = tuner.tuned(splats, steps, seen, still)
+            splats = tuner.finetune(splats, steps, seen, still)
     return splats
 
 

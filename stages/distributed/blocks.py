@@ -246,10 +246,10 @@ class _Scene:
         report, how many splats each gave: they lie block after block."""
         import numpy as np
 
-        from stages.capacity.tuning import Tuner
         from stages.distributed import merge
         from stages.measure.judge import load_photographs
         from stages.scene import TrainedSplats, seen_extent
+        from stages.training.finetune import FineTuner
 
         degree, backend = self.settings.sh_degree, drawn_by(self.settings)
         given = [part.splats.with_sh_degree(degree) for part in parts]
@@ -263,7 +263,7 @@ class _Scene:
             self.report.progress(0, 1, "seams")
             photographs = load_photographs(self.whole.folder, crossing, look)
             extent = seen_extent(self.whole)
-            tuner = Tuner(photographs, extent, backend, self.report, found.sat_out)
+            tuner = FineTuner(photographs, extent, backend, self.report, found.sat_out)
             splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
         ends = np.cumsum([0, *counts])
         left = [int((~gone[i:j]).sum()) for i, j in pairwise(ends)]

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.capacity.tuning import Tuner
 from stages.distributed.ground import Cell
 from stages.measure.judge import Photograph
 from stages.measure.worth import measure_worth, squared_error
 from stages.scene import Look, Splats
+from stages.training.finetune import FineTuner
 
 REACH = 3.0  # standard deviations: as far as a splat is there
 STEPS_A_PHOTOGRAPH, MOST_STEPS = 24, 1200  # of putting seams right
@@ -77,7 +77,7 @@ def put_right(
     splats: Splats,
     seam: NDArray[np.bool_],
     photographs: Sequence[Photograph],
-    tuner: Tuner,
+    tuner: FineTuner,
     backend: str,
 ) -> tuple[Splats, NDArray[np.bool_]]:
     """(the splats without those at the seam that these photographs would be better without, tuned
@@ -93,4 +93,4 @@ def put_right(
         if squared_error(splats.take(~gone), photographs, backend) <= worth.sse:
             break
     steps = min(MOST_STEPS, STEPS_A_PHOTOGRAPH * len(photographs))
-    return tuner.tuned(splats.take(~gone), steps, worth.photographs[~gone]), gone
+    return tuner.finetune(splats.take(~gone), steps, worth.photographs[~gone]), gone

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.capacity.cutting import Cut
+from stages.capacity.selection import Removal
 from stages.measure.judge import drawing_of, load_photographs
 from stages.measure.worth import colours_by_degree, measure_worth, squared_error
 from stages.scene import Splats
@@ -19,7 +19,7 @@ def without(splats: Splats, row: int, degree: int, added: np.ndarray) -> Splats:
     """One splat cut to a degree, its colour moved."""
     degrees, shift = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     degrees[row], shift[row] = degree, added
-    return Cut(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).of(splats)
+    return Removal(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).of(splats)
 
 
 def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) -> None:

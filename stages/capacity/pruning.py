@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.base.stage import Report
-from stages.capacity.aim import Aim
-from stages.capacity.cutting import SPLATS_A_ROUND, Cut, choose
-from stages.capacity.tuning import Tuner
+from stages.capacity.selection import SPLATS_A_ROUND, Removal, choose
+from stages.capacity.targets import Targets
 from stages.measure.judge import Photograph, drawing_of
 from stages.measure.price import Price, price_of
 from stages.measure.worth import Worth, measure_worth, squared_error
 from stages.scene import Splats, spread_over
+from stages.training.finetune import FineTuner
 
 BACK_OFFS = 3  # times that a round may ask for half as much
 # Splats that go together cost more than the sum of each alone, since they stood in for each other:
@@ -44,7 +44,7 @@ class Round:
 
 
 @dataclass
-class Outcome:
+class PruningResult:
     """What came of it. start_db, end_db: mean over the photographs that decide. stopped_by: PRICE
     (what is left pays), LOSS or ROUNDS. least_tenth_db: what the tenth of the splats that is worth
     least was worth at the start."""
@@ -59,17 +59,17 @@ class Outcome:
 
 
 @dataclass
-class Shrinking:
-    """One model on its way down. rounds: at most, unless targets want more. tune_steps: after each
+class Pruner:
+    """One model on its way down. rounds: at most, unless targets want more. finetune_steps: after each
     of as many; where targets want more rounds, they share the steps. All photographs tell what it
     learns and what each splat is worth at first, as many as `LOOKED_AT` decide."""
 
     photographs: Sequence[Photograph]
-    aim: Aim
+    targets: Targets
     backend: str
-    tuner: Tuner
+    tuner: FineTuner
     rounds: int
-    tune_steps: int
+    finetune_steps: int
     report: Report
 
     def __post_init__(self) -> None:
@@ -79,22 +79,22 @@ class Shrinking:
         # in the order in which worth tells of photographs
         self.cameras = [self.tuner.cameras[i] for i in (*self.others, *self.decide)]
 
-    def run(self, splats: Splats) -> Outcome:
+    def run(self, splats: Splats) -> PruningResult:
         """The smaller model. Raises SplatError for targets that cannot be met, and Interrupted."""
         worth = self._first_worth(splats)
         best = worth.psnr_db
         mean_db = float(best.mean())
-        self.aim.check_start(mean_db)
+        self.targets.check_start(mean_db)
         price = price_of(drawing_of(splats, self.backend), self._pictures(self.decide))
         price = price.of_more(len(self.photographs) / max(1, len(self.decide)))
-        found = Outcome(splats, price, mean_db, mean_db, _least_tenth_db(worth))
+        found = PruningResult(splats, price, mean_db, mean_db, _least_tenth_db(worth))
         planned, share, overlap = self._planned(splats), SPLATS_A_ROUND, OVERLAP
         if planned:
             worth = self._without_harm(found, worth)
             best = max(best, worth.psnr_db, key=np.mean)
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
-            excess = self.aim.excess(found.splats)
+            excess = self.targets.excess(found.splats)
             cut = self._cut(found, worth, excess, share)
             if cut is None:
                 found.stopped_by = PRICE
@@ -102,9 +102,9 @@ class Shrinking:
             fewer, seen = cut.of(found.splats), worth.photographs[~cut.gone]
             measured = squared_error(fewer, self._pictures(self.decide), self.backend)
             measured = (measured - _fresh_sse(worth)) * _told_by(worth)
-            fewer = self.tuner.tuned(fewer, self.tune_steps * self.rounds // planned, seen)
+            fewer = self.tuner.finetune(fewer, self.finetune_steps * self.rounds // planned, seen)
             after = self._worth(fewer, worth, cut)
-            kept = excess > 0 or self.aim.holds(after.psnr_db, best)
+            kept = excess > 0 or self.targets.holds(after.psnr_db, best)
             predicted = cut.predicted_sse * (overlap if cut.predicted_sse > 0 else 1)
             told = (predicted, measured, float(after.psnr_db.mean()), kept)
             found.rounds.append(_round(found.splats, cut, *told))
@@ -119,10 +119,10 @@ class Shrinking:
             if share < SPLATS_A_ROUND / 2**BACK_OFFS:
                 break
         found.end_db = float(worth.psnr_db.mean())
-        self.aim.check_end(found.splats, found.end_db)
+        self.targets.check_end(found.splats, found.end_db)
         return found
 
-    def _without_harm(self, found: Outcome, worth: Worth) -> Worth:
+    def _without_harm(self, found: PruningResult, worth: Worth) -> Worth:
         """Take out what the photographs are better without. Fewer, where they turn out to be missed
         together: drawing tells."""
         share = SPLATS_A_ROUND
@@ -154,21 +154,21 @@ class Shrinking:
             others = measure_worth(splats, self._pictures(self.others), self.backend)
         return measure_worth(splats, self._pictures(self.decide), self.backend, others)
 
-    def _worth(self, splats: Splats, before: Worth, cut: Cut) -> Worth:
+    def _worth(self, splats: Splats, before: Worth, cut: Removal) -> Worth:
         others = before.others.take(~cut.gone) if before.others else None
         return measure_worth(splats, self._pictures(self.decide), self.backend, others)
 
     def _planned(self, splats: Splats) -> int:
         """As many rounds as targets need, and a few for what they leave over."""
-        left = len(splats) - self.aim.excess(splats)
+        left = len(splats) - self.targets.excess(splats)
         if left == len(splats):
             return self.rounds
         needed = math.log(left / len(splats)) / math.log(1 - SPLATS_A_ROUND)
         return max(self.rounds, math.ceil(needed) + 4)
 
-    def _cut(self, found: Outcome, worth: Worth, excess: int, share: float) -> Cut | None:
-        forced = excess > 0 or self.aim.min_psnr_db > 0
-        limit = math.inf if forced else self.aim.price * found.price.sse_a_number
+    def _cut(self, found: PruningResult, worth: Worth, excess: int, share: float) -> Removal | None:
+        forced = excess > 0 or self.targets.min_psnr_db > 0
+        limit = math.inf if forced else self.targets.price * found.price.sse_a_number
         most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
         most = min(most, excess, len(found.splats) - 1) if excess else most
         return choose(
@@ -187,7 +187,7 @@ def _told_by(worth: Worth) -> float:
 
 
 def _round(
-    before: Splats, cut: Cut, predicted: float, measured: float, psnr_db: float, kept: bool
+    before: Splats, cut: Removal, predicted: float, measured: float, psnr_db: float, kept: bool
 ) -> Round:
     return Round(
         splats=len(before),

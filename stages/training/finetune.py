@@ -28,7 +28,7 @@ RATE, RATE_END = 1.2, 0.6
 MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
 
 
-class Tuner:
+class FineTuner:
     """Goes on with splats where training left them. extent: of the scene, world units. sits_out:
     whether splats sit steps out here, as they did in training, and colours are settled for the
     whole after it."""
@@ -48,7 +48,7 @@ class Tuner:
         self.stepper, self.rasteriser = step_of(backend), rasteriser_of(backend)
         self.steps = 0  # made so far
 
-    def tuned(
+    def finetune(
         self,
         splats: Splats,
         steps: int,
@@ -74,10 +74,10 @@ class Tuner:
             )
             rates = replace(rates, **dict.fromkeys(still, 0.0))
             self.stepper.step(self._level(), settings, rates, False, self._dropout())
-        tuned = _with(self._finished(self.stepper.model(), splats), splats, still)
+        finetuned = _with(self._finished(self.stepper.model(), splats), splats, still)
         if worth_settling(self.sits_out, len(self.photographs)):
-            return self._recoloured(tuned, settings, still)
-        return tuned
+            return self._recoloured(finetuned, settings, still)
+        return finetuned
 
     def _recoloured(
         self, splats: Splats, settings: RasterSettings, still: Collection[str]
@@ -120,14 +120,14 @@ class Tuner:
         )
 
 
-def _with(tuned: Splats, before: Splats, still: Collection[str]) -> Splats:
+def _with(finetuned: Splats, before: Splats, still: Collection[str]) -> Splats:
     """`tuned`, with `still` as it was: lengths of quaternions and clamped sizes were looked at."""
-    sh = tuned.sh.copy()
+    sh = finetuned.sh.copy()
     for name, bands in (("sh_dc", slice(0, 1)), ("sh_rest", slice(1, None))):
         if name in still:
             sh[:, bands] = before.sh[:, bands]
     arrays = {name: getattr(before, name) for name in still if not name.startswith("sh_")}
-    return replace(tuned, sh=sh, **arrays)
+    return replace(finetuned, sh=sh, **arrays)
 
 
 def _level(photograph: Photograph) -> Level:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from stages.base.words import counted
-from stages.capacity.aim import felt_share
-from stages.capacity.rounds import LOSS, PRICE, Outcome
+from stages.capacity.pruning import LOSS, PRICE, PruningResult
+from stages.capacity.targets import felt_share
 from stages.scene import TrainedSplats
 
 _WHY = {
@@ -13,7 +13,9 @@ _WHY = {
 }
 
 
-def said(before: TrainedSplats, found: Outcome, dial: float, tune_steps: int) -> list[str]:
+def summarise(
+    before: TrainedSplats, found: PruningResult, dial: float, finetune_steps: int
+) -> list[str]:
     """dial: the price that was asked for."""
     price, after, start = found.price, found.splats, before.splats
     told = [
@@ -31,7 +33,7 @@ def said(before: TrainedSplats, found: Outcome, dial: float, tune_steps: int) ->
         f"Cut: {counted(len(start) - len(after), 'splat')} of {len(start):,}"
         f"{f' ({floaters:,} of them floaters)' if floaters else ''}; of the {len(after):,} left, "
         f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
-        f"{counted(len(kept), 'round')} with {counted(tune_steps, 'step')} of fine-tuning in all: "
+        f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning in all: "
         f"{found.end_db - found.start_db:+.2f} dB on the photographs of training; other views "
         f"feel at most {felt_share(before.by_heart):.0%} of that."
     )
@@ -39,7 +41,7 @@ def said(before: TrainedSplats, found: Outcome, dial: float, tune_steps: int) ->
     return [*told, f"It stopped since {why}."]
 
 
-def more_would_pay(found: Outcome, dial: float) -> str:
+def more_would_pay(found: PruningResult, dial: float) -> str:
     """The sentence, or "" where it would not: the tenth of the splats that is worth least, before
     anything was cut, against what as many cost; a next tenth would be worth less than this one."""
     if not found.rounds or any(one.kept and one.removed for one in found.rounds):

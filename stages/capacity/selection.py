@@ -17,7 +17,7 @@ BANDS = 2.5  # times as many splats may lose bands: colours hardly depend on eac
 
 
 @dataclass(frozen=True)
-class Cut:
+class Removal:
     """gone [N]: which splats. degrees [N], colour [N, 3]: of each the degree that is left, and what
     is added to its colour for the bands that go. floaters: how many of `gone`. predicted_sse: what
     it should change the photographs' squared error by, as if each went alone."""
@@ -45,7 +45,7 @@ def choose(
     most: int,
     share: float = SPLATS_A_ROUND,
     harm: bool = False,
-) -> Cut | None:
+) -> Removal | None:
     """At most `most` splats, and bands of a share of the others, that are worth less squared error
     than `sse_a_number` for each of their numbers; the least worth first. None if there is nothing.
 
@@ -75,7 +75,7 @@ def choose(
     if not len(chosen) and np.array_equal(degrees, splats.sh_degrees):
         return None
     predicted = float(worth.sse_change[chosen].sum()) + bands_sse
-    return Cut(gone, degrees, colour, int(floating[chosen].sum()), predicted)
+    return Removal(gone, degrees, colour, int(floating[chosen].sum()), predicted)
 
 
 def _first_of_neighbours(splats: Splats, ratio: NDArray[np.float64]) -> NDArray[np.bool_]:

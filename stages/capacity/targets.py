@@ -24,7 +24,7 @@ def felt_share(by_heart: bool) -> float:
 
 
 @dataclass(frozen=True)
-class Aim:
+class Targets:
     """price: what a number must be worth, in units of what the photographs ask; the loss allowed
     grows with it. max_loss_db: at price 1, mean over views that were not trained on. felt: see
     `felt_share`. max_splats, max_bytes, min_psnr_db: targets that override the price; 0 for none.
