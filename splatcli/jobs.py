@@ -17,8 +17,8 @@ from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
 from stages.base.settings import Setting, settings_of
-from stages.distributed import blocks, cluster, sharing
-from stages.distributed.tasks import Engine
+from stages.distributed import blocks, cluster, sfm_chunks
+from stages.distributed.tasks import Executor
 from stages.raster.backends import backend_of, drawn_by
 from stages.run import runfolder
 from stages.run.listeners import Listeners
@@ -271,11 +271,11 @@ def in_blocks(pipeline: Pipeline, address: str | None) -> Pipeline:
     """The pipeline; if it has blocks, the cluster at `address` trains them, or this process. A
     cluster does shares of structure from motion, too."""
 
-    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Engine]:
+    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Executor]:
         seen = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
-        return cluster.engine_at(address, folder, seen, listener)
+        return cluster.open_executor(address, folder, seen, listener)
 
-    shared = pipeline if address is None else sharing.with_shares(pipeline, opened)
+    shared = pipeline if address is None else sfm_chunks.with_shares(pipeline, opened)
     return blocks.in_blocks(shared, opened)
 
 

@@ -163,8 +163,8 @@ def _fitting(
     import numpy as np
 
     from stages.capacity.rounding import Fitting
-    from stages.measure.judge import load_photographs
-    from stages.measure.worth import measure_worth
+    from stages.measure.contribution import measure_contributions
+    from stages.measure.evaluation import load_evaluation_views
     from stages.scene import seen_extent, split_held_out, spread_over
     from stages.training.finetune import FineTuner
 
@@ -173,12 +173,12 @@ def _fitting(
     if not (settings.rounding_steps and training and any(FORMATS[name].rounds for name in wanted)):
         return None
     sat_out, backend, folder = inputs["train"].sat_out, drawn_by(settings), reconstruction.folder
-    photographs = load_photographs(folder, training, splats.look)
+    photographs = load_evaluation_views(folder, training, splats.look)
     tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, sat_out)
     seen = np.zeros(len(splats), np.int32)
     if sat_out:  # only then it matters
-        seen = measure_worth(splats, photographs, backend).photographs
-    deciding = load_photographs(folder, spread_over(training, DECIDING), splats.look)
+        seen = measure_contributions(splats, photographs, backend).photographs
+    deciding = load_evaluation_views(folder, spread_over(training, DECIDING), splats.look)
     return Fitting(tuner, deciding, backend, settings.rounding_steps, seen)
 
 

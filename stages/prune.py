@@ -15,7 +15,7 @@ from stages.raster.backends import backend_setting, device_setting, drawn_by, te
 
 if TYPE_CHECKING:
     from stages.capacity.pruning import PruningResult
-    from stages.measure.judge import Photograph
+    from stages.measure.evaluation import EvaluationView
     from stages.scene import Reconstruction, Splats, TrainedSplats
 
 
@@ -92,7 +92,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     from stages.capacity import summary
     from stages.capacity.pruning import Pruner
     from stages.capacity.targets import Targets, felt_share
-    from stages.measure.judge import load_photographs, mean_psnr_db
+    from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
     from stages.scene import seen_extent, split_held_out
     from stages.scene.storage import save_splats
     from stages.training.finetune import FineTuner
@@ -101,8 +101,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     trained: TrainedSplats = inputs["train"]
     splats = trained.splats
     kept, held = split_held_out(reconstruction.views)
-    photographs = load_photographs(reconstruction.folder, kept, splats.look)
-    judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
+    photographs = load_evaluation_views(reconstruction.folder, kept, splats.look)
+    judges = load_evaluation_views(reconstruction.folder, held, splats.look) or photographs
     backend = drawn_by(settings)
     before = mean_psnr_db(splats, judges, backend)
     extent = seen_extent(reconstruction)
@@ -140,7 +140,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
 def _sizes(
     settings: PruneSettings,
     splats: Splats,
-    photographs: Sequence[Photograph],
+    photographs: Sequence[EvaluationView],
     reconstruction: Reconstruction,
 ) -> Callable[[Splats], int]:
     """Measures the file that --max-mb speaks of, as one that is really written: in as few bits as
@@ -151,7 +151,7 @@ def _sizes(
     from stages.base.lazy import named
     from stages.capacity.bits import choose_bits
     from stages.formats.coarse import Bits
-    from stages.measure.judge import mean_psnr_db
+    from stages.measure.evaluation import mean_psnr_db
     from stages.scene import spread_over
 
     row = FORMATS[settings.mb_of]
@@ -182,7 +182,9 @@ def _report_cuts(before: Splats, found: PruningResult, report: Report) -> None:
     report.metric("unneeded_removed", start - len(after) - floaters)
     report.metric("floater_share", round(floaters / max(start, 1), 5))
     report.metric("splats_by_sh_degree", degrees)
-    report.metric("price", asdict(found.price) | {"bits_a_number": found.price.bits_a_number})
+    report.metric(
+        "price", asdict(found.price) | {"bits_per_parameter": found.price.bits_per_parameter}
+    )
     report.metric("training_psnr_before_db", round(found.start_db, 3))
     report.metric("training_psnr_db", round(found.end_db, 3))
     report.metric("stopped_by", found.stopped_by)

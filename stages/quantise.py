@@ -19,7 +19,7 @@ from stages.capacity.usual import DECIDING, SOG_LOSS_DB
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
 
 if TYPE_CHECKING:
-    from stages.measure.judge import Photograph
+    from stages.measure.evaluation import EvaluationView
     from stages.scene import Look, QuantisedSplats, Reconstruction, Splats
 
 _DECISIONS, _FLAT = "decisions.json", "flat_dc.npy"
@@ -161,7 +161,7 @@ def _measures(
     reconstruction: Reconstruction, look: Look, settings: QuantiseSettings, report: Report
 ) -> tuple[_Measure, _Measure]:
     """(what decides, what judges): training photographs, and those held out if there are any."""
-    from stages.measure.judge import load_photographs
+    from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out, spread_over
 
     training, held = split_held_out(reconstruction.views)
@@ -175,9 +175,9 @@ def _measures(
         )
     lent = tuple(spread_over(training, settings.max_views))
     judges, what = (held, "held out") if held else (lent, "training")
-    decider = _Measure(load_photographs(reconstruction.folder, lent, look), settings, report)
+    decider = _Measure(load_evaluation_views(reconstruction.folder, lent, look), settings, report)
     judge = _Measure(
-        load_photographs(reconstruction.folder, judges, look), settings, Report(), what
+        load_evaluation_views(reconstruction.folder, judges, look), settings, Report(), what
     )
     return decider, judge
 
@@ -186,7 +186,7 @@ def _measures(
 class _Measure:
     """Measures splats on photographs that are loaded once."""
 
-    photographs: Sequence[Photograph]
+    photographs: Sequence[EvaluationView]
     settings: QuantiseSettings
     report: Report
     what: str = "training"
@@ -194,7 +194,7 @@ class _Measure:
 
     def psnr(self, splats: Splats) -> float:
         """Mean PSNR over the photographs (dB)."""
-        from stages.measure.judge import mean_psnr_db
+        from stages.measure.evaluation import mean_psnr_db
 
         mean = round(mean_psnr_db(splats, self.photographs, drawn_by(self.settings)), 4)
         self.done += 1

@@ -101,7 +101,7 @@ def _with_agreed(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.structure.seeding.sweep import agreed_points
+    from stages.structure.seeding.plane_sweep import agreed_points
 
     training, _ = split_held_out(reconstruction.views)
     more, more_colours = agreed_points(reconstruction.folder, training, points)

@@ -22,9 +22,9 @@ from stages.base.words import counted
 
 if TYPE_CHECKING:
     from stages.scene import Capture, Reconstruction
+    from stages.structure.chunks import Hands
+    from stages.structure.fallbacks import Attempt, Climb
     from stages.structure.job import Job
-    from stages.structure.ladder import Attempt, Climb
-    from stages.structure.shares import Hands
     from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PHOTOGRAPHS = 3
@@ -138,12 +138,19 @@ def run(
     pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
     SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
-    from stages.structure import attempts, finish, ladder, light, metric, reconstruction_files
+    from stages.structure import (
+        attempts,
+        fallbacks,
+        finish,
+        light,
+        metric_scale,
+        reconstruction_files,
+    )
 
     capture: Capture = inputs["ingest"]
     _check(capture)
     if settings.scale:
-        metric.checked_distance(settings.scale, capture)  # now, not when cameras are found
+        metric_scale.checked_distance(settings.scale, capture)  # now, not when cameras are found
     if (folder / _FINISHED).exists():
         return _again(folder, report)
     work = folder / _WORK
@@ -160,7 +167,7 @@ def run(
         allow_partial=settings.allow_partial,
         hands=hands,
     )
-    climbed = ladder.climb(
+    climbed = fallbacks.climb(
         bench.try_rung,
         already_exhaustive=base.matching == "exhaustive",
         out_of_time=bench.out_of_time,
@@ -170,7 +177,7 @@ def run(
     model = _accepted(best, settings, capture)
     _tell(best, climbed, capture, report)
     found = finish.finish(
-        model, capture, folder, report, metric.Known(settings.scale, settings.marker)
+        model, capture, folder, report, metric_scale.Known(settings.scale, settings.marker)
     )
     reconstruction = light.with_light(found, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
@@ -190,10 +197,10 @@ def _with_known_cameras(
 ) -> Reconstruction:
     import numpy as np
 
-    from stages.structure import known, light, metric, reconstruction_files
+    from stages.structure import known_cameras, light, metric_scale, reconstruction_files
 
     deadline = time.monotonic() + 60.0 * settings.max_minutes
-    found = known.reconstruct(
+    found = known_cameras.reconstruct(
         capture,
         cameras,
         folder,
@@ -204,7 +211,9 @@ def _with_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        size=metric.Known(settings.scale, settings.marker, float(settings.metres), "--metres"),
+        size=metric_scale.Known(
+            settings.scale, settings.marker, float(settings.metres), "--metres"
+        ),
         seconds_left=lambda: deadline - time.monotonic(),
     )
     found = light.with_light(found, report)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from stages.measure.judge import Photograph
+    from stages.measure.evaluation import EvaluationView
     from stages.raster.definition import MemoryFull
     from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats
     from stages.training.clock import Spent
@@ -239,7 +239,7 @@ def make_trainer(
     report: Report,
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
-    from stages.measure.judge import load_photographs
+    from stages.measure.evaluation import load_evaluation_views
     from stages.scene import look_of, seen_extent, split_held_out
     from stages.training.cap import cap_for, splats_told
     from stages.training.schedule import Schedule
@@ -250,7 +250,7 @@ def make_trainer(
     light = light_wanted(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
     look = look_of(reconstruction.views, settings.train_side, light)
-    held_out = load_photographs(reconstruction.folder, held, look)
+    held_out = load_evaluation_views(reconstruction.folder, held, look)
     smaller = [
         v
         for v in reconstruction.views
@@ -342,7 +342,7 @@ def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
 class Judged(Protocol):
     """What `write_quality` asks of whoever trained; see `Trainer`."""
 
-    held_out: Sequence[Photograph]
+    held_out: Sequence[EvaluationView]
     look: Look
     history: list[dict[str, Any]]
     times: list[Spent]
@@ -357,11 +357,11 @@ def write_quality(
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.measure.judge import as_taken_db, inside_db, scores, spread
+    from stages.measure.evaluation import evaluate, psnr_as_taken_db, psnr_inside_masks_db, spread
     from stages.scene import split_held_out
     from stages.training.charts import contact_sheet, training_plot
 
-    found = scores(trainer.drawn, trainer.held_out, with_flip=True)
+    found = evaluate(trainer.drawn, trainer.held_out, with_flip=True)
     if found:
         values = [score.psnr_db for score in found]
         worst = min(found, key=lambda score: score.psnr_db)
@@ -379,10 +379,10 @@ def write_quality(
         )
     if trainer.look.light and found:
         _, held = split_held_out(reconstruction.views)
-        plain, adapted = as_taken_db(trainer.drawn, reconstruction.folder, held, trainer.look)
+        plain, adapted = psnr_as_taken_db(trainer.drawn, reconstruction.folder, held, trainer.look)
         report.metric("psnr_as_taken_db", round(plain, 3))
         report.metric("psnr_adapted_db", round(adapted, 3))
-    inside = inside_db(trainer.drawn, trainer.held_out)
+    inside = psnr_inside_masks_db(trainer.drawn, trainer.held_out)
     if inside is not None:
         report.metric("psnr_inside_db", round(inside, 3))
     report.metric("held_out", [asdict(score) for score in found])

@@ -11,8 +11,8 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.capacity import pruning
 from stages.capacity.targets import FELT
-from stages.measure.judge import load_photographs, mean_psnr_db
-from stages.measure.worth import Worth, beside_pictures, floaters
+from stages.measure.contribution import Contributions, floaters, near_view_frusta
+from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.scene import Splats, TrainedSplats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
@@ -47,7 +47,7 @@ def rows_of(part: Splats, whole: Splats) -> np.ndarray:
 
 def training_db(scene: SmallScene, found: Splats) -> float:
     training, _ = split_held_out(scene.reconstruction.views)
-    photographs = load_photographs(scene.reconstruction.folder, training, found.look)
+    photographs = load_evaluation_views(scene.reconstruction.folder, training, found.look)
     return mean_psnr_db(found, photographs, "cpu")
 
 
@@ -226,13 +226,15 @@ def test_the_origin_stays(scene, tmp_path) -> None:
     assert (result.origin == origin).all()
 
 
-def worth_of(photographs, sse_change, scene_depth=(4.0,)) -> Worth:
+def worth_of(photographs, sse_change, scene_depth=(4.0,)) -> Contributions:
     """A Worth with what the rules read; a splat in no photograph has no weight."""
     seen = np.asarray(photographs, np.int32)
     weight = (seen > 0).astype(np.float64)
     change, depth = np.asarray(sse_change, np.float64), np.asarray(scene_depth, np.float64)
     bands = np.zeros((len(seen), 0))
-    return Worth(change, change, weight, weight, seen, 1.0, depth, bands, bands, bands, depth)
+    return Contributions(
+        change, change, weight, weight, seen, 1.0, depth, bands, bands, bands, depth
+    )
 
 
 def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
@@ -250,4 +252,4 @@ def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:
 def test_beside_a_picture_is_a_quarter_of_its_longer_side_beyond_the_rim() -> None:
     """A camera of 64 x 48 pixels and focal length 60 sees x of -0.53 to 0.53 at depth 1."""
     scene = splats([[0, 0, 1], [0.75, 0, 1], [0.85, 0, 1], [0, 0, -1]])
-    assert beside_pictures(scene, [camera()]).tolist() == [True, True, False, False]
+    assert near_view_frusta(scene, [camera()]).tolist() == [True, True, False, False]

@@ -11,9 +11,9 @@ import numpy as np
 from stages.base.stage import Report
 from stages.capacity.selection import SPLATS_A_ROUND, Removal, choose
 from stages.capacity.targets import Targets
-from stages.measure.judge import Photograph, drawing_of
-from stages.measure.price import Price, price_of
-from stages.measure.worth import Worth, measure_worth, squared_error
+from stages.measure.contribution import Contributions, measure_contributions, squared_error
+from stages.measure.evaluation import EvaluationView, image_renderer
+from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
 from stages.scene import Splats, spread_over
 from stages.training.finetune import FineTuner
 
@@ -50,7 +50,7 @@ class PruningResult:
     least was worth at the start."""
 
     splats: Splats
-    price: Price
+    price: RateDistortion
     start_db: float
     end_db: float
     least_tenth_db: float
@@ -64,7 +64,7 @@ class Pruner:
     of as many; where targets want more rounds, they share the steps. All photographs tell what it
     learns and what each splat is worth at first, as many as `LOOKED_AT` decide."""
 
-    photographs: Sequence[Photograph]
+    photographs: Sequence[EvaluationView]
     targets: Targets
     backend: str
     tuner: FineTuner
@@ -85,8 +85,10 @@ class Pruner:
         best = worth.psnr_db
         mean_db = float(best.mean())
         self.targets.check_start(mean_db)
-        price = price_of(drawing_of(splats, self.backend), self._pictures(self.decide))
-        price = price.of_more(len(self.photographs) / max(1, len(self.decide)))
+        price = rate_distortion_of(
+            image_renderer(splats, self.backend), self._pictures(self.decide)
+        )
+        price = price.scaled(len(self.photographs) / max(1, len(self.decide)))
         found = PruningResult(splats, price, mean_db, mean_db, _least_tenth_db(worth))
         planned, share, overlap = self._planned(splats), SPLATS_A_ROUND, OVERLAP
         if planned:
@@ -122,7 +124,7 @@ class Pruner:
         self.targets.check_end(found.splats, found.end_db)
         return found
 
-    def _without_harm(self, found: PruningResult, worth: Worth) -> Worth:
+    def _without_harm(self, found: PruningResult, worth: Contributions) -> Contributions:
         """Take out what the photographs are better without. Fewer, where they turn out to be missed
         together: drawing tells."""
         share = SPLATS_A_ROUND
@@ -145,18 +147,18 @@ class Pruner:
             share /= 2
         return worth
 
-    def _pictures(self, numbers: list[int]) -> Iterator[Photograph]:
+    def _pictures(self, numbers: list[int]) -> Iterator[EvaluationView]:
         return (self.photographs[i] for i in numbers)
 
-    def _first_worth(self, splats: Splats) -> Worth:
+    def _first_worth(self, splats: Splats) -> Contributions:
         others = None
         if self.others:
-            others = measure_worth(splats, self._pictures(self.others), self.backend)
-        return measure_worth(splats, self._pictures(self.decide), self.backend, others)
+            others = measure_contributions(splats, self._pictures(self.others), self.backend)
+        return measure_contributions(splats, self._pictures(self.decide), self.backend, others)
 
-    def _worth(self, splats: Splats, before: Worth, cut: Removal) -> Worth:
+    def _worth(self, splats: Splats, before: Contributions, cut: Removal) -> Contributions:
         others = before.others.take(~cut.gone) if before.others else None
-        return measure_worth(splats, self._pictures(self.decide), self.backend, others)
+        return measure_contributions(splats, self._pictures(self.decide), self.backend, others)
 
     def _planned(self, splats: Splats) -> int:
         """As many rounds as targets need, and a few for what they leave over."""
@@ -166,9 +168,11 @@ class Pruner:
         needed = math.log(left / len(splats)) / math.log(1 - SPLATS_A_ROUND)
         return max(self.rounds, math.ceil(needed) + 4)
 
-    def _cut(self, found: PruningResult, worth: Worth, excess: int, share: float) -> Removal | None:
+    def _cut(
+        self, found: PruningResult, worth: Contributions, excess: int, share: float
+    ) -> Removal | None:
         forced = excess > 0 or self.targets.min_psnr_db > 0
-        limit = math.inf if forced else self.targets.price * found.price.sse_a_number
+        limit = math.inf if forced else self.targets.price * found.price.sse_per_parameter
         most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
         most = min(most, excess, len(found.splats) - 1) if excess else most
         return choose(
@@ -176,12 +180,12 @@ class Pruner:
         )
 
 
-def _fresh_sse(worth: Worth) -> float:
+def _fresh_sse(worth: Contributions) -> float:
     """Of the photographs that decide."""
     return worth.sse - (worth.others.sse if worth.others else 0.0)
 
 
-def _told_by(worth: Worth) -> float:
+def _told_by(worth: Contributions) -> float:
     """How much larger a change is of all photographs than of those that decide."""
     return 1 + (worth.others.sse if worth.others else 0.0) / max(_fresh_sse(worth), TINY)
 
@@ -201,7 +205,7 @@ def _round(
     )
 
 
-def _least_tenth_db(worth: Worth) -> float:
+def _least_tenth_db(worth: Contributions) -> float:
     """By the worth of each alone."""
     change = np.sort(worth.sse_change)[: max(1, len(worth.sse_change) // 10)].sum()
     return 10 * math.log10(max(1e-12, 1 + float(change) / worth.sse)) if worth.sse else 0.0

@@ -24,7 +24,7 @@ from stages.base.lazy import named
 from stages.formats.axes import least_turned
 from stages.formats.coarse import Bits, held_by, on_grids
 from stages.formats.table import Format
-from stages.measure.judge import Photograph, mean_psnr_db
+from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
 from stages.training.finetune import FineTuner
 
@@ -41,7 +41,7 @@ class Fitting:
     them that tell whether it was worth it. steps: see `tuned_to`; seen: see `Tuner.tuned`."""
 
     tuner: FineTuner
-    deciding: Sequence[Photograph]
+    deciding: Sequence[EvaluationView]
     backend: str
     steps: int
     seen: NDArray[np.int32]

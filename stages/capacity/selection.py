@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.worth import Worth, beside_pictures, floaters
+from stages.measure.contribution import Contributions, floaters, near_view_frusta
 from stages.scene import SH_C0, Camera, Splats, morton, numbers_of
 
 SPLATS_A_ROUND = 0.10  # predictions for single splats add up only while few go at once,
@@ -39,9 +39,9 @@ class Removal:
 
 def choose(
     splats: Splats,
-    worth: Worth,
+    worth: Contributions,
     cameras: Sequence[Camera],
-    sse_a_number: float,
+    sse_per_parameter: float,
     most: int,
     share: float = SPLATS_A_ROUND,
     harm: bool = False,
@@ -57,7 +57,7 @@ def choose(
     Floaters and what lies where no photograph looks go whatever the price. What continues a picture
     beyond its rim, where none speaks against it, goes last, and only at an infinite price.
     """
-    seen, beside = worth.photographs > 0, beside_pictures(splats, list(cameras))
+    seen, beside = worth.photographs > 0, near_view_frusta(splats, list(cameras))
     floating = floaters(splats, worth, list(cameras))
     free = floating | (~seen & ~beside)
     alone = worth.sse_change if harm else worth.picture_change
@@ -66,11 +66,11 @@ def choose(
     ratio[free] = -np.inf
     order = np.argsort(ratio, kind="stable")
     allowed = free | _first_of_neighbours(splats, ratio)
-    chosen = order[(allowed & (ratio < sse_a_number))[order]][:most]
+    chosen = order[(allowed & (ratio < sse_per_parameter))[order]][:most]
     gone = np.zeros(len(splats), bool)
     gone[chosen] = True
     # bands by the worth of the last splat that goes: what is worth more stays, splat or band
-    limit = float(ratio[chosen[-1]]) if 0 < len(chosen) == most else sse_a_number
+    limit = float(ratio[chosen[-1]]) if 0 < len(chosen) == most else sse_per_parameter
     degrees, colour, bands_sse = _cut_bands(splats, worth, gone, limit, share, harm)
     if not len(chosen) and np.array_equal(degrees, splats.sh_degrees):
         return None
@@ -90,25 +90,28 @@ def _first_of_neighbours(splats: Splats, ratio: NDArray[np.float64]) -> NDArray[
 
 def _cut_bands(
     splats: Splats,
-    worth: Worth,
+    worth: Contributions,
     gone: NDArray[np.bool_],
-    sse_a_number: float,
+    sse_per_parameter: float,
     share: float,
     harm: bool,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
     """(degrees, colour, predicted change) of the splats that stay, as in `Cut`."""
     degrees, colour = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     best, to = np.full(len(splats), np.inf), np.zeros(len(splats), np.int64)
-    numbers, change = numbers_of(degrees), worth.cut_change if harm else worth.cut_picture
+    numbers, change = (
+        numbers_of(degrees),
+        worth.truncated_sse_change if harm else worth.truncated_picture_change,
+    )
     for degree in range(splats.sh_degree):
         saved = numbers - numbers_of(np.full(1, degree))
         ratio = np.where(saved > 0, change[:, degree] / np.maximum(saved, 1), np.inf)
         better = (ratio < best) & ~gone
         best[better], to[better] = ratio[better], degree
     order = np.argsort(best, kind="stable")[: max(1, int(BANDS * share * len(splats)))]
-    rows = order[best[order] < sse_a_number]
+    rows = order[best[order] < sse_per_parameter]
     degrees[rows] = to[rows]
     if not len(rows):
         return degrees, colour, 0.0
-    colour[rows] = worth.cut_colour[rows, to[rows]]
-    return degrees, colour, float(worth.cut_change[rows, to[rows]].sum())
+    colour[rows] = worth.truncated_colour[rows, to[rows]]
+    return degrees, colour, float(worth.truncated_sse_change[rows, to[rows]].sum())

@@ -21,7 +21,7 @@ def summarise(
     told = [
         f"Price: the photographs of training hold {price.samples:,} colour values, worth "
         f"{price.independent:,.0f} independent ones; so a number costs "
-        f"{price.bits_a_number:.1f} bits, and one dB is worth {price.bits_a_db / 8e3:,.0f} kB "
+        f"{price.bits_per_parameter:.1f} bits, and one dB is worth {price.bits_per_db / 8e3:,.0f} kB "
         f"(dial at {dial:g})."
     ]
     kept = [one for one in found.rounds if one.kept]

@@ -21,7 +21,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Report, Stage
 from stages.base.words import counted
 from stages.distributed import block_folders
-from stages.distributed.tasks import Engine, OpenEngine, Run, do_all, need_of
+from stages.distributed.tasks import Executor, OpenExecutor, RunTask, resources_of, run_all
 from stages.raster.backends import drawn_by
 from stages.run.pipeline import Listener, Pipeline
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from stages.distributed.ground import Cell
-    from stages.measure.judge import Photograph
+    from stages.distributed.partition import Cell
+    from stages.measure.evaluation import EvaluationView
     from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats, View
     from stages.training.clock import Spent
 
@@ -40,7 +40,7 @@ PHOTOGRAPHS_A_BLOCK = 250
 COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4
 
 
-def in_blocks(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
+def in_blocks(pipeline: Pipeline, open_engine: OpenExecutor) -> Pipeline:
     """The pipeline, training in blocks where its settings ask for it."""
     plain = pipeline.layout.stage("train")
     return pipeline.with_run("train", partial(_train, pipeline, plain, open_engine))
@@ -54,7 +54,7 @@ def blocks_wanted(asked: str, photographs: int) -> int:
 def _train(
     pipeline: Pipeline,
     plain: Stage,
-    open_engine: OpenEngine,
+    open_engine: OpenExecutor,
     inputs: Mapping[str, Any],
     settings: Any,
     folder: Path,
@@ -83,12 +83,12 @@ class _Scene:
     whole: Reconstruction
     settings: Any
     root: Path
-    engine: Engine
+    engine: Executor
     report: Report
 
     def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
         """The merged splats, written to `folder` as training writes them."""
-        from stages.distributed import ground, sight
+        from stages.distributed import block_views, partition
         from stages.scene import look_of, split_held_out
         from stages.train import light_wanted, save, write_quality
 
@@ -97,14 +97,16 @@ class _Scene:
         self.settings = replace(self.settings, light="on" if light else "off")
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
-        places, weights = ground.looked_at(replace(self.whole, views=training))
-        cells = ground.cut(places, weights, blocks)
+        places, weights = partition.looked_at(replace(self.whole, views=training))
+        cells = partition.cut(places, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
-        member = sight.members(sight.shares(coarse, cells, cameras, drawn_by(self.settings)))
-        folders = self._blocks(seeds, coarse, cells, member, ground.margin(places))
+        member = block_views.members(
+            block_views.shares(coarse, cells, cameras, drawn_by(self.settings))
+        )
+        folders = self._blocks(seeds, coarse, cells, member, partition.margin(places))
         parts = self._parts(folders, cells, member)
         look = look_of(self.whole.views, self.settings.train_side, light)
-        crossed = sight.crossing(member)
+        crossed = block_views.crossing(member)
         crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
         teachers = [view for view in crossing if view in training]
         trained = self._joined(parts, cells, teachers, look)
@@ -194,13 +196,13 @@ class _Scene:
     ) -> NDArray[np.bool_]:
         """[N] which of a block's splats are of the whole: those of its cell, at most as many."""
         from stages.distributed import merge
-        from stages.measure.judge import load_photographs
+        from stages.measure.evaluation import load_evaluation_views
 
         own = cell.holds(splats.means)
         if own.sum() <= most:
             return own
         training = [view for view in views if view.role != "test"]
-        photographs = load_photographs(self.whole.folder, training, splats.look)
+        photographs = load_evaluation_views(self.whole.folder, training, splats.look)
         return merge.shown_most(splats, own, most, photographs, drawn_by(self.settings))
 
     def _begin(
@@ -225,11 +227,11 @@ class _Scene:
     def _run(self, names: Sequence[str], most_splats: int) -> None:
         """Train in the run folders of these names. Raises SplatError for the first that failed,
         once the others have ended."""
-        tasks = [Run(self.root / name, until="train") for name in names]
-        do_all(
+        tasks = [RunTask(self.root / name, until="train") for name in names]
+        run_all(
             self.engine,
             tasks,
-            need_of(replace(self.settings, max_splats=most_splats)),
+            resources_of(replace(self.settings, max_splats=most_splats)),
             self.report.stop_requested,
             lambda done: self.report.progress(done, len(names), "blocks"),
             hint="Give the same command again: blocks that are finished are kept.",
@@ -247,7 +249,7 @@ class _Scene:
         import numpy as np
 
         from stages.distributed import merge
-        from stages.measure.judge import load_photographs
+        from stages.measure.evaluation import load_evaluation_views
         from stages.scene import TrainedSplats, seen_extent
         from stages.training.finetune import FineTuner
 
@@ -261,7 +263,7 @@ class _Scene:
         gone = np.zeros(len(splats), bool)
         if crossing:
             self.report.progress(0, 1, "seams")
-            photographs = load_photographs(self.whole.folder, crossing, look)
+            photographs = load_evaluation_views(self.whole.folder, crossing, look)
             extent = seen_extent(self.whole)
             tuner = FineTuner(photographs, extent, backend, self.report, found.sat_out)
             splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
@@ -279,7 +281,7 @@ class _Judged:
     """See `stages.train.Judged`."""
 
     draw: Callable[[Camera], Any]
-    held_out: Sequence[Photograph]
+    held_out: Sequence[EvaluationView]
     look: Look
     history: list[dict[str, Any]]
     times: list[Spent]
@@ -290,10 +292,10 @@ class _Judged:
 
 
 def _judged(splats: Splats, scene: _Scene, held: Sequence[View]) -> _Judged:
-    from stages.measure.judge import drawing_of, load_photographs
+    from stages.measure.evaluation import image_renderer, load_evaluation_views
 
-    photographs = load_photographs(scene.whole.folder, held, splats.look)
-    draw = drawing_of(splats, drawn_by(scene.settings))
+    photographs = load_evaluation_views(scene.whole.folder, held, splats.look)
+    draw = image_renderer(splats, drawn_by(scene.settings))
     return _Judged(draw, photographs, splats.look, [], [])
 
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.distributed.ground import Cell
-from stages.measure.judge import Photograph
-from stages.measure.worth import measure_worth, squared_error
+from stages.distributed.partition import Cell
+from stages.measure.contribution import measure_contributions, squared_error
+from stages.measure.evaluation import EvaluationView
 from stages.scene import Look, Splats
 from stages.training.finetune import FineTuner
 
@@ -33,12 +33,12 @@ def shown_most(
     splats: Splats,
     own: NDArray[np.bool_],
     most: int,
-    photographs: Sequence[Photograph],
+    photographs: Sequence[EvaluationView],
     backend: str,
 ) -> NDArray[np.bool_]:
     """[N] as many of a block's splats `own` [N]: without those whose going changes the pictures of
     its photographs least."""
-    change = measure_worth(splats, photographs, backend).picture_change
+    change = measure_contributions(splats, photographs, backend).picture_change
     rows = np.flatnonzero(own)
     kept = own.copy()
     kept[rows[np.argsort(change[rows], kind="stable")[: len(rows) - most]]] = False
@@ -76,7 +76,7 @@ def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> ND
 def put_right(
     splats: Splats,
     seam: NDArray[np.bool_],
-    photographs: Sequence[Photograph],
+    photographs: Sequence[EvaluationView],
     tuner: FineTuner,
     backend: str,
 ) -> tuple[Splats, NDArray[np.bool_]]:
@@ -84,7 +84,7 @@ def put_right(
     to them all for a while; [N] which went). Two blocks that each stood in for the other have put
     there twice what is there once; what only seems to be too much is missed when all of it goes,
     and drawing tells."""
-    worth = measure_worth(splats, photographs, backend)
+    worth = measure_contributions(splats, photographs, backend)
     harm = np.flatnonzero(seam & (worth.sse_change < 0))
     harm = harm[np.argsort(worth.sse_change[harm], kind="stable")]
     for part in HARM_PARTS:

@@ -20,7 +20,7 @@ from stages.editing.scene import Edited
 from stages.editing.turning import Similarity
 from stages.editing.words import WORDS, Typed
 from stages.formats.rows import chosen, kept_rows
-from stages.measure.worth import floaters as hanging
+from stages.measure.contribution import floaters as hanging
 from stages.scene import Splats
 
 Operation = Callable[[Edited], Edited]

@@ -20,12 +20,12 @@ from statistics import median
 from stages.base.atomic import replacing
 from stages.base.stage import Report
 from stages.structure import database as sqlite
-from stages.structure import ticks
+from stages.structure import worker_progress
+from stages.structure.chunks import Hands, hand_out_features, hand_out_pairs
+from stages.structure.fallbacks import LADDER, Attempt, Rung
 from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
 from stages.structure.job import Job, looked_path
-from stages.structure.ladder import LADDER, Attempt, Rung
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
-from stages.structure.shares import Hands, hand_out_features, hand_out_pairs
 from stages.structure.sparse_model import load_result, measure, without_odd_views
 
 MORE_FEATURES = 2.0  # times as many, at most
@@ -210,7 +210,7 @@ class Workbench:
 
     def _tick(self, job: Job, unit: str, more: str = "") -> None:
         """Pass on how far the worker says it is."""
-        told = ticks.read(Path(job.progress))
+        told = worker_progress.read(Path(job.progress))
         if told is not None:
             phase, done, total = told
             self.report.progress(done, total, phase + more, **{unit: done})

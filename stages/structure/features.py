@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from stages.base import memory
 from stages.base.memory import MIB
-from stages.structure import blank_database
 from stages.structure import database as sqlite
+from stages.structure import new_database
 from stages.structure.job import Job, shares_path
-from stages.structure.ticks import Ticks
+from stages.structure.worker_progress import Ticks
 
 LARGEST_SIDE = 3200  # pixels; larger photographs are made smaller for finding features
 LAYERS = 3  # of an octave
@@ -37,7 +37,7 @@ def extract(job: Job) -> None:
     what finished shares hold."""
     path = Path(job.database)
     if not path.exists():
-        blank_database.create(path, job)
+        new_database.create(path, job)
     sqlite.gather(path, sorted(shares_path(job).glob("*.db")))
     have = sqlite.photographs_with_features(path)
     missing = [position for position in range(len(job.names)) if position not in have]
@@ -46,7 +46,7 @@ def extract(job: Job) -> None:
 
 def extract_share(job: Job) -> None:
     """Those of the job's share of the photographs, into a database of their own."""
-    blank_database.create(Path(job.database), job, job.photographs)
+    new_database.create(Path(job.database), job, job.photographs)
     _extract(job, list(job.photographs), 0)
 
 

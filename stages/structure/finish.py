@@ -15,9 +15,9 @@ from stages.base.stage import Report
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
 from stages.structure.levelling import upright
-from stages.structure.metric import NOTHING, Known, find_metric
+from stages.structure.metric_scale import NOTHING, Known, find_metric
 from stages.structure.sparse_model import SparseModel, point_errors
-from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px
+from stages.structure.undistortion import Pinhole, maps, pinhole_for, undistorted_px
 
 COLMAP = "colmap"
 IMAGES = f"{COLMAP}/images"

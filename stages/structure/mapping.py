@@ -12,11 +12,11 @@ import numpy as np
 import pycolmap
 
 from stages.structure import database as sqlite
-from stages.structure.agreement import fitting_shares
+from stages.structure.epipolar import fitting_shares
 from stages.structure.job import Job
 from stages.structure.placing import Placing
 from stages.structure.sparse_model import SparseModel, save_model
-from stages.structure.ticks import Ticks
+from stages.structure.worker_progress import Ticks
 
 # Of a smaller model that may contradict the largest.
 CREDIBLE_VIEWS, CREDIBLE_SHARE, CREDIBLE_POINTS = 4, 0.1, 20  # points: for each view

@@ -14,8 +14,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.structure import blank_database, nearest, pairs, retrieval
 from stages.structure import database as sqlite
+from stages.structure import descriptor_matching, new_database, pairs, retrieval
 from stages.structure.job import (
     Job,
     alike_path,
@@ -25,8 +25,8 @@ from stages.structure.job import (
     words_path,
 )
 from stages.structure.pairs import Pair
-from stages.structure.ticks import Ticks
-from stages.structure.words import SAMPLE, Sorted, sort_by_word, two_words, vocabulary
+from stages.structure.vocabulary import SAMPLE, Sorted, sort_by_word, two_words, vocabulary
+from stages.structure.worker_progress import Ticks
 
 FIRST_LOOK = 1000  # features: the largest, which are seen from farthest
 FIRST_COMPARED = 64  # see `words.COMPARED`; a first look need not be right about single features
@@ -67,7 +67,7 @@ def choose(job: Job) -> None:
 
 def match_share(job: Job) -> None:
     """Match and verify the job's share of the pairs, into a database of their own."""
-    blank_database.create(Path(job.database), job, ())
+    new_database.create(Path(job.database), job, ())
     sqlite.take_cameras(Path(job.database), Path(job.source))
     with _matcher(job, job.source, still=True) as matcher:
         matcher.run(list(job.pairs))
@@ -164,7 +164,9 @@ class _Matcher:
         known = self._features.matches(first, second)
         matches = known
         if matches is None:
-            matches = nearest.matches(self.album.sorted(first), self.album.sorted(second))
+            matches = descriptor_matching.matches(
+                self.album.sorted(first), self.album.sorted(second)
+            )
         geometry = pycolmap.TwoViewGeometry()
         if len(matches) >= FEWEST_INLIERS:
             found = pycolmap.estimate_two_view_geometry(
@@ -201,7 +203,7 @@ def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
         )
 
         def look(pair: Pair) -> int:
-            return len(nearest.matches(sorted_[pair[0]], sorted_[pair[1]]))
+            return len(descriptor_matching.matches(sorted_[pair[0]], sorted_[pair[1]]))
 
         for done, (pair, count) in enumerate(zip(wanted, pool.map(look, wanted), strict=True), 1):
             alike[pair] = count

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from types import TracebackType
 
-from stages.structure.ticks import Ticks
+from stages.structure.worker_progress import Ticks
 
 LONG_S = 0.5  # between two photographs: so long mostly if all cameras were adjusted between them
 ENDING = 0.4  # of all the time: what follows when all are placed, adjusting all of them once more

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.structure.gates import Figures, Limits
-from stages.structure.links import loosest_link
+from stages.structure.view_graph import loosest_link
 
 _SAMPLED_POINTS = 4000  # angles need every pair of rays of a point: a sample is enough
 _SAMPLED_RAYS = 24

@@ -17,14 +17,14 @@ def main(arguments: list[str]) -> int:
     """Run the job named on the command line. Returns the exit status (0: done)."""
     die_with_parent()
     job = Job.read(Path(arguments[0]))
-    from stages.structure import features, known_worker, mapping, matching
+    from stages.structure import features, known_cameras_worker, mapping, matching
 
     steps = {
         "features": features.extract,
         "matching": matching.match,
         "mapping": mapping.map_photographs,
-        "neighbours": known_worker.match_neighbours,
-        "triangulation": known_worker.triangulate,
+        "neighbours": known_cameras_worker.match_neighbours,
+        "triangulation": known_cameras_worker.triangulate,
         "choosing": matching.choose,
         "features share": features.extract_share,
         "matching share": matching.match_share,

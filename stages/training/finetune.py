@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
 from stages.raster.draw import settings_of
@@ -35,7 +35,7 @@ class FineTuner:
 
     def __init__(
         self,
-        photographs: Sequence[Photograph],
+        photographs: Sequence[EvaluationView],
         extent: float,
         backend: str,
         report: Report,
@@ -130,7 +130,7 @@ def _with(finetuned: Splats, before: Splats, still: Collection[str]) -> Splats:
     return replace(finetuned, sh=sh, **arrays)
 
 
-def _level(photograph: Photograph) -> Level:
+def _level(photograph: EvaluationView) -> Level:
     """In the light and over the background that it is judged in, without what is not judged."""
     planar: NDArray[np.uint8] = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
     kept = photograph.kept

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
+from stages.measure.evaluation import EvaluationView, evaluate, evaluation_subset
 from stages.measure.images import psnr
-from stages.measure.judge import Photograph, scores, spread
 from stages.raster.backends import AUTO, backend_of, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths
@@ -72,7 +72,7 @@ class Trainer:
 
     schedule: Schedule
     train: list[TrainingView]
-    held_out: Sequence[Photograph]
+    held_out: Sequence[EvaluationView]
     look: Look
     cap: int
     folder: Path
@@ -99,7 +99,7 @@ class Trainer:
         self.stopped = False  # by the last of them: training went back to the one before
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
-        self._onlookers = [self.held_out[i] for i in spread(len(self.held_out))]
+        self._onlookers = [self.held_out[i] for i in evaluation_subset(len(self.held_out))]
         self.history: list[dict[str, Any]] = []
         self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
 
@@ -360,7 +360,7 @@ class Trainer:
 
     def _record(self, step: int) -> None:
         began = self.clock.spent().seconds
-        found = scores(self.drawn, self._onlookers)
+        found = evaluate(self.drawn, self._onlookers)
         entry: dict[str, Any] = {"step": step, "splats": len(self.model)}
         self._pace.reserve = LAST_WORDS * (self.clock.spent().seconds - began)
         if found:

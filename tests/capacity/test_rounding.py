@@ -15,7 +15,7 @@ from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import least_turned
 from stages.formats.coarse import Bits, on_grids
-from stages.measure.judge import load_photographs, mean_psnr_db
+from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats, TrainedSplats, seen_extent, split_held_out
 from stages.training.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene
@@ -37,7 +37,7 @@ def tuner(scene: SmallScene, sits_out: bool = False) -> FineTuner:
 
 def photographs(scene: SmallScene, held_out: bool = False):
     views = split_held_out(scene.reconstruction.views)[held_out]
-    return load_photographs(scene.reconstruction.folder, views, scene.splats.look)
+    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.look)
 
 
 def nothing_seen(splats: Splats) -> np.ndarray:

@@ -12,7 +12,7 @@ import pytest
 from stages.editing.operations import done, prepared
 from stages.editing.scene import Edited
 from stages.editing.words import Typed
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.raster.draw import render
 from stages.scene import Camera, Look, Splats, View, look_at
 from tests import scenes
@@ -41,7 +41,7 @@ def scene(splats: Splats) -> Edited:
     photographs, views = [], []
     for number, camera in enumerate(cameras()):
         pixels = np.rint(255 * np.clip(render(splats, camera).image, 0, 1)).astype(np.uint8)
-        photographs.append(Photograph(str(number), camera, pixels))
+        photographs.append(EvaluationView(str(number), camera, pixels))
         views.append(View(str(number), "", camera))
     return Edited(splats, "metres", photographs, photographs[:2], tuple(views))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.scene import Camera
 from stages.scene.light import NOISE_EV, spread_ev
 from stages.structure.light import ALIKE, measured_light
@@ -82,7 +82,7 @@ def test_a_photograph_is_brought_back_to_what_the_median_one_shows(
     truth = rng.uniform(0.02, 0.5, (20, 30, 3))
     where = Camera(30, 20, 30.0, 30.0, 15.0, 10.0, np.eye(4))
     as_taken = np.rint(seen(truth * 2.0 ** np.array(light)) * 255).astype(np.uint8)
-    even = Photograph("a", where, as_taken).in_median_light(light)
+    even = EvaluationView("a", where, as_taken).in_median_light(light)
     kept = even.kept
     assert kept is not None
     assert kept.mean() > 0.3

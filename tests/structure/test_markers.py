@@ -13,7 +13,7 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.scene import Camera, Capture, look_at
 from stages.structure.markers import marker_sides
-from stages.structure.metric import Known, find_metric
+from stages.structure.metric_scale import Known, find_metric
 from tests.structure.bad_captures import SAMPLE
 
 SIDE = 0.37  # of a marker, world units

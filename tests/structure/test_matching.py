@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.structure import database as sqlite
-from stages.structure import ticks
+from stages.structure import worker_progress
 from stages.structure.job import Job
 from stages.structure.pairs import every
 from tests.structure import sample_jobs as jobs
@@ -61,7 +61,7 @@ def test_three_threads_find_what_one_finds(
     jobs.work(job)
     assert (found(job, "matches"), found(job, "two_view_geometries")) == whole
     assert len(whole[0]) == len(every(PHOTOGRAPHS))
-    assert ticks.read(Path(job.progress)) == ("matching", 36, 36)
+    assert worker_progress.read(Path(job.progress)) == ("matching", 36, 36)
 
 
 def test_what_was_found_before_is_kept_and_the_missing_added(

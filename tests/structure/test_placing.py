@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stages.structure.placing import Placing
-from stages.structure.ticks import Ticks, read
+from stages.structure.worker_progress import Ticks, read
 
 PHOTOGRAPHS = 300
 PLACING_S, ADJUSTING_S = 0.15, 0.05  # each photograph; each photograph that is there

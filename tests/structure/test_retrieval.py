@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure import retrieval, words
+from stages.structure import retrieval, vocabulary
 from stages.structure.pairs import every
 
 
@@ -49,5 +49,5 @@ def test_a_feature_is_the_two_words_nearest_to_it() -> None:
     near = np.zeros((2, 128), np.uint8)
     near[0, [1, 3]] = 180, 120
     near[1, [3, 1]] = 180, 120
-    assert words.two_words(near, vocabulary).tolist() == [7, 7]
-    assert words.two_words(near, vocabulary[:1]).tolist() == [0, 0]
+    assert vocabulary.two_words(near, vocabulary).tolist() == [7, 7]
+    assert vocabulary.two_words(near, vocabulary[:1]).tolist() == [0, 0]

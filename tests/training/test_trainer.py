@@ -11,8 +11,8 @@ from splatcli.summary import headline
 from stages import train
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
+from stages.measure.evaluation import EvaluationView, evaluate
 from stages.measure.images import psnr
-from stages.measure.judge import Photograph, scores
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
@@ -37,7 +37,7 @@ def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, back
     # of an extent of 10, no splat of these toys is large enough to be pruned as a giant
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=degree, n_start=len(start), seed=0)
     judges = [
-        Photograph(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
+        EvaluationView(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
         for view in views
     ]
     report = report or Report()
@@ -46,7 +46,7 @@ def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, back
 
 def psnr_of(trained):
     """Of the first photograph, drawn as it is now."""
-    return scores(trained.drawn, trained.held_out)[0].psnr_db
+    return evaluate(trained.drawn, trained.held_out)[0].psnr_db
 
 
 def disc_and_square():

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
-from stages.structure.seeding.places import cells, centres, seen, unprojected
-from stages.structure.seeding.witnesses import Witnesses
+from stages.structure.seeding.projection import cells, centres, seen, unprojected
+from stages.structure.seeding.visibility import Witnesses
 
 CELLS = 32  # along the longer side of a photograph
 MARGIN = 0.25  # of the longer side: how far beyond its rim a photograph is continued

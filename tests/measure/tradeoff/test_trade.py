@@ -11,8 +11,8 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.formats import FORMATS
-from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE
-from stages.measure.judge import load_photographs
+from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
+from stages.measure.evaluation import load_evaluation_views
 from stages.measure.tradeoff import words
 from stages.measure.tradeoff.measuring import SHARES, Material, deciding, measure_trade
 from stages.measure.tradeoff.pair import Side, pair, verdict
@@ -37,7 +37,7 @@ def material(scene):
     look = Look(near=0.01, side=72)
     reconstruction = scene.reconstruction
     training, held = (
-        load_photographs(reconstruction.folder, views, look)
+        load_evaluation_views(reconstruction.folder, views, look)
         for views in split_held_out(reconstruction.views)
     )
     splats = replace(scene.splats, look=look)
@@ -87,7 +87,7 @@ def test_splats_go_by_their_worth_to_photographs_that_do_not_judge(trade, materi
 
 
 def test_worth_leaves_a_better_picture_than_chance(trade, material) -> None:
-    from stages.measure.judge import mean_psnr_db
+    from stages.measure.evaluation import mean_psnr_db
 
     half = next(point for point in trade.counts if point.splats == 125)
     chance = material.splats.take(np.random.default_rng(1).permutation(250)[:125])
@@ -172,7 +172,7 @@ def side(scene, name: str, splats=None) -> Side:
 
 def test_a_run_is_not_told_apart_from_itself(scene) -> None:
     found = pair(side(scene, "a"), side(scene, "b"))
-    assert (found.psnr.mean, found.psnr.verdict) == (0, NOT_TOLD_APART)
+    assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
     assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): not told apart." in verdict(found)
 
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from stages.scene import Camera, View, look_at
-from stages.structure.seeding.sweep import agreed_points
+from stages.structure.seeding.plane_sweep import agreed_points
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 WALL, PLATE, HALF = 6.0, 4.0, 0.7  # depths of a wall and of a square plate before it

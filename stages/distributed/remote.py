@@ -19,7 +19,7 @@ from typing import Any
 from stages.base.atomic import make_folder
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Stage
-from stages.distributed.tasks import Place, Run
+from stages.distributed.tasks import Location, RunTask
 from stages.run.failures import disk_full
 from stages.run.listeners import Listeners
 from stages.run.lock import locked
@@ -30,36 +30,36 @@ from stages.run.runfile import RUN_FILE
 from stages.training.checkpoint import FILE_NAME, checkpoint_files
 
 
-def place_of(text: str) -> Place:
+def parse_location(text: str) -> Location:
     """What was typed, as a path unless it is a URL."""
     return text if "://" in text else Path(text)
 
 
-def spread_out(typed: Iterable[str]) -> list[Place]:
+def expand_locations(typed: Iterable[str]) -> list[Location]:
     """The places that were typed; a URL with * in it stands for all that it fits. Raises
     SplatError."""
-    found: list[Place] = []
-    for place in map(place_of, typed):
-        found += Folder.at(place).fitting() if isinstance(place, str) else [place]
+    found: list[Location] = []
+    for place in map(parse_location, typed):
+        found += RemoteFolder.at(place).fitting() if isinstance(place, str) else [place]
     return found
 
 
-def name_of(place: Place) -> str:
+def capture_name(place: Location) -> str:
     """Of a capture: its folder's, or its video's without the ending. Raises SplatError."""
     if isinstance(place, str):
-        folder = Folder.at(place)
+        folder = RemoteFolder.at(place)
         last = PurePosixPath(folder.root)
         return last.stem if folder.is_file() else last.name
     whole = place.absolute()
     return whole.stem if whole.is_file() else whole.name
 
 
-def inside(place: Place, name: str) -> Place:
+def joined(place: Location, name: str) -> Location:
     return f"{place.rstrip('/')}/{name}" if isinstance(place, str) else place / name
 
 
 @contextmanager
-def kept(place: Place) -> Iterator[Path]:
+def prepare_output(place: Location) -> Iterator[Path]:
     """The folder itself, made if it is new, and locked; of one at a URL, which nobody can lock, an
     empty one for copies. Raises SplatError."""
     if isinstance(place, str):
@@ -71,15 +71,15 @@ def kept(place: Place) -> Iterator[Path]:
             yield place
 
 
-def look(place: Place, name: str, here: Path) -> None:
+def fetch_manifests(place: Location, name: str, here: Path) -> None:
     """Copy the manifests of the run `name` to `here`, if it lies at a URL. Raises SplatError."""
     if isinstance(place, str):
-        run = Folder.at(place) / name
+        run = RemoteFolder.at(place) / name
         run.fetch([file for file in run.names() if file.endswith(f"/{MANIFEST}")], here / name)
 
 
 @dataclass(frozen=True)
-class Folder:
+class RemoteFolder:
     """A folder at a URL. system: fsspec's. root: its path there."""
 
     url: str
@@ -87,7 +87,7 @@ class Folder:
     root: str
 
     @classmethod
-    def at(cls, url: str) -> Folder:
+    def at(cls, url: str) -> RemoteFolder:
         """Raises SplatError: url-unknown, url-not-installed."""
         try:
             system, root = importlib.import_module("fsspec").core.url_to_fs(url)
@@ -101,14 +101,14 @@ class Folder:
             raise _error("url-unknown", url, str(error), hint) from error
         return cls(url.rstrip("/"), system, root.rstrip("/"))
 
-    def __truediv__(self, name: str) -> Folder:
+    def __truediv__(self, name: str) -> RemoteFolder:
         return replace(self, url=f"{self.url}/{name}", root=f"{self.root}/{name}")
 
     def is_file(self) -> bool:
         with self._told():
             return bool(self.system.isfile(self.root))
 
-    def fitting(self) -> list[Place]:
+    def fitting(self) -> list[Location]:
         """URLs of what the pattern fits, in order. Raises SplatError."""
         if "*" not in self.root:
             return [self.url]
@@ -183,12 +183,12 @@ def _error(code: str, url: str, what: str, hint: str, family: Family = Family.IN
 
 
 @dataclass(frozen=True)
-class FarRun:
+class RemoteRunTask:
     """`tasks.Run`, of which the photographs or the run folder are at a URL. TMPDIR says where its
     scratch folder is made."""
 
-    run_folder: Place
-    photos: Place
+    run_folder: Location
+    photos: Location
     settings: Mapping[str, Any]
 
     @property
@@ -201,12 +201,12 @@ class FarRun:
             photos = _fetched(self.photos, Path(name) / "photographs")
             run_folder, put_back = self.run_folder, Listener()
             if isinstance(run_folder, str):
-                far, run_folder = Folder.at(run_folder), Path(name) / "run"
+                far, run_folder = RemoteFolder.at(run_folder), Path(name) / "run"
                 far.fetch(far.names(), run_folder)
-                put_back = PutBack(run_folder, far)
+                put_back = UploadListener(run_folder, far)
             try:
                 listeners = Listeners(put_back, listener or Listener())
-                Run(run_folder, photos, self.settings).work(listeners)
+                RunTask(run_folder, photos, self.settings).work(listeners)
             except SplatError as error:
                 if error.code == "disk-full":  # the scratch folder's
                     raise
@@ -215,23 +215,25 @@ class FarRun:
                 raise
 
 
-def run_at(run_folder: Place, photos: Place, settings: Mapping[str, Any]) -> Run | FarRun:
+def task_for(
+    run_folder: Location, photos: Location, settings: Mapping[str, Any]
+) -> RunTask | RemoteRunTask:
     """The task, by where its folders are: paths as they are seen from anywhere."""
     if isinstance(run_folder, Path) and isinstance(photos, Path):
-        return Run(run_folder.absolute(), photos.absolute(), settings)
-    return FarRun(_anywhere(run_folder), _anywhere(photos), settings)
+        return RunTask(run_folder.absolute(), photos.absolute(), settings)
+    return RemoteRunTask(_anywhere(run_folder), _anywhere(photos), settings)
 
 
-def _anywhere(place: Place) -> Place:
+def _anywhere(place: Location) -> Location:
     return place.absolute() if isinstance(place, Path) else place
 
 
-def _fetched(photos: Place, target: Path) -> Path:
+def _fetched(photos: Location, target: Path) -> Path:
     """Where the photographs are; those at a URL are copied into `target`, under the name that they
     have there. Raises SplatError."""
     if isinstance(photos, Path):
         return photos
-    far = Folder.at(photos)
+    far = RemoteFolder.at(photos)
     names = far.names()
     if not names:
         raise _missing(far.url)
@@ -240,10 +242,10 @@ def _fetched(photos: Place, target: Path) -> Path:
     return place
 
 
-class PutBack(Listener):
+class UploadListener(Listener):
     """Puts what a run finishes, and training's checkpoints, where its run folder really is."""
 
-    def __init__(self, run_folder: Path, far: Folder) -> None:
+    def __init__(self, run_folder: Path, far: RemoteFolder) -> None:
         self._here, self._far = run_folder, far
         self._partial, self._saved_ns = "", 0
         self._there: dict[str, int] = {}  # when what was put there was made

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.measure.judge import Photograph, decibels, drawing_of
+from stages.measure.evaluation import EvaluationView, capped_psnr_db, image_renderer
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import CHANGE, LARGEST, PULL, SQUARES, WEIGHT, splat_arrays
 from stages.raster.draw import settings_of
@@ -23,7 +23,7 @@ RIM = 0.25  # of the longer side: as far as seeds continue a photograph beyond i
 
 
 @dataclass(frozen=True)
-class Worth:
+class Contributions:
     """Per splat [N]. sse_change: of the summed squared error over all photographs if it alone
     were removed (negative: they would be better without it). picture_change: the summed squared
     change of the pictures then, whatever the photographs say to it. weight: summed blend weight;
@@ -31,8 +31,8 @@ class Worth:
     sse: summed squared error now. scene_depth, psnr_db [photographs]: median depth of each picture,
     and how near it is.
 
-    cut_change, cut_picture [N, L]: the same two if its colour kept only the bands up to degree
-    0..L - 1, the mean of what is lost baked in: cut_colour [N, L, 3], what that adds to its colour.
+    truncated_sse_change, truncated_picture_change [N, L]: the same two if its colour kept only the bands up to degree
+    0..L - 1, the mean of what is lost baked in: truncated_colour [N, L, 3], what that adds to its colour.
     bands: the sums that this was told from. others: what it went on from, included in all but
     psnr_db.
     """
@@ -44,14 +44,14 @@ class Worth:
     photographs: NDArray[np.int32]
     sse: float
     scene_depth: NDArray[np.float64]
-    cut_change: NDArray[np.float64]
-    cut_picture: NDArray[np.float64]
-    cut_colour: NDArray[np.float64]
+    truncated_sse_change: NDArray[np.float64]
+    truncated_picture_change: NDArray[np.float64]
+    truncated_colour: NDArray[np.float64]
     psnr_db: NDArray[np.float64]
     bands: tuple[NDArray[np.float64], ...] = ()
-    others: Worth | None = None
+    others: Contributions | None = None
 
-    def take(self, rows: NDArray[np.bool_]) -> Worth:
+    def take(self, rows: NDArray[np.bool_]) -> Contributions:
         """Of these splats alone; their bands are no longer told."""
         return replace(
             self,
@@ -64,9 +64,12 @@ class Worth:
         )
 
 
-def measure_worth(
-    splats: Splats, photographs: Iterable[Photograph], backend: str, others: Worth | None = None
-) -> Worth:
+def measure_contributions(
+    splats: Splats,
+    photographs: Iterable[EvaluationView],
+    backend: str,
+    others: Contributions | None = None,
+) -> Contributions:
     """What each splat does for the photographs, drawn by its own look. others: what it did for
     further ones, before it or what is around it changed a little; that goes on counting."""
     n = len(splats)
@@ -83,7 +86,7 @@ def measure_worth(
     for photograph in photographs:
         forward = rasteriser.forward(arrays, photograph.camera, settings, depths=True)
         drawn, truth = forward.image[:3].transpose(1, 2, 0), photograph.image
-        psnr_db.append(decibels(drawn, truth, photograph.kept))
+        psnr_db.append(capped_psnr_db(drawn, truth, photograph.kept))
         residual = np.ascontiguousarray((drawn - truth).transpose(2, 0, 1))
         if photograph.kept is not None:
             residual *= photograph.kept
@@ -99,8 +102,8 @@ def measure_worth(
         largest[rows] = np.maximum(largest[rows], found[:, LARGEST])
         seen_in[rows] += found[:, LARGEST] >= SEEN
         bands.add(photograph.camera.centre, rows, found)
-    cut_change, cut_picture, cut_colour = bands.cuts()
-    return Worth(
+    truncated_sse_change, truncated_picture_change, truncated_colour = bands.cuts()
+    return Contributions(
         change,
         picture,
         weight,
@@ -108,9 +111,9 @@ def measure_worth(
         seen_in,
         sse,
         np.array(depths),
-        cut_change,
-        cut_picture,
-        cut_colour,
+        truncated_sse_change,
+        truncated_picture_change,
+        truncated_colour,
         np.array(psnr_db),
         bands.sums,
         others,
@@ -147,7 +150,7 @@ class _Bands:
         self.squares[rows] += q
 
     def cuts(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """(cut_change, cut_picture, cut_colour) of `Worth`: with s added to the colour, each
+        """(truncated_sse_change, truncated_picture_change, truncated_colour) of `Worth`: with s added to the colour, each
         photograph's error changes by 2 (d + s) g + (d + s)^2 q; s is what makes the mean of d,
         weighted by q, zero."""
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -168,16 +171,16 @@ def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[n
     return np.maximum(0.5 + np.cumsum(terms, axis=1)[:, ends], 0.0)
 
 
-def squared_error(splats: Splats, photographs: Iterable[Photograph], backend: str) -> float:
+def squared_error(splats: Splats, photographs: Iterable[EvaluationView], backend: str) -> float:
     """Summed over all photographs, as `Worth.sse`."""
-    draw, found = drawing_of(splats, backend), 0.0
+    draw, found = image_renderer(splats, backend), 0.0
     for photograph in photographs:
         squares = np.square(draw(photograph.camera) - photograph.image, dtype=np.float64)
         found += float(squares.sum() if photograph.kept is None else squares[photograph.kept].sum())
     return found
 
 
-def floaters(splats: Splats, worth: Worth, cameras: list[Camera]) -> NDArray[np.bool_]:
+def floaters(splats: Splats, worth: Contributions, cameras: list[Camera]) -> NDArray[np.bool_]:
     """[N] splats that hang in empty space: close before a camera, compared with what that camera
     sees behind, and needed by at most two photographs."""
     close = np.zeros(len(splats), bool)
@@ -188,7 +191,7 @@ def floaters(splats: Splats, worth: Worth, cameras: list[Camera]) -> NDArray[np.
     return np.asarray(close & (worth.photographs <= FEW_PHOTOGRAPHS))
 
 
-def beside_pictures(splats: Splats, cameras: list[Camera]) -> NDArray[np.bool_]:
+def near_view_frusta(splats: Splats, cameras: list[Camera]) -> NDArray[np.bool_]:
     """[N] splats in a picture or just beyond its rim, where the next view will look."""
     beside = np.zeros(len(splats), bool)
     for camera in cameras:

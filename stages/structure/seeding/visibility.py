@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stages.scene import View
-from stages.structure.seeding.places import seen
+from stages.structure.seeding.projection import seen
 
 SIDE = 320  # pixels: the scale at which nearest is meant
 NEAREST = 6  # points

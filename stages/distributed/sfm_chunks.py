@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.stage import Report, Stage
-from stages.distributed.tasks import Engine, Need, OfStructure, OpenEngine, do_all
+from stages.distributed.tasks import ChunkTask, Executor, OpenExecutor, Resources, run_all
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
-    from stages.structure.shares import Share
+    from stages.structure.chunks import Share
 
 
-def with_shares(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
+def with_shares(pipeline: Pipeline, open_engine: OpenExecutor) -> Pipeline:
     """The pipeline, whose features and matches are found by what `open_engine` opens."""
     plain = pipeline.layout.stage("sfm")
     return pipeline.with_run("sfm", partial(_sfm, pipeline, plain, open_engine))
@@ -24,7 +24,7 @@ def with_shares(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
 def _sfm(
     pipeline: Pipeline,
     plain: Stage,
-    open_engine: OpenEngine,
+    open_engine: OpenExecutor,
     inputs: Mapping[str, Any],
     settings: Any,
     folder: Path,
@@ -38,9 +38,9 @@ def _sfm(
 
 
 def _hand_out(
-    engine: Engine, report: Report, shares: Sequence[Share], look: Callable[[], None]
+    engine: Executor, report: Report, shares: Sequence[Share], look: Callable[[], None]
 ) -> None:
-    from stages.structure.shares import NEED_MIB
+    from stages.structure.chunks import NEED_MIB
 
     if not shares:
         return
@@ -50,10 +50,10 @@ def _hand_out(
         report.progress(done, len(shares), f"{what} (shares)")
         look()
 
-    do_all(
+    run_all(
         engine,
-        [OfStructure(share) for share in shares],
-        Need(NEED_MIB),
+        [ChunkTask(share) for share in shares],
+        Resources(NEED_MIB),
         report.stop_requested,
         tick,
         hint="Give the same command again: shares that are finished are kept.",

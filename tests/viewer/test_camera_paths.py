@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.scene import Camera, look_at
-from stages.viewer.travel import (
+from stages.viewer.camera_paths import (
     length_in_turns,
     levelled,
     steadied,

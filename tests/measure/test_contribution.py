@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from stages.capacity.selection import Removal
-from stages.measure.judge import drawing_of, load_photographs
-from stages.measure.worth import colours_by_degree, measure_worth, squared_error
+from stages.measure.contribution import colours_by_degree, measure_contributions, squared_error
+from stages.measure.evaluation import image_renderer, load_evaluation_views
 from stages.scene import Splats
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import small_scene
@@ -26,30 +26,32 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) 
     scene = small_scene(tmp_path, views=4, n=60)
     # no colour at its end, where it is not linear any more
     splats = replace(scene.splats, sh=scene.splats.sh * np.float32(0.3))
-    photographs = load_photographs(
+    photographs = load_evaluation_views(
         scene.reconstruction.folder, scene.reconstruction.views, splats.look
     )
-    worth = measure_worth(splats, photographs, "cpu")
+    worth = measure_contributions(splats, photographs, "cpu")
     assert worth.sse == pytest.approx(squared_error(splats, photographs, "cpu"), rel=1e-5)
     for row in (0, 10, 20):
         for degree in (0, 1):
-            cut = without(splats, row, degree, worth.cut_colour[row, degree])
+            cut = without(splats, row, degree, worth.truncated_colour[row, degree])
             change = squared_error(cut, photographs, "cpu") - worth.sse
-            assert worth.cut_change[row, degree] == pytest.approx(change, rel=2e-3, abs=1e-5)
+            assert worth.truncated_sse_change[row, degree] == pytest.approx(
+                change, rel=2e-3, abs=1e-5
+            )
             plain = without(splats, row, degree, np.zeros(3))
             assert not np.array_equal(plain.sh[row, 0], cut.sh[row, 0])
 
 
 def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> None:
     scene = small_scene(tmp_path, views=4, n=60)
-    photographs = load_photographs(
+    photographs = load_evaluation_views(
         scene.reconstruction.folder, scene.reconstruction.views, scene.splats.look
     )
-    worth = measure_worth(scene.splats, photographs, "cpu")
+    worth = measure_contributions(scene.splats, photographs, "cpu")
     assert (worth.picture_change >= 0).all()
-    draw = drawing_of(scene.splats, "cpu")
+    draw = image_renderer(scene.splats, "cpu")
     for row in (0, 10, 20):
-        fewer = drawing_of(scene.splats.take(np.arange(60) != row), "cpu")
+        fewer = image_renderer(scene.splats.take(np.arange(60) != row), "cpu")
         changes = [fewer(p.camera).astype(float) - draw(p.camera) for p in photographs]
         wanted = sum(np.square(change).sum() for change in changes)
         assert worth.picture_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
@@ -57,13 +59,19 @@ def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> No
 
 def test_worth_goes_on_from_what_other_photographs_told(tmp_path) -> None:
     scene = small_scene(tmp_path, views=6, n=60)
-    photographs = load_photographs(
+    photographs = load_evaluation_views(
         scene.reconstruction.folder, scene.reconstruction.views, scene.splats.look
     )
-    whole = measure_worth(scene.splats, photographs, "cpu")
-    others = measure_worth(scene.splats, photographs[:4], "cpu")
-    found = measure_worth(scene.splats, photographs[4:], "cpu", others)
-    for name in ("sse_change", "picture_change", "weight", "cut_change", "cut_picture"):
+    whole = measure_contributions(scene.splats, photographs, "cpu")
+    others = measure_contributions(scene.splats, photographs[:4], "cpu")
+    found = measure_contributions(scene.splats, photographs[4:], "cpu", others)
+    for name in (
+        "sse_change",
+        "picture_change",
+        "weight",
+        "truncated_sse_change",
+        "truncated_picture_change",
+    ):
         np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-9)
     assert (found.photographs == whole.photographs).all()
     assert found.sse == pytest.approx(whole.sse)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure.links import Link, loosest_link
+from stages.structure.view_graph import Link, loosest_link
 
 Seen = tuple[NDArray[np.int64], NDArray[np.int64]]
 

@@ -15,13 +15,13 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.judge import Drawing, Photograph
+from stages.measure.evaluation import EvaluationView, ImageRenderer
 
 _TILE = 64  # pixels: residuals farther apart have nothing to do with each other
 
 
 @dataclass(frozen=True)
-class Price:
+class RateDistortion:
     """independent: colour samples that tell as much as the photographs' `samples`, whose residuals
     resemble their neighbours'. sse: summed squared error now."""
 
@@ -29,26 +29,30 @@ class Price:
     independent: float
     sse: float
 
-    def of_more(self, times: float) -> Price:
+    def scaled(self, times: float) -> RateDistortion:
         """For as many times the photographs, which tell as much each."""
-        return Price(round(self.samples * times), self.independent * times, self.sse * times)
+        return RateDistortion(
+            round(self.samples * times), self.independent * times, self.sse * times
+        )
 
     @property
-    def bits_a_number(self) -> float:
+    def bits_per_parameter(self) -> float:
         return 0.5 * math.log2(max(2.0, self.independent))
 
     @property
-    def bits_a_db(self) -> float:
+    def bits_per_db(self) -> float:
         """What one dB of PSNR is worth."""
         return self.independent * 0.05 * math.log2(10)
 
     @property
-    def sse_a_number(self) -> float:
+    def sse_per_parameter(self) -> float:
         """The squared error that a number must save to pay: the slope of the code length."""
-        return self.bits_a_number * 2 * math.log(2) * self.sse / max(1.0, self.independent)
+        return self.bits_per_parameter * 2 * math.log(2) * self.sse / max(1.0, self.independent)
 
 
-def price_of(draw: Drawing, photographs: Iterable[Photograph]) -> Price:
+def rate_distortion_of(
+    draw: ImageRenderer, photographs: Iterable[EvaluationView]
+) -> RateDistortion:
     """The price at what `draw` has reached of the photographs."""
     samples, sse, tiles = 0, 0.0, []
     for photograph in photographs:
@@ -59,7 +63,7 @@ def price_of(draw: Drawing, photographs: Iterable[Photograph]) -> Price:
         samples += residual.size if kept is None else 3 * int(kept.sum())
         sse += float(np.square(residual, dtype=np.float64).sum())
         tiles.append(_tiles(residual))
-    return Price(samples, samples * independent_share(tiles), sse)
+    return RateDistortion(samples, samples * independent_share(tiles), sse)
 
 
 def _tiles(residual: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.structure.undistort import distort, maps, pinhole_for, undistort, undistorted_px
+from stages.structure.undistortion import distort, maps, pinhole_for, undistort, undistorted_px
 
 SIZE = np.array([640, 480])
 

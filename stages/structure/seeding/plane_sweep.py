@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from stages.base import threads
 from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
-from stages.structure.seeding.places import cells, centres, seen, unprojected
-from stages.structure.seeding.witnesses import Witnesses
+from stages.structure.seeding.projection import cells, centres, seen, unprojected
+from stages.structure.seeding.visibility import Witnesses
 
 SIDE = 200  # pixels, longer side of the photographs compared
 PLANES = 64

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stages.structure.gates import Failure, Figures
-from stages.structure.ladder import LADDER, Attempt, Climb, Rung, climb
+from stages.structure.fallbacks import LADDER, Attempt, Climb, Rung, climb
 
 
 def failing(*codes: str) -> tuple[Failure, ...]:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.measure.price import Price, independent_share
+from stages.measure.rate_distortion import RateDistortion, independent_share
 
 
 def noise(seed: int = 0) -> np.ndarray:
@@ -34,12 +34,12 @@ def test_a_blur_leaves_as_many_as_its_correlations_say(sigma: float) -> None:
 
 
 def test_the_price_is_the_slope_of_the_code_length() -> None:
-    price = Price(samples=1_000_000, independent=1e5, sse=1000.0)
+    price = RateDistortion(samples=1_000_000, independent=1e5, sse=1000.0)
 
     def bits(sse: float) -> float:
         return 0.5 * price.independent * math.log2(sse / price.samples)
 
-    saved = bits(price.sse) - bits(price.sse - 1e-3 * price.sse_a_number)
-    assert saved == pytest.approx(1e-3 * price.bits_a_number, rel=1e-3)
+    saved = bits(price.sse) - bits(price.sse - 1e-3 * price.sse_per_parameter)
+    assert saved == pytest.approx(1e-3 * price.bits_per_parameter, rel=1e-3)
     one_db = bits(price.sse) - bits(price.sse * 10**-0.1)
-    assert one_db == pytest.approx(price.bits_a_db)
+    assert one_db == pytest.approx(price.bits_per_db)

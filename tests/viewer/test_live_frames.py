@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stages.scene import Camera
-from stages.viewer.onlookers import SHARE, Picture, Pictures
+from stages.viewer.live_frames import SHARE, Picture, Pictures
 from tests import scenes
 
 WAIT_S = 20.0

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.measure import judge
-from stages.measure.images import flip
-from stages.measure.judge import (
-    CAP_DB,
-    MOST_SHOWN,
-    Photograph,
-    decibels,
-    drawing_of,
-    load_photographs,
-    scores,
-    spread,
+from stages.measure import evaluation
+from stages.measure.evaluation import (
+    IDENTICAL_DB,
+    LARGEST_SUBSET,
+    EvaluationView,
+    capped_psnr_db,
+    evaluate,
+    evaluation_subset,
+    image_renderer,
+    load_evaluation_views,
 )
+from stages.measure.images import flip
 from stages.raster.draw import settings_of
 from stages.scene import (
     IGNORE,
@@ -67,8 +67,10 @@ def test_a_scene_in_other_units_gets_the_same_figures(
     figures = []
     for units in (1.0, factor):
         trained, reconstruction = in_units(scene, units)
-        photographs = load_photographs(reconstruction.folder, reconstruction.views, trained.look)
-        figures.append(scores(drawing_of(trained, backend), photographs))
+        photographs = load_evaluation_views(
+            reconstruction.folder, reconstruction.views, trained.look
+        )
+        figures.append(evaluate(image_renderer(trained, backend), photographs))
     for one, other in zip(*figures, strict=True):
         assert one.psnr_db == pytest.approx(other.psnr_db, abs=0.01)
         assert one.ssim == pytest.approx(other.ssim, abs=1e-3)
@@ -84,9 +86,9 @@ def test_a_file_without_cameras_gets_a_near_plane_of_its_own_size(scene: SmallSc
 
 def test_photographs_are_judged_at_the_size_that_was_trained(scene: SmallScene) -> None:
     views, folder = scene.reconstruction.views, scene.reconstruction.folder
-    (small, *_) = load_photographs(folder, views, Look(0.01, 36))
+    (small, *_) = load_evaluation_views(folder, views, Look(0.01, 36))
     assert small.pixels.shape == (27, 36, 3)
-    (full, *_) = load_photographs(folder, views, Look(0.01))
+    (full, *_) = load_evaluation_views(folder, views, Look(0.01))
     with Image.open(Path(folder) / views[0].image) as picture:
         np.testing.assert_array_equal(full.pixels, np.asarray(picture))
 
@@ -99,9 +101,9 @@ def test_the_near_plane_of_the_look_decides_what_is_drawn() -> None:
 
 def test_figures_stay_finite() -> None:
     white = np.ones((4, 4, 3), np.float32)
-    assert decibels(white, white) == CAP_DB
-    assert decibels(white * np.nan, white) == 0.0
-    assert decibels(white * 7, white) == CAP_DB  # a screen shows no more than white
+    assert capped_psnr_db(white, white) == IDENTICAL_DB
+    assert capped_psnr_db(white * np.nan, white) == 0.0
+    assert capped_psnr_db(white * 7, white) == IDENTICAL_DB  # a screen shows no more than white
 
 
 def test_flip_is_that_of_its_authors_worked_cases() -> None:
@@ -130,14 +132,14 @@ def with_masks(scene: SmallScene, folder: Path, outside: str) -> tuple[View, ...
 def test_what_is_ignored_is_not_judged(scene: SmallScene) -> None:
     folder = scene.reconstruction.folder
     views = with_masks(scene, folder, IGNORE)
-    (photograph, *_) = load_photographs(folder, views, Look(0.01))
+    (photograph, *_) = load_evaluation_views(folder, views, Look(0.01))
     wrong = photograph.image.copy()
     wrong[:, 36:] = 1 - wrong[:, 36:]
-    (score,) = scores(lambda _: wrong, [photograph], with_flip=True)
-    assert score.psnr_db == CAP_DB
+    (score,) = evaluate(lambda _: wrong, [photograph], with_flip=True)
+    assert score.psnr_db == IDENTICAL_DB
     assert score.ssim == pytest.approx(1)
     assert score.flip == pytest.approx(0)
-    (score,) = scores(lambda _: photograph.image + 0.1, [photograph])
+    (score,) = evaluate(lambda _: photograph.image + 0.1, [photograph])
     assert 19.9 < score.psnr_db < 20.5  # but for what is clipped
 
 
@@ -145,11 +147,11 @@ def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScen
     folder = scene.reconstruction.folder
     views = with_masks(scene, folder, TRANSPARENT)
     look = look_of(views)
-    (photograph, *_) = load_photographs(folder, views, look)
+    (photograph, *_) = load_evaluation_views(folder, views, look)
     assert look.background == 1.0
     assert photograph.pixels[:, 36:].min() == 255
     assert settings_of(replace(scene.splats, look=look)).background == (1.0, 1.0, 1.0)
-    (score,) = scores(lambda _: photograph.image * (np.arange(72) < 36)[:, None], [photograph])
+    (score,) = evaluate(lambda _: photograph.image * (np.arange(72) < 36)[:, None], [photograph])
     assert score.psnr_db < 4
 
 
@@ -158,27 +160,29 @@ def test_photographs_that_do_not_fit_into_memory_are_judged_alike(
 ) -> None:
     folder, views = scene.reconstruction.folder, scene.reconstruction.views
     figures = []
-    for most in (judge.IN_MEMORY_MIB, 0.01, 0.0):
-        monkeypatch.setattr(judge, "IN_MEMORY_MIB", most)
-        photographs = load_photographs(folder, views, scene.splats.look)
+    for most in (evaluation.IN_MEMORY_MIB, 0.01, 0.0):
+        monkeypatch.setattr(evaluation, "IN_MEMORY_MIB", most)
+        photographs = load_evaluation_views(folder, views, scene.splats.look)
         assert len(photographs) == len(views)
         assert [p.name for p in photographs] == [view.name for view in views]
         assert (photographs[-1].pixels == list(photographs)[-1].pixels).all()
-        figures.append(scores(drawing_of(scene.splats, "cpu"), photographs))
+        figures.append(evaluate(image_renderer(scene.splats, "cpu"), photographs))
     assert figures[0] == figures[1] == figures[2]
 
 
 @pytest.mark.parametrize("count", [0, 1, 24, 25, 200, 1000])
 def test_of_many_judges_a_few_evenly_spread_ones_are_shown(count: int) -> None:
-    chosen = spread(count)
-    assert min(count, MOST_SHOWN // 2) <= len(chosen) <= MOST_SHOWN
-    assert count > MOST_SHOWN or list(chosen) == list(range(count))
+    chosen = evaluation_subset(count)
+    assert min(count, LARGEST_SUBSET // 2) <= len(chosen) <= LARGEST_SUBSET
+    assert count > LARGEST_SUBSET or list(chosen) == list(range(count))
     assert not count or count - chosen[-1] <= chosen.step
 
 
 def test_flip_is_told_by_those_and_psnr_by_all() -> None:
     camera = Camera(16, 16, 20.0, 20.0, 8.0, 8.0, np.eye(4))
-    shown = Photograph("a", camera, np.full((16, 16, 3), 99, np.uint8))
-    found = scores(lambda _: shown.image, [shown] * 50, with_flip=True)
+    shown = EvaluationView("a", camera, np.full((16, 16, 3), 99, np.uint8))
+    found = evaluate(lambda _: shown.image, [shown] * 50, with_flip=True)
     assert len(found) == 50
-    assert [i for i, score in enumerate(found) if score.flip is not None] == list(spread(50))
+    assert [i for i, score in enumerate(found) if score.flip is not None] == list(
+        evaluation_subset(50)
+    )

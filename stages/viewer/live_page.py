@@ -23,7 +23,7 @@ from stages.formats.page import document
 from stages.formats.page.shots import Shot
 from stages.scene import Camera, View
 from stages.scene.framing import depth_of_interest
-from stages.viewer.onlookers import Picture, Pictures
+from stages.viewer.live_frames import Picture, Pictures
 from stages.viewer.server import Answer, Item
 from stages.viewer.site import with_photographs
 

@@ -20,14 +20,16 @@ from stages.raster.draw import renderer
 from stages.scene import IGNORE, TRANSPARENT, Camera, Look, Splats, View
 from stages.scene.light import BRIGHT, Light, gains_and_offsets
 
-CAP_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
+IDENTICAL_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
 IN_MEMORY_MIB = 512  # of photographs that judge; more of them are read anew each time
-MOST_SHOWN = 24  # of many judges, those that are worth FLIP's time, or a place where all are seen
-Drawing = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
+LARGEST_SUBSET = (
+    24  # of many judges, those that are worth FLIP's time, or a place where all are seen
+)
+ImageRenderer = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
 
 
 @dataclass(frozen=True)
-class Photograph:
+class EvaluationView:
     """One photograph at the size it is judged at: pixels [H, W, 3] uint8, sRGB. mask [H, W],
     outside: as in `scene.Photo`; None where everything counts. cut_off [H, W]: where a channel was
     too bright for the picture to tell; not judged either."""
@@ -52,7 +54,7 @@ class Photograph:
             return kept
         return ~self.cut_off if kept is None else kept & ~self.cut_off
 
-    def in_median_light(self, light: Light | None) -> Photograph:
+    def in_median_light(self, light: Light | None) -> EvaluationView:
         """As the median photograph would show it; see `scene.light`."""
         if light is None:
             return self
@@ -63,7 +65,7 @@ class Photograph:
         pixels = np.rint(even * 255).clip(0, 255).astype(np.uint8)
         return replace(self, pixels=pixels, cut_off=np.asarray((self.image >= BRIGHT).any(2)))
 
-    def over(self, grey: float) -> Photograph:
+    def over(self, grey: float) -> EvaluationView:
         """A cut-out photograph, which is over black, over `grey` (0 to 1); any other as it is."""
         if self.mask is None or self.outside != TRANSPARENT:
             return self
@@ -82,12 +84,12 @@ class Score:
     flip: float | None = None
 
 
-class _Photographs(Sequence[Photograph]):
+class _Photographs(Sequence[EvaluationView]):
     """The first of them in memory, the others on disk."""
 
     def __init__(self, folder: Path, views: Iterable[View], look: Look) -> None:
         self._folder, self._views, self._look = folder, tuple(views), look
-        self._kept: list[Photograph] = []
+        self._kept: list[EvaluationView] = []
         free = IN_MEMORY_MIB * 2**20
         for number, view in enumerate(self._views):
             camera = look.camera(view.camera)
@@ -100,28 +102,30 @@ class _Photographs(Sequence[Photograph]):
         return len(self._views)
 
     @overload
-    def __getitem__(self, number: int) -> Photograph: ...
+    def __getitem__(self, number: int) -> EvaluationView: ...
     @overload
-    def __getitem__(self, number: slice) -> Sequence[Photograph]: ...
-    def __getitem__(self, number: int | slice) -> Photograph | Sequence[Photograph]:
+    def __getitem__(self, number: slice) -> Sequence[EvaluationView]: ...
+    def __getitem__(self, number: int | slice) -> EvaluationView | Sequence[EvaluationView]:
         if isinstance(number, slice):
             return [self[i] for i in range(len(self))[number]]
         number = range(len(self))[number]
         return self._kept[number] if number < len(self._kept) else self._loaded(number)
 
-    def _loaded(self, number: int) -> Photograph:
+    def _loaded(self, number: int) -> EvaluationView:
         view, look = self._views[number], self._look
-        found = load_photograph(self._folder, view, look.camera(view.camera))
+        found = load_evaluation_view(self._folder, view, look.camera(view.camera))
         return found.in_median_light(view.light if look.light else None).over(look.background)
 
 
-def load_photographs(folder: Path, views: Iterable[View], look: Look) -> Sequence[Photograph]:
+def load_evaluation_views(
+    folder: Path, views: Iterable[View], look: Look
+) -> Sequence[EvaluationView]:
     """The views' photographs at the size of `look`, over its background and in its light; in memory
     as far as `IN_MEMORY_MIB` goes. Raises SplatError, now or when they are used."""
     return _Photographs(folder, views, look)
 
 
-def load_photograph(folder: Path, view: View, camera: Camera) -> Photograph:
+def load_evaluation_view(folder: Path, view: View, camera: Camera) -> EvaluationView:
     """The view's picture in `folder` on the camera's pixel grid, over black where it is cut out.
     Raises SplatError."""
     picture = load_image(folder / view.image, camera.width, camera.height)
@@ -129,10 +133,10 @@ def load_photograph(folder: Path, view: View, camera: Camera) -> Photograph:
     mask = mask_of(folder, view, camera.width, camera.height)
     if mask is not None and view.outside == TRANSPARENT:
         pixels[mask == 0] = 0  # where JPEG left traces of an edge
-    return Photograph(view.name, camera, pixels, mask, view.outside)
+    return EvaluationView(view.name, camera, pixels, mask, view.outside)
 
 
-def decibels(
+def capped_psnr_db(
     image: NDArray[np.floating],
     truth: NDArray[np.floating],
     kept: NDArray[np.bool_] | None = None,
@@ -140,45 +144,45 @@ def decibels(
     """PSNR of what a screen would show of `image`, at most `CAP_DB`; 0 for what is no number. kept
     [H, W]: the pixels that count; None for all."""
     found = psnr(np.clip(image, 0.0, 1.0), truth, kept)
-    return 0.0 if np.isnan(found) else min(found, CAP_DB)
+    return 0.0 if np.isnan(found) else min(found, IDENTICAL_DB)
 
 
-def spread(count: int) -> range:
+def evaluation_subset(count: int) -> range:
     """Which of `count` judges, evenly over them, where `MOST_SHOWN` must do."""
-    return range(0, count, max(1, -(-count // MOST_SHOWN)))
+    return range(0, count, max(1, -(-count // LARGEST_SUBSET)))
 
 
-def scores(
-    draw: Drawing, photographs: Sequence[Photograph], with_flip: bool = False
+def evaluate(
+    draw: ImageRenderer, photographs: Sequence[EvaluationView], with_flip: bool = False
 ) -> list[Score]:
     """PSNR and SSIM of each, and perhaps FLIP of as many as are `spread` over them, of drawings
     clipped to what a screen can show."""
     found = []
-    flipped = spread(len(photographs)) if with_flip else ()
+    flipped = evaluation_subset(len(photographs)) if with_flip else ()
     for number, photograph in enumerate(photographs):
         image, truth = np.clip(draw(photograph.camera), 0.0, 1.0), photograph.image
         kept = photograph.kept
         seen = flip(image, truth, kept) if number in flipped else None
         alike = ssim(image, truth, kept)
-        found.append(Score(photograph.name, decibels(image, truth, kept), alike, seen))
+        found.append(Score(photograph.name, capped_psnr_db(image, truth, kept), alike, seen))
     return found
 
 
-def as_taken_db(
-    draw: Drawing, folder: Path, views: Iterable[View], look: Look
+def psnr_as_taken_db(
+    draw: ImageRenderer, folder: Path, views: Iterable[View], look: Look
 ) -> tuple[float, float]:
     """Mean PSNR of photographs in the light that they were taken in: (as they are, and the right
     halves of drawings that an affine map of each channel, fitted on the left halves, adapts)."""
     plain, adapted = [], []
-    for photograph in load_photographs(folder, views, replace(look, light=False)):
+    for photograph in load_evaluation_views(folder, views, replace(look, light=False)):
         image, truth = np.clip(draw(photograph.camera), 0.0, 1.0), photograph.image
         half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
         kept = everywhere if photograph.kept is None else photograph.kept
-        plain.append(decibels(image, truth, kept))
+        plain.append(capped_psnr_db(image, truth, kept))
         left, right = kept.copy(), kept.copy()
         left[:, half:], right[:, :half] = False, False
         if left.sum() > 1 and right.any():
-            adapted.append(decibels(_adapted(image, truth, left), truth, right))
+            adapted.append(capped_psnr_db(_adapted(image, truth, left), truth, right))
     return float(np.mean(plain)), float(np.mean(adapted)) if adapted else 0.0
 
 
@@ -194,23 +198,25 @@ def _adapted(
     return found
 
 
-def inside_db(draw: Drawing, photographs: Iterable[Photograph]) -> float | None:
+def psnr_inside_masks_db(
+    draw: ImageRenderer, photographs: Iterable[EvaluationView]
+) -> float | None:
     """Mean PSNR of what is inside the masks of cut-out photographs; None where none is."""
     found = [
-        decibels(draw(p.camera), p.image, p.mask > 0)
+        capped_psnr_db(draw(p.camera), p.image, p.mask > 0)
         for p in photographs
         if p.mask is not None and p.outside == TRANSPARENT
     ]
     return float(np.mean(found)) if found else None
 
 
-def drawing_of(splats: Splats, backend: str) -> Drawing:
+def image_renderer(splats: Splats, backend: str) -> ImageRenderer:
     """What draws `splats` by their own look."""
     draw = renderer(splats, backend=backend)
     return lambda camera: draw(camera).image
 
 
-def mean_psnr_db(splats: Splats, photographs: Iterable[Photograph], backend: str) -> float:
+def mean_psnr_db(splats: Splats, photographs: Iterable[EvaluationView], backend: str) -> float:
     """Mean PSNR over the photographs, dB."""
-    draw = drawing_of(splats, backend)
-    return float(np.mean([decibels(draw(p.camera), p.image, p.kept) for p in photographs]))
+    draw = image_renderer(splats, backend)
+    return float(np.mean([capped_psnr_db(draw(p.camera), p.image, p.kept) for p in photographs]))

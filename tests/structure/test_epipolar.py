@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.scene import look_at
-from stages.structure.agreement import agreement, alternatives
+from stages.structure.epipolar import agreement, alternatives
 
 LENS = np.array([500.0, 520.0, 310.0, 250.0])
 RANDOM = np.random.default_rng(3)

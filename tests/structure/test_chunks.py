@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from stages.structure import database as sqlite
-from stages.structure import shares
+from stages.structure import chunks
 from stages.structure.job import Job, chosen_path, shares_path
-from stages.structure.shares import Share
+from stages.structure.chunks import Share
 from tests.structure import sample_jobs as jobs
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # a process for each share
@@ -49,7 +49,7 @@ class Hands:
     def __call__(self, wanted: Sequence[Share], look: Callable[[], None]) -> None:
         for share in reversed(wanted):
             self.asked.append(share.out.stem)
-            shares.do(share)
+            chunks.do(share)
             look()
             self.lose -= 1
             if self.lose == 0:
@@ -57,19 +57,19 @@ class Hands:
 
 
 def in_shares(job: Job, hands: Hands) -> None:
-    shares.hand_out_features(job, hands, lambda: None)
+    chunks.hand_out_features(job, hands, lambda: None)
     jobs.work(job)
     left = 1
     while left:
         jobs.work(replace(job, step="choosing"))
-        left = shares.hand_out_pairs(job, hands, lambda: None)
+        left = chunks.hand_out_pairs(job, hands, lambda: None)
     jobs.work(replace(job, step="matching"))
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shares, "PHOTOGRAPHS", 6)
-    monkeypatch.setattr(shares, "PAIRS", 20)
+    monkeypatch.setattr(chunks, "PHOTOGRAPHS", 6)
+    monkeypatch.setattr(chunks, "PAIRS", 20)
 
 
 def test_shares_find_what_one_process_finds(whole: Job, tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_every_pair_and_known_matches_are_shared_too(whole: Job, tmp_path: Path)
     jobs.work(replace(wanted, database=str(plain)))
     job = replace(wanted, database=str(shared), step="choosing")
     jobs.work(job)
-    assert shares.hand_out_pairs(job, Hands(), lambda: None) == 36
+    assert chunks.hand_out_pairs(job, Hands(), lambda: None) == 36
     jobs.work(job)
     assert chosen_path(job).read_text() == "[]"
     assert found(job) == found(replace(job, database=str(plain)))
@@ -109,5 +109,5 @@ def test_every_pair_and_known_matches_are_shared_too(whole: Job, tmp_path: Path)
 def test_a_share_that_is_done_is_not_done_again(whole: Job, tmp_path: Path) -> None:
     out = tmp_path / "pair-0-1.db"
     out.write_bytes(b"done")
-    shares.do(Share(tmp_path / "no job", out, pairs=((0, 1),)))
+    chunks.do(Share(tmp_path / "no job", out, pairs=((0, 1),)))
     assert out.read_bytes() == b"done"

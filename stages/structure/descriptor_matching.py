@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.raster.kernels.simd import kernel
-from stages.structure.words import Sorted
+from stages.structure.vocabulary import Sorted
 
 RATIO = 0.8  # of the angles to the nearest and to the second (Lowe 2004), as COLMAP has it
 LARGEST_ANGLE = 0.7  # radians, as COLMAP has it

@@ -20,7 +20,7 @@ from PIL import Image
 
 from stages.formats.page.shots import Shot, shots_of
 from stages.scene import Camera
-from stages.viewer.live import SIDES, LivePage
+from stages.viewer.live_page import SIDES, LivePage
 from stages.viewer.server import LocalServer
 from tests import scenes
 from tests.viewer.asking import ask

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure import features, nearest, words
+from stages.structure import features
+from stages.structure import descriptor_matching
+from stages.structure import vocabulary
 from tests.structure.sample_jobs import SAMPLE
 
 
@@ -16,7 +18,7 @@ def compared_with_all(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> se
 
     def clear(table: NDArray[np.float64]) -> NDArray[np.int64]:
         best, next_best = np.sort(table, axis=1)[:, :2].T
-        good = (best <= nearest.LARGEST_ANGLE) & (best < nearest.RATIO * next_best)
+        good = (best <= descriptor_matching.LARGEST_ANGLE) & (best < descriptor_matching.RATIO * next_best)
         return np.where(good, table.argmin(axis=1), -1)
 
     there, back = clear(angles), clear(angles.T)
@@ -26,9 +28,9 @@ def compared_with_all(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> se
 def test_nearly_all_matches_are_found_and_hardly_others() -> None:
     photographs = sorted(SAMPLE.glob("*.jpg"))
     first, second = (features.find(photographs[i], 3000, 0.0045)[1] for i in (0, 2))
-    vocabulary = words.vocabulary(np.concatenate([first, second])[::2])
-    found = nearest.matches(
-        words.sort_by_word(first, vocabulary), words.sort_by_word(second, vocabulary)
+    vocabulary = vocabulary.vocabulary(np.concatenate([first, second])[::2])
+    found = descriptor_matching.matches(
+        vocabulary.sort_by_word(first, vocabulary), vocabulary.sort_by_word(second, vocabulary)
     )
     wanted = compared_with_all(first, second)
     got = {(int(i), int(j)) for i, j in found}
@@ -44,17 +46,17 @@ def test_a_picture_matches_itself_feature_by_feature() -> None:
     histograms = random.exponential(size=(400, 128)) ** 2
     roots = np.sqrt(histograms / histograms.sum(axis=1, keepdims=True))
     descriptors = np.rint(512 * roots).clip(0, 255).astype(np.uint8)
-    own = words.sort_by_word(descriptors, words.vocabulary(descriptors))
-    assert (nearest.matches(own, own) == np.arange(400)[:, None]).all()
+    own = vocabulary.sort_by_word(descriptors, vocabulary.vocabulary(descriptors))
+    assert (descriptor_matching.matches(own, own) == np.arange(400)[:, None]).all()
 
 
 def test_no_features_match_nothing() -> None:
     none = np.empty((0, 128), np.uint8)
-    vocabulary = words.vocabulary(none)
-    empty = words.sort_by_word(none, vocabulary)
-    some = words.sort_by_word(np.full((5, 128), 45, np.uint8), vocabulary)
-    assert nearest.matches(empty, some).shape == nearest.matches(some, empty).shape == (0, 2)
+    vocabulary = vocabulary.vocabulary(none)
+    empty = vocabulary.sort_by_word(none, vocabulary)
+    some = vocabulary.sort_by_word(np.full((5, 128), 45, np.uint8), vocabulary)
+    assert descriptor_matching.matches(empty, some).shape == descriptor_matching.matches(some, empty).shape == (0, 2)
 
 
 def test_the_vocabulary_of_few_features_is_small() -> None:
-    assert len(words.vocabulary(np.eye(7, 128, dtype=np.uint8) * 200)) == 7
+    assert len(vocabulary.vocabulary(np.eye(7, 128, dtype=np.uint8) * 200)) == 7

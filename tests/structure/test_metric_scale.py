@@ -9,7 +9,7 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.photos.exif import read_exif
 from stages.scene import Camera, Capture, Photo, look_at
-from stages.structure.metric import Known, Metric, east_north, find_metric
+from stages.structure.metric_scale import Known, Metric, east_north, find_metric
 from tests.structure.bad_captures import SAMPLE
 
 METRES = 7.0  # of one unit of the made worlds

@@ -18,7 +18,7 @@ import pytest
 
 from stages import train
 from stages.base.errors import SplatError
-from stages.distributed import far
+from stages.distributed import remote
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
 from tests import processes, sample
@@ -107,9 +107,9 @@ def test_a_checkpoint_goes_with_the_models_put_aside_for_it_each_once(store, tmp
     partial = tmp_path / ".4-train.partial"
     put: list[str] = []
     partial.mkdir()
-    run = far.Folder.at("memory://runs/hill")
+    run = remote.RemoteFolder.at("memory://runs/hill")
     (tmp_path / RUN_FILE).write_text("{}")
-    back = far.PutBack(tmp_path, run)
+    back = remote.UploadListener(tmp_path, run)
     back.started(train.STAGE, 4, "", False)
     system_put = store.put_file
 
@@ -209,7 +209,7 @@ def test_nothing_imports_fsspec_without_a_url() -> None:
 
 def test_names_that_lead_out_of_a_folder_are_left_alone(store) -> None:
     store.store["/captures/hill/../../evil.jpg"] = store.store["/captures/hill/a.jpg"]
-    assert far.Folder.at("memory://captures/hill").names() == ["a.jpg"]
+    assert remote.RemoteFolder.at("memory://captures/hill").names() == ["a.jpg"]
 
 
 def hashes(runs: Path) -> dict[str, str]:

@@ -13,7 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from stages.scene.similarity import similarity
-from stages.structure.agreement import agreement, alternatives
+from stages.structure.epipolar import agreement, alternatives
 from stages.structure.job import Job, known_path
 from stages.structure.mapping import observations
 from stages.structure.matching import match_pairs

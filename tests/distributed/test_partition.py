@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.distributed import ground, merge, sight
-from stages.measure.judge import Photograph
+from stages.distributed import block_views, merge, partition
+from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import AUTO
 from stages.scene import Camera, look_at
 from tests import scenes
@@ -22,7 +22,7 @@ def places(n: int = 101) -> np.ndarray:
 @pytest.mark.parametrize("blocks", [2, 3, 4, 7])
 def test_blocks_hold_about_equal_photographs(blocks: int) -> None:
     at, weights = places(2000), np.random.default_rng(2).uniform(0, 1, 2000)
-    cells = ground.cut(at, weights, blocks)
+    cells = partition.cut(at, weights, blocks)
     found = [weights[cell.holds(np.insert(at, 1, 0.0, axis=1))].sum() for cell in cells]
     assert len(found) == blocks
     assert np.isclose(sum(found), weights.sum())
@@ -30,7 +30,7 @@ def test_blocks_hold_about_equal_photographs(blocks: int) -> None:
 
 
 def test_every_point_lies_in_one_cell() -> None:
-    cells = ground.cut(places(), np.ones(101), 5)
+    cells = partition.cut(places(), np.ones(101), 5)
     points = np.random.default_rng(1).normal(0, 1000, (500, 3))
     lines = [value for cell in cells for value in (*cell.low, *cell.high) if abs(value) < 1e29]
     points[: len(lines), 0] = points[: len(lines), 2] = lines  # on the borders too
@@ -41,12 +41,12 @@ def test_each_photograph_counts_as_much_as_any_other(tmp_path) -> None:
     """However many points it shows."""
     scene = small_scene(tmp_path, views=6).reconstruction
     points = np.random.default_rng(4).normal(0, 0.4, (300, 3))
-    _, weights = ground.looked_at(replace(scene, points=points))
+    _, weights = partition.looked_at(replace(scene, points=points))
     assert np.isclose(weights.sum(), 6.0)
 
 
 def test_photographs_that_look_at_one_spot_are_one_block() -> None:
-    assert ground.cut(np.ones((20, 2)), np.ones(20), 4) == [ground.EVERYWHERE]
+    assert partition.cut(np.ones((20, 2)), np.ones(20), 4) == [partition.EVERYWHERE]
 
 
 def test_a_photograph_teaches_what_it_shows_and_not_what_is_hidden(tmp_path) -> None:
@@ -62,25 +62,25 @@ def test_a_photograph_teaches_what_it_shows_and_not_what_is_hidden(tmp_path) -> 
     )
     behind = replace(wall, means=(wall.means + np.array([2, 0, 0])).astype("f4"))
     lines = (np.array([-2.0, 0.0]), np.array([0.0, 2.0]))
-    halves = [ground.Cell((low, -9.0), (high, 9.0)) for low, high in lines]
+    halves = [partition.Cell((low, -9.0), (high, 9.0)) for low, high in lines]
     both, _ = merge.merged([wall, behind], halves, wall.look)
-    cells = ground.cut(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
+    cells = partition.cut(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
     eye = Camera(72, 54, 160.0, 160.0, 36.0, 27.0, look_at(np.array([-4.0, 0, 0]), np.zeros(3)))
-    share = sight.shares(both, cells, [eye], AUTO)
+    share = block_views.shares(both, cells, [eye], AUTO)
     assert share[0, 0] > 0.9
-    assert sight.members(share)[:, 0].tolist() == [True, False]
+    assert block_views.members(share)[:, 0].tolist() == [True, False]
 
 
 def test_each_photograph_teaches_one_block_at_least() -> None:
     share = np.array([[0.06, 0.5, 0.0], [0.04, 0.5, 0.0]])
-    member = sight.members(share)
+    member = block_views.members(share)
     assert member.tolist() == [[True, True, False], [False, True, False]]
-    assert sight.crossing(member).tolist() == [False, True, False]
+    assert block_views.crossing(member).tolist() == [False, True, False]
 
 
 def test_merged_blocks_give_each_place_once_and_in_order(tmp_path) -> None:
     splats = small_scene(tmp_path, views=2).splats
-    cells = ground.cut(splats.means[:, [0, 2]].astype(np.float64), np.ones(len(splats)), 3)
+    cells = partition.cut(splats.means[:, [0, 2]].astype(np.float64), np.ones(len(splats)), 3)
     whole, counts = merge.merged([splats] * 3, cells, splats.look)
     assert sum(counts) == len(splats)
     assert sorted(map(tuple, whole.means)) == sorted(map(tuple, splats.means))
@@ -94,7 +94,7 @@ def test_seams_are_where_a_splat_reaches_over_its_border(tmp_path) -> None:
     means = np.array([[-0.1, 0, 0], [-3, 0, 0], [3, 0, 0]], np.float32)
     sizes = np.log(np.array([[0.05] * 3, [0.05] * 3, [0.05, 2.0, 0.05]], np.float32))
     splats = replace(splats, means=means, log_scales=sizes)
-    cells = ground.cut(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
+    cells = partition.cut(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
     assert merge.at_seams(splats, [2, 1], cells).tolist() == [True, False, True]
 
 
@@ -105,7 +105,7 @@ def test_a_block_with_too_many_splats_gives_those_that_its_photographs_show() ->
     )
     hidden = scenes.splats([(x / 8, 0.1, 3.0) for x in range(-6, 7)], 0.05, 0.9)
     both = scenes.join(hidden, wall)
-    seen = [Photograph("a", scenes.camera(), np.zeros((48, 64, 3), np.uint8))]
+    seen = [EvaluationView("a", scenes.camera(), np.zeros((48, 64, 3), np.uint8))]
     own = np.ones(len(both), bool)
     own[-3:] = False
     found = merge.shown_most(both, own, len(wall) - 3, seen, AUTO)

@@ -25,7 +25,7 @@ from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.cameras.table import read_cameras, read_points
 from stages.photos.load import load_mask
 from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
-from stages.structure import ticks
+from stages.structure import worker_progress
 from stages.structure.attempts import _repair_or_delete as repair_or_delete
 from stages.structure.common_view import random_points, seen_by
 from stages.structure.finish import (
@@ -40,8 +40,8 @@ from stages.structure.finish import (
 from stages.structure.job import CameraGuess, Job, known_path
 from stages.structure.lenses import maps, straightened
 from stages.structure.levelling import levelling_rotation, up_direction
-from stages.structure.metric import Known, find_metric
-from stages.structure.named import Posed, posed_photographs
+from stages.structure.match_cameras import Posed, posed_photographs
+from stages.structure.metric_scale import Known, find_metric
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
 
 NEIGHBOURS = 10
@@ -238,7 +238,7 @@ def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], floa
             Path(job.progress).unlink(missing_ok=True)
 
             def tick() -> None:
-                told = ticks.read(Path(job.progress))
+                told = worker_progress.read(Path(job.progress))
                 if told is not None:
                     phase, done, total = told
                     report.progress(done, total, phase)

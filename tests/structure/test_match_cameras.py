@@ -12,7 +12,7 @@ from stages.base.stage import Report
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import PINHOLE
 from stages.scene import Camera, Capture, Photo, View, split_held_out
-from stages.structure.named import posed_photographs
+from stages.structure.match_cameras import posed_photographs
 
 
 def capture(*names: str, size: tuple[int, int] = (640, 480)) -> Capture:

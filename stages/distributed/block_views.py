@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.distributed.ground import Cell
+from stages.distributed.partition import Cell
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import WEIGHT, splat_arrays
 from stages.raster.draw import settings_of

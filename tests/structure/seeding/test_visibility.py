@@ -3,7 +3,7 @@
 import numpy as np
 
 from stages.scene import Camera, View, look_at
-from stages.structure.seeding.witnesses import Witnesses
+from stages.structure.seeding.visibility import Witnesses
 
 WALL = 6.0
 
