@@ -66,8 +66,8 @@ class PruneSettings:
     min_psnr: float = field(
         default=0.0,
         metadata={
-            "help": "As small as the training photographs allow at this PSNR, instead of by --strength; "
-            "0 for none (dB).",
+            "help": "Remove as much as leaves the training views this PSNR, instead of by "
+            "--strength; 0 for none (dB).",
             "min": 0,
             "max": 99,
         },

@@ -60,9 +60,18 @@ class PruningResult:
 
 @dataclass
 class Pruner:
-    """One model on its way down. rounds: at most, unless targets want more. finetune_steps: after each
-    of as many; where targets want more rounds, they share the steps. All photographs tell what it
-    learns and what each splat is worth at first, as many as `LOOKED_AT` decide."""
+    """Prunes a model in rounds.
+
+    Args:
+        photographs: training views.
+        targets: what ends the pruning.
+        backend: name of the rasteriser.
+        tuner: fine-tunes the model after each round.
+        rounds: the largest number, unless a target needs more.
+        finetune_steps: after each round; where a target needs more rounds, those share
+            `rounds * finetune_steps` steps.
+        report: for progress.
+    """
 
     photographs: Sequence[EvaluationView]
     targets: Targets
