@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand
 
 from splatcli.options import keyword
-from stages.editing.words import WORDS, Typed, from_file
+from stages.editing.syntax import WORDS, Typed, from_file
 
 _OPS = "ops"
 _TYPED = "splat.typed"  # where a context keeps the words of its command

@@ -19,7 +19,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.settings import Setting, settings_of
 from stages.distributed import blocks, cluster, sfm_chunks
 from stages.distributed.tasks import Executor
-from stages.raster.backends import backend_of, drawn_by
+from stages.raster.backends import backend_of, backend_of_settings
 from stages.run import runfolder
 from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
@@ -136,7 +136,9 @@ def settings_for(
         chosen["train"] = presets()[preset]
     found = {name: options.changed(settings, typed) for name, settings in chosen.items()}
     if typed.keys() & {"backend", "device"}:  # said now, not after an hour of other work
-        for asked in {drawn_by(each) for each in found.values() if hasattr(each, "backend")}:
+        for asked in {
+            backend_of_settings(each) for each in found.values() if hasattr(each, "backend")
+        }:
             backend_of(asked).require()
     return found
 

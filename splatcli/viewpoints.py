@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from splatcli import console
 from stages.base.errors import Family, SplatError
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:

@@ -14,10 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.capacity.usual import DECIDING
 from stages.formats import FORMATS, MESHES, Format
-from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
 
 if TYPE_CHECKING:
     from stages.capacity.rounding import Fitting
@@ -106,7 +111,7 @@ def run(
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
-    prover = Prover.of(splats, cameras, drawn_by(settings))
+    prover = Prover.of(splats, cameras, backend_of_settings(settings))
     fitting = _fitting(inputs, splats, settings, wanted, report) if len(splats) else None
     files, figures = [], {}
     for number, name in enumerate(wanted):
@@ -127,7 +132,7 @@ def run(
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
         files.append(file)
         figures[file.format] = {"size_bytes": file.size_bytes}
-    tell(report, drawn_by(settings))
+    report_backend(report, backend_of_settings(settings))
     report.metric("files", len(files))
     report.metric("splats", len(splats))
     report.metric("dropped", dropped)
@@ -172,13 +177,17 @@ def _fitting(
     training = split_held_out(reconstruction.views)[0]
     if not (settings.rounding_steps and training and any(FORMATS[name].rounds for name in wanted)):
         return None
-    sat_out, backend, folder = inputs["train"].sat_out, drawn_by(settings), reconstruction.folder
-    photographs = load_evaluation_views(folder, training, splats.look)
-    tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, sat_out)
+    dropout, backend, folder = (
+        inputs["train"].dropout,
+        backend_of_settings(settings),
+        reconstruction.folder,
+    )
+    photographs = load_evaluation_views(folder, training, splats.draw_settings)
+    tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, dropout)
     seen = np.zeros(len(splats), np.int32)
-    if sat_out:  # only then it matters
+    if dropout:  # only then it matters
         seen = measure_contributions(splats, photographs, backend).photographs
-    deciding = load_evaluation_views(folder, spread_over(training, DECIDING), splats.look)
+    deciding = load_evaluation_views(folder, spread_over(training, DECIDING), splats.draw_settings)
     return Fitting(tuner, deciding, backend, settings.rounding_steps, seen)
 
 
@@ -203,17 +212,19 @@ def _write_meshes(
     wanted = [MESHES[ending] for ending in dict.fromkeys(asked) if ending in MESHES]
     if not wanted:
         return []
-    from stages.base.lazy import named
+    from stages.base.lazy import load_object
     from stages.scene import ExportedFile
     from stages.surface.files import fault_of
     from stages.surface.make import make
 
-    made = make(splats, reconstruction, settings.mesh_triangles, drawn_by(settings), report)
+    made = make(
+        splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
+    )
     report.metric("mesh", made.figures)
     files = []
     for row in wanted:
         path = folder / f"{settings.name}.{row.ending}"
-        named(row.writer)(path, made.mesh, reconstruction.units)
+        load_object(row.writer)(path, made.mesh, reconstruction.units)
         if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, row.size_bytes(path)))

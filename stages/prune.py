@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Any
 from stages.base.stage import Report, Stage
 from stages.capacity.usual import DECIDING, SOG_LOSS_DB
 from stages.formats.table import FORMATS
-from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
 
 if TYPE_CHECKING:
     from stages.capacity.pruning import PruningResult
@@ -101,17 +106,17 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     trained: TrainedSplats = inputs["train"]
     splats = trained.splats
     kept, held = split_held_out(reconstruction.views)
-    photographs = load_evaluation_views(reconstruction.folder, kept, splats.look)
-    judges = load_evaluation_views(reconstruction.folder, held, splats.look) or photographs
-    backend = drawn_by(settings)
+    photographs = load_evaluation_views(reconstruction.folder, kept, splats.draw_settings)
+    judges = load_evaluation_views(reconstruction.folder, held, splats.draw_settings) or photographs
+    backend = backend_of_settings(settings)
     before = mean_psnr_db(splats, judges, backend)
     extent = seen_extent(reconstruction)
-    tuner = FineTuner(photographs, extent, backend, report, trained.sat_out)
+    tuner = FineTuner(photographs, extent, backend, report, trained.dropout)
     size_bytes = _sizes(settings, splats, photographs, reconstruction)
     targets = Targets(
         settings.strength,
         settings.max_loss_db,
-        felt_share(trained.by_heart),
+        felt_share(trained.overfitted),
         settings.max_splats,
         settings.max_mb * 1e6,
         settings.min_psnr,
@@ -122,8 +127,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     )
     found = shrinking.run(splats)
     after = mean_psnr_db(found.splats, judges, backend)
-    tell(report, backend)
-    report.metric("judged_side_px", splats.look.side)
+    report_backend(report, backend)
+    report.metric("judged_side_px", splats.draw_settings.side)
     report.metric("psnr_before_db", round(before, 3))
     report.metric("psnr_db", round(after, 3))
     report.metric("psnr_change_db", round(after - before, 3))
@@ -148,7 +153,7 @@ def _sizes(
     import tempfile
 
     from stages import formats
-    from stages.base.lazy import named
+    from stages.base.lazy import load_object
     from stages.capacity.bits import choose_bits
     from stages.formats.coarse import Bits
     from stages.measure.evaluation import mean_psnr_db
@@ -157,11 +162,11 @@ def _sizes(
     row = FORMATS[settings.mb_of]
     few: dict[str, int] = {}
     if settings.max_mb and row.coarse:
-        deciding, backend = spread_over(photographs, DECIDING), drawn_by(settings)
+        deciding, backend = spread_over(photographs, DECIDING), backend_of_settings(settings)
         few, _ = choose_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
 
     def size_bytes(splats: Splats) -> int:
-        held = named(row.coarse)(splats, Bits(**few)) if few else splats
+        held = load_object(row.coarse)(splats, Bits(**few)) if few else splats
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"scene.{settings.mb_of}"
             formats.write(path, held, units=reconstruction.units, views=reconstruction.views)

@@ -31,11 +31,11 @@ def unseen(n: int) -> Splats:
 
 
 def run(
-    scene: SmallScene, trained: Splats, folder: Path, by_heart: bool = False, **settings
+    scene: SmallScene, trained: Splats, folder: Path, overfitted: bool = False, **settings
 ) -> tuple[Splats, Report]:
     """Without fine-tuning unless it is asked for: splats that stay are then the same."""
     report = Report()
-    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained, by_heart=by_heart)}
+    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained, overfitted=overfitted)}
     wanted = prune.PruneSettings(**{"finetune_steps": 0, **settings})
     return prune.run(inputs, wanted, folder, report), report
 
@@ -47,7 +47,7 @@ def rows_of(part: Splats, whole: Splats) -> np.ndarray:
 
 def training_db(scene: SmallScene, found: Splats) -> float:
     training, _ = split_held_out(scene.reconstruction.views)
-    photographs = load_evaluation_views(scene.reconstruction.folder, training, found.look)
+    photographs = load_evaluation_views(scene.reconstruction.folder, training, found.draw_settings)
     return mean_psnr_db(found, photographs, "cpu")
 
 
@@ -100,8 +100,8 @@ def test_the_loss_allowed_is_kept_and_the_price_moves_it(scene, tmp_path) -> Non
 
 
 def test_what_is_learnt_by_heart_may_lose_more_of_it(scene, tmp_path) -> None:
-    plain, _ = run(scene, scene.splats, tmp_path, by_heart=False, max_loss_db=0.02)
-    heart, _ = run(scene, scene.splats, tmp_path, by_heart=True, max_loss_db=0.02)
+    plain, _ = run(scene, scene.splats, tmp_path, overfitted=False, max_loss_db=0.02)
+    heart, _ = run(scene, scene.splats, tmp_path, overfitted=True, max_loss_db=0.02)
     assert len(heart) < len(plain)
 
 

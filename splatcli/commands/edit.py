@@ -13,7 +13,7 @@ from stages.base.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.editing.operations import Done
     from stages.editing.scene import Edited
-    from stages.editing.words import Typed
+    from stages.editing.syntax import Typed
 
 
 def edit(
@@ -84,8 +84,8 @@ def _opened(source: Path) -> Edited:
         return Edited(splats, units_of(source))
     found = pipeline.load("sfm")
     training, held = split_held_out(found.views)
-    photographs = load_evaluation_views(found.folder, training, splats.look)
-    judges = load_evaluation_views(found.folder, held, splats.look) or photographs
+    photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
+    judges = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
     return Edited(
         *(splats, found.units, photographs, judges, found.views),
         backend=backend_of(pipeline),

@@ -14,7 +14,7 @@ from stages.raster.kernels import cache
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.proof.census import Census
+    from stages.proof.statistics import Census
     from stages.scene import ExportedFile, Splats
 
 _ATTRIBUTES = {
@@ -35,7 +35,7 @@ def show(target: Path | None, speed: bool, as_json: bool) -> None:
     Raises SplatError for what cannot be read; values that are not finite are warned of.
     """
     from stages.base import scratch
-    from stages.proof.census import census_of
+    from stages.proof.statistics import census_of
 
     with scratch.scratch_in(Path(tempfile.gettempdir()), spare=True):
         splats, pipeline = splats_of(target, strict=False)
@@ -107,7 +107,9 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     views = views_of(pipeline)
     chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
-    cameras = [splats.look.camera(v.camera) for v in chosen] or around(splats, _TIMED_FRAMES, 0.9)
+    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or around(
+        splats, _TIMED_FRAMES, 0.9
+    )
     backend = backend_of(pipeline)
     seconds = seconds_per_frame(splats, cameras, backend)
     return {
@@ -120,7 +122,7 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
 
 def warnings_of(census: Census) -> list[tuple[str, str]]:
     """(code, sentence) for each kind of trouble that is there."""
-    from stages.proof.census import GIANT_PART, NEEDLE_ASPECT, OUTLIER_BOXES
+    from stages.proof.statistics import GIANT_PART, NEEDLE_ASPECT, OUTLIER_BOXES
 
     found = []
     for name, count in census.not_finite.items():
@@ -151,7 +153,7 @@ def _share(count: int, census: Census) -> str:
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:
     from stages.formats import format_of
-    from stages.proof.anatomy import anatomy_of
+    from stages.proof.byte_breakdown import anatomy_of
 
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size": console.size(size)}

@@ -75,9 +75,9 @@ def material_of(pipeline: Pipeline) -> Material:
     return Material(
         splats=splats,
         training=load_evaluation_views(
-            reconstruction.folder, deciding(training, splats.look), splats.look
+            reconstruction.folder, deciding(training, splats.draw_settings), splats.draw_settings
         ),
-        held_out=load_evaluation_views(reconstruction.folder, held, splats.look),
+        held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
         views=reconstruction.views,
         units=reconstruction.units,
         backend=sources.backend_of(pipeline),

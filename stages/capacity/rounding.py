@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages import formats
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats.axes import least_turned
 from stages.formats.coarse import Bits, held_by, on_grids
 from stages.formats.table import Format
@@ -94,9 +94,9 @@ def as_read(row: Format, splats: Splats) -> Splats:
         read = formats.read(path)
     found = read.with_sh_degree(splats.sh_degree)
     if row.order:
-        places = np.argsort(named(row.order)(splats))
+        places = np.argsort(load_object(row.order)(splats))
         found = found.take(places)
-    return replace(found, look=splats.look, origin=splats.origin)
+    return replace(found, draw_settings=splats.draw_settings, origin=splats.origin)
 
 
 def _only(name: str, coarse: Splats, splats: Splats) -> Splats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.capacity.pruning import LOSS, PRICE, PruningResult
 from stages.capacity.targets import felt_share
 from stages.scene import TrainedSplats
@@ -35,7 +35,7 @@ def summarise(
         f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
         f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning in "
         f"all: {found.end_db - found.start_db:+.2f} dB on the photographs of training; other views "
-        f"feel at most {felt_share(before.by_heart):.0%} of that."
+        f"feel at most {felt_share(before.overfitted):.0%} of that."
     )
     why = _WHY.get(found.stopped_by, "the rounds that were asked for were done")
     return [*told, f"It stopped since {why}."]

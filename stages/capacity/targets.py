@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.scene import Splats
 
 WORST_VIEW_DB = 0.3  # that any one view may lose, at price 1
@@ -18,9 +18,9 @@ WORST_VIEW_DB = 0.3  # that any one view may lose, at price 1
 FELT, FELT_BY_HEART = 0.25, 0.05
 
 
-def felt_share(by_heart: bool) -> float:
+def felt_share(overfitted: bool) -> float:
     """How much of what training photographs lose other views lose as well, at most."""
-    return FELT_BY_HEART if by_heart else FELT
+    return FELT_BY_HEART if overfitted else FELT
 
 
 @dataclass(frozen=True)

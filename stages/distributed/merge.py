@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stages.distributed.partition import Cell
 from stages.measure.contribution import measure_contributions, squared_error
 from stages.measure.evaluation import EvaluationView
-from stages.scene import Look, Splats
+from stages.scene import DrawSettings, Splats
 from stages.training.finetune import FineTuner
 
 REACH = 3.0  # standard deviations: as far as a splat is there
@@ -26,7 +26,7 @@ def surrounded(seeds: Splats, coarse: Splats, cell: Cell, most: int) -> Splats:
     inside = seeds.with_sh_degree(degree).take(cell.holds(seeds.means))
     if len(inside) > most:
         inside = inside.take(np.linspace(0, len(inside) - 1, most).round().astype(np.int64))
-    return _joined([inside, coarse.take(~cell.holds(coarse.means))], coarse.look)
+    return _joined([inside, coarse.take(~cell.holds(coarse.means))], coarse.draw_settings)
 
 
 def shown_most(
@@ -45,21 +45,23 @@ def shown_most(
     return kept
 
 
-def merged(parts: Sequence[Splats], cells: Sequence[Cell], look: Look) -> tuple[Splats, list[int]]:
+def merged(
+    parts: Sequence[Splats], cells: Sequence[Cell], draw_settings: DrawSettings
+) -> tuple[Splats, list[int]]:
     """(the splats of each part whose centres lie in its cell, part after part; how many of each).
 
     What stood in for a block's surroundings is left behind. All parts have one origin.
     """
     own = [part.take(cell.holds(part.means)) for part, cell in zip(parts, cells, strict=True)]
-    return _joined(own, look), [len(part) for part in own]
+    return _joined(own, draw_settings), [len(part) for part in own]
 
 
-def _joined(parts: Sequence[Splats], look: Look) -> Splats:
+def _joined(parts: Sequence[Splats], draw_settings: DrawSettings) -> Splats:
     arrays = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in (*("means", "quaternions", "log_scales"), "opacity_logits", "sh", "sh_degrees")
     }
-    return replace(parts[0], look=look, **arrays)
+    return replace(parts[0], draw_settings=draw_settings, **arrays)
 
 
 def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from stages.distributed.tasks import ChunkTask, Executor, OpenExecutor, Resource
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
-    from stages.structure.chunks import Share
+    from stages.structure.chunks import Chunk
 
 
 def with_shares(pipeline: Pipeline, open_engine: OpenExecutor) -> Pipeline:
@@ -34,13 +34,13 @@ def _sfm(
         return plain.run(inputs, settings, folder, report)
     run: Callable[..., Any] = plain.run
     with open_engine(pipeline.run_folder, Listener()) as engine:
-        return run(inputs, settings, folder, report, hands=partial(_hand_out, engine, report))
+        return run(inputs, settings, folder, report, executor=partial(_hand_out, engine, report))
 
 
 def _hand_out(
-    engine: Executor, report: Report, shares: Sequence[Share], look: Callable[[], None]
+    engine: Executor, report: Report, shares: Sequence[Chunk], look: Callable[[], None]
 ) -> None:
-    from stages.structure.chunks import NEED_MIB
+    from stages.structure.chunks import CHUNK_MEMORY_MIB
 
     if not shares:
         return
@@ -53,7 +53,7 @@ def _hand_out(
     run_all(
         engine,
         [ChunkTask(share) for share in shares],
-        Resources(NEED_MIB),
+        Resources(CHUNK_MEMORY_MIB),
         report.stop_requested,
         tick,
         hint="Give the same command again: shares that are finished are kept.",

@@ -18,7 +18,7 @@ from stages.run.failures import as_splat_error
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
-    from stages.structure.chunks import Share
+    from stages.structure.chunks import Chunk
 
 
 Location: TypeAlias = Path | str  # a path, or a URL
@@ -57,16 +57,16 @@ class RunTask:
 class ChunkTask:
     """A share of features or matches."""
 
-    share: Share
+    share: Chunk
 
     @property
     def folder(self) -> Path:
         return self.share.out.parent
 
     def work(self, listener: Listener | None = None) -> None:
-        from stages.structure.chunks import do
+        from stages.structure.chunks import run_chunk
 
-        do(self.share)
+        run_chunk(self.share)
 
 
 @dataclass(frozen=True)

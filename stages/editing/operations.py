@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.atomic import partial_prefix
 from stages.base.errors import Family, SplatError
-from stages.editing import expression, floaters, regions, turning
+from stages.editing import expression, regions, transform
 from stages.editing.decimate import FAR, NEAR, decimated
 from stages.editing.joining import joined
 from stages.editing.scene import Edited
-from stages.editing.turning import Similarity
-from stages.editing.words import WORDS, Typed
+from stages.editing.syntax import WORDS, Typed
+from stages.editing.transform import Similarity
 from stages.formats.rows import chosen, kept_rows
+from stages.measure import floaters
 from stages.measure.contribution import floaters as hanging
 from stages.scene import Splats
 
@@ -85,7 +86,7 @@ def _prepared(typed: Typed, target: Path) -> Operation:
         case "move":
             return _placing(Similarity(offset=_vector(typed, value)))
         case "up":
-            return _placing(Similarity(rotation=turning.upright(_direction(typed, value))))
+            return _placing(Similarity(rotation=transform.upright(_direction(typed, value))))
         case "merge":
             return _merging(Path(value))
         case "degree":
@@ -114,7 +115,7 @@ def _without_floaters(scene: Edited) -> Edited:
     if len(scene.photographs):
         gone = hanging(scene.splats, scene.worth(), scene.cameras())
     else:
-        gone = floaters.alone(scene.splats)
+        gone = floaters.isolated_splats(scene.splats)
     return scene.but(chosen(scene.splats, ~gone))
 
 
@@ -179,7 +180,7 @@ def _rotation(typed: Typed) -> NDArray[np.float64]:
     angle = regions.numbers(degrees, 1)
     if angle is None:
         raise _wrong(typed)
-    return turning.about(_direction(typed, axis), float(angle[0]))
+    return transform.about(_direction(typed, axis), float(angle[0]))
 
 
 def _direction(typed: Typed, text: str) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.editing.decimate import Appraisal
-from stages.editing.turning import Similarity
+from stages.editing.transform import Similarity
 from stages.measure.contribution import Contributions, measure_contributions, near_view_frusta
 from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.raster.backends import AUTO

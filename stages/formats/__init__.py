@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import clear_left
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats.table import BY_ENDING, FORMATS, MESHES, TABLE, Anatomy, Format, format_of
 from stages.formats.units import units_of
 
@@ -57,7 +57,7 @@ def write(
     row = format_of(path)
     clear_left(Path(path).parent)
     more: dict[str, Any] = {"views": views} if row.wants_views else {}
-    dropped: int = named(row.writer)(Path(path), splats, units=units, **more)
+    dropped: int = load_object(row.writer)(Path(path), splats, units=units, **more)
     return dropped
 
 
@@ -69,7 +69,7 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     """
     from stages.formats.rows import damage_kept
 
-    reader = named(format_of(path).reader)
+    reader = load_object(format_of(path).reader)
     with nullcontext() if strict else damage_kept():
         splats: Splats = reader(Path(path))
     return splats

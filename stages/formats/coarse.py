@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import codebook, smallest_three
 from stages.formats.axes import least_turned
 from stages.formats.rows import (
@@ -88,7 +88,7 @@ def held_by(row: Format, quantised: QuantisedSplats) -> Splats:
     bits = quantised.decisions.get("bits")
     if not row.coarse or not isinstance(bits, dict):
         return splats
-    found: Splats = named(row.coarse)(splats, Bits(**bits))
+    found: Splats = load_object(row.coarse)(splats, Bits(**bits))
     return found
 
 

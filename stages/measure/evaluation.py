@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stages.measure.images import flip, psnr, ssim
 from stages.photos.load import load_image, mask_of
 from stages.raster.draw import renderer
-from stages.scene import IGNORE, TRANSPARENT, Camera, Look, Splats, View
+from stages.scene import IGNORE, TRANSPARENT, Camera, DrawSettings, Splats, View
 from stages.scene.light import BRIGHT, Light, gains_and_offsets
 
 IDENTICAL_DB = 99.0  # what "no difference at all" is written as: JSON has no infinity
@@ -87,12 +87,12 @@ class Score:
 class _Photographs(Sequence[EvaluationView]):
     """The first of them in memory, the others on disk."""
 
-    def __init__(self, folder: Path, views: Iterable[View], look: Look) -> None:
-        self._folder, self._views, self._look = folder, tuple(views), look
+    def __init__(self, folder: Path, views: Iterable[View], draw_settings: DrawSettings) -> None:
+        self._folder, self._views, self._look = folder, tuple(views), draw_settings
         self._kept: list[EvaluationView] = []
         free = IN_MEMORY_MIB * 2**20
         for number, view in enumerate(self._views):
-            camera = look.camera(view.camera)
+            camera = draw_settings.camera(view.camera)
             free -= 4 * camera.width * camera.height  # three colours and perhaps a mask
             if free < 0:
                 break
@@ -112,17 +112,19 @@ class _Photographs(Sequence[EvaluationView]):
         return self._kept[number] if number < len(self._kept) else self._loaded(number)
 
     def _loaded(self, number: int) -> EvaluationView:
-        view, look = self._views[number], self._look
-        found = load_evaluation_view(self._folder, view, look.camera(view.camera))
-        return found.in_median_light(view.light if look.light else None).over(look.background)
+        view, draw_settings = self._views[number], self._look
+        found = load_evaluation_view(self._folder, view, draw_settings.camera(view.camera))
+        return found.in_median_light(view.light if draw_settings.light else None).over(
+            draw_settings.background
+        )
 
 
 def load_evaluation_views(
-    folder: Path, views: Iterable[View], look: Look
+    folder: Path, views: Iterable[View], draw_settings: DrawSettings
 ) -> Sequence[EvaluationView]:
     """The views' photographs at the size of `look`, over its background and in its light; in memory
     as far as `IN_MEMORY_MIB` goes. Raises SplatError, now or when they are used."""
-    return _Photographs(folder, views, look)
+    return _Photographs(folder, views, draw_settings)
 
 
 def load_evaluation_view(folder: Path, view: View, camera: Camera) -> EvaluationView:
@@ -169,12 +171,12 @@ def evaluate(
 
 
 def psnr_as_taken_db(
-    draw: ImageRenderer, folder: Path, views: Iterable[View], look: Look
+    draw: ImageRenderer, folder: Path, views: Iterable[View], draw_settings: DrawSettings
 ) -> tuple[float, float]:
     """Mean PSNR of photographs in the light that they were taken in: (as they are, and the right
     halves of drawings that an affine map of each channel, fitted on the left halves, adapts)."""
     plain, adapted = [], []
-    for photograph in load_evaluation_views(folder, views, replace(look, light=False)):
+    for photograph in load_evaluation_views(folder, views, replace(draw_settings, light=False)):
         image, truth = np.clip(draw(photograph.camera), 0.0, 1.0), photograph.image
         half, everywhere = truth.shape[1] // 2, np.ones(truth.shape[:2], bool)
         kept = everywhere if photograph.kept is None else photograph.kept

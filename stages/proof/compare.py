@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.blocks import blocks
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, Format
+from stages.proof.independent_readers import FileContent
 from stages.proof.matching import Rows, extent_of, matched_rows
-from stages.proof.second_readers import FileContent
 from stages.scene import SH_C0, Splats
 from stages.scene.turn import FLIP, turned
 
@@ -87,7 +87,7 @@ def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows
     """How a format may have sorted either side; made one by one, as the first often fits."""
     for row in formats:
         if row.order:
-            order = named(row.order)
+            order = load_object(row.order)
             yield order(truth)
             yield np.argsort(order(file))
 

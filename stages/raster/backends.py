@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.raster.torch_device import DEVICES, PROCESSOR
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Backend:
     name: str
     rasteriser: str
     what: str
-    step: str = "stages.training.plain_step:PlainStep"
+    step: str = "stages.training.reference_step:ReferenceStep"
     obstacle: str = ""
     told: str = ""
     devices: tuple[str, ...] = ()
@@ -45,11 +45,11 @@ class Backend:
 
     def where(self) -> str:
         """What it runs on, for a manifest."""
-        return str(named(self.told)(*self._device())) if self.told else PROCESSOR
+        return str(load_object(self.told)(*self._device())) if self.told else PROCESSOR
 
     def made(self) -> Rasteriser:
         """A new rasteriser. Raises SplatError where what it runs on is not there."""
-        found: Rasteriser = named(self.rasteriser)(*self._device())
+        found: Rasteriser = load_object(self.rasteriser)(*self._device())
         return found
 
     def require(self) -> None:
@@ -62,7 +62,7 @@ class Backend:
 
     def why_not(self) -> str:
         """Why "auto" passes it over here; "" where it does not."""
-        return str(named(self.obstacle)()) if self.obstacle else ""
+        return str(load_object(self.obstacle)()) if self.obstacle else ""
 
 
 # "auto" takes the first that nothing stands against.
@@ -103,7 +103,7 @@ def backend_of(name: str) -> Backend:
     raise ValueError(f"backend {name!r}, wanted one of {', '.join(CHOICES)}")
 
 
-def passed_over(name: str) -> dict[str, str]:
+def unavailable_backends(name: str) -> dict[str, str]:
     """Why "auto" did not take the backends before the one that it takes; {} for another name."""
     chosen = [b.name for b in BACKENDS].index(backend_of(name).name) if name == AUTO else 0
     return {backend.name: backend.why_not() for backend in BACKENDS[:chosen]}
@@ -124,7 +124,7 @@ def runs_here(name: str) -> bool:
     return True
 
 
-def asked_for(backend: str, device: str = PROCESSOR) -> str:
+def qualified_name(backend: str, device: str = PROCESSOR) -> str:
     """What the options --backend and --device ask for together, in one word. Raises SplatError
     (option-device) for a device of a backend that takes none."""
     if device == PROCESSOR:
@@ -142,12 +142,12 @@ def asked_for(backend: str, device: str = PROCESSOR) -> str:
     )
 
 
-def drawn_by(settings: Any) -> str:
+def backend_of_settings(settings: Any) -> str:
     """What a stage's settings ask to draw with. Raises SplatError (option-device)."""
-    return asked_for(settings.backend, settings.device)
+    return qualified_name(settings.backend, settings.device)
 
 
-def tell(report: Report, name: str) -> None:
+def report_backend(report: Report, name: str) -> None:
     """Into a stage's report: which backend the name stands for here, and what it runs on."""
     chosen = backend_of(name)
     report.metric("backend", chosen.name)

@@ -21,19 +21,21 @@ from typing import TYPE_CHECKING
 from stages.base import threads
 from stages.base.blocks import blocks
 from stages.structure import database as sqlite
-from stages.structure.job import Job, chosen_path, shares_path
+from stages.structure.job import Job, chunks_path, selected_pairs_path
 from stages.structure.process import WorkerCrashed, crash_error, run_worker
 
 if TYPE_CHECKING:
     from stages.structure.pairs import Pair
 
-PHOTOGRAPHS, PAIRS = 16, 128  # in a share: some seconds of one core
-NEED_MIB = 2560.0  # sorted features of so many photographs, or the pictures they are found in
+PHOTOGRAPHS_PER_CHUNK, PAIRS_PER_CHUNK = 16, 128  # in a share: some seconds of one core
+CHUNK_MEMORY_MIB = (
+    2560.0  # sorted features of so many photographs, or the pictures they are found in
+)
 _MOST_S = 7 * 86400.0  # who hands shares out looks at the clock
 
 
 @dataclass(frozen=True)
-class Share:
+class Chunk:
     """job: file of the whole job. out: the database to leave. photographs, or pairs: positions."""
 
     job: Path
@@ -42,41 +44,41 @@ class Share:
     pairs: tuple[Pair, ...] = ()
 
 
-Hands = Callable[[Sequence[Share], Callable[[], None]], None]
+ChunkExecutor = Callable[[Sequence[Chunk], Callable[[], None]], None]
 """Does shares to their ends, in any order, and calls the second each time that one ends. Raises as
 `do` and as the second, and Interrupted."""
 
 
-def hand_out_features(job: Job, hands: Hands, look: Callable[[], None]) -> None:
+def extract_features_in_chunks(job: Job, executor: ChunkExecutor, look: Callable[[], None]) -> None:
     """Have the features found that neither the job's database nor a finished share holds."""
     have: set[int] = set()
-    for database in (Path(job.database), *shares_path(job).glob("*.db")):
+    for database in (Path(job.database), *chunks_path(job).glob("*.db")):
         if database.exists():
             have |= sqlite.photographs_with_features(database)
     missing = [position for position in range(len(job.names)) if position not in have]
     file, folder = _written(job)
-    parts = (tuple(missing[part]) for part in blocks(len(missing), PHOTOGRAPHS))
-    hands([Share(file, folder / f"photograph-{p[0]}.db", p) for p in parts], look)
+    parts = (tuple(missing[part]) for part in blocks(len(missing), PHOTOGRAPHS_PER_CHUNK))
+    executor([Chunk(file, folder / f"photograph-{p[0]}.db", p) for p in parts], look)
 
 
-def hand_out_pairs(job: Job, hands: Hands, look: Callable[[], None]) -> int:
+def match_pairs_in_chunks(job: Job, executor: ChunkExecutor, look: Callable[[], None]) -> int:
     """Have the pairs matched that the step "choosing" chose; how many they are."""
-    chosen = [(first, second) for first, second in json.loads(chosen_path(job).read_text())]
+    chosen = [(first, second) for first, second in json.loads(selected_pairs_path(job).read_text())]
     file, folder = _written(job)
-    parts = (tuple(chosen[part]) for part in blocks(len(chosen), PAIRS))
-    hands([Share(file, folder / f"pair-{p[0][0]}-{p[0][1]}.db", pairs=p) for p in parts], look)
+    parts = (tuple(chosen[part]) for part in blocks(len(chosen), PAIRS_PER_CHUNK))
+    executor([Chunk(file, folder / f"pair-{p[0][0]}-{p[0][1]}.db", pairs=p) for p in parts], look)
     return len(chosen)
 
 
 def _written(job: Job) -> tuple[Path, Path]:
     """(the job's file, the folder for its shares), at paths that mean the same everywhere."""
     whole = replace(job, database=str(Path(job.database).absolute()))
-    folder = shares_path(whole)
+    folder = chunks_path(whole)
     folder.mkdir(exist_ok=True)
     return whole.write(folder / "job.json"), folder
 
 
-def do(share: Share) -> None:
+def run_chunk(share: Chunk) -> None:
     """Do a share, unless it is done, in a worker process. Raises SplatError."""
     if share.out.exists():
         return

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.raster.kernels.simd import kernel
-from stages.structure.vocabulary import Sorted
+from stages.structure.vocabulary import FeatureIndex
 
 RATIO = 0.8  # of the angles to the nearest and to the second (Lowe 2004), as COLMAP has it
 LARGEST_ANGLE = 0.7  # radians, as COLMAP has it
 _SQUARED_LENGTH = 512.0**2  # of a descriptor
 
 
-def matches(first: Sorted, second: Sorted) -> NDArray[np.uint32]:
+def match_descriptors(first: FeatureIndex, second: FeatureIndex) -> NDArray[np.uint32]:
     """[M, 2] rows of features that match, sorted. Every feature is in one match at most."""
     there = _nearest(first, np.arange(len(first.rows)), second)
     candidates = np.flatnonzero(there >= 0)
@@ -25,7 +25,9 @@ def matches(first: Sorted, second: Sorted) -> NDArray[np.uint32]:
     return pairs[np.argsort(pairs[:, 0])].astype(np.uint32)
 
 
-def _nearest(queries: Sorted, asked: NDArray[np.int64], targets: Sorted) -> NDArray[np.int64]:
+def _nearest(
+    queries: FeatureIndex, asked: NDArray[np.int64], targets: FeatureIndex
+) -> NDArray[np.int64]:
     """[A] place in `targets` of the clearly nearest to each feature that is asked for, or -1."""
     best = np.empty(len(asked), np.int64)
     dots = np.empty((len(asked), 2), np.int32)

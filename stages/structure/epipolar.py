@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 MatchedPair = tuple[int, int, NDArray[np.float64], NDArray[np.float64]]
 
-NEAR = 0.0025  # of the longer side: 4 px of 1600
+INLIER_DISTANCE = 0.0025  # of the longer side: 4 px of 1600
 _ROUNDING = 1e-9
 _OURS_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def agreement(
+def median_inlier_ratio(
     pairs: Sequence[MatchedPair],
     intrinsics: NDArray[np.float64],
     world_to_camera: NDArray[np.float64],
@@ -22,12 +22,12 @@ def agreement(
 ) -> float | None:
     """The median over pairs of `fitting_shares`; None without pairs, and where all are seen from
     one place."""
-    shares = fitting_shares(pairs, intrinsics, world_to_camera, side)
+    shares = inlier_ratios(pairs, intrinsics, world_to_camera, side)
     told = shares[~np.isnan(shares)]
     return float(np.median(told)) if len(told) else None
 
 
-def fitting_shares(
+def inlier_ratios(
     pairs: Sequence[MatchedPair],
     intrinsics: NDArray[np.float64],
     world_to_camera: NDArray[np.float64],
@@ -48,11 +48,13 @@ def fitting_shares(
             continue
         essential = _cross(shift) @ relative[:3, :3]
         left, right = _pixel_matrix(intrinsics[second]), _pixel_matrix(intrinsics[first])
-        shares[number] = (_sampson(left.T @ essential @ right, a, b) < NEAR * side).mean()
+        shares[number] = (
+            _sampson(left.T @ essential @ right, a, b) < INLIER_DISTANCE * side
+        ).mean()
     return shares
 
 
-def alternatives(poses: NDArray[np.float64]) -> Iterator[tuple[str, NDArray[np.float64]]]:
+def likely_mistakes(poses: NDArray[np.float64]) -> Iterator[tuple[str, NDArray[np.float64]]]:
     """What people hand over by mistake, put right: (the mistake in words, poses [V, 4, 4])."""
     inverse = np.asarray(np.linalg.inv(poses), np.float64)
     yield (

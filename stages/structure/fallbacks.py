@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from stages.structure.gates import Failure, Figures
+from stages.structure.gates import Failure, ModelStatistics
 from stages.structure.sparse_model import MappingResult
 
 
 @dataclass(frozen=True)
-class Rung:
+class Configuration:
     """One way to reconstruct.
 
     more_features: lower SIFT's threshold and allow more. exhaustive: match every pair even where
@@ -37,26 +37,28 @@ _SPARSE = frozenset({"sfm-too-few-points", "sfm-short-tracks", "sfm-too-few-feat
 _UNLINKED = frozenset({"sfm-separate-groups", "sfm-no-matches"})
 _CAMERA = frozenset({"sfm-implausible-distortion", "sfm-implausible-focal"})
 
-LADDER = (
-    Rung("standard"),
-    Rung("without stationary matches", drop_stationary=True, mends=_CAMERA),
-    Rung("looser registration", loose=True, mends=_UNPLACED),
-    Rung("every pair matched", exhaustive=True, mends=_UNPLACED | _UNLINKED | _SPARSE),
-    Rung(
+CONFIGURATIONS = (
+    Configuration("standard"),
+    Configuration("without stationary matches", drop_stationary=True, mends=_CAMERA),
+    Configuration("looser registration", loose=True, mends=_UNPLACED),
+    Configuration("every pair matched", exhaustive=True, mends=_UNPLACED | _UNLINKED | _SPARSE),
+    Configuration(
         "more features",
         more_features=True,
         exhaustive=True,
         loose=True,
         mends=_UNPLACED | _UNLINKED | _SPARSE,
     ),
-    Rung(
+    Configuration(
         "another first pair",
         exhaustive=True,
         loose=True,
         other_pair=True,
         mends=_UNPLACED | _CAMERA | {"sfm-high-error", "sfm-crashed"},
     ),
-    Rung("global mapper", exhaustive=True, mapper="global", mends=_UNPLACED | {"sfm-crashed"}),
+    Configuration(
+        "global mapper", exhaustive=True, mapper="global", mends=_UNPLACED | {"sfm-crashed"}
+    ),
 )
 
 
@@ -66,9 +68,9 @@ class Attempt:
     reached. keypoints_median: before matching. pairs_matched, pairs_verified: of photographs that
     were compared in full, and that were found to show the same thing."""
 
-    rung: Rung
+    rung: Configuration
     failures: tuple[Failure, ...]
-    figures: Figures
+    figures: ModelStatistics
     result: MappingResult | None = None
     keypoints_median: float = 0.0
     pairs_matched: int = 0
@@ -89,7 +91,7 @@ class Attempt:
 
 
 @dataclass
-class Climb:
+class Attempts:
     """All attempts in order, and the one to use: the first that passed, else the best."""
 
     attempts: list[Attempt] = field(default_factory=list)
@@ -102,21 +104,21 @@ class Climb:
         return max(self.attempts, key=lambda attempt: attempt.merit)
 
 
-def climb(
-    try_rung: Callable[[Rung], Attempt],
+def try_configurations(
+    try_rung: Callable[[Configuration], Attempt],
     *,
     already_exhaustive: bool,
     out_of_time: Callable[[], bool],
-) -> Climb:
+) -> Attempts:
     """Try rungs until one passes, none that is left can mend what failed, or time is up.
 
     already_exhaustive: the settings match every pair anyway, so that a rung which adds nothing
     else is skipped.
     """
-    climbed = Climb()
+    climbed = Attempts()
     wanted: set[str] = set()
-    for rung in LADDER:
-        if rung is not LADDER[0] and not _worth_trying(rung, wanted, already_exhaustive):
+    for rung in CONFIGURATIONS:
+        if rung is not CONFIGURATIONS[0] and not _worth_trying(rung, wanted, already_exhaustive):
             continue
         if climbed.attempts and out_of_time():
             break
@@ -128,10 +130,10 @@ def climb(
     return climbed
 
 
-def _worth_trying(rung: Rung, failures: set[str], already_exhaustive: bool) -> bool:
+def _worth_trying(rung: Configuration, failures: set[str], already_exhaustive: bool) -> bool:
     if "sfm-no-parallax" in failures:
         return False
-    only_exhaustive = rung == Rung(rung.name, exhaustive=True, mends=rung.mends)
+    only_exhaustive = rung == Configuration(rung.name, exhaustive=True, mends=rung.mends)
     if already_exhaustive and only_exhaustive:
         return False
     return bool(rung.mends & failures)

@@ -19,15 +19,15 @@ from stages.base import threads
 from stages.base.atomic import replacing
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.stage import Report
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.cameras.table import read_cameras, read_points
 from stages.photos.load import load_mask
 from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
 from stages.structure import worker_progress
-from stages.structure.attempts import _repair_or_delete as repair_or_delete
-from stages.structure.common_view import random_points, seen_by
+from stages.structure.attempt_runner import _repair_or_delete as repair_or_delete
+from stages.structure.common_view import count_views, random_points
 from stages.structure.finish import (
     COLMAP,
     IMAGES,
@@ -37,11 +37,11 @@ from stages.structure.finish import (
     write_mask,
     write_picture,
 )
-from stages.structure.job import CameraGuess, Job, known_path
+from stages.structure.job import CameraGuess, Job, known_cameras_path
 from stages.structure.lenses import maps, straightened
 from stages.structure.levelling import levelling_rotation, up_direction
-from stages.structure.match_cameras import Posed, posed_photographs
-from stages.structure.metric_scale import Known, find_metric
+from stages.structure.match_cameras import PosedPhoto, match_cameras
+from stages.structure.metric_scale import KnownScale, find_metric_scale
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
 
 NEIGHBOURS = 10
@@ -66,7 +66,7 @@ def reconstruct(
     allow_partial: bool,
     seed: int,
     max_features: int,
-    size: Known,
+    size: KnownScale,
     seconds_left: Callable[[], float],
 ) -> Reconstruction:
     """The capture with the cameras in `path`. Leaves what `finish` leaves, but reconstruction.json.
@@ -76,7 +76,7 @@ def reconstruct(
     """
     found = read_cameras(path)
     from_file = read_points(path)
-    posed = posed_photographs(found, capture, split, allow_partial, report)
+    posed = match_cameras(found, capture, split, allow_partial, report)
     if len(posed) < 3:
         raise _too_few(len(posed))
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
@@ -106,7 +106,9 @@ def reconstruct(
     return _finished(posed, cameras, cloud, observed, folder, report, size, capture, axes)
 
 
-def _undistorted(posed: list[Posed], source: Path, folder: Path, report: Report) -> list[Camera]:
+def _undistorted(
+    posed: list[PosedPhoto], source: Path, folder: Path, report: Report
+) -> list[Camera]:
     """The pinhole camera of each photograph, whose picture is written. A photograph that is
     straight already stays as it is, byte for byte."""
     cameras, kept = [], []
@@ -149,7 +151,7 @@ def _undistorted(posed: list[Posed], source: Path, folder: Path, report: Report)
 
 
 def _job(
-    posed: list[Posed],
+    posed: list[PosedPhoto],
     cameras: list[Camera],
     training: list[int],
     folder: Path,
@@ -189,7 +191,7 @@ def _job(
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         described.write_text(about, encoding="utf-8")
-    np.savez(known_path(job), **known)  # type: ignore[arg-type]
+    np.savez(known_cameras_path(job), **known)  # type: ignore[arg-type]
     return job
 
 
@@ -238,7 +240,7 @@ def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], floa
             Path(job.progress).unlink(missing_ok=True)
 
             def tick() -> None:
-                told = worker_progress.read(Path(job.progress))
+                told = worker_progress.read_progress(Path(job.progress))
                 if told is not None:
                     phase, done, total = told
                     report.progress(done, total, phase)
@@ -331,7 +333,7 @@ def _file_points(
     """The file's points if they lie where its cameras look."""
     if found is None or not len(found.points):
         return None
-    seen = seen_by(cameras, found.points)
+    seen = count_views(cameras, found.points)
     if (seen >= 2).mean() < _SEEN_SHARE:
         report.warn(
             "cameras-points-elsewhere",
@@ -381,7 +383,7 @@ def _with_random(
         np.concatenate([cloud.points, points]),
         np.concatenate([cloud.colours, grey]),
         np.concatenate([cloud.errors_px, np.zeros(len(points))]),
-        np.concatenate([cloud.tracks, seen_by(cameras, points)]),
+        np.concatenate([cloud.tracks, count_views(cameras, points)]),
     )
 
 
@@ -397,13 +399,13 @@ def _judges_cannot_follow() -> SplatError:
 
 
 def _finished(
-    posed: list[Posed],
+    posed: list[PosedPhoto],
     cameras: list[Camera],
     cloud: FilePoints,
     observed: _Observed,
     folder: Path,
     report: Report,
-    size: Known,
+    size: KnownScale,
     capture: Capture,
     axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
@@ -416,7 +418,7 @@ def _finished(
     points = (cloud.points - middle) @ turn.T
     names = [one.photo.name for one in posed]
     places = [folder / IMAGES / one.photo.picture for one in posed]
-    metric = find_metric(size, capture, names, cameras, places, levelled, report)
+    metric = find_metric_scale(size, capture, names, cameras, places, levelled, report)
     if metric is not None:
         poses = np.array([camera.world_to_camera for camera in cameras])
         points, poses = metric.points(points), metric.poses(poses)

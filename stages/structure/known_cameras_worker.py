@@ -13,8 +13,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from stages.scene.similarity import similarity
-from stages.structure.epipolar import agreement, alternatives
-from stages.structure.job import Job, known_path
+from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
+from stages.structure.job import Job, known_cameras_path
 from stages.structure.mapping import observations
 from stages.structure.matching import match_pairs
 
@@ -26,7 +26,7 @@ FEWEST_MATCHES = 30  # of a pair that is asked whether poses are right
 
 def match_neighbours(job: Job) -> None:
     """Match and verify the pairs of the job's known cameras, whose lenses are known exactly."""
-    known = np.load(known_path(job))
+    known = np.load(known_cameras_path(job))
     with pycolmap.Database.open(job.database) as database:
         for number, lens in enumerate(zip(known["intrinsics"], known["sizes"], strict=True), 1):
             database.update_camera(_camera(number, *lens))
@@ -36,7 +36,7 @@ def match_neighbours(job: Job) -> None:
 def triangulate(job: Job) -> None:
     """Leave in `job.out`: agreement.json, how well matches fit the poses and what others would fit
     better (see `agreement`); points.npz, what the matches and the poses give."""
-    known = np.load(known_path(job))
+    known = np.load(known_cameras_path(job))
     out = Path(job.out)
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
@@ -46,15 +46,16 @@ def triangulate(job: Job) -> None:
     found = {
         "pairs": len(pairs),
         "matches": sum(len(pair[2]) for pair in pairs),
-        "given": agreement(pairs, lens, poses, side),
-        "roughly": agreement(pairs, lens, poses, 4.0 * side),
+        "given": median_inlier_ratio(pairs, lens, poses, side),
+        "roughly": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
         "others": {
-            name: agreement(pairs, lens, turned, side) for name, turned in alternatives(poses)
+            name: median_inlier_ratio(pairs, lens, turned, side)
+            for name, turned in likely_mistakes(poses)
         },
     }
     if job.refine:
         poses = _refined(job, known, out / "colmap")
-        found["refined"] = agreement(pairs, lens, poses, side)
+        found["refined"] = median_inlier_ratio(pairs, lens, poses, side)
         known = {**known, "world_to_camera": poses}
     (out / "agreement.json").write_text(json.dumps(found), encoding="utf-8")
     _save_points(_triangulated(job, known, out / "colmap"), poses, out / "points.npz")

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import Lens
 from stages.photos.find import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
@@ -24,7 +24,7 @@ _PARTIAL = "--allow-partial goes on with those that have both."
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedPhoto:
     """A photograph, its camera in the photograph's own pixels, its lens, and its role."""
 
     photo: Photo
@@ -33,9 +33,9 @@ class Posed:
     role: str
 
 
-def posed_photographs(
+def match_cameras(
     found: CameraFile, capture: Capture, split: bool, allow_partial: bool, report: Report
-) -> list[Posed]:
+) -> list[PosedPhoto]:
     """The photographs that have a camera, in the capture's order.
 
     split: whether the file's own train and test photographs are kept, and all others left out.
@@ -54,7 +54,7 @@ def posed_photographs(
     for number, position in sorted(matches.items(), key=lambda match: match[1]):
         view, photo = views[number], capture.photos[position]
         lens = found.lenses[wanted[number]]
-        posed.append(Posed(photo, _fitted(view, photo), lens, view.role if split else ""))
+        posed.append(PosedPhoto(photo, _fitted(view, photo), lens, view.role if split else ""))
     return posed
 
 

@@ -25,7 +25,7 @@ _AXIS, _ECCENTRICITY2 = 6_378_137.0, 6.69437999014e-3
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownScale:
     """What is said of the size. distance: two photographs' names and how far apart they are,
     metres; or nothing. marker: side of the printed markers, metres; 0 for none. stated: metres of
     one unit of a world that came with its cameras, 0 where nobody says; stated_by: who does."""
@@ -36,11 +36,11 @@ class Known:
     stated_by: str = ""
 
 
-NOTHING = Known()
+UNKNOWN_SCALE = KnownScale()
 
 
 @dataclass(frozen=True)
-class Metric:
+class MetricScale:
     """metres: of one unit of the world. heading: rotation about the vertical, radians, after which
     +Z is north and +X east; 0 where that is not known. source: in words."""
 
@@ -66,15 +66,15 @@ class Metric:
         return np.asarray(self.metres * points @ self.turn.T)
 
 
-def find_metric(
-    known: Known,
+def find_metric_scale(
+    known: KnownScale,
     capture: Capture,
     names: Sequence[str],
     cameras: Sequence[Camera],
     pictures: Sequence[Path],
     levelled: bool,
     report: Report,
-) -> Metric | None:
+) -> MetricScale | None:
     """What is known of the size of the world of `cameras`, pinholes, of the capture's photographs
     `names`, whose undistorted `pictures` lie on disk. Where the user says nothing, the cameras'
     file may, or GPS. None where nothing says.
@@ -83,11 +83,11 @@ def find_metric(
     """
     centres = np.array([camera.centre for camera in cameras])
     if known.distance:
-        metric: Metric | None = _from_distance(known.distance, capture, names, centres)
+        metric: MetricScale | None = _from_distance(known.distance, capture, names, centres)
     elif known.marker:
         metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
     elif known.stated:
-        metric = Metric(known.stated, 0.0, known.stated_by)
+        metric = MetricScale(known.stated, 0.0, known.stated_by)
     else:
         photos = {photo.name: photo for photo in capture.photos}
         metric = _from_gps([photos[name] for name in names], centres, levelled, report)
@@ -96,7 +96,7 @@ def find_metric(
     return metric
 
 
-def checked_distance(asked: Sequence[str], capture: Capture) -> float:
+def check_distance(asked: Sequence[str], capture: Capture) -> float:
     """The metres of what was asked. Raises SplatError where it cannot be of this capture."""
     *ends, said = asked
     try:
@@ -113,8 +113,8 @@ def checked_distance(asked: Sequence[str], capture: Capture) -> float:
 
 def _from_distance(
     asked: Sequence[str], capture: Capture, names: Sequence[str], centres: NDArray[np.float64]
-) -> Metric:
-    metres = checked_distance(asked, capture)
+) -> MetricScale:
+    metres = check_distance(asked, capture)
     first, second, _ = asked
     for name in (first, second):
         if name not in names:
@@ -124,10 +124,10 @@ def _from_distance(
     spread = float(np.linalg.norm(centres - np.median(centres, axis=0), axis=1).max())
     if apart < 1e-3 * spread:
         raise _unusable(f"{first} and {second} were taken from the same place")
-    return Metric(metres / apart, 0.0, f"{first} and {second} are {metres:g} m apart")
+    return MetricScale(metres / apart, 0.0, f"{first} and {second} are {metres:g} m apart")
 
 
-def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> Metric:
+def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> MetricScale:
     report.metric("markers", len(sides) // 4)
     if not len(sides):
         raise _no_marker("no ArUco marker was found in two photographs that see it from two sides")
@@ -136,12 +136,12 @@ def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> 
     report.metric("marker_sides_spread", round(spread, 5))
     if spread > _WORST_SPREAD:
         raise _no_marker(f"the sides of {len(sides) // 4} markers differ by {spread:.0%}")
-    return Metric(metres / side, 0.0, f"{len(sides) // 4} markers of {metres:g} m")
+    return MetricScale(metres / side, 0.0, f"{len(sides) // 4} markers of {metres:g} m")
 
 
 def _from_gps(
     photos: Sequence[Photo], centres: NDArray[np.float64], levelled: bool, report: Report
-) -> Metric | None:
+) -> MetricScale | None:
     """From horizontal positions alone: heights by GPS are worse than the photographs' level."""
     rows = [i for i, photo in enumerate(photos) if photo.gps is not None]
     report.metric("with_gps", len(rows))
@@ -150,7 +150,7 @@ def _from_gps(
     earth = east_north([photos[i].gps or (0.0, 0.0) for i in rows])
     here = centres[rows, 0] + 1j * centres[rows, 2]  # x and z: east and north, once turned
     there = earth[:, 0] + 1j * earth[:, 1]
-    factor, inliers, residual = fit(here, there)
+    factor, inliers, residual = fit_similarity_2d(here, there)
     spread = float(np.sqrt(np.mean(np.abs(there - there.mean()) ** 2)))
     report.metric("gps_residual_m", round(residual, 3))
     report.metric("gps_agreeing", int(inliers.sum()))
@@ -159,14 +159,14 @@ def _from_gps(
     if not agreed or residual > _WORST_RESIDUAL * spread or abs(factor) == 0:
         return None
     # (x + iz) e^(i angle) turns x to z; `turn` has the opposite sign for its angle.
-    return Metric(
+    return MetricScale(
         float(abs(factor)),
         -float(np.angle(factor)),
         f"GPS of {int(inliers.sum())} photographs, {residual:.2g} m off",
     )
 
 
-def fit(
+def fit_similarity_2d(
     here: NDArray[np.complex128], there: NDArray[np.complex128]
 ) -> tuple[complex, NDArray[np.bool_], float]:
     """(factor, who agrees [N], their RMS distance) of the similarity that takes most of `here` [N]

@@ -12,16 +12,16 @@ _SMALLEST_PART = 0.1  # of the photographs; a few at the rim may hang loosely
 
 
 @dataclass(frozen=True)
-class Link:
+class Cut:
     """What holds two parts of a model together: points seen from both; views: the smaller part."""
 
     points: int
     views: tuple[int, ...]
 
 
-def loosest_link(
+def weakest_cut(
     points: NDArray[np.integer], views: NDArray[np.integer], photographs: int, fewest: int = 3
-) -> Link:
+) -> Cut:
     """The cut through the model that severs fewest points, neither part being small.
 
     points, views [O]: who sees what. Looked for where photographs are sorted by the second
@@ -31,7 +31,7 @@ def loosest_link(
     count = int(points.max(initial=-1)) + 1
     smallest = max(fewest, round(_SMALLEST_PART * photographs))
     if photographs < 2 * smallest:
-        return Link(count, ())
+        return Cut(count, ())
     shared = _shared(points, views, photographs)
     root = 1.0 / np.sqrt(np.maximum(shared.sum(axis=1), 1e-9))
     order = np.argsort(np.linalg.eigh(-root[:, None] * shared * root)[1][:, 1] * root)
@@ -46,7 +46,7 @@ def loosest_link(
     severed = np.cumsum(steps)[smallest - 1 : photographs - smallest]
     cut = smallest + int(severed.argmin())
     part = order[:cut] if 2 * cut <= photographs else order[cut:]
-    return Link(int(severed.min()), tuple(sorted(part.tolist())))
+    return Cut(int(severed.min()), tuple(sorted(part.tolist())))
 
 
 def _shared(

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-WORDS = 256
-LOOKED_UNDER = 8  # words for each feature; finds 97 of 100 of the matches that looking at all finds
+VOCABULARY_SIZE = 256
+PROBED_WORDS = 8  # words for each feature; finds 97 of 100 of the matches that looking at all finds
 # Features that each is compared with, at least: of few features, the second nearest, by which the
 # nearest is judged, is often under another word.
-COMPARED = 256
-SAMPLE = 32768  # descriptors that the vocabulary is made from
+FEWEST_COMPARED = 256
+SAMPLED_DESCRIPTORS = 32768  # descriptors that the vocabulary is made from
 _ROUNDS = 8
 
 
 @dataclass(frozen=True)
-class Sorted:
+class FeatureIndex:
     """N features of one photograph, sorted by word.
 
     rows [N]: place of each in the photograph's list. descriptors [N, 128] uint8. near [N, K]:
@@ -37,13 +37,13 @@ class Sorted:
     starts: NDArray[np.signedinteger]
 
 
-def vocabulary(sample: NDArray[np.uint8]) -> NDArray[np.float32]:
+def build_vocabulary(sample: NDArray[np.uint8]) -> NDArray[np.float32]:
     """[W, 128] means of clusters of `sample` [S, 128] (Lloyd 1982); at most S of them."""
     if not len(sample):
         return np.zeros((1, sample.shape[1]), np.float32)
     points = sample.astype(np.float32)
     random = np.random.default_rng(0)
-    words = points[random.permutation(len(points))[:WORDS]]
+    words = points[random.permutation(len(points))[:VOCABULARY_SIZE]]
     for _ in range(_ROUNDS):
         nearest = _likeness(points, words).argmax(axis=1)
         counts = np.bincount(nearest, minlength=len(words))
@@ -54,9 +54,9 @@ def vocabulary(sample: NDArray[np.uint8]) -> NDArray[np.float32]:
     return words
 
 
-def sort_by_word(
-    descriptors: NDArray[np.uint8], words: NDArray[np.float32], compared: int = COMPARED
-) -> Sorted:
+def index_by_word(
+    descriptors: NDArray[np.uint8], words: NDArray[np.float32], compared: int = FEWEST_COMPARED
+) -> FeatureIndex:
     """The features with these descriptors [N, 128], sorted by their nearest words.
 
     compared: with about so many features each will be compared, or with more.
@@ -64,17 +64,17 @@ def sort_by_word(
     likeness = _likeness(descriptors.astype(np.float32), words)
     nearest = likeness.argmax(axis=1)
     order = np.argsort(nearest, kind="stable")
-    wanted = max(LOOKED_UNDER, math.ceil(compared * len(words) / max(1, len(order))))
+    wanted = max(PROBED_WORDS, math.ceil(compared * len(words) / max(1, len(order))))
     count = min(wanted, len(words))
     under = np.argpartition(-likeness, count - 1, axis=1)[:, :count]
     # In order of words, neighbours in the list look at the same descriptors, which are at hand.
     near = np.sort(under, axis=1).astype(np.int32)
     counts = np.bincount(nearest, minlength=len(words))
     starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
-    return Sorted(order.astype(np.int32), descriptors[order], near[order], starts)
+    return FeatureIndex(order.astype(np.int32), descriptors[order], near[order], starts)
 
 
-def two_words(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.int64]:
+def word_pairs(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.int64]:
     """[N] the two nearest words of each descriptor [N, 128] as one number: of W words they make
     W (W - 1) / 2, fine enough to tell places apart."""
     if len(words) < 2:

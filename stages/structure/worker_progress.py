@@ -10,7 +10,7 @@ from pathlib import Path
 _SECONDS = 0.2  # between two writings
 
 
-class Ticks:
+class ProgressWriter:
     """Keeps the file at `path` up to date."""
 
     def __init__(self, path: Path) -> None:
@@ -29,7 +29,7 @@ class Ticks:
         os.replace(partial, self._path)
 
 
-def read(path: Path) -> tuple[str, int, int] | None:
+def read_progress(path: Path) -> tuple[str, int, int] | None:
     """(phase, done, total) as last written; None before the first time."""
     try:
         phase, done, total = json.loads(path.read_text())

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import Format
 from stages.surface.mesh import Mesh
 
@@ -19,7 +19,7 @@ def fault_of(path: Path, row: Format, mesh: Mesh) -> str:
     """What is wrong with a file that should hold `mesh`, as `row`'s second reader finds it; "" if
     nothing is."""
     try:
-        vertices, faces = named(row.second_reader)(path)
+        vertices, faces = load_object(row.second_reader)(path)
     except Exception as error:  # whatever another parser raises: the file is wrong
         return f"another reader refused it ({error})"
     if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):

@@ -16,7 +16,7 @@ from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
 from stages.raster.draw import settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
-from stages.training.colours import Recolouring, worth_settling
+from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.dropout import Dropout
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
@@ -39,10 +39,10 @@ class FineTuner:
         extent: float,
         backend: str,
         report: Report,
-        sits_out: bool = False,
+        dropout: bool = False,
     ) -> None:
         self.photographs, self.extent, self.report = photographs, extent, report
-        self.sits_out = sits_out
+        self.dropout = dropout
         self.cameras = [photograph.camera for photograph in photographs]
         self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
         self.stepper, self.rasteriser = step_of(backend), rasteriser_of(backend)
@@ -75,7 +75,7 @@ class FineTuner:
             rates = replace(rates, **dict.fromkeys(still, 0.0))
             self.stepper.step(self._level(), settings, rates, False, self._dropout())
         finetuned = _with(self._finished(self.stepper.model(), splats), splats, still)
-        if worth_settling(self.sits_out, len(self.photographs)):
+        if needs_colour_refit(self.dropout, len(self.photographs)):
             return self._recoloured(finetuned, settings, still)
         return finetuned
 
@@ -88,10 +88,10 @@ class FineTuner:
         model = new_model(*splat_arrays(splats))
         model.sh_degrees[:] = 0 if "sh_rest" in still else splats.sh_degrees
         where = self.rasteriser, settings, lambda: map(_level, self.photographs), NO_SMOOTHING
-        return replace(splats, sh=Recolouring(*where).of(model).sh)
+        return replace(splats, sh=ColourRefit(*where).of(model).sh)
 
     def _dropout(self) -> Dropout | None:
-        if not self.sits_out:
+        if not self.dropout:
             return None
         key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
         return Dropout(len(self.photographs), key)
@@ -108,7 +108,7 @@ class FineTuner:
     def _finished(self, model: Model, before: Splats) -> Splats:
         norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
         with np.errstate(divide="ignore"):
-            finest = np.log(smoothing_widths(before.means, self.cameras, before.look.near))
+            finest = np.log(smoothing_widths(before.means, self.cameras, before.draw_settings.near))
         least = np.minimum(before.log_scales, finest[:, None])
         return replace(
             before,

@@ -37,7 +37,7 @@ from stages.scene import Camera, Splats
 from stages.training.gpu_step import GpuStep
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.plain_step import photograph_loss
+from stages.training.reference_step import photograph_loss
 from stages.training.views import Level
 from tests.benchmarks.scenes import random_scene, view
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative

@@ -39,9 +39,9 @@ from stages.measure.evaluation import (
     load_evaluation_views,
 )
 from stages.run.pipeline import Pipeline
-from stages.scene import Reconstruction, Splats, look_of, split_held_out
+from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
 from stages.sfm import SfmSettings
-from stages.train import PRESETS, TrainSettings, light_wanted
+from stages.train import PRESETS, TrainSettings, corrects_light
 from tests.benchmarks.sample_judges import judges_in, render_judges
 from tests.sample import PHOTOS
 
@@ -75,15 +75,15 @@ class Capture:
         self.judges = self._judges(out, side)
 
     def _judges(self, out: Path, side: int) -> tuple[EvaluationView, ...]:
-        light = light_wanted(self.reconstruction, TrainSettings().light, Report())
-        look = look_of(self.reconstruction.views, side, light)
+        light = corrects_light(self.reconstruction, TrainSettings().light, Report())
+        draw_settings = draw_settings_of(self.reconstruction.views, side, light)
         _, held = split_held_out(self.reconstruction.views)
-        found = tuple(load_evaluation_views(self.reconstruction.folder, held, look))
+        found = tuple(load_evaluation_views(self.reconstruction.folder, held, draw_settings))
         if self.name != SAMPLE:
             return found
         render_judges(out / "judges")
         return (
-            *load_evaluation_views(out / "judges", judges_in(self.reconstruction), look),
+            *load_evaluation_views(out / "judges", judges_in(self.reconstruction), draw_settings),
             *found,
         )
 
@@ -149,7 +149,9 @@ def made(capture: Capture, preset: str, seed: int, folder: Path) -> tuple[Splats
 
 def judged(splats: Splats, judges: Sequence[EvaluationView], side: int) -> list[dict[str, Any]]:
     """What each judge says of them at a size."""
-    draw = image_renderer(replace(splats, look=replace(splats.look, side=side)), "auto")
+    draw = image_renderer(
+        replace(splats, draw_settings=replace(splats.draw_settings, side=side)), "auto"
+    )
     return [asdict(score) for score in evaluate(draw, judges, with_flip=True)]
 
 

@@ -29,15 +29,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
     return small_scene(tmp_path_factory.mktemp("photos"), noise=0.0)
 
 
-def tuner(scene: SmallScene, sits_out: bool = False) -> FineTuner:
+def tuner(scene: SmallScene, dropout: bool = False) -> FineTuner:
     return FineTuner(
-        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), sits_out
+        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), dropout
     )
 
 
 def photographs(scene: SmallScene, held_out: bool = False):
     views = split_held_out(scene.reconstruction.views)[held_out]
-    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.look)
+    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.draw_settings)
 
 
 def nothing_seen(splats: Splats) -> np.ndarray:
@@ -45,11 +45,11 @@ def nothing_seen(splats: Splats) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sits_out", [False, True])
-def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, sits_out: bool) -> None:
+def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, dropout: bool) -> None:
     splats, everything = scene.splats, set(ORDER)
     for moving in ORDER:
         still = everything - {moving}
-        found = tuner(scene, sits_out).finetune(splats, 3, nothing_seen(splats), still)
+        found = tuner(scene, dropout).finetune(splats, 3, nothing_seen(splats), still)
         same = {
             "means": np.array_equal(found.means, splats.means),
             "quaternions": np.array_equal(found.quaternions, splats.quaternions),
@@ -112,7 +112,9 @@ def test_compact_files_hold_splats_that_were_fitted_to_them_if_that_helps(
         assert export.fitted_in(tmp_path / "plain", name) is None
         read = formats.read(tmp_path / "fitted" / f"scene.{name}")
         drawn = mean_psnr_db(
-            replace(read, look=scene.splats.look, origin=held.origin), photographs(scene), "cpu"
+            replace(read, draw_settings=scene.splats.draw_settings, origin=held.origin),
+            photographs(scene),
+            "cpu",
         )
         better = max(fitted[name]["plain_db"], fitted[name]["fitted_db"])
         assert drawn == pytest.approx(better, abs=0.02)

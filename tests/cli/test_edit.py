@@ -16,7 +16,7 @@ from splatcli.commands import edit as command
 from stages import formats
 from stages.base import scratch
 from stages.editing.scene import Edited
-from stages.editing.words import WORDS, Typed, as_text, from_file
+from stages.editing.syntax import WORDS, Typed, as_text, from_file
 from stages.scene import Splats, View, look_at
 from tests import scenes
 from tests.cli.help_text import help_of

@@ -11,9 +11,9 @@ import pytest
 
 from stages import formats
 from stages.base.errors import Family, SplatError
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import FORMATS, MESHES, TABLE, Format
-from stages.proof.anatomy import anatomy_of
+from stages.proof.byte_breakdown import anatomy_of
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
@@ -42,13 +42,13 @@ def test_readmes_table_is_made_of_the_rows() -> None:
 @pytest.mark.parametrize("row", TABLE, ids=lambda row: row.ending)
 def test_every_function_that_a_row_names_is_there(row: Format) -> None:
     for place in filter(None, (getattr(row, name) for name in PLACES)):
-        assert callable(named(place)), place
+        assert callable(load_object(place)), place
     assert bool(row.anatomy) != row.is_mesh
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
 def test_a_writer_takes_views_where_its_row_says_so(row: Format) -> None:
-    assert ("views" in inspect.signature(named(row.writer)).parameters) == row.wants_views
+    assert ("views" in inspect.signature(load_object(row.writer)).parameters) == row.wants_views
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
@@ -56,7 +56,7 @@ def test_rows_of_a_file_lie_in_the_order_that_the_table_tells(tmp_path: Path, ro
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
-    order = named(row.order)(splats) if row.order else np.arange(200)
+    order = load_object(row.order)(splats) if row.order else np.arange(200)
     back = read(path)
     np.testing.assert_allclose(back.means, splats.means[order], atol=0.02)
     assert back.sh_degree == row.sh_degree
@@ -67,7 +67,7 @@ def test_what_a_row_says_is_lost_is_lost_and_nothing_else(tmp_path: Path, row: F
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
-    order = named(row.order)(splats) if row.order else np.arange(200)
+    order = load_object(row.order)(splats) if row.order else np.arange(200)
     back, wanted = read(path).with_sh_degree(3), splats.take(order)
     pairs = [(getattr(back, n), getattr(wanted, n)) for n in ("means", "sh", "opacities")]
     same = all(np.allclose(a, b, atol=1e-6) for a, b in pairs)

@@ -27,7 +27,7 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) 
     # no colour at its end, where it is not linear any more
     splats = replace(scene.splats, sh=scene.splats.sh * np.float32(0.3))
     photographs = load_evaluation_views(
-        scene.reconstruction.folder, scene.reconstruction.views, splats.look
+        scene.reconstruction.folder, scene.reconstruction.views, splats.draw_settings
     )
     worth = measure_contributions(splats, photographs, "cpu")
     assert worth.sse == pytest.approx(squared_error(splats, photographs, "cpu"), rel=1e-5)
@@ -45,7 +45,7 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) 
 def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> None:
     scene = small_scene(tmp_path, views=4, n=60)
     photographs = load_evaluation_views(
-        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.look
+        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
     )
     worth = measure_contributions(scene.splats, photographs, "cpu")
     assert (worth.picture_change >= 0).all()
@@ -60,7 +60,7 @@ def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> No
 def test_worth_goes_on_from_what_other_photographs_told(tmp_path) -> None:
     scene = small_scene(tmp_path, views=6, n=60)
     photographs = load_evaluation_views(
-        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.look
+        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
     )
     whole = measure_contributions(scene.splats, photographs, "cpu")
     others = measure_contributions(scene.splats, photographs[:4], "cpu")

@@ -26,11 +26,11 @@ from stages.scene import (
     IGNORE,
     TRANSPARENT,
     Camera,
-    Look,
+    DrawSettings,
     Reconstruction,
     Splats,
     View,
-    look_of,
+    draw_settings_of,
     near_plane,
 )
 from tests.scenes import BACKENDS, join, splats
@@ -54,7 +54,7 @@ def in_units(scene: SmallScene, factor: float) -> tuple[Splats, Reconstruction]:
         found,
         means=found.means * np.float32(factor),
         log_scales=found.log_scales + np.float32(np.log(factor)),
-        look=Look(near_plane(tuple(views)), 72),
+        draw_settings=DrawSettings(near_plane(tuple(views)), 72),
     )
     return larger, replace(scene.reconstruction, views=tuple(views))
 
@@ -68,7 +68,7 @@ def test_a_scene_in_other_units_gets_the_same_figures(
     for units in (1.0, factor):
         trained, reconstruction = in_units(scene, units)
         photographs = load_evaluation_views(
-            reconstruction.folder, reconstruction.views, trained.look
+            reconstruction.folder, reconstruction.views, trained.draw_settings
         )
         figures.append(evaluate(image_renderer(trained, backend), photographs))
     for one, other in zip(*figures, strict=True):
@@ -79,16 +79,16 @@ def test_a_scene_in_other_units_gets_the_same_figures(
 def test_a_file_without_cameras_gets_a_near_plane_of_its_own_size(scene: SmallScene) -> None:
     """In small units nothing is clipped, in large ones what hangs before the lens is."""
     for factor in (1e-4, 1.0, 1e4):
-        alone = replace(in_units(scene, factor)[0], look=Look())
+        alone = replace(in_units(scene, factor)[0], draw_settings=DrawSettings())
         extent = float(np.ptp(alone.means, axis=0).max())
         assert 1e-4 * extent < settings_of(alone).near < 0.02 * extent
 
 
 def test_photographs_are_judged_at_the_size_that_was_trained(scene: SmallScene) -> None:
     views, folder = scene.reconstruction.views, scene.reconstruction.folder
-    (small, *_) = load_evaluation_views(folder, views, Look(0.01, 36))
+    (small, *_) = load_evaluation_views(folder, views, DrawSettings(0.01, 36))
     assert small.pixels.shape == (27, 36, 3)
-    (full, *_) = load_evaluation_views(folder, views, Look(0.01))
+    (full, *_) = load_evaluation_views(folder, views, DrawSettings(0.01))
     with Image.open(Path(folder) / views[0].image) as picture:
         np.testing.assert_array_equal(full.pixels, np.asarray(picture))
 
@@ -96,7 +96,7 @@ def test_photographs_are_judged_at_the_size_that_was_trained(scene: SmallScene) 
 def test_the_near_plane_of_the_look_decides_what_is_drawn() -> None:
     before_the_lens = splats([[0.0, 0.0, 0.5]], rgb=(1.0, 0.0, 0.0))
     both = join(before_the_lens, splats([[0.0, 0.0, 5.0]], rgb=(0.0, 1.0, 0.0)))
-    assert settings_of(replace(both, look=Look(near=1.0))).near == 1.0
+    assert settings_of(replace(both, draw_settings=DrawSettings(near=1.0))).near == 1.0
 
 
 def test_figures_stay_finite() -> None:
@@ -132,7 +132,7 @@ def with_masks(scene: SmallScene, folder: Path, outside: str) -> tuple[View, ...
 def test_what_is_ignored_is_not_judged(scene: SmallScene) -> None:
     folder = scene.reconstruction.folder
     views = with_masks(scene, folder, IGNORE)
-    (photograph, *_) = load_evaluation_views(folder, views, Look(0.01))
+    (photograph, *_) = load_evaluation_views(folder, views, DrawSettings(0.01))
     wrong = photograph.image.copy()
     wrong[:, 36:] = 1 - wrong[:, 36:]
     (score,) = evaluate(lambda _: wrong, [photograph], with_flip=True)
@@ -146,11 +146,15 @@ def test_what_is_ignored_is_not_judged(scene: SmallScene) -> None:
 def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScene) -> None:
     folder = scene.reconstruction.folder
     views = with_masks(scene, folder, TRANSPARENT)
-    look = look_of(views)
-    (photograph, *_) = load_evaluation_views(folder, views, look)
-    assert look.background == 1.0
+    draw_settings = draw_settings_of(views)
+    (photograph, *_) = load_evaluation_views(folder, views, draw_settings)
+    assert draw_settings.background == 1.0
     assert photograph.pixels[:, 36:].min() == 255
-    assert settings_of(replace(scene.splats, look=look)).background == (1.0, 1.0, 1.0)
+    assert settings_of(replace(scene.splats, draw_settings=draw_settings)).background == (
+        1.0,
+        1.0,
+        1.0,
+    )
     (score,) = evaluate(lambda _: photograph.image * (np.arange(72) < 36)[:, None], [photograph])
     assert score.psnr_db < 4
 
@@ -162,7 +166,7 @@ def test_photographs_that_do_not_fit_into_memory_are_judged_alike(
     figures = []
     for most in (evaluation.IN_MEMORY_MIB, 0.01, 0.0):
         monkeypatch.setattr(evaluation, "IN_MEMORY_MIB", most)
-        photographs = load_evaluation_views(folder, views, scene.splats.look)
+        photographs = load_evaluation_views(folder, views, scene.splats.draw_settings)
         assert len(photographs) == len(views)
         assert [p.name for p in photographs] == [view.name for view in views]
         assert (photographs[-1].pixels == list(photographs)[-1].pixels).all()

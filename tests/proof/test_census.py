@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stages.proof.census import Census, census_of
+from stages.proof.statistics import Census, census_of
 from stages.scene import Splats
 
 TROUBLES = (

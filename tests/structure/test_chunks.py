@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from stages.structure import database as sqlite
 from stages.structure import chunks
-from stages.structure.job import Job, chosen_path, shares_path
-from stages.structure.chunks import Share
+from stages.structure import database as sqlite
+from stages.structure.chunks import Chunk
+from stages.structure.job import Job, chunks_path, selected_pairs_path
 from tests.structure import sample_jobs as jobs
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # a process for each share
@@ -46,23 +46,23 @@ class Hands:
     def __init__(self, lose: int = 0) -> None:
         self.lose, self.asked = lose, list[str]()
 
-    def __call__(self, wanted: Sequence[Share], look: Callable[[], None]) -> None:
+    def __call__(self, wanted: Sequence[Chunk], look: Callable[[], None]) -> None:
         for share in reversed(wanted):
             self.asked.append(share.out.stem)
-            chunks.do(share)
+            chunks.run_chunk(share)
             look()
             self.lose -= 1
             if self.lose == 0:
                 raise KeyboardInterrupt
 
 
-def in_shares(job: Job, hands: Hands) -> None:
-    chunks.hand_out_features(job, hands, lambda: None)
+def in_shares(job: Job, executor: Hands) -> None:
+    chunks.extract_features_in_chunks(job, executor, lambda: None)
     jobs.work(job)
     left = 1
     while left:
         jobs.work(replace(job, step="choosing"))
-        left = chunks.hand_out_pairs(job, hands, lambda: None)
+        left = chunks.match_pairs_in_chunks(job, executor, lambda: None)
     jobs.work(replace(job, step="matching"))
 
 
@@ -73,22 +73,22 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_shares_find_what_one_process_finds(whole: Job, tmp_path: Path) -> None:
-    job, hands = jobs.sample_job(tmp_path, PHOTOGRAPHS), Hands()
-    in_shares(job, hands)
+    job, executor = jobs.sample_job(tmp_path, PHOTOGRAPHS), Hands()
+    in_shares(job, executor)
     assert found(job) == found(whole)
-    assert len(hands.asked) == len(set(hands.asked)) > 3
-    assert not list(shares_path(job).glob("*.db"))
+    assert len(executor.asked) == len(set(executor.asked)) > 3
+    assert not list(chunks_path(job).glob("*.db"))
 
 
 def test_finished_shares_are_kept_when_the_head_is_lost(whole: Job, tmp_path: Path) -> None:
-    job, hands = jobs.sample_job(tmp_path, PHOTOGRAPHS), Hands(lose=1)
+    job, executor = jobs.sample_job(tmp_path, PHOTOGRAPHS), Hands(lose=1)
     for _ in range(2):  # among features, and among matches
         with pytest.raises(KeyboardInterrupt):
-            in_shares(job, hands)
-        hands.lose = 2
-    in_shares(job, hands)
+            in_shares(job, executor)
+        executor.lose = 2
+    in_shares(job, executor)
     assert found(job) == found(whole)
-    assert len(hands.asked) == len(set(hands.asked))
+    assert len(executor.asked) == len(set(executor.asked))
 
 
 def test_every_pair_and_known_matches_are_shared_too(whole: Job, tmp_path: Path) -> None:
@@ -100,14 +100,14 @@ def test_every_pair_and_known_matches_are_shared_too(whole: Job, tmp_path: Path)
     jobs.work(replace(wanted, database=str(plain)))
     job = replace(wanted, database=str(shared), step="choosing")
     jobs.work(job)
-    assert chunks.hand_out_pairs(job, Hands(), lambda: None) == 36
+    assert chunks.match_pairs_in_chunks(job, Hands(), lambda: None) == 36
     jobs.work(job)
-    assert chosen_path(job).read_text() == "[]"
+    assert selected_pairs_path(job).read_text() == "[]"
     assert found(job) == found(replace(job, database=str(plain)))
 
 
 def test_a_share_that_is_done_is_not_done_again(whole: Job, tmp_path: Path) -> None:
     out = tmp_path / "pair-0-1.db"
     out.write_bytes(b"done")
-    chunks.do(Share(tmp_path / "no job", out, pairs=((0, 1),)))
+    chunks.run_chunk(Chunk(tmp_path / "no job", out, pairs=((0, 1),)))
     assert out.read_bytes() == b"done"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.scene import look_at
-from stages.structure.epipolar import agreement, alternatives
+from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
 
 LENS = np.array([500.0, 520.0, 310.0, 250.0])
 RANDOM = np.random.default_rng(3)
@@ -25,7 +25,7 @@ PAIRS = [(i, j, seen(POSES[i]), seen(POSES[j])) for i in range(8) for j in range
 
 def fits(poses: np.ndarray, shift_px: float = 0.0) -> float:
     moved = [(i, j, a, b + np.array([0.0, shift_px])) for i, j, a, b in PAIRS]
-    found = agreement(moved, np.tile(LENS, (8, 1)), poses, 640.0)
+    found = median_inlier_ratio(moved, np.tile(LENS, (8, 1)), poses, 640.0)
     assert found is not None
     return found
 
@@ -56,12 +56,12 @@ def test_the_scale_and_the_place_of_the_world_do_not_matter() -> None:
 def test_a_mistake_is_found_out(mistake, told: str) -> None:
     given = mistake(POSES)
     assert fits(given) < 0.3
-    shares = {name: fits(poses) for name, poses in alternatives(given)}
+    shares = {name: fits(poses) for name, poses in likely_mistakes(given)}
     (best,) = [name for name, share in shares.items() if share > 0.9]
     assert told in best
 
 
 def test_without_pairs_nothing_is_known() -> None:
-    assert agreement([], np.tile(LENS, (8, 1)), POSES, 640.0) is None
+    assert median_inlier_ratio([], np.tile(LENS, (8, 1)), POSES, 640.0) is None
     here = np.tile(POSES[:1], (8, 1, 1))
-    assert agreement(PAIRS, np.tile(LENS, (8, 1)), here, 640.0) is None
+    assert median_inlier_ratio(PAIRS, np.tile(LENS, (8, 1)), here, 640.0) is None

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from stages.structure.gates import Failure, Figures
-from stages.structure.fallbacks import LADDER, Attempt, Climb, Rung, climb
+from stages.structure.fallbacks import (
+    CONFIGURATIONS,
+    Attempt,
+    Attempts,
+    Configuration,
+    try_configurations,
+)
+from stages.structure.gates import Failure, ModelStatistics
 
 
 def failing(*codes: str) -> tuple[Failure, ...]:
@@ -18,14 +24,14 @@ class Script:
         self.answers = {name.replace("_", " "): codes for name, codes in answers.items()}
         self.tried: list[str] = []
 
-    def __call__(self, rung: Rung) -> Attempt:
+    def __call__(self, rung: Configuration) -> Attempt:
         self.tried.append(rung.name)
         codes = self.answers.get(rung.name, (self.otherwise,))
-        return Attempt(rung, failing(*codes), Figures(photographs=10, mapper=rung.mapper))
+        return Attempt(rung, failing(*codes), ModelStatistics(photographs=10, mapper=rung.mapper))
 
 
-def run(script: Script, exhaustive: bool = True) -> Climb:
-    return climb(script, already_exhaustive=exhaustive, out_of_time=lambda: False)
+def run(script: Script, exhaustive: bool = True) -> Attempts:
+    return try_configurations(script, already_exhaustive=exhaustive, out_of_time=lambda: False)
 
 
 def test_a_good_capture_is_reconstructed_once() -> None:
@@ -72,19 +78,23 @@ def test_few_features_ask_for_more_and_nothing_else() -> None:
 
 def test_when_time_is_up_the_first_attempt_has_still_been_made() -> None:
     script = Script("sfm-too-few-registered")
-    climb(script, already_exhaustive=True, out_of_time=lambda: True)
+    try_configurations(script, already_exhaustive=True, out_of_time=lambda: True)
     assert script.tried == ["standard"]
 
 
 def test_among_failures_the_global_mapper_counts_least() -> None:
-    few = Attempt(LADDER[0], failing("sfm-too-few-registered"), Figures(10, registered=5))
-    all_of_them = Attempt(
-        LADDER[-1], failing("sfm-weak-link"), Figures(10, registered=10, mapper="global")
+    few = Attempt(
+        CONFIGURATIONS[0], failing("sfm-too-few-registered"), ModelStatistics(10, registered=5)
     )
-    assert Climb([few, all_of_them]).best is few
+    all_of_them = Attempt(
+        CONFIGURATIONS[-1],
+        failing("sfm-weak-link"),
+        ModelStatistics(10, registered=10, mapper="global"),
+    )
+    assert Attempts([few, all_of_them]).best is few
 
 
 def test_every_rung_but_the_first_says_what_it_mends() -> None:
-    assert not LADDER[0].mends
-    assert all(rung.mends for rung in LADDER[1:])
-    assert len({rung.name for rung in LADDER}) == len(LADDER)
+    assert not CONFIGURATIONS[0].mends
+    assert all(rung.mends for rung in CONFIGURATIONS[1:])
+    assert len({rung.name for rung in CONFIGURATIONS}) == len(CONFIGURATIONS)

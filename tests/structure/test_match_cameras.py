@@ -12,7 +12,7 @@ from stages.base.stage import Report
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import PINHOLE
 from stages.scene import Camera, Capture, Photo, View, split_held_out
-from stages.structure.match_cameras import posed_photographs
+from stages.structure.match_cameras import match_cameras
 
 
 def capture(*names: str, size: tuple[int, int] = (640, 480)) -> Capture:
@@ -33,7 +33,7 @@ def cameras(*names: str, roles: str = "", size: tuple[int, int] = (640, 480)) ->
 def names_of(
     found: CameraFile, photographs: Capture, split: bool = False, partial: bool = False
 ) -> list[str]:
-    posed = posed_photographs(found, photographs, split, partial, Report())
+    posed = match_cameras(found, photographs, split, partial, Report())
     return [one.photo.name for one in posed]
 
 
@@ -62,7 +62,7 @@ def test_names_that_hold_points_are_whole() -> None:
 
 def test_of_equal_names_the_folder_decides() -> None:
     photographs = capture("test/r_0.png", "train/r_0.png", "train/r_1.png")
-    posed = posed_photographs(
+    posed = match_cameras(
         cameras("./train/r_0", "./train/r_1", "./test/r_0", roles="rrt"),
         photographs,
         True,
@@ -103,7 +103,7 @@ def test_a_name_of_two_photographs_is_refused() -> None:
 
 def test_cameras_are_scaled_with_their_photographs() -> None:
     found = cameras("a", "b", "c", size=(1280, 960))
-    (first, *_) = posed_photographs(found, capture("a", "b", "c"), False, False, Report())
+    (first, *_) = match_cameras(found, capture("a", "b", "c"), False, False, Report())
     assert (first.camera.width, first.camera.fx, first.camera.cy) == (640, 250, 240)
 
 
@@ -126,7 +126,7 @@ def test_what_a_split_leaves_out_may_lack_its_counterpart() -> None:
     found = cameras("train/a", "train/b", "test/c", "val/d", roles="rrtv")
     photographs = capture("train/a.png", "train/b.png", "test/c.png", "test/c_depth.png")
     report = Report()
-    posed = posed_photographs(found, photographs, True, False, report)
+    posed = match_cameras(found, photographs, True, False, report)
     assert sorted(one.role for one in posed) == ["test", "train", "train"]
     ((code, words),) = report.warnings
     assert code == "cameras-missing"

@@ -9,7 +9,7 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.photos.exif import read_exif
 from stages.scene import Camera, Capture, Photo, look_at
-from stages.structure.metric_scale import Known, Metric, east_north, find_metric
+from stages.structure.metric_scale import KnownScale, MetricScale, east_north, find_metric_scale
 from tests.structure.bad_captures import SAMPLE
 
 METRES = 7.0  # of one unit of the made worlds
@@ -55,7 +55,7 @@ def found(capture: Capture, poses: np.ndarray, *asked: str, levelled: bool = Tru
     report = Report()
     names = [photo.name for photo in capture.photos]
     posed = [Camera(640, 480, 600.0, 600.0, 320.0, 240.0, pose) for pose in poses]
-    return find_metric(Known(asked), capture, names, posed, [], levelled, report), report
+    return find_metric_scale(KnownScale(asked), capture, names, posed, [], levelled, report), report
 
 
 def test_a_distance_between_two_photographs_makes_the_world_metric() -> None:
@@ -68,7 +68,7 @@ def test_a_distance_between_two_photographs_makes_the_world_metric() -> None:
 
 
 def test_points_move_with_the_cameras() -> None:
-    poses, metric = cameras(), Metric(3.0, 0.5, "")
+    poses, metric = cameras(), MetricScale(3.0, 0.5, "")
     points = np.random.default_rng(1).normal(size=(20, 3))
     for before, after in zip(poses, metric.poses(poses), strict=True):
         seen = points @ before[:3, :3].T + before[:3, 3]

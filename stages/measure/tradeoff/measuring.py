@@ -18,7 +18,7 @@ from stages.measure.evaluation import EvaluationView, Score, evaluate, image_ren
 from stages.measure.speed import seconds_per_frame
 from stages.measure.tradeoff.points import Moment, Point, Trade, change_db, mean_db
 from stages.measure.tradeoff.thin import Thin, measure_thin
-from stages.scene import Look, QuantisedSplats, Splats, View, split_held_out, spread_over
+from stages.scene import DrawSettings, QuantisedSplats, Splats, View, split_held_out, spread_over
 
 # Shares of the splats that are left, each taken from the one before: what single splats are worth
 # no longer adds up where many go at once.
@@ -104,7 +104,7 @@ def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, .
             held = material.fitted.get(name, held)
             formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)
-            read = replace(formats.read(path), look=splats.look)
+            read = replace(formats.read(path), draw_settings=splats.draw_settings)
             for file in row.files(path):
                 file.unlink()
             found = own if _same(read, splats) else _scores(material, read)
@@ -150,10 +150,10 @@ def _fewer(material: Material, own: list[Score], worth: Contributions, tell: Tel
     return points
 
 
-def deciding(views: Sequence[View], look: Look) -> list[View]:
+def deciding(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
     """Those photographs of training that decide, at the size that they are judged at."""
     if not views:
         return []
-    camera = look.camera(views[0].camera)
+    camera = draw_settings.camera(views[0].camera)
     most = round(DECIDING_PIXELS / (camera.width * camera.height))
     return spread_over(views, max(_LEAST_DECIDING, most))

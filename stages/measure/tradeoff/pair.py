@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.base.errors import Family, SplatError
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.measure.bootstrap import Difference, paired_difference
 from stages.measure.evaluation import (
     EvaluationView,
@@ -39,9 +39,9 @@ class Side:
 
     def photographs(self, names: Sequence[str], side_px: int) -> tuple[EvaluationView, ...]:
         """Each from where this run saw it. Raises SplatError."""
-        views, look = self.held_out, replace(self.splats.look, side=side_px)
+        views, draw_settings = self.held_out, replace(self.splats.draw_settings, side=side_px)
         chosen = [views[n] for n in names]
-        return tuple(load_evaluation_views(self.reconstruction.folder, chosen, look))
+        return tuple(load_evaluation_views(self.reconstruction.folder, chosen, draw_settings))
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def pair(first: Side, second: Side) -> Pairing:
 
 
 def _side(one: Side, name: str) -> int:
-    camera = one.splats.look.camera(one.held_out[name].camera)
+    camera = one.splats.draw_settings.camera(one.held_out[name].camera)
     return max(camera.width, camera.height)
 
 

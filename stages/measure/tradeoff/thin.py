@@ -55,7 +55,7 @@ def measure_thin(
 ) -> Thin:
     """hanging [N]: which splats are floaters; the others as in `Material`."""
     chosen = spread_over(training, MOST_PHOTOGRAPHS)
-    cameras = tuple(splats.look.camera(view.camera) for view in chosen)
+    cameras = tuple(splats.draw_settings.camera(view.camera) for view in chosen)
     patches = patches_of(splats, cameras, backend)
     ring = around(cameras, patches, levelled) if len(patches.centres) else None
     empty = gaps(ring, patches) if ring else ()

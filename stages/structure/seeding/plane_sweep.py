@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from stages.base import threads
 from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
-from stages.structure.seeding.projection import cells, centres, seen, unprojected
-from stages.structure.seeding.visibility import Witnesses
+from stages.structure.seeding.projection import cells, pixel_centres, unproject, visible_points
+from stages.structure.seeding.visibility import VisibilityConstraints
 
 SIDE = 200  # pixels, longer side of the photographs compared
 PLANES = 64
@@ -52,7 +52,7 @@ class _Guess:
     score: NDArray[np.float32]
 
 
-def agreed_points(
+def plane_sweep_points(
     folder: Path, views: tuple[View, ...], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """(points [M, 3], colours [M, 3] in 0..1) to add to the measured `points` [P, 3].
@@ -79,11 +79,11 @@ def agreed_points(
         others = [j for j in range(len(guesses)) if j in partners[i] or i in partners[j]]
         sure = _confirmed(guess, [guesses[j] for j in others])
         rows, columns = _thinned(guess, sure, np.concatenate(places))
-        at = centres(rows, columns)
-        places.append(unprojected(guess.camera, at, guess.depth[rows, columns].astype(np.float64)))
+        at = pixel_centres(rows, columns)
+        places.append(unproject(guess.camera, at, guess.depth[rows, columns].astype(np.float64)))
         colours.append(pictures[i][rows, columns])
     more = np.concatenate(places[1:] or [np.zeros((0, 3))])
-    believed = Witnesses(views, points).confirm(more)
+    believed = VisibilityConstraints(views, points).confirm(more)
     return more[believed], np.concatenate(colours)[believed]
 
 
@@ -96,7 +96,7 @@ def _partners(cameras: list[Camera], points: NDArray[np.float64]) -> list[list[i
     visible = np.zeros((len(cameras), len(points)), bool)
     rays = np.zeros((len(cameras), len(points), 3))
     for i, camera in enumerate(cameras):
-        visible[i, seen(camera, points)[0]] = True
+        visible[i, visible_points(camera, points)[0]] = True
         towards = points - camera.centre
         rays[i] = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     found = []
@@ -122,7 +122,7 @@ def _swept(
     """The best of PLANES planes at each pixel, as the two most alike of the partners see it."""
     camera = cameras[i]
     nothing = np.full((camera.height, camera.width), -1, np.float32)
-    depths = seen(camera, points)[2]
+    depths = visible_points(camera, points)[2]
     if not partners or not len(depths):
         return _Guess(camera, np.ones_like(nothing), nothing)
     nearest, farthest = np.percentile(depths, (1, 99)) * MARGIN
@@ -203,13 +203,13 @@ def _confirmed(guess: _Guess, others: list[_Guess]) -> NDArray[np.bool_]:
     """[H, W] where enough of the others' guesses agree with this one's."""
     height, width = guess.depth.shape
     rows, columns = np.divmod(np.arange(height * width), width)
-    at = centres(rows, columns)
-    places = unprojected(guess.camera, at, guess.depth.ravel().astype(np.float64))
+    at = pixel_centres(rows, columns)
+    places = unproject(guess.camera, at, guess.depth.ravel().astype(np.float64))
     sure = np.zeros(height * width, bool)
     for likeness, wanted in CONFIRMED:
         count = np.zeros(height * width, int)
         for other in others:
-            landed, pixels, depths = seen(other.camera, places)
+            landed, pixels, depths = visible_points(other.camera, places)
             there = cells(pixels)
             same = np.abs(other.depth[there] / depths - 1) < AGREE
             count[landed] += same & (other.score[there] > likeness)
@@ -224,13 +224,13 @@ def _thinned(
     far before or behind a sure surface lies on another."""
     height, width = sure.shape
     taken = np.zeros((int(height // CELL) + 1, int(width // CELL) + 1), bool)
-    _, pixels, depths = seen(guess.camera, points)
+    _, pixels, depths = visible_points(guess.camera, points)
     there = cells(pixels)
     same = np.abs(depths / guess.depth[there] - 1) < SAME_SURFACE
     rows, columns = cells(pixels[same | ~sure[there]], CELL)
     taken[rows, columns] = True
     rows, columns = np.nonzero(sure)
-    down, across = cells(centres(rows, columns), CELL)
+    down, across = cells(pixel_centres(rows, columns), CELL)
     cell = down * taken.shape[1] + across
     free = ~taken.ravel()[cell]
     rows, columns, cell = rows[free], columns[free], cell[free]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from stages.scene import Camera
 
 
-def seen(
+def visible_points(
     camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
     """(rows [K] of the points that land in the picture, their pixels [K, 2], depths [K])."""
@@ -17,7 +17,7 @@ def seen(
     return rows, pixels[rows], z[rows]
 
 
-def unprojected(
+def unproject(
     camera: Camera, pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """[K, 3] the places at `depths` [K] that `pixels` [K, 2] show."""
@@ -41,6 +41,6 @@ def cells(
     return rows, columns
 
 
-def centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+def pixel_centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
     """[K, 2] the middle of each pixel."""
     return np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)

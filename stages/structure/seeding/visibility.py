@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from stages.scene import View
-from stages.structure.seeding.projection import seen
+from stages.structure.seeding.projection import visible_points
 
 SIDE = 320  # pixels: the scale at which nearest is meant
 NEAREST = 6  # points
@@ -17,7 +17,7 @@ BELIEVED = 4  # times as many photographs must agree as contradict
 ANCHORS, ANCHORED = 3, 0.2  # measured points within this share of the distance to a camera
 
 
-class Witnesses:
+class VisibilityConstraints:
     """The photographs, and the measured points that each of them shows."""
 
     def __init__(self, views: tuple[View, ...], points: NDArray[np.float64]) -> None:
@@ -26,7 +26,7 @@ class Witnesses:
         self._known = []
         for view in views:
             camera = view.camera.fitted(SIDE)
-            _, pixels, depths = seen(camera, points)
+            _, pixels, depths = visible_points(camera, points)
             if len(depths) >= NEAREST:
                 self._known.append((view.name, camera, cKDTree(pixels), depths))
 
@@ -38,7 +38,7 @@ class Witnesses:
         before all of these."""
         agree, before = np.zeros(len(places), np.int64), np.zeros(len(places), np.int64)
         for name, camera, tree, depths in self._known:
-            rows, pixels, place_depths = seen(camera, places)
+            rows, pixels, place_depths = visible_points(camera, places)
             if name == of or not len(rows):
                 continue
             _, nearest = tree.query(pixels, NEAREST)

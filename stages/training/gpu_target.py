@@ -18,7 +18,7 @@ from stages.training.views import Level
 
 
 @dataclass
-class Resident:
+class GpuTarget:
     """pixels [3, H, W]: bytes, or where light was taken out of them or they are cut out float32.
     means [3]. uncovered [H, W]: how much of the background shows, where a photograph is cut out.
     ignored [H, W], bright [3, H, W]: where nothing is asked, and where no less than the value is.
@@ -60,14 +60,14 @@ class Resident:
             v_image.masked_fill_(self.ignored, 0.0)
 
 
-def resident(level: Level, device: torch.device) -> Resident:
+def gpu_target_of(level: Level, device: torch.device) -> GpuTarget:
     """The photograph, on the device."""
 
     def sent(array: Any) -> Tensor:
         return torch.tensor(array, device=device)
 
     if level.plain:
-        return Resident(level, sent(level.pixels), sent(level.means))
+        return GpuTarget(level, sent(level.pixels), sent(level.means))
     pixels, bright = level.pixels * np.float32(1 / 255), None
     cut_out = level.mask if level.outside == TRANSPARENT else None
     solid = np.float32(1) if cut_out is None else cut_out * np.float32(1 / 255)
@@ -78,4 +78,4 @@ def resident(level: Level, device: torch.device) -> Resident:
     uncovered = None if cut_out is None else sent(1 - solid)
     ignores = level.mask is not None and level.outside == IGNORE
     ignored = sent(level.mask == 0) if ignores else None
-    return Resident(level, sent(pixels), sent(level.means), uncovered, ignored, bright)
+    return GpuTarget(level, sent(pixels), sent(level.means), uncovered, ignored, bright)

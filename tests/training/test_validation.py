@@ -9,14 +9,14 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
-from stages.scene import Look
-from stages.train import lent_rows
+from stages.scene import DrawSettings
+from stages.train import validation_rows
 from stages.training import trainer as training
-from stages.training import trial
+from stages.training import validation
 from stages.training.checkpoint import checkpoint_files, load_checkpoint, remove_checkpoint
 from stages.training.schedule import GROWTH_ENDS, Schedule
 from stages.training.trainer import Trainer
-from stages.training.trial import LASTS, Answer, gives_too_little, trial_at
+from stages.training.validation import LASTS, Answer, gives_too_little, trial_at
 from tests.scenes import camera, cloud
 from tests.training.pictures import view_of
 
@@ -37,7 +37,7 @@ def trainer(folder, contradicting, patience_db=0.05, report=None):
     schedule = Schedule(steps=STEPS, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     folder.mkdir(exist_ok=True)
     made = Trainer(
-        *(schedule, views, [], Look(near=0.1), 200, folder, report or Report()),
+        *(schedule, views, [], DrawSettings(near=0.1), 200, folder, report or Report()),
         backend="cpu",
         lent=(LENT,),
         patience_db=patience_db,
@@ -56,7 +56,7 @@ def test_no_photograph_that_is_lent_is_trained_on_while_the_model_grows_and_all_
 
 @pytest.mark.parametrize(("n", "wanted"), [(0, 0), (7, 0), (8, 1), (12, 1), (21, 3), (300, 4)])
 def test_few_are_lent_and_of_too_few_none(n, wanted):
-    rows = lent_rows(n)
+    rows = validation_rows(n)
     assert len(rows) == len(set(rows)) == wanted
     assert all(0 <= row < n for row in rows)
 
@@ -83,7 +83,7 @@ def watched(made):
 
 @pytest.mark.parametrize(("doubt_db", "sits_out"), [(-99.0, True), (99.0, False)])
 def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_forgotten(
-    tmp_path, monkeypatch, doubt_db, sits_out
+    tmp_path, monkeypatch, doubt_db, dropout
 ):
     monkeypatch.setattr(training, "DOUBT_DB", doubt_db)
     made, start = trainer(tmp_path / "a", contradicting=False, patience_db=0.0)
@@ -92,15 +92,15 @@ def test_where_growth_ends_both_ways_are_gone_from_the_same_model_and_forgotten(
     half, lasts = int(GROWTH_ENDS * STEPS), round(LASTS * STEPS)
     plain, other = (slice(half + k * lasts, half + (k + 1) * lasts) for k in range(2))
     assert len(steps) == STEPS + 2 * lasts
-    assert not any(sat_out for _, sat_out in steps[: plain.stop])
-    assert all(sat_out for _, sat_out in steps[other])
-    assert all(sat_out == sits_out for _, sat_out in steps[other.stop :])
+    assert not any(dropout for _, dropout in steps[: plain.stop])
+    assert all(dropout for _, dropout in steps[other])
+    assert all(dropout == dropout for _, dropout in steps[other.stop :])
     assert [row for row, _ in steps[plain]] == [row for row, _ in steps[other]]
     assert LENT not in {row for row, _ in steps[: other.stop]}
     assert LENT in {row for row, _ in steps[other.stop :]}
     at = dict(loads)
     assert at[plain.start] == at[other.start] == at[other.stop]
-    assert made.sits_out is sits_out
+    assert made.dropout is dropout
 
 
 def test_a_trial_settles_as_the_end_of_a_run_does():
@@ -160,7 +160,7 @@ def test_what_counts_is_the_better_way_by_all_photographs():
 @pytest.fixture
 def early(monkeypatch):
     """Lent photographs are asked in short runs, too: at 75, 150 and 300 of 600 steps."""
-    monkeypatch.setattr(trial, "EARLIEST", 70)
+    monkeypatch.setattr(validation, "EARLIEST", 70)
 
 
 @pytest.mark.usefixtures("early")

@@ -26,7 +26,7 @@ EXPLICABLE = 0.03  # an error beyond it counts by its size, not by its square (H
 
 
 @dataclass(frozen=True)
-class Recolouring:
+class ColourRefit:
     """How pictures are drawn, and what they are compared with. levels: gives all photographs, each
     time that it is asked. widths [N]: of the smoothing filter, or [0]."""
 
@@ -88,9 +88,9 @@ class Recolouring:
         total[backward.rows] += np.abs(found) if of_size else found
 
 
-def worth_settling(sat_out: bool, photographs: int) -> bool:
+def needs_colour_refit(dropout: bool, photographs: int) -> bool:
     """Whether splats sat steps out, and so few photographs were learnt that it shows."""
-    return sat_out and photographs <= MOST_PHOTOGRAPHS
+    return dropout and photographs <= MOST_PHOTOGRAPHS
 
 
 def _trust(error: NDArray[np.float32]) -> NDArray[np.float32]:

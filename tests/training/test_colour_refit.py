@@ -8,7 +8,7 @@ import pytest
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.scene import IGNORE, look_at
-from stages.training.colours import Recolouring
+from stages.training.colour_refit import ColourRefit
 from stages.training.loss import channel_means
 from stages.training.optimiser import Model, new_model
 from stages.training.views import Level
@@ -35,7 +35,7 @@ def pictures_of(model: Model) -> list[Level]:
 
 
 def recoloured(model: Model, levels: list[Level]) -> Model:
-    return Recolouring(CpuRasteriser(), SETTINGS, lambda: levels, NO_WIDTHS).of(model)
+    return ColourRefit(CpuRasteriser(), SETTINGS, lambda: levels, NO_WIDTHS).of(model)
 
 
 def squared_error(model: Model, levels: list[Level]) -> float:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.blocks import forget, passing
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import format_of
 from stages.proof.content import (
     Y_DOWN,
@@ -45,7 +45,7 @@ def read_back(path: Path) -> FileContent:
     was just written has no excuse."""
     with np.errstate(all="ignore"):  # flat splats have a logarithm of -infinity
         row = format_of(path)
-        return FileContent(named(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
+        return FileContent(load_object(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
 
 
 def ply(path: Path) -> Splats:

@@ -19,7 +19,7 @@ _MIDDLE = (0.01, 0.99)
 
 
 @dataclass(frozen=True)
-class Look:
+class DrawSettings:
     """What decides a picture of splats besides the camera; it travels with them.
 
     near: a splat is drawn if the z of its centre is larger; world units. 0 where nobody knows:
@@ -40,10 +40,10 @@ class Look:
         return camera.fitted(self.side) if self.side else camera
 
 
-def look_of(views: tuple[View, ...], side: int = 0, light: bool = False) -> Look:
+def draw_settings_of(views: tuple[View, ...], side: int = 0, light: bool = False) -> DrawSettings:
     """How splats fitted to these photographs are drawn. light: as in `Look`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
-    return Look(near_plane(views), side, float(cut_out), light)
+    return DrawSettings(near_plane(views), side, float(cut_out), light)
 
 
 def near_plane(views: tuple[View, ...]) -> float:

@@ -13,7 +13,7 @@ _ALONE = 6.0  # times as far from its neighbours as they are from theirs,
 _REACH = 3.0  # and farther than so many of its own standard deviations
 
 
-def alone(splats: Splats) -> NDArray[np.bool_]:
+def isolated_splats(splats: Splats) -> NDArray[np.bool_]:
     """[N] splats that are farther from their neighbours than these from theirs, by far, and do not
     reach them. Sparse surroundings are not alone: there all are far from each other. Means must be
     finite."""

@@ -42,7 +42,7 @@ _RADIUS, _SIGMA = 5, 1.5  # of SSIM's window
 _C1, _C2 = 0.01**2, 0.03**2
 
 
-class PlainStep(HostStep):
+class ReferenceStep(HostStep):
     """See `step.TrainingStep`."""
 
     def step(

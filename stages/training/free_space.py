@@ -24,7 +24,7 @@ ENOUGH = 4  # photographs that look past it: they would have contradicted what i
 
 
 @dataclass(frozen=True)
-class OpenAir:
+class FreeSpace:
     """cameras: of the photographs in training, a pixel for each cell. depths: of the nearest that
     the start has in each cell and those around it, [H, W], world units; infinite where it has
     nothing."""
@@ -46,7 +46,7 @@ class OpenAir:
         return (passed >= WITNESSES) & (passed < ENOUGH)
 
 
-def open_air(start: NDArray[np.floating], cameras: Sequence[Camera]) -> OpenAir:
+def known_free_space(start: NDArray[np.floating], cameras: Sequence[Camera]) -> FreeSpace:
     """As the start knows it, which has something at these places [N, 3]."""
     from scipy.ndimage import minimum_filter
 
@@ -60,7 +60,7 @@ def open_air(start: NDArray[np.floating], cameras: Sequence[Camera]) -> OpenAir:
         nearest = np.full((camera.height, camera.width), np.inf)
         np.minimum.at(nearest, (y, x), z[rows])
         depths.append(minimum_filter(nearest, 3, mode="nearest"))
-    return OpenAir(cells, tuple(depths))
+    return FreeSpace(cells, tuple(depths))
 
 
 def _of_depth(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stages.base.stage import Report
-from stages.scene import Look, look_at
-from stages.training.open_air import ENOUGH, WITNESSES, open_air
+from stages.scene import DrawSettings, look_at
+from stages.training.free_space import ENOUGH, WITNESSES, known_free_space
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
 from stages.training.trainer import CLEARINGS, Trainer
@@ -34,7 +34,7 @@ def cameras(n):
 
 
 def held(means, n=2, start=None):
-    air = open_air((wall() if start is None else start).means, cameras(n))
+    air = known_free_space((wall() if start is None else start).means, cameras(n))
     return air.holds(np.array(means, np.float32).reshape(-1, 3)).tolist()
 
 
@@ -73,13 +73,13 @@ def test_one_photograph_is_no_witness():
 def test_what_one_photograph_has_a_surface_at_stays_whatever_others_look_past():
     post = np.concatenate([wall().means, np.array([[0.0, 0.0, 4.8]], np.float32)])
     beside, at_the_post = (2.0, 0.0, 4.8), (0.0, 0.0, 4.9)
-    air = open_air(post, cameras(2))
+    air = known_free_space(post, cameras(2))
     assert air.holds(np.array([beside, at_the_post])).tolist() == [True, False]
 
 
 def test_depths_are_of_cells_whatever_the_photographs_size():
     for photograph in (camera(4000, 3000, focal=4000.0), camera(64, 48)):
-        (depths,) = open_air(wall().means, [photograph]).depths
+        (depths,) = known_free_space(wall().means, [photograph]).depths
         assert depths.shape == (24, 32)
         np.testing.assert_allclose(depths, FAR)
 
@@ -114,7 +114,7 @@ def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, steps):
     views = [view_of(f"{k}", pictures, one) for k, one in enumerate(cameras(3))]
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     made = Trainer(
-        *(schedule, views, [], Look(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
+        *(schedule, views, [], DrawSettings(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
     )
     made._strategy = Clouds()
     model = made.run(start)

@@ -40,7 +40,7 @@ class Trial:
     plain_db: tuple[float, ...] = ()
 
     @property
-    def sits_out(self) -> bool:
+    def dropout(self) -> bool:
         """Whether splats sit out on the way that is being gone."""
         return bool(self.plain_db)
 

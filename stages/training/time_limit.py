@@ -9,7 +9,7 @@ PLAN_STEPS = 10  # fewer do not show a pace
 
 
 @dataclass
-class Pace:
+class TimeLimit:
     """Keeps a run within `seconds` of wall time, of which `reserve` are wanted after the last step.
     Each plan asks how long a step takes since the last one, so it follows pictures that become
     larger, splats that become more, and a machine that is needed elsewhere. The first steps, in

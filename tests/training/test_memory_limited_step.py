@@ -16,10 +16,10 @@ from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import MemoryFull, RasterSettings, splat_arrays
 from stages.train import TrainSettings
 from stages.training import trainer
-from stages.training.cap import fitted
+from stages.training.cap import most_opaque
 from stages.training.cpu_step import CpuStep
-from stages.training.frugal_step import FrugalStep
 from stages.training.loss import channel_means
+from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.views import Level
 from tests.scenes import camera, cloud
@@ -105,14 +105,14 @@ def test_what_does_not_fit_at_all_is_still_an_error() -> None:
         room = 0
 
     with pytest.raises(MemoryFull):
-        FrugalStep(Nothing(CpuRasteriser()), lambda fits: None).load(model)
+        MemoryLimitedStep(Nothing(CpuRasteriser()), lambda fits: None).load(model)
 
 
 def test_the_splats_that_hide_most_are_kept_in_their_order() -> None:
     model = new_model(*splat_arrays(cloud(9, 20, 20, degree=0)))
     model.opacity_logits[:] = [1, 5, 2, 5, -3, 0, 7, 5, 1]
-    np.testing.assert_array_equal(fitted(model, 3).opacity_logits, [5, 5, 7])
-    assert fitted(model, 9) is model
+    np.testing.assert_array_equal(most_opaque(model, 3).opacity_logits, [5, 5, 7])
+    assert most_opaque(model, 9) is model
 
 
 def test_kernels_that_run_out_of_memory_go_on_with_half(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,13 +131,13 @@ def test_kernels_that_run_out_of_memory_go_on_with_half(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(rasteriser, "gradients", scarce)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    made = FrugalStep(GpuStep(rasteriser), told.append)
+    made = MemoryLimitedStep(GpuStep(rasteriser), told.append)
     pixels = np.random.default_rng(0).integers(0, 256, (3, 15, 20)).astype(np.uint8)
     level = Level(camera(20, 15), pixels, channel_means(pixels))
     start = new_model(*(a.copy() for a in splat_arrays(cloud(12, 20, 15, degree=0))))
     made.load(start)
     made.step(level, RasterSettings(near=0.1, sh_degree=0), LearningRates(), smooth=False)
     assert told == [6]
-    kept = fitted(start, 6)
+    kept = most_opaque(start, 6)
     assert np.abs(made.model().means - kept.means).max() < 1e-2
     assert made.model().steps.max() == 1

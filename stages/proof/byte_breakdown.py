@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from stages.base.bad_files import reading
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import Anatomy, format_of, spz_read
 from stages.formats.html import unzipped
 from stages.formats.inflate import Inflated
@@ -49,7 +49,7 @@ def anatomy_of(path: Path) -> Anatomy:
     path = Path(path)
     row = format_of(path)
     with reading(path):
-        found: Anatomy = named(row.anatomy)(path)
+        found: Anatomy = load_object(row.anatomy)(path)
     other = row.size_bytes(path) - sum(found.parts.values())
     if found.untold or found.unpacked or other <= 0:
         return found

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from stages.scene import Camera, View, look_at
-from stages.structure.seeding.plane_sweep import agreed_points
+from stages.structure.seeding.plane_sweep import plane_sweep_points
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 WALL, PLATE, HALF = 6.0, 4.0, 0.7  # depths of a wall and of a square plate before it
@@ -52,7 +52,7 @@ def capture(folder: Path, plain: bool = False) -> tuple[tuple[View, ...], np.nda
 def found(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("sweep")
     views, points = capture(folder)
-    return folder, views, points, *agreed_points(folder, views, points)
+    return folder, views, points, *plane_sweep_points(folder, views, points)
 
 
 def test_agreed_points_lie_on_the_surfaces(found) -> None:
@@ -74,20 +74,20 @@ def test_agreed_points_have_the_colour_of_their_place(found) -> None:
 
 def test_nothing_more_is_found_where_points_already_are(found) -> None:
     folder, views, points, more, _ = found
-    again, _ = agreed_points(folder, views, np.concatenate([points, more]))
+    again, _ = plane_sweep_points(folder, views, np.concatenate([points, more]))
     assert len(again) < 0.1 * len(more)
 
 
 def test_the_order_of_the_photographs_decides_nothing(found) -> None:
     folder, views, points, more, colours = found
-    again, again_colours = agreed_points(folder, views[::-1], points)
+    again, again_colours = plane_sweep_points(folder, views[::-1], points)
     assert again.tobytes() == more.tobytes()
     assert again_colours.tobytes() == colours.tobytes()
 
 
 def test_plain_surfaces_give_no_points(tmp_path: Path) -> None:
     views, points = capture(tmp_path, plain=True)
-    flat_wall = agreed_points(tmp_path, views, points)[0]
+    flat_wall = plane_sweep_points(tmp_path, views, points)[0]
     inside = np.abs(flat_wall[:, :2]).max(1) > 1.5 * HALF  # away from the plate's edge
     assert not inside.any()
 
@@ -95,11 +95,11 @@ def test_plain_surfaces_give_no_points(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_too_few_photographs_agree_on_nothing(tmp_path: Path, number: int) -> None:
     views, points = capture(tmp_path)
-    more, colours = agreed_points(tmp_path, views[:number], points)
+    more, colours = plane_sweep_points(tmp_path, views[:number], points)
     assert more.shape == (0, 3)
     assert colours.shape == (0, 3)
 
 
 def test_without_measured_points_nothing_is_found(tmp_path: Path) -> None:
     views, _ = capture(tmp_path)
-    assert len(agreed_points(tmp_path, views, np.zeros((0, 3)))[0]) == 0
+    assert len(plane_sweep_points(tmp_path, views, np.zeros((0, 3)))[0]) == 0

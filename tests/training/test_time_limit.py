@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stages.training.pace import Pace
 from stages.training.schedule import GROWTH_ENDS, RESOLUTIONS, SETTLE_TO, Schedule
+from stages.training.time_limit import TimeLimit
 
 
 def schedule(steps=3000):
@@ -13,7 +13,7 @@ def schedule(steps=3000):
 
 def simulated(seconds, cost, steps=100_000):
     """(seconds that a run takes, its schedule at the end), if a step at a share costs `cost`."""
-    plan, pace = schedule(steps), Pace(seconds, reserve=1.0)
+    plan, pace = schedule(steps), TimeLimit(seconds, reserve=1.0)
     spent, step = 0.0, 0
     while step < plan.steps:
         spent += cost(plan.share(step))
@@ -48,7 +48,7 @@ def test_steps_that_take_a_second_each_still_end_in_time():
 
 
 def test_steps_that_do_not_count_are_not_taken_for_a_slow_machine():
-    pace = Pace(100.0)
+    pace = TimeLimit(100.0)
     assert pace.steps(10, 1.0) is None
     assert pace.steps(110, 11.0) == 110 + 890  # a tenth of a second each
     pace.restart()  # ten seconds went into what did not count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stages.base.words import counted
+from stages.base.text import counted
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stages.raster.definition import MemoryFull, RasterSettings
 from stages.scene import Camera
-from stages.training.cap import fitted
+from stages.training.cap import most_opaque
 from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model
 from stages.training.step import TrainingStep
@@ -20,7 +20,7 @@ from stages.training.views import Level
 Made = TypeVar("Made")
 
 
-class FrugalStep:
+class MemoryLimitedStep:
     """See `step.TrainingStep`. inner: whose device it is. full: is told how many splats fit, each
     time that they have to get fewer. Raises MemoryFull where none would fit."""
 
@@ -33,7 +33,7 @@ class FrugalStep:
     def load(self, model: Model) -> None:
         """See `step.TrainingStep`; as much of the model as there is room for."""
         while (fits := self._refused(partial(self.inner.load, model), len(model))) is not None:
-            model = fitted(model, fits)
+            model = most_opaque(model, fits)
 
     def model(self) -> Model:
         """See `step.TrainingStep`."""
@@ -57,7 +57,7 @@ class FrugalStep:
     def _done(self, work: Callable[[], Made]) -> Made:
         found: list[Made] = []
         while (fits := self._refused(lambda: found.append(work()), len(self))) is not None:
-            self.load(fitted(self.inner.model(), fits))
+            self.load(most_opaque(self.inner.model(), fits))
         return found[0]
 
     def _refused(self, work: Callable[[], None], splats: int) -> int | None:

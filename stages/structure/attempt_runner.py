@@ -21,12 +21,18 @@ from stages.base.atomic import replacing
 from stages.base.stage import Report
 from stages.structure import database as sqlite
 from stages.structure import worker_progress
-from stages.structure.chunks import Hands, hand_out_features, hand_out_pairs
-from stages.structure.fallbacks import LADDER, Attempt, Rung
-from stages.structure.gates import Failure, Figures, check_keypoints, check_model, check_pairs
-from stages.structure.job import Job, looked_path
+from stages.structure.chunks import ChunkExecutor, extract_features_in_chunks, match_pairs_in_chunks
+from stages.structure.fallbacks import CONFIGURATIONS, Attempt, Configuration
+from stages.structure.gates import (
+    Failure,
+    ModelStatistics,
+    check_keypoints,
+    check_model,
+    check_pairs,
+)
+from stages.structure.job import Job, compared_pairs_path
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
-from stages.structure.sparse_model import load_result, measure, without_odd_views
+from stages.structure.sparse_model import load_result, model_statistics, without_implausible_views
 
 MORE_FEATURES = 2.0  # times as many, at most
 LOWER_PEAK = 0.4  # times SIFT's peak threshold
@@ -34,7 +40,7 @@ _SECONDS = "seconds.json"
 
 
 @dataclass
-class Workbench:
+class AttemptRunner:
     """Runs rungs for one capture. base: the job that rungs vary. deadline: time.monotonic().
     hands: who does shares of features and matching; None: this machine, unshared."""
 
@@ -43,7 +49,7 @@ class Workbench:
     report: Report
     deadline: float
     allow_partial: bool = False
-    hands: Hands | None = None
+    executor: ChunkExecutor | None = None
 
     def out_of_time(self) -> bool:
         return self.seconds_left() <= 0
@@ -51,13 +57,13 @@ class Workbench:
     def seconds_left(self) -> float:
         return self.deadline - time.monotonic()
 
-    def try_rung(self, rung: Rung) -> Attempt:
+    def try_rung(self, rung: Configuration) -> Attempt:
         """Features, matches, mapping and all gates for one rung.
 
         Raises SplatError for crashes of extraction and matching, and Interrupted.
         """
         photographs = len(self.base.names)
-        nothing = Figures(photographs=photographs, mapper=rung.mapper)
+        nothing = ModelStatistics(photographs=photographs, mapper=rung.mapper)
         job = self._job(rung)
         try:
             self._features(job)
@@ -84,7 +90,7 @@ class Workbench:
             raise crash_error(crash, self.folder) from crash
         return self._mapped(job, attempt, failures)
 
-    def _hopeful(self, rung: Rung) -> bool:
+    def _hopeful(self, rung: Configuration) -> bool:
         """Whether to go on with few features: only if there is no richer rung to come."""
         return self.allow_partial and rung.more_features
 
@@ -100,12 +106,12 @@ class Workbench:
             return replace(attempt, failures=(failure,))
         result = load_result(Path(job.out))
         if result.model is not None:
-            result = replace(result, model=without_odd_views(result.model))
-        figures = measure(result, len(self.base.names), attempt.rung.mapper)
+            result = replace(result, model=without_implausible_views(result.model))
+        figures = model_statistics(result, len(self.base.names), attempt.rung.mapper)
         failures = tuple(before) + tuple(check_model(figures))
         return replace(attempt, figures=figures, failures=failures, result=result)
 
-    def _job(self, rung: Rung) -> Job:
+    def _job(self, rung: Configuration) -> Job:
         base = self.base
         name = "more" if rung.more_features else "base"
         return replace(
@@ -129,13 +135,13 @@ class Workbench:
             return
         if database.exists():
             _repair_or_delete(database)
-        if self.hands is not None:
+        if self.executor is not None:
             with self._timed("features"):
-                hand_out_features(job, self.hands, self._look)
+                extract_features_in_chunks(job, self.executor, self._look)
         self._run(replace(job, step="features"), lambda: self._tick(job, "photographs"))
         marker.touch()
 
-    def _matching(self, job: Job, rung: Rung) -> Job:
+    def _matching(self, job: Job, rung: Configuration) -> Job:
         """Match; returns the job with the database that holds the geometries to use."""
         database = Path(job.database)
         if rung.drop_stationary:
@@ -150,30 +156,30 @@ class Workbench:
             return job
         if not rung.drop_stationary:
             sqlite.repair(database)
-        if self.hands is not None:
-            self._share_matching(job, self.hands)
+        if self.executor is not None:
+            self._share_matching(job, self.executor)
         self._run(replace(job, step="matching"), lambda: self._tick(job, "pairs"))
         marker.touch()
         return job
 
-    def _share_matching(self, job: Job, hands: Hands) -> None:
+    def _share_matching(self, job: Job, executor: ChunkExecutor) -> None:
         """Until no pairs are left to choose: which those are depends on how the others matched."""
         left = 1
         while left:
             self._run(replace(job, step="choosing"), lambda: self._tick(job, "photographs"))
             with self._timed("matching"):
-                left = hand_out_pairs(job, hands, self._look)
+                left = match_pairs_in_chunks(job, executor, self._look)
 
     def _look(self) -> None:
         """At the clock."""
         if self.out_of_time():
             raise WorkerTimedOut
 
-    def _mapping(self, job: Job, rung: Rung) -> None:
+    def _mapping(self, job: Job, rung: Configuration) -> None:
         if _finished(Path(job.out)):
             return
         total = len(job.names)
-        more = "" if rung is LADDER[0] else f" ({rung.name})"
+        more = "" if rung is CONFIGURATIONS[0] else f" ({rung.name})"
         budget = min(self.seconds_left(), mapping_seconds(total))
         timed = replace(job, step="mapping", max_seconds=max(1, int(budget)))
 
@@ -205,12 +211,12 @@ class Workbench:
 
     def pairs_looked_at(self) -> int:
         """By the first looks, each pair counted once."""
-        path = looked_path(self._job(LADDER[0]))
+        path = compared_pairs_path(self._job(CONFIGURATIONS[0]))
         return int(path.read_text()) if path.exists() else 0
 
     def _tick(self, job: Job, unit: str, more: str = "") -> None:
         """Pass on how far the worker says it is."""
-        told = worker_progress.read(Path(job.progress))
+        told = worker_progress.read_progress(Path(job.progress))
         if told is not None:
             phase, done, total = told
             self.report.progress(done, total, phase + more, **{unit: done})
