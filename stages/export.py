@@ -145,11 +145,11 @@ def _held(
     row: Format, quantised: QuantisedSplats, fitting: Fitting | None, folder: Path
 ) -> tuple[Splats, dict[str, Any]]:
     """(what the file should hold, figures of the fitting). Fitted splats are kept in `folder`."""
-    from stages.formats.coarse import held_by
+    from stages.formats.quantisation import splats_to_write
     from stages.scene import save_splats
 
-    if fitting is None or not row.rounds:
-        return held_by(row, quantised), {}
+    if fitting is None or not row.needs_finetuning:
+        return splats_to_write(row, quantised), {}
     held, figures = fitting.fitted(row, quantised)
     kept = folder / _FITTED / row.ending
     kept.mkdir(parents=True, exist_ok=True)
@@ -175,7 +175,11 @@ def _fitting(
 
     reconstruction: Reconstruction = inputs["sfm"]
     training = split_held_out(reconstruction.views)[0]
-    if not (settings.rounding_steps and training and any(FORMATS[name].rounds for name in wanted)):
+    if not (
+        settings.rounding_steps
+        and training
+        and any(FORMATS[name].needs_finetuning for name in wanted)
+    ):
         return None
     dropout, backend, folder = (
         inputs["train"].dropout,

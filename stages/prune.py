@@ -155,18 +155,18 @@ def _sizes(
     from stages import formats
     from stages.base.lazy import load_object
     from stages.capacity.bits import choose_bits
-    from stages.formats.coarse import Bits
+    from stages.formats.quantisation import BitDepths
     from stages.measure.evaluation import mean_psnr_db
     from stages.scene import spread_over
 
     row = FORMATS[settings.mb_of]
     few: dict[str, int] = {}
-    if settings.max_mb and row.coarse:
+    if settings.max_mb and row.quantiser:
         deciding, backend = spread_over(photographs, DECIDING), backend_of_settings(settings)
         few, _ = choose_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
 
     def size_bytes(splats: Splats) -> int:
-        held = load_object(row.coarse)(splats, Bits(**few)) if few else splats
+        held = load_object(row.quantiser)(splats, BitDepths(**few)) if few else splats
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"scene.{settings.mb_of}"
             formats.write(path, held, units=reconstruction.units, views=reconstruction.views)

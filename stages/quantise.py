@@ -76,7 +76,7 @@ def run(
     from stages.base.atomic import replacing
     from stages.capacity.bits import choose_bits
     from stages.formats import FORMATS, splat32
-    from stages.formats.coarse import held_by
+    from stages.formats.quantisation import splats_to_write
     from stages.measure.flat import flat_dc
     from stages.scene import QuantisedSplats, save_splats, split_held_out
 
@@ -100,7 +100,7 @@ def run(
             (kept.draw_settings.camera(v.camera) for v in views),
             backend_of_settings(settings),
         )
-    drawn = held_by(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
+    drawn = splats_to_write(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
     in_32_bytes = splat32.decode(splat32.encode(drawn))
     judged = {
         "psnr_raw_db": judge.psnr(splats),

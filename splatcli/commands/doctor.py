@@ -159,6 +159,6 @@ def _gpu() -> Check:
         from stages.raster.gpu import device
 
         missing = device.missing()
-        return Check("GPU", f"{missing}; {device.built()}" if missing else device.told())
+        return Check("GPU", f"{missing}; {device.built()}" if missing else device.describe())
     except Exception as error:  # a broken driver may raise anything
         return Check("GPU", _said(error))

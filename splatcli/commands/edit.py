@@ -13,13 +13,13 @@ from stages.base.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.editing.operations import Done
     from stages.editing.scene import Edited
-    from stages.editing.syntax import Typed
+    from stages.editing.syntax import ParsedOperation
 
 
 def edit(
     source: Path,
     target: Path | None,
-    typed: Sequence[Typed],
+    typed: Sequence[ParsedOperation],
     dry_run: bool,
     quiet: bool,
     as_json: bool,
@@ -41,7 +41,7 @@ def edit(
         )
     target = target or Path("scene.ply")
     row, chain = formats.format_of(target), operations.prepared(typed, target)
-    if row.levels and not dry_run:
+    if row.streamed and not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
         if target.parent.is_dir():  # `write` says so where it is not

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.lazy import load_object
 from stages.formats.axes import least_turned
-from stages.formats.coarse import Bits, held_by, on_grids
+from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
 from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
@@ -50,16 +50,18 @@ class Fitting:
         """(what a file of the format should hold, figures: PSNR of the photographs that decide, as
         the file would be drawn without fine-tuning and with it). Raises Interrupted."""
         self.tuner.steps = 0  # what a file holds does not depend on those written before it
-        plain = held_by(row, quantised)
-        exact = held_by(row, replace(quantised, decisions={}))
+        plain = splats_to_write(row, quantised)
+        exact = splats_to_write(row, replace(quantised, decisions={}))
         bits = quantised.decisions.get("bits")
 
         def read(splats: Splats) -> Splats:
             return as_read(row, splats)
 
-        if row.coarse and isinstance(bits, dict):
-            exact, few = least_turned(exact), Bits(**bits)
-            found = tuned_to(lambda s: on_grids(s, few), exact, self.tuner, self.steps, self.seen)
+        if row.quantiser and isinstance(bits, dict):
+            exact, few = least_turned(exact), BitDepths(**bits)
+            found = tuned_to(
+                lambda s: quantise_splats(s, few), exact, self.tuner, self.steps, self.seen
+            )
         else:
             found = tuned_to(read, exact, self.tuner, self.steps, self.seen)
         before, after = (
@@ -76,10 +78,10 @@ def tuned_to(
     changes. Raises Interrupted."""
     still: list[str] = []
     for name in ORDER:
-        coarse = _only(name, rounded(splats), splats)
-        if _equal(name, coarse, splats):
+        quantiser = _only(name, rounded(splats), splats)
+        if _equal(name, quantiser, splats):
             continue  # told as it is: it goes on learning
-        splats = coarse
+        splats = quantiser
         still.append(name)
         if name != ORDER[-1]:
             splats = tuner.finetune(splats, steps, seen, still)
@@ -99,13 +101,13 @@ def as_read(row: Format, splats: Splats) -> Splats:
     return replace(found, draw_settings=splats.draw_settings, origin=splats.origin)
 
 
-def _only(name: str, coarse: Splats, splats: Splats) -> Splats:
+def _only(name: str, quantiser: Splats, splats: Splats) -> Splats:
     """`splats` with one kind of value of `coarse`; degrees stay."""
     if not name.startswith("sh_"):
-        return replace(splats, **{name: getattr(coarse, name)})
+        return replace(splats, **{name: getattr(quantiser, name)})
     bands = _bands(name)
     sh = splats.sh.copy()
-    sh[:, bands] = coarse.sh[:, bands]
+    sh[:, bands] = quantiser.sh[:, bands]
     return replace(splats, sh=sh)
 
 

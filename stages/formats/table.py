@@ -44,7 +44,7 @@ class Format:
     reader: str = ""
     anatomy: str = ""
     order: str = ""
-    coarse: str = ""
+    quantiser: str = ""
     validator: str = ""
     loses: str = ""
     sh_degree: int = 3
@@ -58,7 +58,7 @@ class Format:
     def is_mesh(self) -> bool:
         return not self.reader
 
-    def is_of(self, name: str) -> bool:
+    def matches(self, name: str) -> bool:
         """Whether a file of this name, in small letters, is of this format."""
         return name == self.ending if self.levels else name.endswith("." + self.ending)
 
@@ -80,7 +80,7 @@ class Format:
 
 
 @dataclass(frozen=True)
-class Anatomy:
+class ByteBreakdown:
     """Where the bytes of a file are. parts: by attribute. unpacked: whether they are counted before
     the compression that packs them all together. untold: why there are no parts."""
 
@@ -189,7 +189,7 @@ TABLE = (
         second_reader="stages.proof.independent_packed:sog",
         anatomy="stages.proof.byte_breakdown:sog",
         order="stages.scene.morton:order",
-        coarse="stages.formats.coarse:of_sog",
+        quantiser="stages.formats.quantisation:quantise_for_sog",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         rounds=True,
     ),
@@ -238,7 +238,7 @@ def format_of(path: Path) -> Format:
     Raises SplatError "format-unknown", and "format-mesh" for the name of a mesh.
     """
     name = Path(path).name.lower()
-    rows = [row for row in TABLE if row.is_of(name)]
+    rows = [row for row in TABLE if row.matches(name)]
     if not rows:
         raise SplatError(
             "format-unknown",

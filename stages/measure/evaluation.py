@@ -14,7 +14,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.images import flip, psnr, ssim
+from stages.measure.image_metrics import flip, psnr, ssim
 from stages.photos.load import load_image, mask_of
 from stages.raster.draw import renderer
 from stages.scene import IGNORE, TRANSPARENT, Camera, DrawSettings, Splats, View

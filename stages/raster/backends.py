@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.lazy import load_object
-from stages.raster.torch_device import DEVICES, PROCESSOR
+from stages.raster.torch_device import CPU, DEVICES
 
 if TYPE_CHECKING:
     from stages.base.stage import Report
@@ -41,11 +41,11 @@ class Backend:
     obstacle: str = ""
     told: str = ""
     devices: tuple[str, ...] = ()
-    on: str = PROCESSOR
+    on: str = CPU
 
     def where(self) -> str:
         """What it runs on, for a manifest."""
-        return str(load_object(self.told)(*self._device())) if self.told else PROCESSOR
+        return str(load_object(self.told)(*self._device())) if self.told else CPU
 
     def made(self) -> Rasteriser:
         """A new rasteriser. Raises SplatError where what it runs on is not there."""
@@ -54,7 +54,7 @@ class Backend:
 
     def require(self) -> None:
         """Raises SplatError where what it runs on is not there; asks no more than that takes."""
-        if self.obstacle or self.on != PROCESSOR:
+        if self.obstacle or self.on != CPU:
             self.made()
 
     def _device(self) -> tuple[str, ...]:
@@ -72,8 +72,8 @@ BACKENDS = (
         "stages.raster.gpu.rasteriser:GpuRasteriser",
         "Triton kernels",
         step="stages.training.gpu_step:GpuStep",
-        obstacle="stages.raster.gpu.device:obstacle",
-        told="stages.raster.gpu.device:told",
+        obstacle="stages.raster.gpu.device:why_unavailable",
+        told="stages.raster.gpu.device:describe",
     ),
     Backend(
         "cpu",
@@ -85,7 +85,7 @@ BACKENDS = (
         "reference",
         "stages.raster.reference_rasteriser:ReferenceRasteriser",
         "torch, slow",
-        told="stages.raster.torch_device:told",
+        told="stages.raster.torch_device:describe",
         devices=DEVICES,
     ),
 )
@@ -99,7 +99,7 @@ def backend_of(name: str) -> Backend:
         if backend.name == wanted or (wanted == AUTO and not backend.why_not()):
             if on and on not in backend.devices:
                 break
-            return replace(backend, on=on or PROCESSOR)
+            return replace(backend, on=on or CPU)
     raise ValueError(f"backend {name!r}, wanted one of {', '.join(CHOICES)}")
 
 
@@ -124,10 +124,10 @@ def runs_here(name: str) -> bool:
     return True
 
 
-def qualified_name(backend: str, device: str = PROCESSOR) -> str:
+def qualified_name(backend: str, device: str = CPU) -> str:
     """What the options --backend and --device ask for together, in one word. Raises SplatError
     (option-device) for a device of a backend that takes none."""
-    if device == PROCESSOR:
+    if device == CPU:
         return backend
     able = [each.name for each in BACKENDS if device in each.devices]
     if backend in able:
@@ -136,7 +136,7 @@ def qualified_name(backend: str, device: str = PROCESSOR) -> str:
         "option-device",
         given=f"--device {device} with --backend {backend}, which knows itself what it runs on.",
         wanted=f"--device goes with --backend {' or '.join(able)}.",
-        hint=f"Add --backend {able[0]}, or leave --device away (--device {PROCESSOR} where a run "
+        hint=f"Add --backend {able[0]}, or leave --device away (--device {CPU} where a run "
         "remembers another).",
         family=Family.USAGE,
     )
@@ -164,4 +164,4 @@ def backend_setting() -> Any:
 def device_setting() -> Any:
     """The `device` field beside it."""
     help = f"What --backend reference runs on, as torch names it: {', '.join(DEVICES)}."
-    return field(default=PROCESSOR, metadata={"help": help, "choices": DEVICES, "midway": True})
+    return field(default=CPU, metadata={"help": help, "choices": DEVICES, "midway": True})

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView, evaluate, evaluation_subset
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.backends import AUTO, backend_of, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths

@@ -13,7 +13,7 @@ from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.base.lazy import load_object
 from stages.formats import FORMATS, MESHES, TABLE, Format
-from stages.proof.byte_breakdown import anatomy_of
+from stages.proof.byte_breakdown import byte_breakdown_of
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
@@ -86,8 +86,8 @@ def test_a_format_leaves_the_files_that_its_row_names(tmp_path: Path, row: Forma
 def test_every_format_tells_its_bytes_or_why_not(tmp_path: Path, row: Format) -> None:
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, many_splats(300))
-    found = anatomy_of(path)
-    if found.untold:
+    found = byte_breakdown_of(path)
+    if found.unknown:
         assert not found.parts
     else:
         assert {"positions", "rotations", "scales"} <= found.parts.keys()

@@ -20,7 +20,7 @@ from stages.measure.evaluation import (
     image_renderer,
     load_evaluation_views,
 )
-from stages.measure.images import flip
+from stages.measure.image_metrics import flip
 from stages.raster.draw import settings_of
 from stages.scene import (
     IGNORE,

@@ -12,7 +12,7 @@ from stages import train
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView, evaluate
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render

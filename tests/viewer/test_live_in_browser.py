@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 
 from stages.formats.page.shots import shots_of
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Splats
