@@ -57,7 +57,7 @@ class Fitting:
         def read(splats: Splats) -> Splats:
             return as_read(row, splats)
 
-        if row.quantiser and isinstance(bits, dict):
+        if row.coarse and isinstance(bits, dict):
             exact, few = least_turned(exact), BitDepths(**bits)
             found = tuned_to(
                 lambda s: quantise_splats(s, few), exact, self.tuner, self.steps, self.seen
@@ -78,10 +78,10 @@ def tuned_to(
     changes. Raises Interrupted."""
     still: list[str] = []
     for name in ORDER:
-        quantiser = _only(name, rounded(splats), splats)
-        if _equal(name, quantiser, splats):
+        coarse = _only(name, rounded(splats), splats)
+        if _equal(name, coarse, splats):
             continue  # told as it is: it goes on learning
-        splats = quantiser
+        splats = coarse
         still.append(name)
         if name != ORDER[-1]:
             splats = tuner.finetune(splats, steps, seen, still)
@@ -101,13 +101,13 @@ def as_read(row: Format, splats: Splats) -> Splats:
     return replace(found, draw_settings=splats.draw_settings, origin=splats.origin)
 
 
-def _only(name: str, quantiser: Splats, splats: Splats) -> Splats:
+def _only(name: str, coarse: Splats, splats: Splats) -> Splats:
     """`splats` with one kind of value of `coarse`; degrees stay."""
     if not name.startswith("sh_"):
-        return replace(splats, **{name: getattr(quantiser, name)})
+        return replace(splats, **{name: getattr(coarse, name)})
     bands = _bands(name)
     sh = splats.sh.copy()
-    sh[:, bands] = quantiser.sh[:, bands]
+    sh[:, bands] = coarse.sh[:, bands]
     return replace(splats, sh=sh)
 
 

@@ -27,16 +27,16 @@ def site(
     photos: the folder that `View.image` starts from; a photograph that is not there is left out.
     source: what `splat edit` would read, if it is not the content. Raises SplatError."""
     shots, items = with_photographs(shots_of(views, splats), views, photos)
-    streams = format_of(content).streamed
+    streams = format_of(content).levels
     files = streamed_sog.parts_of(content) if streams else {"scene.ply": content}
     items |= {f"/{name}": Item(file, "application/octet-stream") for name, file in files.items()}
-    streamed = streamed_sog.widths(content, splats) if streams else []
+    levels = streamed_sog.widths(content, splats) if streams else []
     scene = document.scene_data(
         *(title, splats, shots),
         units=units,
         source=source or str(content),
         content=next(iter(files)),
-        streamed=streamed,
+        levels=levels,
     )
     page = document.head(scene) + document.tail()
     items["/"] = Item(page.encode("utf-8"), "text/html; charset=utf-8")
