@@ -86,9 +86,9 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
         splats = replace(splats.with_sh_degree(0), sh=sh)
     splats = kept_rows(splats)[0]
     bits = quantised.decisions.get("bits")
-    if not row.coarse or not isinstance(bits, dict):
+    if not row.quantiser or not isinstance(bits, dict):
         return splats
-    found: Splats = load_object(row.coarse)(splats, BitDepths(**bits))
+    found: Splats = load_object(row.quantiser)(splats, BitDepths(**bits))
     return found
 
 

@@ -19,7 +19,7 @@ class Format:
     end of "the format ..."; "" if everything comes back as float32. sh_degree: the highest kept.
     y_up: whether its axes are y up, turned 180 degrees about x from ours. sidecar: the suffix of a
     file beside it that belongs to it. wants_views: whether the writer takes cameras too.
-    rounds: whether it rounds so much that splats should learn to live with it.
+    needs_finetuning: whether it rounds so much that splats should learn to live with it.
     levels: of detail, which streams: the name is `ending` alone, its chunks lie in folders beside
     it, and a folder holds one such asset; `splat edit` writes it.
 
@@ -51,7 +51,7 @@ class Format:
     y_up: bool = False
     sidecar: str = ""
     wants_views: bool = False
-    rounds: bool = False
+    needs_finetuning: bool = False
     levels: bool = False
 
     @property
@@ -140,7 +140,7 @@ TABLE = (
         order="stages.formats.splat32:order",
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
-        rounds=True,
+        needs_finetuning=True,
     ),
     _GLB,
     replace(_GLB, ending="gltf", sidecar=".bin"),
@@ -166,7 +166,7 @@ TABLE = (
         anatomy="stages.proof.byte_breakdown:ply",
         order="stages.scene.morton:order",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
-        rounds=True,
+        needs_finetuning=True,
     ),
     Format(
         "spz",
@@ -177,7 +177,7 @@ TABLE = (
         second_reader="stages.proof.independent_packed:spz",
         anatomy="stages.proof.byte_breakdown:spz",
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
-        rounds=True,
+        needs_finetuning=True,
         y_up=True,
     ),
     Format(
@@ -191,7 +191,7 @@ TABLE = (
         order="stages.scene.morton:order",
         quantiser="stages.formats.quantisation:quantise_for_sog",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
-        rounds=True,
+        needs_finetuning=True,
     ),
     Format(
         "lod-meta.json",
