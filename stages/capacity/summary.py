@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.capacity.pruning import LOSS, RATE_DISTORTION, PruningResult
 from stages.capacity.targets import held_out_loss_ratio
 from stages.scene import TrainedSplats

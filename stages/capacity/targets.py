@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.scene import Splats
 
 WORST_VIEW_DB = 0.3  # that any one view may lose, at strength 1

@@ -20,7 +20,7 @@ class Format:
     y_up: whether its axes are y up, turned 180 degrees about x from ours. sidecar: the suffix of a
     file beside it that belongs to it. wants_views: whether the writer takes cameras too.
     needs_finetuning: whether it rounds so much that splats should learn to live with it.
-    levels: of detail, which streams: the name is `ending` alone, its chunks lie in folders beside
+    streamed: of detail, which streams: the name is `ending` alone, its chunks lie in folders beside
     it, and a folder holds one such asset; `splat edit` writes it.
 
     Of splats:
@@ -52,7 +52,7 @@ class Format:
     sidecar: str = ""
     wants_views: bool = False
     needs_finetuning: bool = False
-    levels: bool = False
+    streamed: bool = False
 
     @property
     def is_mesh(self) -> bool:
@@ -60,17 +60,17 @@ class Format:
 
     def matches(self, name: str) -> bool:
         """Whether a file of this name, in small letters, is of this format."""
-        return name == self.ending if self.levels else name.endswith("." + self.ending)
+        return name == self.ending if self.streamed else name.endswith("." + self.ending)
 
     def name(self, stem: str) -> str:
         """What a file of this format is called."""
-        return self.ending if self.levels else f"{stem}.{self.ending}"
+        return self.ending if self.streamed else f"{stem}.{self.ending}"
 
     def files(self, path: Path) -> list[Path]:
         """`path` and what lies beside it and belongs to it."""
         page = path.with_suffix(self.sidecar) if self.sidecar else path
         beside = [path, page] if page != path and page.is_file() else [path]
-        if self.levels:
+        if self.streamed:
             every = sorted(path.parent.glob("*_*/*"))
             return [*beside, *(file for file in every if CHUNK.match(file.parent.name))]
         return beside
@@ -82,11 +82,11 @@ class Format:
 @dataclass(frozen=True)
 class ByteBreakdown:
     """Where the bytes of a file are. parts: by attribute. unpacked: whether they are counted before
-    the compression that packs them all together. untold: why there are no parts."""
+    the compression that packs them all together. unknown: why there are no parts."""
 
     parts: dict[str, int]
     unpacked: bool = False
-    untold: str = ""
+    unknown: str = ""
 
 
 CHUNK = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
@@ -205,7 +205,7 @@ TABLE = (
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
         wants_views=True,
-        levels=True,
+        streamed=True,
     ),
     Format(
         "html",
@@ -228,7 +228,7 @@ TABLE = (
 )
 # By ending: all of them, the formats of one file of splats, and those of meshes.
 BY_ENDING = {row.ending: row for row in TABLE}
-FORMATS = {row.ending: row for row in TABLE if not row.is_mesh and not row.levels}
+FORMATS = {row.ending: row for row in TABLE if not row.is_mesh and not row.streamed}
 MESHES = {row.ending: row for row in TABLE if row.is_mesh}
 
 

@@ -26,28 +26,34 @@ class RateDistortion:
     resemble their neighbours'. sse: summed squared error now."""
 
     samples: int
-    independent: float
+    independent_samples: float
     sse: float
 
     def scaled(self, times: float) -> RateDistortion:
         """For as many times the photographs, which tell as much each."""
         return RateDistortion(
-            round(self.samples * times), self.independent * times, self.sse * times
+            round(self.samples * times), self.independent_samples * times, self.sse * times
         )
 
     @property
     def bits_per_parameter(self) -> float:
-        return 0.5 * math.log2(max(2.0, self.independent))
+        return 0.5 * math.log2(max(2.0, self.independent_samples))
 
     @property
     def bits_per_db(self) -> float:
         """What one dB of PSNR is worth."""
-        return self.independent * 0.05 * math.log2(10)
+        return self.independent_samples * 0.05 * math.log2(10)
 
     @property
     def sse_per_parameter(self) -> float:
         """The squared error that a number must save to pay: the slope of the code length."""
-        return self.bits_per_parameter * 2 * math.log(2) * self.sse / max(1.0, self.independent)
+        return (
+            self.bits_per_parameter
+            * 2
+            * math.log(2)
+            * self.sse
+            / max(1.0, self.independent_samples)
+        )
 
 
 def rate_distortion_of(

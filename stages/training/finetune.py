@@ -24,7 +24,7 @@ from stages.scene import IGNORE, Splats
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.step import step_of
+from stages.training.steps import step_of
 from stages.training.views import Level
 
 # Factors of the default learning rates: at the first step of a call, and at its last.

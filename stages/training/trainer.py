@@ -38,7 +38,8 @@ from stages.training.free_space import known_free_space
 from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
 from stages.training.schedule import Schedule
-from stages.training.step import TrainingStep, step_of
+from stages.training.step import TrainingStep
+from stages.training.steps import step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
 from stages.training.time_limit import TimeLimit
@@ -204,7 +205,7 @@ class Trainer:
     def _take_over(self, step: int) -> None:
         """Enter who makes the steps from here on, and say so where somebody else began."""
         chosen = backend_of(self.backend)
-        maker, before = Provenance(step, chosen.name, chosen.where()), self.makers[-1:]
+        maker, before = Provenance(step, chosen.name, chosen.describe()), self.makers[-1:]
         if any(replace(maker, step=one.step) == one for one in before):
             return
         self.makers.append(maker)

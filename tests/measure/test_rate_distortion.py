@@ -34,10 +34,10 @@ def test_a_blur_leaves_as_many_as_its_correlations_say(sigma: float) -> None:
 
 
 def test_the_price_is_the_slope_of_the_code_length() -> None:
-    price = RateDistortion(samples=1_000_000, independent=1e5, sse=1000.0)
+    price = RateDistortion(samples=1_000_000, independent_samples=1e5, sse=1000.0)
 
     def bits(sse: float) -> float:
-        return 0.5 * price.independent * math.log2(sse / price.samples)
+        return 0.5 * price.independent_samples * math.log2(sse / price.samples)
 
     saved = bits(price.sse) - bits(price.sse - 1e-3 * price.sse_per_parameter)
     assert saved == pytest.approx(1e-3 * price.bits_per_parameter, rel=1e-3)
