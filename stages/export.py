@@ -44,7 +44,7 @@ _NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 class ExportSettings:
     """Settings of the export."""
 
-    formats: tuple[str, ...] = formats_setting(DEFAULT_FORMATS)
+    formats: tuple[str, ...] = formats_setting(DEFAULT_FORMATS, panel="Output")
     name: str = field(
         default="scene",
         metadata={

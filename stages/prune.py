@@ -41,6 +41,7 @@ class PruneSettings:
     strength: float = field(
         default=1.0,
         metadata={
+            "panel": "Size",
             "help": "Pruning strength: larger removes more, and allows more loss.",
             "min": 0.001,
             "max": 1000,
@@ -66,6 +67,7 @@ class PruneSettings:
     max_mb: float = field(
         default=0.0,
         metadata={
+            "panel": "Size",
             "help": "Size at most, whatever the loss, of the file that --mb-of names; 0 for any "
             "(megabytes).",
             "min": 0,
@@ -74,11 +76,16 @@ class PruneSettings:
     )
     mb_of: str = field(
         default="ply",
-        metadata={"help": "Format that --max-mb is about", "choices": tuple(FORMATS)},
+        metadata={
+            "panel": "Size",
+            "help": "Format that --max-mb is about",
+            "choices": tuple(FORMATS),
+        },
     )
     min_psnr: float = field(
         default=0.0,
         metadata={
+            "panel": "Size",
             "help": "Remove as much as leaves the training views this PSNR, instead of by "
             "--strength; 0 for none (dB).",
             "min": 0,
@@ -88,6 +95,7 @@ class PruneSettings:
     finetune_steps: int = field(
         default=90,
         metadata={
+            "panel": "Advanced",
             "help": "Steps of fine-tuning after each round; 0 for none.",
             "min": 0,
             "max": 100_000,
