@@ -48,7 +48,6 @@ class Material:
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
     quantised: QuantisedSplats | None = None
-    fitted: Mapping[str, Splats] = field(default_factory=dict)
 
 
 def measure_trade(material: Material, tell: Tell) -> Trade:
@@ -101,7 +100,6 @@ def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, .
             tell(f"writing and judging .{name}")
             path = Path(folder) / f"scene.{name}"
             held = splats_to_write(row, material.quantised) if material.quantised else splats
-            held = material.fitted.get(name, held)
             formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)
             read = replace(formats.read(path), draw_settings=splats.draw_settings)
