@@ -117,7 +117,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     from stages.capacity.summary import advise_more_splats, summarise
     from stages.capacity.targets import Targets, held_out_loss_ratio
     from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
-    from stages.scene import seen_extent, split_held_out
+    from stages.scene import split_held_out, training_extent
     from stages.scene.storage import save_splats
     from stages.training.finetune import FineTuner
 
@@ -130,7 +130,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     )
     evaluated = held_out or training
     before_db = mean_psnr_db(splats, evaluated, backend)
-    extent = seen_extent(reconstruction)
+    extent = training_extent(reconstruction)
     finetuner = FineTuner(training, extent, backend, report, trained.dropout)
     targets = Targets(
         strength=settings.strength,
@@ -169,12 +169,12 @@ def _size_measure(
     `quantise` chooses for all splats: they hardly depend on how many are left."""
     from stages.capacity.bits import choose_bits, file_size_bytes
     from stages.measure.evaluation import mean_psnr_db
-    from stages.scene import spread_over
+    from stages.scene import evenly_spaced
 
     row = FORMATS[settings.mb_of]
     depths: dict[str, int] = {}
     if settings.max_mb and row.quantiser:
-        views, backend = spread_over(training, DECIDING_VIEWS), backend_of_settings(settings)
+        views, backend = evenly_spaced(training, DECIDING_VIEWS), backend_of_settings(settings)
         depths, _ = choose_bits(splats, lambda s: mean_psnr_db(s, views, backend), SOG_LOSS_DB)
     return lambda s: file_size_bytes(row, s, depths, reconstruction.units, reconstruction.views)
 

@@ -199,7 +199,7 @@ def _finetune_to_formats(
     from stages.formats.rows import kept_rows
     from stages.measure.contribution import measure_contributions
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import seen_extent, split_held_out
+    from stages.scene import split_held_out, training_extent
     from stages.training.finetune import FineTuner
 
     splats, reconstruction = kept_rows(quantised.splats)[0], inputs["sfm"]
@@ -211,7 +211,7 @@ def _finetune_to_formats(
     view_counts = np.zeros(len(splats), np.int32)
     if dropout:  # which alone depends on them
         view_counts = measure_contributions(splats, views, backend).view_counts
-    finetuner = FineTuner(views, seen_extent(reconstruction), backend, report, dropout)
+    finetuner = FineTuner(views, training_extent(reconstruction), backend, report, dropout)
     rounding = RoundingFinetuner(
         finetuner, deciding_views, backend, settings.rounding_steps, view_counts
     )
@@ -238,7 +238,7 @@ def _measures(
 ) -> tuple[_Measure, _Measure]:
     """(what decides: training views; what evaluates: held-out views if there are any)."""
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import split_held_out, spread_over
+    from stages.scene import evenly_spaced, split_held_out
 
     training, held_out = split_held_out(reconstruction.views)
     if not training:
@@ -249,7 +249,7 @@ def _measures(
             hint="Run `splat sfm` again.",
             family=Family.RUN_FOLDER,
         )
-    deciding = tuple(spread_over(training, settings.max_views))
+    deciding = tuple(evenly_spaced(training, settings.max_views))
     evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
     folder, backend = reconstruction.folder, backend_of_settings(settings)
     return (

@@ -66,9 +66,9 @@ def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
 
 def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     """What the proof found. Raises SplatError "convert-verify-failed"."""
-    from splatcli.sources import views_around
     from stages.formats import format_of
     from stages.proof.prover import Prover, cameras_for
+    from stages.run.results import views_around
 
     cameras = cameras_for(splats, views_around(source))
     proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)
@@ -106,7 +106,7 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    from stages.base.blocks import watched
+    from stages.base.blocks import progress_reported_to
 
     columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
     with Progress(*columns, console=console.err, transient=True) as bar:
@@ -120,5 +120,5 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
         def pass_over(rows: int, total: int) -> None:
             bar.update(task, completed=rows, total=total)
 
-        with watched(pass_over):
+        with progress_reported_to(pass_over):
             yield show

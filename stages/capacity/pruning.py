@@ -19,7 +19,7 @@ from stages.capacity.targets import Targets
 from stages.measure.contribution import Contributions, measure_contributions, squared_error
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
-from stages.scene import Splats, spread_over
+from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 
 HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
@@ -122,7 +122,7 @@ class Pruner:
 
     def __post_init__(self) -> None:
         every = range(len(self.views))
-        self._measured = spread_over(every, MAX_VIEWS)
+        self._measured = evenly_spaced(every, MAX_VIEWS)
         self._others = sorted(set(every) - set(self._measured))
         # in the order of `Contributions.scene_depth`
         self._cameras = [self.finetuner.cameras[i] for i in (*self._others, *self._measured)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.floaters import near_camera_floaters
-from stages.scene import SH_C0, Camera, Splats, morton, numbers_of
+from stages.scene import SH_C0, Camera, Splats, morton, parameters_per_splat
 
 # Predictions for single splats add up only while few are removed at once, and of so many
 # neighbours only one: neighbours can replace each other.
@@ -81,7 +81,7 @@ def select_removal(
     floaters = near_camera_floaters(splats, contributions, list(cameras))
     free = floaters | (~seen & ~near)
     change = contributions.sse_change if by_error else contributions.picture_change
-    ratio = change / numbers_of(splats.sh_degrees)
+    ratio = change / parameters_per_splat(splats.sh_degrees)
     ratio[~seen & near] = np.finfo(np.float64).max
     ratio[free] = -np.inf
     order = np.argsort(ratio, kind="stable")
@@ -101,7 +101,7 @@ def select_removal(
 def _least_of_neighbours(splats: Splats, ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
     """[N] the splat with the smallest ratio in each group of neighbours."""
     group = np.empty(len(splats), np.int64)
-    group[morton.order(splats)] = np.arange(len(splats)) // NEIGHBOURS
+    group[morton.morton_order(splats)] = np.arange(len(splats)) // NEIGHBOURS
     order = np.lexsort((ratio, group))
     least = np.zeros(len(splats), bool)
     least[order[np.flatnonzero(np.diff(group[order], prepend=-1))]] = True
@@ -123,7 +123,7 @@ def _select_sh(
     if by_error:
         change = contributions.truncated_sse_change
     for degree in range(splats.sh_degree):
-        saved = numbers_of(degrees) - numbers_of(np.full(1, degree))
+        saved = parameters_per_splat(degrees) - parameters_per_splat(np.full(1, degree))
         ratio = np.where(saved > 0, change[:, degree] / np.maximum(saved, 1), np.inf)
         better = (ratio < best) & ~removed
         best[better], to[better] = ratio[better], degree

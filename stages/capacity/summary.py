@@ -22,7 +22,7 @@ def summarise(
     cost, after, start = found.rate_distortion, found.splats, before.splats
     lines = [
         f"Rate-distortion: the training views hold {cost.samples:,} colour values, equivalent to "
-        f"{cost.independent:,.0f} independent ones. So a parameter costs "
+        f"{cost.independent_samples:,.0f} independent ones. So a parameter costs "
         f"{cost.bits_per_parameter:.1f} bits, and one dB is worth {cost.bits_per_db / 8e3:,.0f} kB "
         f"(pruning strength {strength:g})."
     ]
