@@ -51,9 +51,7 @@ class RoundingFinetuner:
     steps: int
     view_counts: NDArray[np.int32]
 
-    def finetune(
-        self, row: Format, quantised: QuantisedSplats
-    ) -> tuple[Splats, dict[str, float]]:
+    def finetune(self, row: Format, quantised: QuantisedSplats) -> tuple[Splats, dict[str, float]]:
         """(the splats that a file of the format should hold; mean PSNR of the deciding views drawn
         from that file, without and with fine-tuning). Raises Interrupted."""
         self.finetuner.steps = 0  # so that a file does not depend on those before it
@@ -71,9 +69,7 @@ class RoundingFinetuner:
             def rounded(splats: Splats) -> Splats:
                 return quantise_splats(splats, depths)
 
-        found = finetune_to_rounding(
-            rounded, found, self.finetuner, self.steps, self.view_counts
-        )
+        found = finetune_to_rounding(rounded, found, self.finetuner, self.steps, self.view_counts)
         plain_db, finetuned_db = (
             mean_psnr_db(written(splats), self.deciding_views, self.backend)
             for splats in (plain, found)

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from splatcli import console
-from stages.viewer import live_training
 from stages.scene import Camera
+from stages.viewer import live_training
 from tests.small_scene import small_scene
 
 TRAIN, PRUNE = (SimpleNamespace(name=name) for name in ("train", "prune"))
