@@ -27,8 +27,7 @@ _ONLY_ITSELF = (
 @dataclass(frozen=True)
 class _Original:
     """What files are compared with. name: in words. came_as: the format that it was read from.
-    itself: whether that was the file in question. backend: what draws. quantised: of a run;
-    exported: its export's folder."""
+    itself: whether that was the file in question. backend: what draws. quantised: of a run."""
 
     splats: Splats
     views: tuple[View, ...]

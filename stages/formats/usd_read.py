@@ -129,7 +129,7 @@ def _splats(prim: Any) -> Splats:
 
 
 def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
-    """[N, width] float32, not to be changed: the attribute, or its duplicate_of in half precision where
+    """[N, width] float32, not to be changed: the attribute, or its twin in half precision where
     only that is set."""
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
         value = attribute.Get() if attribute else None

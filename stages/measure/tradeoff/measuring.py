@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,15 @@ import numpy as np
 from stages import formats
 from stages.formats.quantisation import splats_to_write
 from stages.formats.rows import kept_rows
-from stages.measure.contribution import Contributions, floaters, measure_contributions
-from stages.measure.evaluation import EvaluationView, Score, evaluate, image_renderer
-from stages.measure.speed import seconds_per_frame
+from stages.measure.contribution import Contributions, measure_contributions
+from stages.measure.evaluation import (
+    EvaluationView,
+    Score,
+    evaluate,
+    image_renderer,
+    seconds_per_frame,
+)
+from stages.measure.floaters import near_camera_floaters
 from stages.measure.tradeoff.points import Moment, Point, Trade, change_db, mean_db
 from stages.measure.tradeoff.thin import Thin, measure_thin
 from stages.scene import DrawSettings, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
@@ -35,8 +41,7 @@ Tell = Callable[[str], None]
 class Material:
     """What is measured. splats: the run's last, in the frame of its cameras. training, held_out:
     photographs that decide, and that judge. levelled: whether up is -Y. history: as training logged
-    it. exported: formats. quantised: what was decided on for files; None where nothing was. fitted:
-    by format, what its file holds where export fine-tuned it."""
+    it. exported: formats. quantised: what was decided on for files; None where nothing was."""
 
     splats: Splats
     training: Sequence[EvaluationView]
@@ -127,7 +132,7 @@ def _thin(material: Material, worth: Contributions, tell: Tell) -> Thin:
         split_held_out(material.views)[0],
         material.levelled,
         material.held_out,
-        floaters(material.splats, worth, cameras),
+        near_camera_floaters(material.splats, worth, cameras),
         material.backend,
     )
 
