@@ -13,6 +13,7 @@ from stages.capacity import pruning
 from stages.capacity.targets import LOSS_RATIO
 from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
+from stages.measure.floaters import near_camera_floaters
 from stages.scene import Splats, TrainedSplats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
