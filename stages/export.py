@@ -79,14 +79,14 @@ def run(
     """
     from stages import formats
     from stages.formats.quantisation import splats_to_write
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
     quantised: QuantisedSplats = inputs["quantise"]
     reconstruction: Reconstruction = inputs["sfm"]
     _clear(folder)
-    splats, dropped = kept_rows(quantised.splats)
+    splats, dropped = drop_undrawable(quantised.splats)
     _warn_of_missing(len(splats), dropped, report)
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)

@@ -196,13 +196,13 @@ def _finetune_to_formats(
 
     from stages.capacity.rounding import RoundingFinetuner
     from stages.formats import FORMATS
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.measure.contribution import measure_contributions
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out, training_extent
     from stages.training.finetune import FineTuner
 
-    splats, reconstruction = kept_rows(quantised.splats)[0], inputs["sfm"]
+    splats, reconstruction = drop_undrawable(quantised.splats)[0], inputs["sfm"]
     if not (settings.rounding_steps and settings.formats and len(splats)):
         return {}
     backend, dropout = backend_of_settings(settings), inputs["train"].dropout

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from stages import formats
 from stages.base.lazy import load_object
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, palette_bits, quantise_attribute, quantise_splats
-from stages.formats.rows import kept_rows
 from stages.formats.table import Format
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
 # Of each attribute of a .sog: (values per splat, smallest bit depth).
@@ -42,7 +42,7 @@ def choose_bits(
         psnr_db: measures the mean PSNR of splats on training views.
         loss_db: what all removed bits together may cost.
     """
-    exact = least_turned(kept_rows(splats)[0])
+    exact = smallest_rotations(drop_undrawable(splats)[0])
     depths = asdict(BitDepths(palette=palette_bits(len(exact))))
     if not len(exact):
         return depths, 0.0

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.lazy import load_object
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
 from stages.measure.evaluation import EvaluationView, mean_psnr_db
@@ -64,7 +64,7 @@ class RoundingFinetuner:
 
         rounded = written
         if row.quantiser and isinstance(bits, dict):
-            depths, found = BitDepths(**bits), least_turned(found)
+            depths, found = BitDepths(**bits), smallest_rotations(found)
 
             def rounded(splats: Splats) -> Splats:
                 return quantise_splats(splats, depths)

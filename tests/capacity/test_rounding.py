@@ -13,7 +13,7 @@ from stages.base.stage import Report
 from stages.capacity.rounding import RoundingFinetuner, finetune_to_rounding, write_and_read
 from stages.export import ExportSettings
 from stages.formats import FORMATS
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_splats
 from stages.formats.settings import rounding_formats
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
@@ -44,7 +44,7 @@ def no_counts(scene: SmallScene) -> np.ndarray:
 
 
 def test_other_attributes_compensate_for_those_that_are_rounded(scene: SmallScene) -> None:
-    exact = least_turned(scene.splats)
+    exact = smallest_rotations(scene.splats)
     found = finetune_to_rounding(
         lambda s: quantise_splats(s, FEW), exact, finetuner(scene), 30, no_counts(scene)
     )
