@@ -1,8 +1,8 @@
 """What settings may be: stated once, in each field's metadata, and checked from there.
 
 "help": with the unit. "min", "max": of numbers, both allowed. "choices": the words allowed; of a
-list's items, of which there must then be one at least, unless "may_be_empty" is True. "pattern": of
-a text, a regular expression for all of it, with "wanted", the sentence that says what it asks for.
+list's items, of which there must then be one at least unless "may_be_empty". "pattern": of a text,
+a regular expression for all of it, with "wanted", the sentence that says what it asks for.
 "option": the option's name where it is not the field's. "together": of a list, the words that one
 use of the option takes, as its help shows them. "needs": another field, without which a value but
 the default means nothing. "affects_output": False where another value gives the same bytes.

@@ -13,7 +13,7 @@ A new format, in five steps:
    What each takes and gives is said at `table.Format`.
 4. A row in `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the fuzzer
    and the tests of every format know it from then on.
-5. README's table: `pytest tests/formats/test_table.py` prints the line that is missing.
+5. `python -m tests.docs_tables` writes the tables of the documentation.
 """
 
 from __future__ import annotations

@@ -79,8 +79,7 @@ def palette_bits(count: int) -> int:
 
 def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
     """What a file of this format should hold: drawable splats, their mean colours where colours do
-    not change with the view, in as many bits as were decided on; fine-tuned to its rounding where
-    that was done."""
+    not change with the view, in as many bits as were decided on."""
     if row.ending in quantised.finetuned:
         return quantised.finetuned[row.ending]
     splats = quantised.splats

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.evaluation import EvaluationView
-from stages.measure.image_metrics import capped_psnr_db
+from stages.measure.evaluation import EvaluationView, capped_psnr_db
 from stages.scene import Camera
 
 STEP_PX = 0.5
@@ -99,7 +98,7 @@ def small_psnr_db(draw: Draw, photographs: Iterable[EvaluationView]) -> tuple[fl
     """Mean PSNR of pictures a quarter as large a side: (drawn so, drawn whole and scaled down)."""
     found = []
     for photograph in photographs:
-        camera, kept = photograph.camera, photograph.valid
+        camera, kept = photograph.camera, photograph.kept
         truth = blocks(photograph.image)
         counts = None if kept is None else blocks(kept[..., None]) == 1
         fx, fy, cx, cy = (x / FEWER for x in (camera.fx, camera.fy, camera.cx, camera.cy))

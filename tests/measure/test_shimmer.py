@@ -93,12 +93,12 @@ def test_fine_splats_thicken_in_small_pictures_and_not_in_pictures_scaled_down()
 def test_what_is_not_judged_does_not_judge_small_pictures_either() -> None:
     draw = drawing(sheet(8, 6))
     pixels = (np.clip(draw(CAMERA), 0, 1) * 255 + 0.5).astype(np.uint8)
-    saturated = np.zeros((48, 64), bool)
-    saturated[:9] = True
+    cut_off = np.zeros((48, 64), bool)
+    cut_off[:9] = True
     pixels[:9] = 255
     whole, kept = (
-        small_psnr_db(draw, [EvaluationView("a", CAMERA, pixels, saturated=c)])
-        for c in (None, saturated)
+        small_psnr_db(draw, [EvaluationView("a", CAMERA, pixels, cut_off=c)])
+        for c in (None, cut_off)
     )
     assert whole[1] < 20
     assert kept[1] > 45

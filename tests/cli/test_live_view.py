@@ -1,0 +1,96 @@
+"""`--view` between the pipeline and the page."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatcli import console, live_view
+from stages.scene import Camera
+from tests.small_scene import small_scene
+
+TRAIN, PRUNE = (SimpleNamespace(name=name) for name in ("train", "prune"))
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    lines: list[str] = []
+    monkeypatch.setattr(console, "note", lambda text, style="": lines.append(text))
+    monkeypatch.setattr(live_view, "open_page", lambda address: False)
+    return lines
+
+
+@pytest.fixture
+def watcher(tmp_path: Path, said: list[str]) -> live_view.LiveTraining:
+    scene = small_scene(tmp_path, views=3)
+    outputs = {"sfm": scene.reconstruction, "seed": scene.splats}
+    pipeline: Any = SimpleNamespace(load=outputs.__getitem__, run_folder=tmp_path / "run")
+    return live_view.LiveTraining(pipeline, as_json=False)
+
+
+def get(address: str) -> Any:
+    return json.loads(urllib.request.urlopen(address, timeout=20).read())
+
+
+def draw(camera: Camera) -> np.ndarray:
+    return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
+def test_training_is_served_from_its_start_to_the_end_of_the_run(watcher, said) -> None:
+    watcher.started(PRUNE, 5, "has not run yet", False)
+    assert said == []
+    watcher.started(TRAIN, 4, "has not run yet", False)
+    (address,) = re.findall(r"http://127\.0\.0\.1:\d+/", said[0])
+    assert b"<title>run</title>" in urllib.request.urlopen(address, timeout=20).read()
+    watcher.progressed(TRAIN, "training", 1, 2, {"splats": 250})
+    watcher.progressed(PRUNE, "pruning", 1, 9, {})
+    assert get(address + "state")["total"] == 2
+    answers: list[Any] = []
+    place = "1,0,0,0,0,1,0,0,0,0,1,4"
+    asking = threading.Thread(
+        target=lambda: answers.append(get(f"{address}picture?shot=0&side=64&place={place}"))
+    )
+    asking.start()
+    while asking.is_alive():
+        watcher.drawable(TRAIN, draw)
+        time.sleep(0.001)
+    assert answers[0]["step"] == 1
+    watcher.progressed(TRAIN, "training", 2, 2, {"splats": 250})
+    watcher.drawable(TRAIN, draw)
+    watcher.finished(TRAIN, 4, SimpleNamespace())
+    watcher.finished(PRUNE, 5, SimpleNamespace())
+    assert get(address + "state")["end"] == "finished"
+    assert get(f"{address}picture?shot=0&side=64&place={place}")["step"] == 2
+    watcher.ended()
+    with pytest.raises(urllib.error.URLError):
+        get(address + "state")
+
+
+def test_a_run_that_ends_early_says_so_and_waits_for_nobody_who_does_not_look(
+    watcher, said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "sleep", lambda s: pytest.fail("waited"))
+    watcher.started(TRAIN, 4, "has not run yet", False)
+    watcher.progressed(TRAIN, "training", 1, 2, {})
+    watcher.drawable(TRAIN, lambda camera: pytest.fail("drawn"))
+    ends: list[str] = []
+    monkeypatch.setattr(watcher._page, "ended", ends.append)
+    watcher.ended()
+    assert ends == ["stopped"]
+
+
+def test_a_run_that_never_trains_serves_nothing(watcher, said) -> None:
+    watcher.drawable(TRAIN, draw)
+    watcher.progressed(TRAIN, "training", 1, 2, {})
+    watcher.ended()
+    assert said == []
