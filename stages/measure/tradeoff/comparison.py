@@ -30,7 +30,7 @@ class Candidate:
     splats: Splats
     reconstruction: Reconstruction
     backend: str
-    facts: dict[str, str]
+    fact_rows: dict[str, str]
 
     @property
     def held_out(self) -> dict[str, View]:

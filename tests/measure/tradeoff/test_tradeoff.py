@@ -14,14 +14,18 @@ from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.measure.evaluation import load_evaluation_views
 from stages.measure.tradeoff import summary
-from stages.measure.tradeoff.comparison import Candidate, compare_runs, verdict_lines
+from stages.measure.tradeoff.comparison import (
+    Candidate,
+    compare_runs,
+    verdict_lines,
+    write_comparison,
+)
 from stages.measure.tradeoff.measurement import (
     SHARES,
     TradeoffInputs,
     deciding_views,
     measure_tradeoff,
 )
-from stages.measure.tradeoff.pair_report import write_comparison
 from stages.measure.tradeoff.report import write_report
 from stages.scene import Camera, DrawSettings, QuantisedSplats, View, evenly_spaced, split_held_out
 from tests.small_scene import small_scene
