@@ -140,7 +140,7 @@ def _choose_sh_degrees(
     of all; the threshold at which single splats have lost degrees, of 255)."""
     import numpy as np
 
-    from stages.measure.sh import cut, degrees_at
+    from stages.measure.sh import sufficient_degrees, truncate_sh
 
     raw_db = decider.psnr(splats)
     by_degree, kept = {splats.sh_degree: raw_db}, splats
@@ -151,10 +151,10 @@ def _choose_sh_degrees(
             kept = candidate
             break
     for threshold in _THRESHOLDS_OF_255 if kept.sh_degree else ():
-        degrees = degrees_at(kept, threshold / 255)
+        degrees = sufficient_degrees(kept, threshold / 255)
         if np.array_equal(degrees, kept.sh_degrees):
             continue
-        candidate = cut(kept, degrees)
+        candidate = truncate_sh(kept, degrees)
         if raw_db - decider.psnr(candidate) < settings.max_loss_db:
             return candidate, by_degree, threshold
     return kept, by_degree, 0.0
@@ -164,14 +164,14 @@ def _flat_colours(
     splats: Splats, reconstruction: Reconstruction, settings: QuantiseSettings
 ) -> NDArray[np.floating] | None:
     """[N, 3] DC coefficients for formats without view dependence; None where `splats` have none."""
-    from stages.measure.flat import flat_dc
     from stages.scene import split_held_out
 
     if not splats.sh_degree:
         return None
     views = split_held_out(reconstruction.views)[0]
     cameras = (splats.draw_settings.camera(view.camera) for view in views)
-    return flat_dc(splats, cameras, backend_of_settings(settings))
+    found: NDArray[np.floating] = view_averaged_dc(splats, cameras, backend_of_settings(settings))
+    return found
 
 
 def _as_splat32(splats: Splats, flat: NDArray[np.floating] | None) -> Splats:

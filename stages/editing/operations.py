@@ -21,7 +21,6 @@ from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
 from stages.formats.values import drop_undrawable, select_rows
 from stages.measure import floaters
-from stages.measure.contribution import floaters as hanging
 from stages.scene import Splats
 
 Operation = Callable[[EditedScene], EditedScene]
@@ -119,7 +118,7 @@ def _placing(where: Similarity) -> Operation:
 
 def _without_floaters(scene: EditedScene) -> EditedScene:
     if len(scene.photographs):
-        gone = hanging(scene.splats, scene.worth(), scene.cameras())
+        gone = floaters.near_camera_floaters(scene.splats, scene.worth(), scene.cameras())
     else:
         gone = floaters.isolated_splats(scene.splats)
     return scene.with_splats(select_rows(scene.splats, ~gone))

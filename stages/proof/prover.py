@@ -19,7 +19,7 @@ from stages.base.blocks import blocks
 from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, format_of
 from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
-from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
+from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import diagnosis, independent_readers
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
