@@ -104,7 +104,7 @@ def run(
     capture.json (`load` reads it). Raises SplatError for a folder without at least 3 usable
     photographs and for masks that do not fit them, and Interrupted.
     """
-    from stages.photos import advice, capture_file, cut_out, find, masks
+    from stages.photos import advice, capture_file, find, masking, masks
     from stages.photos.quality import near_duplicates
     from stages.scene import Capture
 
@@ -131,7 +131,7 @@ def run(
         report.warn,
     )
     inside = [t.inside for t in taken if t.photo is not None]
-    cut_out.check_shares(photos, inside, bool(found.masks))
+    masking.check_shares(photos, inside, bool(found.masks))
     advice.about_masks(
         photos,
         [n for n, t in zip(names, taken, strict=True) if t.alpha],
@@ -230,7 +230,7 @@ def _kept(
 ) -> _Taken:
     """Write a normalised picture and its mask, and measure it. film: the video that it comes
     from."""
-    from stages.photos.cut_out import Masked
+    from stages.photos.masking import Masked
     from stages.photos.quality import measure
     from stages.photos.write import write_mask, write_picture
     from stages.scene import Photo

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from stages.photos.cut_out import AUTO, Masked
 from stages.photos.decode import Decoded
 from stages.photos.exif import Exif
+from stages.photos.masking import AUTO, Masked
 from tests.fuzz.layer import Layer
 
 WIDTH, HEIGHT = 48, 32
