@@ -98,7 +98,7 @@ def run(
     file from being written.
     """
     from stages import formats
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
@@ -108,7 +108,7 @@ def run(
     if not quantised.splats.origin.any():
         moved = replace(quantised.splats, origin=reconstruction.origin)
         quantised = replace(quantised, splats=moved)
-    splats, dropped = kept_rows(quantised.splats)
+    splats, dropped = drop_undrawable(quantised.splats)
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
@@ -191,7 +191,7 @@ def _fitting(
     tuner = FineTuner(photographs, training_extent(reconstruction), backend, report, dropout)
     seen = np.zeros(len(splats), np.int32)
     if dropout:  # only then it matters
-        seen = measure_contributions(splats, photographs, backend).photographs
+        seen = measure_contributions(splats, photographs, backend).view_counts
     deciding = load_evaluation_views(
         folder, evenly_spaced(training, DECIDING), splats.draw_settings
     )

@@ -104,6 +104,7 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
     around the splats where there are none."""
     from stages.measure.speed import seconds_per_frame
+
     from stages.scene.framing import orbit_cameras
 
     if not cache.are_compiled():

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.editing.decimate import FAR, decimated
+from stages.editing.decimate import FAR_ROUND_SHARE, decimate
 from stages.formats import html, streamed_sog
-from stages.formats.rows import kept_rows
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
 # On a surface a quarter of the splats are twice as large, and look as large twice as far away.
@@ -18,7 +18,7 @@ def levels_of(splats: Splats) -> list[Splats]:
     """The finest first. Every splat must be drawable."""
     found = [splats]
     while len(found[-1]) > _FEWEST:
-        found.append(decimated(found[-1], len(found[-1]) // A_LEVEL, FAR))
+        found.append(decimate(found[-1], len(found[-1]) // A_LEVEL, FAR_ROUND_SHARE))
     return found
 
 
@@ -30,7 +30,7 @@ def write(
 
     views: cameras to look from. Raises SplatError when it cannot be written.
     """
-    kept, dropped = kept_rows(splats)
+    kept, dropped = drop_undrawable(splats)
     streamed_sog.write_levels(Path(path), levels_of(kept), units)
     html.write_beside(Path(path), kept, units, views)
     return dropped

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from stages.base.blocks import blocks
 from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, format_of
-from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
-from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
+from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
+from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import diagnosis, independent_readers
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
@@ -176,7 +176,7 @@ def _drawable(content: FileContent) -> FileContent:
                 splats.opacity_logits,
             ),
         )
-    return replace(content, splats=kept_rows(splats)[0])
+    return replace(content, splats=drop_undrawable(splats)[0])
 
 
 def _words(error: Exception) -> str:
