@@ -164,6 +164,7 @@ def _flat_colours(
     splats: Splats, reconstruction: Reconstruction, settings: QuantiseSettings
 ) -> NDArray[np.floating] | None:
     """[N, 3] DC coefficients for formats without view dependence; None where `splats` have none."""
+    from stages.measure.sh import view_averaged_dc
     from stages.scene import split_held_out
 
     if not splats.sh_degree:
