@@ -199,11 +199,11 @@ def _frames_of(
     source: Source, settings: IngestSettings, folder: Path, report: Report
 ) -> list[_Taken]:
     """The chosen frames of a video, kept as photographs of one camera."""
-    from stages.photos import from_video
+    from stages.photos import video_frames
     from stages.photos.decode import Unusable
 
     try:
-        chosen = from_video.photographs(source, settings.frames, settings.max_side, report)
+        chosen = video_frames.photographs(source, settings.frames, settings.max_side, report)
         return [
             _kept(
                 f"{source.name}/{number}",
@@ -230,12 +230,12 @@ def _kept(
 ) -> _Taken:
     """Write a normalised picture and its mask, and measure it. film: the video that it comes
     from."""
-    from stages.photos.masking import Masked
+    from stages.photos.masking import MaskedPhoto
     from stages.photos.quality import measure
     from stages.photos.write import write_mask, write_picture
     from stages.scene import Photo
 
-    masked = Masked.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
+    masked = MaskedPhoto.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
     decoded = masked.decoded
     target = folder / image
     target.parent.mkdir(parents=True, exist_ok=True)
