@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console
+from splatcli import console, sources
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
-from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -54,12 +53,11 @@ def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> 
 def material_of(pipeline: Pipeline) -> TradeoffInputs:
     """What is measured of a finished run. Raises SplatError (stage-not-finished, run-half-anew,
     nothing-held-out)."""
-    from stages.export import fitted_in
     from stages.measure.evaluation import load_evaluation_views
     from stages.measure.tradeoff.measurement import TradeoffInputs, deciding_views
     from stages.scene import split_held_out
 
-    splats = results.finished_splats(pipeline)
+    splats = sources.finished_splats(pipeline)
     reconstruction = pipeline.load("sfm")
     training, held = split_held_out(reconstruction.views)
     if not held:
@@ -71,8 +69,7 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
             family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
-    exported = tuple(results.exported_formats(pipeline))
-    fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
+    exported = tuple(sources.exported_formats(pipeline))
     return TradeoffInputs(
         splats=splats,
         training=load_evaluation_views(
@@ -83,10 +80,9 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
         held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
         views=reconstruction.views,
         units=reconstruction.units,
-        backend=results.backend_of(pipeline),
+        backend=sources.backend_of(pipeline),
         levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,
         quantised=pipeline.load("quantise"),
-        finetuned={name: splats for name, splats in fitted.items() if splats is not None},
     )

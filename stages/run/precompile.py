@@ -14,7 +14,7 @@ from stages.run.pipeline import Listener
 
 _BEFORE = ("ingest", "sfm", "seed")  # stages that draw nothing
 _PATIENCE_S = 300.0
-_LAST = "gather_contributions"  # of the kernels, see `training.compile_kernels`
+_LAST = "gather_contributions"  # of the kernels, see `training.warm`
 
 
 class PrecompileListener(Listener):

@@ -33,7 +33,7 @@ class Candidate:
     splats: Splats
     reconstruction: Reconstruction
     backend: str
-    fact_rows: dict[str, str]
+    facts: dict[str, str]
 
     @property
     def held_out(self) -> dict[str, View]:
