@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand
 
 from splatcli.options import keyword
-from stages.editing.words import WORDS, Typed, from_file
+from stages.editing.syntax import OPERATIONS, ParsedOperation, parse_file
 
 _OPS = "ops"
 _TYPED = "splat.typed"  # where a context keeps the words of its command
@@ -39,30 +39,30 @@ def chain_parameters() -> list[Parameter]:
             ),
             None if word.takes else False,
         )
-        for word in WORDS.values()
+        for word in OPERATIONS.values()
     ]
     told = "Text file of operations, one a line: done where it stands."
     option = typer.Option(f"--{_OPS}", help=told, show_default=False, metavar="FILE")
     return [*found, keyword(_OPS, list[str] | None, option)]
 
 
-def typed_in(ctx: typer.Context) -> list[Typed]:
+def typed_in(ctx: typer.Context) -> list[ParsedOperation]:
     """The operations in the order in which they were typed, those of files in their place. The
     parser has let the words pass. Raises SplatError "edit-ops"."""
     return list(_operations(iter(ctx.meta[_TYPED])))
 
 
-def _operations(words: Iterator[str]) -> Iterator[Typed]:
+def _operations(words: Iterator[str]) -> Iterator[ParsedOperation]:
     for word in words:
         if word == "--":
             return
         flag, given, value = word.partition("=")
         name = flag.removeprefix("--") if flag.startswith("--") else ""
-        if name != _OPS and name not in WORDS:
+        if name != _OPS and name not in OPERATIONS:
             continue
         if name == _OPS:
-            yield from from_file(Path(value if given else next(words)))
-        elif WORDS[name].takes:
-            yield Typed(name, value if given else next(words))
+            yield from parse_file(Path(value if given else next(words)))
+        elif OPERATIONS[name].takes:
+            yield ParsedOperation(name, value if given else next(words))
         else:
-            yield Typed(name)
+            yield ParsedOperation(name)

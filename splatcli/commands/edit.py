@@ -13,13 +13,13 @@ from stages.base.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.editing.operations import Done
     from stages.editing.scene import Edited
-    from stages.editing.words import Typed
+    from stages.editing.syntax import ParsedOperation
 
 
 def edit(
     source: Path,
     target: Path | None,
-    typed: Sequence[Typed],
+    typed: Sequence[ParsedOperation],
     dry_run: bool,
     quiet: bool,
     as_json: bool,

@@ -14,7 +14,7 @@ from stages.raster.kernels import cache
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.proof.census import Census
+    from stages.proof.statistics import Statistics
     from stages.scene import ExportedFile, Splats
 
 _ATTRIBUTES = {
@@ -35,19 +35,19 @@ def show(target: Path | None, speed: bool, as_json: bool) -> None:
     Raises SplatError for what cannot be read; values that are not finite are warned of.
     """
     from stages.base import scratch
-    from stages.proof.census import census_of
+    from stages.proof.statistics import statistics_of
 
     with scratch.scratch_in(Path(tempfile.gettempdir()), spare=True):
         splats, pipeline = splats_of(target, strict=False)
-        census = census_of(splats)
-    facts = describe(splats, census)
+        statistics = statistics_of(splats)
+    facts = describe(splats, statistics)
     if pipeline is None and target is not None:
         facts = {**_about_file(target, len(splats)), **facts}
     if pipeline is not None:
         facts = {**_about_run(pipeline), **facts}
-    if speed and census.count:
+    if speed and statistics.count:
         facts |= _speed(splats, pipeline or pipeline_around(target))
-    warnings = warnings_of(census)
+    warnings = warnings_of(statistics)
     if as_json:
         console.emit("info", **facts, warnings=dict(warnings))
         return
@@ -57,20 +57,23 @@ def show(target: Path | None, speed: bool, as_json: bool) -> None:
         console.note(f"Warning: {sentence} ({code})", "yellow")
 
 
-def describe(splats: Splats, census: Census) -> dict[str, Any]:
+def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
     """Plain facts: count, SH degrees, bounds of the centres, typical size and opacity."""
-    facts: dict[str, Any] = {"splats": census.count, "sh_degree": splats.sh_degree}
-    if not census.count:
+    facts: dict[str, Any] = {"splats": statistics.count, "sh_degree": splats.sh_degree}
+    if not statistics.count:
         return facts
-    facts["splats_by_degree"] = {str(degree): n for degree, n in census.by_degree.items()}
-    facts["not_finite"] = census.count - census.whole
-    if census.whole:
-        facts["bounds_low"], facts["bounds_high"] = _rounded(census.low), _rounded(census.high)
-        facts["middle_98_percent_low"] = _rounded(census.middle_low)
-        facts["middle_98_percent_high"] = _rounded(census.middle_high)
-        facts["median_centre"] = _rounded(census.median_centre)
-        facts["median_scale"] = census.median_scale
-        facts["median_opacity"] = census.median_opacity
+    facts["splats_by_degree"] = {str(degree): n for degree, n in statistics.by_degree.items()}
+    facts["not_finite"] = statistics.count - statistics.whole
+    if statistics.whole:
+        facts["bounds_low"], facts["bounds_high"] = (
+            _rounded(statistics.low),
+            _rounded(statistics.high),
+        )
+        facts["middle_98_percent_low"] = _rounded(statistics.middle_low)
+        facts["middle_98_percent_high"] = _rounded(statistics.middle_high)
+        facts["median_centre"] = _rounded(statistics.median_centre)
+        facts["median_scale"] = statistics.median_scale
+        facts["median_opacity"] = statistics.median_opacity
     facts["origin"] = [float(value) for value in splats.origin]
     return facts | _cost(splats)
 
@@ -118,49 +121,49 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     }
 
 
-def warnings_of(census: Census) -> list[tuple[str, str]]:
+def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
     """(code, sentence) for each kind of trouble that is there."""
-    from stages.proof.census import GIANT_PART, NEEDLE_ASPECT, OUTLIER_BOXES
+    from stages.proof.statistics import GIANT_PART, NEEDLE_ASPECT, OUTLIER_BOXES
 
     found = []
-    for name, count in census.not_finite.items():
-        told = f"{_share(count, census)} not finite in their {_ATTRIBUTES[name]}"
+    for name, count in statistics.not_finite.items():
+        told = f"{_share(count, statistics)} not finite in their {_ATTRIBUTES[name]}"
         found.append((f"not-finite-{_ATTRIBUTES[name]}", f"{told}: no viewer can draw them."))
     kinds = {
-        "no-rotation": (census.no_rotation, "without a rotation: no viewer can draw them."),
-        "too-large": (census.too_large, "larger than numbers go: no viewer can draw them."),
-        "transparent": (census.transparent, "below an opacity of 1/255, and so never seen."),
-        "needles": (census.needles, f"needles, over {NEEDLE_ASPECT:g} times as long as wide."),
-        "giants": (census.giants, f"giants, larger than {GIANT_PART:g} of the scene."),
+        "no-rotation": (statistics.no_rotation, "without a rotation: no viewer can draw them."),
+        "too-large": (statistics.too_large, "larger than numbers go: no viewer can draw them."),
+        "transparent": (statistics.transparent, "below an opacity of 1/255, and so never seen."),
+        "needles": (statistics.needles, f"needles, over {NEEDLE_ASPECT:g} times as long as wide."),
+        "giants": (statistics.giants, f"giants, larger than {GIANT_PART:g} of the scene."),
         "outliers": (
-            census.outliers,
+            statistics.outliers,
             f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
         ),
-        "duplicates": (census.duplicates, "duplicates of others."),
+        "duplicates": (statistics.duplicates, "duplicates of others."),
     }
     for code, (count, what) in kinds.items():
         if count:
-            found.append((code, f"{_share(count, census)} {what}"))
+            found.append((code, f"{_share(count, statistics)} {what}"))
     return found
 
 
-def _share(count: int, census: Census) -> str:
+def _share(count: int, statistics: Statistics) -> str:
     """ "12 splats (0.03 %) are"."""
-    return f"{count:,} splats ({100 * count / census.count:.2g} %) are"
+    return f"{count:,} splats ({100 * count / statistics.count:.2g} %) are"
 
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:
     from stages.formats import format_of
-    from stages.proof.anatomy import anatomy_of
+    from stages.proof.byte_breakdown import byte_breakdown_of
 
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size": console.size(size)}
-    anatomy = anatomy_of(path)
-    if anatomy.untold:
-        facts["bytes_per_splat_unknown"] = anatomy.untold
+    breakdown = byte_breakdown_of(path)
+    if breakdown.unknown:
+        facts["bytes_per_splat_unknown"] = breakdown.unknown
     elif count:
-        name = "bytes_per_splat_unpacked" if anatomy.unpacked else "bytes_per_splat"
-        facts[name] = {what: round(n / count, 2) for what, n in anatomy.parts.items()}
+        name = "bytes_per_splat_unpacked" if breakdown.unpacked else "bytes_per_splat"
+        facts[name] = {what: round(n / count, 2) for what, n in breakdown.parts.items()}
     return facts
 
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.atomic import partial_prefix
 from stages.base.errors import Family, SplatError
-from stages.editing import expression, floaters, regions, turning
+from stages.editing import expression, floaters, regions, transform
 from stages.editing.decimate import FAR, NEAR, decimated
 from stages.editing.joining import joined
 from stages.editing.scene import Edited
-from stages.editing.turning import Similarity
-from stages.editing.words import WORDS, Typed
+from stages.editing.syntax import OPERATIONS, ParsedOperation
+from stages.editing.transform import Similarity
 from stages.formats.rows import chosen, kept_rows
 from stages.measure.worth import floaters as hanging
 from stages.scene import Splats
@@ -33,19 +33,21 @@ _SPARE = 0.995
 class Done:
     """One operation that was done. before, after: how many splats."""
 
-    typed: Typed
+    typed: ParsedOperation
     before: int
     after: int
     scene: Edited
 
 
-def prepared(typed: Sequence[Typed], target: Path) -> list[tuple[Typed, Operation]]:
+def prepared(
+    typed: Sequence[ParsedOperation], target: Path
+) -> list[tuple[ParsedOperation, Operation]]:
     """What to do; `target`: the file that comes of it. Raises SplatError for whatever of it is
     wrong, files that are named included."""
     return [(one, _prepared(one, target)) for one in typed]
 
 
-def done(scene: Edited, chain: Sequence[tuple[Typed, Operation]]) -> Iterator[Done]:
+def done(scene: Edited, chain: Sequence[tuple[ParsedOperation, Operation]]) -> Iterator[Done]:
     """One operation after the other. Raises SplatError "edit-nothing-left"."""
     for typed, operation in chain:
         before = len(scene.splats)
@@ -66,7 +68,7 @@ def without_undrawable(splats: Splats) -> Splats:
     return kept_rows(splats)[0]
 
 
-def _prepared(typed: Typed, target: Path) -> Operation:
+def _prepared(typed: ParsedOperation, target: Path) -> Operation:
     value = typed.value
     match typed.word:
         case "crop":
@@ -85,7 +87,7 @@ def _prepared(typed: Typed, target: Path) -> Operation:
         case "move":
             return _placing(Similarity(offset=_vector(typed, value)))
         case "up":
-            return _placing(Similarity(rotation=turning.upright(_direction(typed, value))))
+            return _placing(Similarity(rotation=transform.upright(_direction(typed, value))))
         case "merge":
             return _merging(Path(value))
         case "degree":
@@ -137,9 +139,9 @@ def fewer(scene: Edited, count: int) -> Splats:
     return decimated(scene.splats, count, NEAR)
 
 
-def _decimating(typed: Typed) -> Operation:
+def _decimating(typed: ParsedOperation) -> Operation:
     if typed.value.endswith("%"):
-        part = _number(Typed(typed.word, typed.value[:-1]), 1e-6, 100) / 100
+        part = _number(ParsedOperation(typed.word, typed.value[:-1]), 1e-6, 100) / 100
         return lambda scene: scene.but(fewer(scene, round(part * len(scene.splats))))
     count = int(_number(typed, 1, 1e9, whole=True))
     return lambda scene: scene.but(fewer(scene, count))
@@ -174,15 +176,15 @@ def _fitting(most: float, target: Path) -> Operation:
     return fitted
 
 
-def _rotation(typed: Typed) -> NDArray[np.float64]:
+def _rotation(typed: ParsedOperation) -> NDArray[np.float64]:
     axis, _, degrees = typed.value.rpartition(":")
     angle = regions.numbers(degrees, 1)
     if angle is None:
         raise _wrong(typed)
-    return turning.about(_direction(typed, axis), float(angle[0]))
+    return transform.about(_direction(typed, axis), float(angle[0]))
 
 
-def _direction(typed: Typed, text: str) -> NDArray[np.float64]:
+def _direction(typed: ParsedOperation, text: str) -> NDArray[np.float64]:
     """[3] of +x, -y, z, or three numbers; never of length 0."""
     if text[-1:] in _AXES and text[:-1] in ("", "+", "-"):
         return np.array(_AXES[text[-1]]) * (-1.0 if text[0] == "-" else 1.0)
@@ -193,25 +195,25 @@ def _direction(typed: Typed, text: str) -> NDArray[np.float64]:
     return np.asarray(found / length)
 
 
-def _vector(typed: Typed, text: str) -> NDArray[np.float64]:
+def _vector(typed: ParsedOperation, text: str) -> NDArray[np.float64]:
     found = regions.numbers(text, 3)
     if found is None:
         raise _wrong(typed)
     return found
 
 
-def _number(typed: Typed, low: float, high: float, whole: bool = False) -> float:
+def _number(typed: ParsedOperation, low: float, high: float, whole: bool = False) -> float:
     found = regions.numbers(typed.value, 1)
     if found is None or not low <= found[0] <= high or (whole and found[0] != int(found[0])):
         raise _wrong(typed, f" from {low:g} to {high:g}")
     return float(found[0])
 
 
-def _wrong(typed: Typed, bounds: str = "") -> SplatError:
+def _wrong(typed: ParsedOperation, bounds: str = "") -> SplatError:
     return SplatError(
         f"edit-{typed.word}",
         given=f"{typed} is not understood.",
-        wanted=f"--{typed.word} {WORDS[typed.word].takes}{bounds}.",
-        hint=WORDS[typed.word].help,
+        wanted=f"--{typed.word} {OPERATIONS[typed.word].takes}{bounds}.",
+        hint=OPERATIONS[typed.word].help,
         family=Family.USAGE,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.editing.decimate import Appraisal
-from stages.editing.turning import Similarity
+from stages.editing.transform import Similarity
 from stages.measure.judge import Photograph, mean_psnr_db
 from stages.measure.worth import Worth, beside_pictures, measure_worth
 from stages.raster.backends import AUTO

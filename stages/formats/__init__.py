@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import clear_left
 from stages.base.lazy import named
-from stages.formats.table import BY_ENDING, FORMATS, MESHES, TABLE, Anatomy, Format, format_of
+from stages.formats.table import BY_ENDING, FORMATS, MESHES, TABLE, ByteBreakdown, Format, format_of
 from stages.formats.units import units_of
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ __all__ = [
     "FORMATS",
     "MESHES",
     "TABLE",
-    "Anatomy",
+    "ByteBreakdown",
     "Format",
     "format_of",
     "read",

@@ -80,7 +80,7 @@ class Format:
 
 
 @dataclass(frozen=True)
-class Anatomy:
+class ByteBreakdown:
     """Where the bytes of a file are. parts: by attribute. unpacked: whether they are counted before
     the compression that packs them all together. untold: why there are no parts."""
 
@@ -97,8 +97,8 @@ _GLB = Format(
     keeps="everything",
     writer="stages.formats.gltf:write",
     reader="stages.formats.gltf_read:read",
-    second_reader="stages.proof.second_readers:gltf",
-    anatomy="stages.proof.anatomy:gltf",
+    second_reader="stages.proof.independent_readers:gltf",
+    anatomy="stages.proof.byte_breakdown:gltf",
     y_up=True,
 )
 _USD = Format(
@@ -107,8 +107,8 @@ _USD = Format(
     keeps="everything",
     writer="stages.formats.usd:write",
     reader="stages.formats.usd_read:read",
-    second_reader="stages.proof.second_readers:usd",
-    anatomy="stages.proof.anatomy:usd",
+    second_reader="stages.proof.independent_readers:usd",
+    anatomy="stages.proof.byte_breakdown:usd",
     validator="stages.proof.usd_validators:complaints",
     y_up=True,
 )
@@ -126,8 +126,8 @@ TABLE = (
         keeps="everything, float32",
         writer="stages.formats.ply:write",
         reader="stages.formats.ply:read",
-        second_reader="stages.proof.second_readers:ply",
-        anatomy="stages.proof.anatomy:ply",
+        second_reader="stages.proof.independent_readers:ply",
+        anatomy="stages.proof.byte_breakdown:ply",
     ),
     Format(
         "splat",
@@ -135,8 +135,8 @@ TABLE = (
         keeps="8-bit colour and rotation; the mean of the colours that photographs see",
         writer="stages.formats.splat32:write",
         reader="stages.formats.splat32:read",
-        second_reader="stages.proof.second_readers:splat",
-        anatomy="stages.proof.anatomy:splat",
+        second_reader="stages.proof.independent_readers:splat",
+        anatomy="stages.proof.byte_breakdown:splat",
         order="stages.formats.splat32:order",
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
@@ -162,8 +162,8 @@ TABLE = (
         keeps="positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",
         writer="stages.formats.compressed_ply:write",
         reader="stages.formats.compressed_ply:read",
-        second_reader="stages.proof.second_packed:compressed_ply",
-        anatomy="stages.proof.anatomy:ply",
+        second_reader="stages.proof.independent_packed:compressed_ply",
+        anatomy="stages.proof.byte_breakdown:ply",
         order="stages.scene.morton:order",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
         rounds=True,
@@ -174,8 +174,8 @@ TABLE = (
         keeps="sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
-        second_reader="stages.proof.second_packed:spz",
-        anatomy="stages.proof.anatomy:spz",
+        second_reader="stages.proof.independent_packed:spz",
+        anatomy="stages.proof.byte_breakdown:spz",
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         rounds=True,
         y_up=True,
@@ -186,8 +186,8 @@ TABLE = (
         keeps="16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
         writer="stages.formats.sog:write",
         reader="stages.formats.sog_read:read",
-        second_reader="stages.proof.second_packed:sog",
-        anatomy="stages.proof.anatomy:sog",
+        second_reader="stages.proof.independent_packed:sog",
+        anatomy="stages.proof.byte_breakdown:sog",
         order="stages.scene.morton:order",
         coarse="stages.formats.coarse:of_sog",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
@@ -199,8 +199,8 @@ TABLE = (
         keeps="as `sog`, in chunks and levels of detail; written by `splat edit`",
         writer="stages.editing.levels:write",
         reader="stages.formats.streamed_sog:read",
-        second_reader="stages.proof.second_packed:streamed_sog",
-        anatomy="stages.proof.anatomy:streamed_sog",
+        second_reader="stages.proof.independent_packed:streamed_sog",
+        anatomy="stages.proof.byte_breakdown:streamed_sog",
         order="stages.formats.streamed_sog:order",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
@@ -213,8 +213,8 @@ TABLE = (
         keeps="everything; the viewer and the cameras too",
         writer="stages.formats.html:write",
         reader="stages.formats.html:read",
-        second_reader="stages.proof.second_readers:html",
-        anatomy="stages.proof.anatomy:html",
+        second_reader="stages.proof.independent_readers:html",
+        anatomy="stages.proof.byte_breakdown:html",
         wants_views=True,
     ),
     replace(

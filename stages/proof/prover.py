@@ -20,7 +20,7 @@ from stages.base.lazy import named
 from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
 from stages.measure.judge import CAP_DB, decibels
-from stages.proof import diagnosis, second_readers
+from stages.proof import diagnosis, independent_readers
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows
@@ -102,7 +102,7 @@ class Prover:
         """
         row = format_of(path)
         try:
-            content = _drawable(second_readers.read_back(path))
+            content = _drawable(independent_readers.read_back(path))
             said = named(row.validator)(path) if row.validator else []
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")

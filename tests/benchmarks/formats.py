@@ -21,7 +21,7 @@ from rich.table import Table
 from stages import formats
 from stages.base.memory import PeakMemory, resident_mib
 from stages.proof.compare import differences
-from stages.proof.second_readers import read_back
+from stages.proof.independent_readers import read_back
 from stages.scene import Splats, load_splats, save_splats
 from tests import processes
 from tests.benchmarks.scenes import random_scene, view

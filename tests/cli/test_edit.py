@@ -16,7 +16,7 @@ from splatcli.commands import edit as command
 from stages import formats
 from stages.base import scratch
 from stages.editing.scene import Edited
-from stages.editing.words import WORDS, Typed, as_text, from_file
+from stages.editing.syntax import OPERATIONS, ParsedOperation, as_text, parse_file
 from stages.scene import Splats, View, look_at
 from tests import scenes
 from tests.cli.help_text import help_of
@@ -166,9 +166,13 @@ def test_a_file_of_operations_is_done_where_it_stands(source: Path, tmp_path: Pa
 
 
 def test_operations_written_to_a_file_are_read_back(tmp_path: Path) -> None:
-    chain = [Typed("keep", "x > 0 and y < 1"), Typed("drop-floaters"), Typed("move", "-1,0,0")]
+    chain = [
+        ParsedOperation("keep", "x > 0 and y < 1"),
+        ParsedOperation("drop-floaters"),
+        ParsedOperation("move", "-1,0,0"),
+    ]
     (tmp_path / "ops").write_text(as_text(chain))
-    assert from_file(tmp_path / "ops") == chain
+    assert parse_file(tmp_path / "ops") == chain
 
 
 @pytest.mark.parametrize(
@@ -249,5 +253,5 @@ def test_levels_of_detail_go_into_a_folder_that_is_made(source: Path, tmp_path: 
 
 def test_help_names_every_operation() -> None:
     text = help_of("edit")
-    for word in (*WORDS, "ops", "dry-run"):
+    for word in (*OPERATIONS, "ops", "dry-run"):
         assert f"--{word}" in text

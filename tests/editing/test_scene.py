@@ -11,7 +11,7 @@ import pytest
 
 from stages.editing.operations import done, prepared
 from stages.editing.scene import Edited
-from stages.editing.words import Typed
+from stages.editing.syntax import ParsedOperation
 from stages.measure.judge import Photograph
 from stages.raster.draw import render
 from stages.scene import Camera, Look, Splats, View, look_at
@@ -47,7 +47,7 @@ def scene(splats: Splats) -> Edited:
 
 
 def after(start: Edited, *words: str) -> Edited:
-    typed = [Typed(*word.split(maxsplit=1)) for word in words]
+    typed = [ParsedOperation(*word.split(maxsplit=1)) for word in words]
     *_, last = done(start, prepared(typed, Path("scene.ply")))
     return last.scene
 

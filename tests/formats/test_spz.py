@@ -14,8 +14,8 @@ import pytest
 from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import spz_read
+from stages.proof.independent_readers import read_back
 from stages.proof.prover import Prover, cameras_for
-from stages.proof.second_readers import read_back
 from stages.scene import Splats
 from tests.formats.files import angles
 from tests.formats.truth import C0, extreme_splats, many_splats, red_splat

@@ -20,7 +20,7 @@ from stages.editing import levels
 from stages.formats import sog, streamed_sog
 from stages.formats.rows import drawable
 from stages.measure.judge import decibels
-from stages.proof import second_readers
+from stages.proof import independent_readers
 from stages.raster.draw import renderer, settings_of
 from stages.scene import Camera, Splats, look_at
 from tests.editing.walls import wall
@@ -65,7 +65,7 @@ def test_the_finest_level_comes_back_in_the_order_that_is_told(asset: Path) -> N
 
 
 def test_a_second_reader_finds_the_same(asset: Path) -> None:
-    first, second = formats.read(asset), second_readers.read_back(asset).splats
+    first, second = formats.read(asset), independent_readers.read_back(asset).splats
     np.testing.assert_allclose(second.means, first.means, atol=1e-5)
     np.testing.assert_allclose(second.sh, first.sh, atol=1e-6)
 

@@ -14,8 +14,8 @@ from stages import formats
 from stages.formats import splat32
 from stages.proof import prover as proving
 from stages.proof import usd_validators
+from stages.proof.independent_readers import read_back
 from stages.proof.prover import Proof, Prover, cameras_for
-from stages.proof.second_readers import read_back
 from stages.scene import Splats
 from tests.small_scene import SmallScene, small_scene
 

@@ -11,7 +11,7 @@ import pytest
 
 from stages import formats
 from stages.proof.compare import differences
-from stages.proof.second_readers import read_back
+from stages.proof.independent_readers import read_back
 from tests.formats.truth import many_splats
 from tests.packages import UnavailableError
 from tests.readers.values import READERS, Reader

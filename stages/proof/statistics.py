@@ -35,7 +35,7 @@ _VALUES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
 @dataclass(frozen=True)
-class Census:
+class Statistics:
     """count: of splats. by_degree: how many use each SH degree. not_finite: by attribute, how many
     splats hold NaN or infinity there; all that follows is of the others (`whole` of them).
 
@@ -65,7 +65,7 @@ class Census:
     duplicates: int
 
 
-def census_of(splats: Splats) -> Census:
+def statistics_of(splats: Splats) -> Statistics:
     """Count everything. Values may be anything, NaN included."""
     degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
     by_degree = {int(d): int(n) for d, n in zip(degrees, counts, strict=True)}
@@ -82,7 +82,7 @@ def census_of(splats: Splats) -> Census:
         for name, marks in _marks(block.take(whole[rows]), box, extent).items():
             found[name] += int(np.count_nonzero(marks))
     keys = keys[whole]
-    return Census(
+    return Statistics(
         count=len(splats),
         by_degree=by_degree,
         not_finite=not_finite,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from stages.editing.turning import Similarity, about, upright
+from stages.editing.transform import Similarity, about, upright
 from stages.raster.definition import RasterSettings
 from stages.raster.reference import parameters_of, render_tensors
 from stages.scene import Look, Splats

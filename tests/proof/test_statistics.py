@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stages.proof.census import Census, census_of
+from stages.proof.statistics import Statistics, statistics_of
 from stages.scene import Splats
 
 TROUBLES = (
@@ -33,17 +33,21 @@ def tidy(n: int = 500) -> Splats:
     )
 
 
-def troubles(census: Census) -> dict[str, int]:
-    return {name: getattr(census, name) for name in TROUBLES if getattr(census, name)}
+def troubles(statistics: Statistics) -> dict[str, int]:
+    return {name: getattr(statistics, name) for name in TROUBLES if getattr(statistics, name)}
 
 
 def test_nothing_is_wrong_with_a_tidy_scene() -> None:
-    census = census_of(tidy())
-    assert (census.count, census.whole, census.by_degree) == (500, 500, {0: 250, 1: 250})
-    assert census.not_finite == {}
-    assert troubles(census) == {}
-    assert abs(census.median_scale - 0.01) < 1e-6
-    assert census.median_opacity == 0.5
+    statistics = statistics_of(tidy())
+    assert (statistics.count, statistics.whole, statistics.by_degree) == (
+        500,
+        500,
+        {0: 250, 1: 250},
+    )
+    assert statistics.not_finite == {}
+    assert troubles(statistics) == {}
+    assert abs(statistics.median_scale - 0.01) < 1e-6
+    assert statistics.median_opacity == 0.5
 
 
 def test_each_kind_of_trouble_is_counted() -> None:
@@ -60,7 +64,7 @@ def test_each_kind_of_trouble_is_counted() -> None:
     for name in ("means", "opacity_logits", "sh"):
         getattr(splats, name)[9] = getattr(splats, name)[10]
     splats.sh[9, 1:] += 1  # what changes with the view does not count
-    found = troubles(census_of(splats))
+    found = troubles(statistics_of(splats))
     assert found == {
         **dict.fromkeys(("needles", "outliers", "transparent", "no_rotation"), 1),
         "too_large": 1,
@@ -75,38 +79,41 @@ def test_values_that_are_not_finite_are_named_and_left_out() -> None:
     splats.means[1] = np.inf
     splats.sh[1, 2, 0] = np.nan
     splats.opacity_logits[3] = -np.inf
-    census = census_of(splats)
-    assert census.not_finite == {"means": 2, "sh": 1, "opacity_logits": 1}
-    assert (census.count, census.whole) == (500, 497)
-    assert np.isfinite([census.low, census.high, census.median_centre]).all()
-    assert troubles(census) == {}
+    statistics = statistics_of(splats)
+    assert statistics.not_finite == {"means": 2, "sh": 1, "opacity_logits": 1}
+    assert (statistics.count, statistics.whole) == (500, 497)
+    assert np.isfinite([statistics.low, statistics.high, statistics.median_centre]).all()
+    assert troubles(statistics) == {}
 
 
 def test_the_box_of_the_middle_does_not_follow_a_stray() -> None:
     splats = tidy()
     splats.means[0] = 1e6
-    census = census_of(splats)
-    assert census.high.max() == 1e6
-    assert census.middle_high.max() < 1.1
-    assert census.outliers == 1
+    statistics = statistics_of(splats)
+    assert statistics.high.max() == 1e6
+    assert statistics.middle_high.max() < 1.1
+    assert statistics.outliers == 1
 
 
 def test_the_order_of_the_rows_does_not_matter() -> None:
     splats = tidy()
     splats.log_scales[:40, 0] += 6
-    a, b = census_of(splats), census_of(splats.take(np.random.default_rng(0).permutation(500)))
-    for name in Census.__dataclass_fields__:
+    a, b = (
+        statistics_of(splats),
+        statistics_of(splats.take(np.random.default_rng(0).permutation(500))),
+    )
+    for name in Statistics.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_a_scene_of_many_blocks_is_counted_whole() -> None:
     n = 70_000  # more than one block
     splats = replace(tidy(n), opacity_logits=np.full(n, -9, np.float32))
-    assert census_of(splats).transparent == n
+    assert statistics_of(splats).transparent == n
 
 
 def test_nothing_has_nothing_in_it() -> None:
-    census = census_of(tidy(0))
-    assert (census.count, census.whole, census.by_degree) == (0, 0, {})
-    alone = census_of(tidy(1))
+    statistics = statistics_of(tidy(0))
+    assert (statistics.count, statistics.whole, statistics.by_degree) == (0, 0, {})
+    alone = statistics_of(tidy(1))
     assert troubles(alone) == {}

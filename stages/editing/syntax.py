@@ -14,7 +14,7 @@ from stages.base.errors import Family, SplatError
 
 
 @dataclass(frozen=True)
-class Word:
+class OperationSyntax:
     """name: as typed, behind two dashes. takes: what its value looks like, "" if it takes none."""
 
     name: str
@@ -22,27 +22,35 @@ class Word:
     help: str
 
 
-WORDS = {
+OPERATIONS = {
     word.name: word
     for word in (
-        Word("crop", "box:...|sphere:...|hull:FILE|lasso:...", "Keep what lies inside."),
-        Word("drop", "box:...|sphere:...|hull:FILE|lasso:...", "Leave out what lies inside."),
-        Word("keep", "CONDITION", "Keep where it is true: 'opacity > 0.1 and scale < 0.5'."),
-        Word("drop-floaters", "", "Leave out what hangs in empty space."),
-        Word("rotate", "AXIS:DEGREES", "Turn about the origin: x:90, or 0,1,1:30."),
-        Word("scale", "X", "Enlarge about the origin."),
-        Word("move", "X,Y,Z", "Move."),
-        Word("up", "AXIS", "Turn what points there upward: -y as it is, +z, or 0,-1,0.1."),
-        Word("merge", "FILE", "Add the splats of another file."),
-        Word("degree", "N", "View-dependent colour of this degree at most, 0 to 3."),
-        Word("decimate", "N", "At most so many splats, or 25%: neighbours become one."),
-        Word("max-mb", "MB", "As many splats as fit into the file: neighbours become one."),
+        OperationSyntax("crop", "box:...|sphere:...|hull:FILE|lasso:...", "Keep what lies inside."),
+        OperationSyntax(
+            "drop", "box:...|sphere:...|hull:FILE|lasso:...", "Leave out what lies inside."
+        ),
+        OperationSyntax(
+            "keep", "CONDITION", "Keep where it is true: 'opacity > 0.1 and scale < 0.5'."
+        ),
+        OperationSyntax("drop-floaters", "", "Leave out what hangs in empty space."),
+        OperationSyntax("rotate", "AXIS:DEGREES", "Turn about the origin: x:90, or 0,1,1:30."),
+        OperationSyntax("scale", "X", "Enlarge about the origin."),
+        OperationSyntax("move", "X,Y,Z", "Move."),
+        OperationSyntax(
+            "up", "AXIS", "Turn what points there upward: -y as it is, +z, or 0,-1,0.1."
+        ),
+        OperationSyntax("merge", "FILE", "Add the splats of another file."),
+        OperationSyntax("degree", "N", "View-dependent colour of this degree at most, 0 to 3."),
+        OperationSyntax("decimate", "N", "At most so many splats, or 25%: neighbours become one."),
+        OperationSyntax(
+            "max-mb", "MB", "As many splats as fit into the file: neighbours become one."
+        ),
     )
 }
 
 
 @dataclass(frozen=True)
-class Typed:
+class ParsedOperation:
     """One operation as it was asked for."""
 
     word: str
@@ -52,7 +60,7 @@ class Typed:
         return f"--{self.word} {self.value}".rstrip()
 
 
-def from_file(path: Path) -> list[Typed]:
+def parse_file(path: Path) -> list[ParsedOperation]:
     """The operations of a text file: one a line, dashes before it or not, quotes around its value
     or not; # begins a remark. Raises SplatError "edit-ops"."""
     try:
@@ -68,18 +76,18 @@ def from_file(path: Path) -> list[Typed]:
     return found
 
 
-def _of_line(line: str, where: str) -> Typed:
+def _of_line(line: str, where: str) -> ParsedOperation:
     word, value = re.fullmatch(r"(?:--)?([^\s=]*)[\s=]*(.*)", line).groups()  # type: ignore[union-attr]
-    if word not in WORDS:
+    if word not in OPERATIONS:
         raise _wrong(f"{where}: {word[:40]!r} is no operation.")
     if value[:1] in ("'", '"') and value[-1] == value[0] and len(value) > 1:
         value = value[1:-1]
-    if bool(value) != bool(WORDS[word].takes):
-        raise _wrong(f"{where}: {word} takes {WORDS[word].takes or 'no value'}.")
-    return Typed(word, value)
+    if bool(value) != bool(OPERATIONS[word].takes):
+        raise _wrong(f"{where}: {word} takes {OPERATIONS[word].takes or 'no value'}.")
+    return ParsedOperation(word, value)
 
 
-def as_text(operations: Iterable[Typed]) -> str:
+def as_text(operations: Iterable[ParsedOperation]) -> str:
     """What `from_file` reads."""
     return "".join(f"{typed.word} {typed.value}".rstrip() + "\n" for typed in operations)
 
@@ -88,7 +96,7 @@ def _wrong(given: str) -> SplatError:
     return SplatError(
         "edit-ops",
         given=given,
-        wanted=f"Operations, one a line: {', '.join(WORDS)}.",
+        wanted=f"Operations, one a line: {', '.join(OPERATIONS)}.",
         hint="For example: crop box:-1,-1,-1,1,1,1",
         family=Family.USAGE,
     )

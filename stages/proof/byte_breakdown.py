@@ -13,7 +13,7 @@ from typing import Any
 
 from stages.base.bad_files import reading
 from stages.base.lazy import named
-from stages.formats import Anatomy, format_of, spz_read
+from stages.formats import ByteBreakdown, format_of, spz_read
 from stages.formats.html import unzipped
 from stages.formats.inflate import Inflated
 from stages.formats.ply_header import Header, read_header
@@ -43,33 +43,33 @@ _SPZ = ("positions", "opacities", "colours", "scales", "rotations", "SH")
 _SOG = {"means": "positions", "quats": "rotations", "sh0": "colours, opacities", "shN": "SH"}
 
 
-def anatomy_of(path: Path) -> Anatomy:
+def byte_breakdown_of(path: Path) -> ByteBreakdown:
     """Where the bytes of a file of splats are, "other" for what belongs to no attribute. Raises
     SplatError as `format_of`, or "splats-unreadable"."""
     path = Path(path)
     row = format_of(path)
     with reading(path):
-        found: Anatomy = named(row.anatomy)(path)
+        found: ByteBreakdown = named(row.anatomy)(path)
     other = row.size_bytes(path) - sum(found.parts.values())
-    if found.untold or found.unpacked or other <= 0:
+    if found.unknown or found.unpacked or other <= 0:
         return found
-    return Anatomy({**found.parts, "other": other})
+    return ByteBreakdown({**found.parts, "other": other})
 
 
-def ply(path: Path) -> Anatomy:
+def ply(path: Path) -> ByteBreakdown:
     with path.open("rb") as file:
-        return Anatomy(_columns(read_header(file)))
+        return ByteBreakdown(_columns(read_header(file)))
 
 
-def html(path: Path) -> Anatomy:
+def html(path: Path) -> ByteBreakdown:
     """Of the .ply that is packed inside."""
     start = next(unzipped(path))  # some megabytes: longer than any header
-    return Anatomy(_columns(read_header(io.BytesIO(start))), unpacked=True)
+    return ByteBreakdown(_columns(read_header(io.BytesIO(start))), unpacked=True)
 
 
-def usd(path: Path) -> Anatomy:
-    untold = "USD packs values as it likes, and tells nobody how many bytes each attribute took"
-    return Anatomy({}, untold=untold)
+def usd(path: Path) -> ByteBreakdown:
+    unknown = "USD packs values as it likes, and tells nobody how many bytes each attribute took"
+    return ByteBreakdown({}, unknown=unknown)
 
 
 def _columns(header: Header) -> dict[str, int]:
@@ -83,13 +83,13 @@ def _columns(header: Header) -> dict[str, int]:
     return dict(parts)
 
 
-def splat(path: Path) -> Anatomy:
+def splat(path: Path) -> ByteBreakdown:
     count = path.stat().st_size // RECORD.itemsize
     fields: Any = RECORD.fields or {}
-    return Anatomy({_SPLAT[name]: count * kind[0].itemsize for name, kind in fields.items()})
+    return ByteBreakdown({_SPLAT[name]: count * kind[0].itemsize for name, kind in fields.items()})
 
 
-def gltf(path: Path) -> Anatomy:
+def gltf(path: Path) -> ByteBreakdown:
     with path.open("rb") as file:
         text = file.read(20)
         if text[:4] == b"glTF":
@@ -107,36 +107,36 @@ def gltf(path: Path) -> Anatomy:
                 what = _GLTF.get(name) or _GLTF_ENDS.get(end) or "SH"
                 what = "colours" if end == "SH_DEGREE_0_COEF_0" else what
                 parts[what] += element * accessor["count"]
-    return Anatomy(dict(parts))
+    return ByteBreakdown(dict(parts))
 
 
-def spz(path: Path) -> Anatomy:
+def spz(path: Path) -> ByteBreakdown:
     sizes = spz_read.packed_sizes(path)
     if sizes:
-        return Anatomy(dict(zip(_SPZ, sizes, strict=False)))
+        return ByteBreakdown(dict(zip(_SPZ, sizes, strict=False)))
     with path.open("rb") as file:
         head = Inflated(file, path.stat().st_size).read(spz_read.HEADER.size)
     _, version, count, degree, bits, _, _ = spz_read.HEADER.unpack(head)
     widths = spz_read.widths(version, degree, bits)
     parts = {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}
-    return Anatomy(parts, unpacked=True)
+    return ByteBreakdown(parts, unpacked=True)
 
 
-def sog(path: Path) -> Anatomy:
+def sog(path: Path) -> ByteBreakdown:
     with zipfile.ZipFile(path) as package:
         return _of_pictures((m.filename, m.compress_size) for m in package.infolist())
 
 
-def streamed_sog(path: Path) -> Anatomy:
+def streamed_sog(path: Path) -> ByteBreakdown:
     chunks = format_of(path).files(path)[1:]
     return _of_pictures((file.name, file.stat().st_size) for file in chunks)
 
 
-def _of_pictures(members: Iterable[tuple[str, int]]) -> Anatomy:
+def _of_pictures(members: Iterable[tuple[str, int]]) -> ByteBreakdown:
     """Of (name, bytes) of the files of a SOG."""
     parts: Counter[str] = Counter()
     for name, size in members:
         stem = name.rpartition("/")[2].partition(".")[0].partition("_")[0]
         parts[_SOG.get(stem, stem)] += size
     parts.pop("meta", None)
-    return Anatomy(dict(parts))
+    return ByteBreakdown(dict(parts))
