@@ -16,8 +16,9 @@ from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.words import counted
 from stages.capacity.usual import DECIDING
-from stages.formats import FORMATS, MESHES, Format
+from stages.formats import FORMATS, Format
 from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
+from stages.surface.table import MESHES
 
 if TYPE_CHECKING:
     from stages.capacity.rounding import Fitting
@@ -140,11 +141,11 @@ def _held(
     row: Format, quantised: QuantisedSplats, fitting: Fitting | None, folder: Path
 ) -> tuple[Splats, dict[str, Any]]:
     """(what the file should hold, figures of the fitting). Fitted splats are kept in `folder`."""
-    from stages.formats.coarse import held_by
+    from stages.formats.quantisation import splats_to_write
     from stages.scene import save_splats
 
-    if fitting is None or not row.rounds:
-        return held_by(row, quantised), {}
+    if fitting is None or not row.needs_finetuning:
+        return splats_to_write(row, quantised), {}
     held, figures = fitting.fitted(row, quantised)
     kept = folder / _FITTED / row.ending
     kept.mkdir(parents=True, exist_ok=True)
@@ -170,7 +171,9 @@ def _fitting(
 
     reconstruction: Reconstruction = inputs["sfm"]
     training = split_held_out(reconstruction.views)[0]
-    if not (settings.fit_steps and training and any(FORMATS[name].rounds for name in wanted)):
+    if not (
+        settings.fit_steps and training and any(FORMATS[name].needs_finetuning for name in wanted)
+    ):
         return None
     sat_out, backend, folder = inputs["train"].sat_out, drawn_by(settings), reconstruction.folder
     photographs = load_photographs(folder, training, splats.look)
@@ -216,7 +219,7 @@ def _write_meshes(
         named(row.writer)(path, made.mesh, reconstruction.units)
         if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
-        files.append(ExportedFile(row.ending, path.name, row.size_bytes(path)))
+        files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
     return files
 
 

@@ -151,18 +151,18 @@ def _sizes(
     from stages import formats
     from stages.base.lazy import named
     from stages.capacity.bits import fewest_bits
-    from stages.formats.coarse import Bits
+    from stages.formats.quantisation import BitDepths
     from stages.measure.judge import mean_psnr_db
     from stages.scene import spread_over
 
     row = FORMATS[settings.mb_of]
     few: dict[str, int] = {}
-    if settings.max_mb and row.coarse:
+    if settings.max_mb and row.quantiser:
         deciding, backend = spread_over(photographs, DECIDING), drawn_by(settings)
         few, _ = fewest_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
 
     def size_bytes(splats: Splats) -> int:
-        held = named(row.coarse)(splats, Bits(**few)) if few else splats
+        held = named(row.quantiser)(splats, BitDepths(**few)) if few else splats
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"scene.{settings.mb_of}"
             formats.write(path, held, units=reconstruction.units, views=reconstruction.views)

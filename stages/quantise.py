@@ -71,7 +71,7 @@ def run(
     from stages.base.atomic import replacing
     from stages.capacity.bits import fewest_bits
     from stages.formats import FORMATS, splat32
-    from stages.formats.coarse import held_by
+    from stages.formats.quantisation import splats_to_write
     from stages.measure.flat import flat_dc
     from stages.scene import QuantisedSplats, save_splats, split_held_out
 
@@ -91,7 +91,7 @@ def run(
     if kept.sh_degree:
         views = split_held_out(inputs["sfm"].views)[0]
         flat = flat_dc(kept, (kept.look.camera(v.camera) for v in views), drawn_by(settings))
-    drawn = held_by(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
+    drawn = splats_to_write(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
     in_32_bytes = splat32.decode(splat32.encode(drawn))
     judged = {
         "psnr_raw_db": judge.psnr(splats),

@@ -29,7 +29,7 @@ def edit(
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
-    from stages.editing import operations
+    from stages.editing import levels, operations
 
     if target is None and not dry_run:
         raise SplatError(
@@ -41,7 +41,7 @@ def edit(
         )
     target = target or Path("scene.ply")
     row, chain = formats.format_of(target), operations.prepared(typed, target)
-    if row.levels and not dry_run:
+    if row.streamed and not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
         if target.parent.is_dir():  # `write` says so where it is not
@@ -58,7 +58,7 @@ def edit(
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
         if not dry_run:
             views = scene.views_there()
-            formats.write(target, scene.splats, units=scene.units, views=views)
+            levels.write(target, scene.splats, units=scene.units, views=views)
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
             if views:
                 facts |= _proven(source, target, scene)

@@ -44,13 +44,13 @@ class _Original:
         the format, and what a conversion of the run's splats would."""
         from stages import export
         from stages.formats import format_of
-        from stages.formats.coarse import held_by
+        from stages.formats.quantisation import splats_to_write
 
         row = format_of(file)
         if self.exported is not None:
             fitted = export.fitted_in(self.exported, row.ending)
             yield from () if fitted is None else (fitted,)
-        yield held_by(row, self.quantised) if self.quantised else self.splats
+        yield splats_to_write(row, self.quantised) if self.quantised else self.splats
 
 
 def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool) -> None:
@@ -90,7 +90,7 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
 
 def _files(target: Path | None) -> list[Path]:
     """The file itself; of a run folder, what it exported but for meshes, which hold no splats."""
-    from stages.formats import MESHES
+    from stages.surface.table import MESHES
 
     if target is not None and not target.is_dir():
         return [target]

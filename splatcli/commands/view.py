@@ -59,7 +59,7 @@ def _items(
     run = pipeline or sources.pipeline_around(target)
     sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
     units = sfm.units if sfm else "arbitrary"
-    if pipeline is None and target is not None and format_of(target).levels:
+    if pipeline is None and target is not None and format_of(target).streamed:
         content = target
     else:
         ply.write(content, splats, units=units)

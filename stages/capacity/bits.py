@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from stages.formats.axes import least_turned
-from stages.formats.coarse import Bits, on_grids, palette_bits, told
+from stages.formats.quantisation import BitDepths, palette_bits, quantise_attribute, quantise_splats
 from stages.formats.rows import kept_rows
 from stages.scene import Splats
 
@@ -30,22 +30,22 @@ def fewest_bits(
     where it saves most bytes for what it costs, as long as all together cost `psnr_db` no more
     than loss_db. A step that follows is foretold to cost four times as much: half the precision."""
     exact = least_turned(kept_rows(splats)[0])
-    found = asdict(Bits(palette=palette_bits(len(exact))))
+    found = asdict(BitDepths(palette=palette_bits(len(exact))))
     if not len(exact):
         return found, 0.0
-    splats = on_grids(exact, Bits(**found))
+    splats = quantise_splats(exact, BitDepths(**found))
     best = psnr_db(splats)
     floor, least = best - loss_db, {n: bits for n, (_, bits) in _NUMBERS.items()}
     if not splats.sh_degree:
         least["palette"] = found["palette"]
     losses = {
-        name: best - psnr_db(told(exact, splats, name, bits - 1))
+        name: best - psnr_db(quantise_attribute(exact, splats, name, bits - 1))
         for name, bits in found.items()
         if bits > least[name]
     }
     while losses:
         name = max(losses, key=lambda n: _saved(n, found[n], exact) / max(losses[n], _LEAST_DB))
-        tried = told(exact, splats, name, found[name] - 1)
+        tried = quantise_attribute(exact, splats, name, found[name] - 1)
         found_db = psnr_db(tried)
         if found_db < floor:
             del losses[name]

@@ -23,7 +23,7 @@ from stages import formats
 from stages.base.lazy import named
 from stages.capacity.tuning import Tuner
 from stages.formats.axes import least_turned
-from stages.formats.coarse import Bits, held_by, on_grids
+from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
 from stages.measure.judge import Photograph, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
@@ -50,16 +50,18 @@ class Fitting:
         """(what a file of the format should hold, figures: PSNR of the photographs that decide, as
         the file would be drawn without fine-tuning and with it). Raises Interrupted."""
         self.tuner.steps = 0  # what a file holds does not depend on those written before it
-        plain = held_by(row, quantised)
-        exact = held_by(row, replace(quantised, decisions={}))
+        plain = splats_to_write(row, quantised)
+        exact = splats_to_write(row, replace(quantised, decisions={}))
         bits = quantised.decisions.get("bits")
 
         def read(splats: Splats) -> Splats:
             return as_read(row, splats)
 
-        if row.coarse and isinstance(bits, dict):
-            exact, few = least_turned(exact), Bits(**bits)
-            found = tuned_to(lambda s: on_grids(s, few), exact, self.tuner, self.steps, self.seen)
+        if row.quantiser and isinstance(bits, dict):
+            exact, few = least_turned(exact), BitDepths(**bits)
+            found = tuned_to(
+                lambda s: quantise_splats(s, few), exact, self.tuner, self.steps, self.seen
+            )
         else:
             found = tuned_to(read, exact, self.tuner, self.steps, self.seen)
         before, after = (
@@ -89,7 +91,7 @@ def tuned_to(
 def as_read(row: Format, splats: Splats) -> Splats:
     """What a file of them says, in their order. All rows must be drawable."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / row.name("scene")
+        path = Path(folder) / row.file_name("scene")
         formats.write(path, splats)
         read = formats.read(path)
     found = read.with_sh_degree(splats.sh_degree)

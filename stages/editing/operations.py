@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.atomic import partial_prefix
 from stages.base.errors import Family, SplatError
-from stages.editing import expression, floaters, regions, transform
+from stages.editing import expression, floaters, levels, regions, transform
 from stages.editing.decimate import FAR, NEAR, decimated
 from stages.editing.joining import joined
 from stages.editing.scene import Edited
@@ -153,8 +153,8 @@ def _fitting(most: float, target: Path) -> Operation:
 
     def size_bytes(scene: Edited) -> int:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=partial_prefix()) as folder:
-            path = Path(folder) / row.name("scene")
-            formats.write(path, scene.splats, units=scene.units, views=scene.views_there())
+            path = Path(folder) / row.file_name("scene")
+            levels.write(path, scene.splats, units=scene.units, views=scene.views_there())
             return row.size_bytes(path)
 
     def fitted(scene: Edited) -> Edited:

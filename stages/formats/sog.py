@@ -103,24 +103,26 @@ def _positions(
     """places: the order in which the splats are written; of what follows too."""
     low, high = (np.zeros(3), np.zeros(3))
     if len(splats):  # the curve rises: the ends of the bent are the bent ends
-        low, high = (bent(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
+        low, high = (symmetric_log(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
     span = np.where(high > low, high - low, 1.0)
     halves = np.empty((2, len(splats), 3), np.uint8)
     for rows in passing(len(splats)):
-        steps = np.rint((bent(splats.means[places[rows]]) - low) / span * STEPS).astype(np.uint16)
+        steps = np.rint((symmetric_log(splats.means[places[rows]]) - low) / span * STEPS).astype(
+            np.uint16
+        )
         halves[:, rows] = steps & 255, steps >> 8
     files = ["means_l.webp", "means_u.webp"]
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
     return {name: _picture(half) for name, half in zip(files, halves, strict=True)}
 
 
-def bent(means: NDArray[np.floating]) -> NDArray[np.float64]:
+def symmetric_log(means: NDArray[np.floating]) -> NDArray[np.float64]:
     """Positions on the curve whose even steps are stored: finer near the centre."""
     exact = means.astype(np.float64)
     return np.sign(exact) * np.log1p(np.abs(exact))
 
 
-def unbent(curved: NDArray[np.float64]) -> NDArray[np.float64]:
+def symmetric_exp(curved: NDArray[np.float64]) -> NDArray[np.float64]:
     """The inverse of `bent`."""
     return np.sign(curved) * np.expm1(np.abs(curved))
 

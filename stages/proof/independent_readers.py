@@ -22,30 +22,11 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.blocks import forget, passing
-from stages.base.lazy import named
-from stages.formats import format_of
-from stages.proof.content import (
-    Y_DOWN,
-    Y_UP,
-    FileContent,
-    logits,
-    splats_by_rows,
-    splats_of,
-)
+from stages.proof.content import logits, splats_by_rows, splats_of
 from stages.scene import Splats
-
-__all__ = ["FileContent", "read_back"]
 
 _PLY_ROWS = 1 << 14  # columns are gathered from the cache
 _PAGE_PIECE = 1 << 22  # characters: the parser goes over an unfinished element once a piece
-
-
-def read_back(path: Path) -> FileContent:
-    """What another program would find in the file. Raises whatever its parser raises: a file that
-    was just written has no excuse."""
-    with np.errstate(all="ignore"):  # flat splats have a logarithm of -infinity
-        row = format_of(path)
-        return FileContent(named(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
 
 
 def ply(path: Path) -> Splats:

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.base.lazy import named
 from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
 from stages.measure.judge import CAP_DB, decibels
-from stages.proof import diagnosis, independent_readers
+from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows
@@ -102,13 +101,13 @@ class Prover:
         """
         row = format_of(path)
         try:
-            content = _drawable(independent_readers.read_back(path))
-            said = named(row.validator)(path) if row.validator else []
+            content = _drawable(checks.read_back(path))
+            errors = checks.CHECKS[row.ending].validate(path)
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)
-        if said:
-            return Proof(count, {}, f"its validator says: {said[0]}")
+        if errors:
+            return Proof(count, {}, f"its validator says: {errors[0]}")
         if count != len(self.splats):
             return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
         names = tuple(filter(None, (row.ending, self.came_as)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 
-def complaints(path: Path) -> list[str]:
+def errors_in(path: Path) -> list[str]:
     """One line for each error that any of its registered validators finds.
 
     They know stages, packages and prims, but nothing of particle fields: values are for the

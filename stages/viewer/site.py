@@ -27,7 +27,7 @@ def site(
     photos: the folder that `View.image` starts from; a photograph that is not there is left out.
     source: what `splat edit` would read, if it is not the content. Raises SplatError."""
     shots, items = with_photographs(shots_of(views, splats), views, photos)
-    streams = format_of(content).levels
+    streams = format_of(content).streamed
     files = streamed_sog.parts_of(content) if streams else {"scene.ply": content}
     items |= {f"/{name}": Item(file, "application/octet-stream") for name, file in files.items()}
     levels = streamed_sog.widths(content, splats) if streams else []

@@ -15,13 +15,13 @@ from stages.capacity.tuning import Tuner
 from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import least_turned
-from stages.formats.coarse import Bits, on_grids
+from stages.formats.quantisation import BitDepths, quantise_splats
 from stages.measure.judge import load_photographs, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats, TrainedSplats, seen_extent, split_held_out
 from tests.small_scene import SmallScene, small_scene
 
-FEW = Bits(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)
-ROUNDING = [name for name, row in FORMATS.items() if row.rounds]
+FEW = BitDepths(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)
+ROUNDING = [name for name, row in FORMATS.items() if row.needs_finetuning]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, sits_out:
 def test_the_others_make_up_for_what_is_rounded(scene: SmallScene) -> None:
     exact = least_turned(scene.splats)
     found = tuned_to(
-        lambda s: on_grids(s, FEW), exact, tuner(scene), 30, nothing_seen(scene.splats)
+        lambda s: quantise_splats(s, FEW), exact, tuner(scene), 30, nothing_seen(scene.splats)
     )
     rounded = as_read(FORMATS["sog"], found)
     for name in ("means", "log_scales", "opacity_logits"):
@@ -70,7 +70,7 @@ def test_the_others_make_up_for_what_is_rounded(scene: SmallScene) -> None:
     for held_out, gain in ((False, 1.0), (True, 0.5)):
         plain, fitted = (
             mean_psnr_db(splats, photographs(scene, held_out), "cpu")
-            for splats in (on_grids(exact, FEW), rounded)
+            for splats in (quantise_splats(exact, FEW), rounded)
         )
         assert fitted > plain + gain
 

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from splatcli.app import app
 from stages import formats
 from stages.base import scratch
+from stages.surface.table import MESHES
 from tests.cli.help_text import help_of
 from tests.formats.truth import many_splats
 
@@ -114,7 +115,7 @@ def test_help_names_every_ending() -> None:
         assert f".{name}" in text
 
 
-@pytest.mark.parametrize("ending", formats.MESHES)
+@pytest.mark.parametrize("ending", MESHES)
 def test_a_mesh_is_made_from_a_run_and_converted_neither_to_nor_from(
     tmp_path: Path, ending: str
 ) -> None:

@@ -12,20 +12,22 @@ import pytest
 from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.base.lazy import named
-from stages.formats import FORMATS, MESHES, TABLE, Format
-from stages.proof.anatomy import anatomy_of
+from stages.formats import BY_ENDING, FORMATS, Format
+from stages.proof.checks import CHECKS, byte_breakdown_of
+from stages.surface.table import MESHES, MeshFormat
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
 README = Path(__file__).parents[2] / "README.md"
-PLACES = ("writer", "reader", "second_reader", "anatomy", "order", "validator")
+PLACES = ("writer", "reader", "independent_reader", "order", "quantiser")
+ROWS: list[Format | MeshFormat] = [*BY_ENDING.values(), *MESHES.values()]
 
 
 def readme_lines() -> list[str]:
     """The lines of README's table, formats that say the same of themselves on one."""
     lines = []
     for (opens_in, keeps, y_up), rows in itertools.groupby(
-        TABLE, lambda row: (row.opens_in, row.keeps, row.y_up)
+        ROWS, lambda row: (row.opens_in, row.keeps, row.y_up)
     ):
         names = ", ".join(f"`{row.ending}`" for row in rows)
         lines.append(f"| {names} | {opens_in} | {keeps}{'; y up' if y_up else ''} |")
@@ -39,16 +41,19 @@ def test_readmes_table_is_made_of_the_rows() -> None:
     assert found == readme_lines(), "README's table should be:\n" + "\n".join(readme_lines())
 
 
-@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.ending)
-def test_every_function_that_a_row_names_is_there(row: Format) -> None:
-    for place in filter(None, (getattr(row, name) for name in PLACES)):
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.ending)
+def test_every_function_that_a_row_names_exists(row: Format | MeshFormat) -> None:
+    for place in filter(None, (getattr(row, name, "") for name in PLACES)):
         assert callable(named(place)), place
-    assert bool(row.anatomy) != row.is_mesh
+
+
+def test_every_format_has_its_checks() -> None:
+    assert list(CHECKS) == list(BY_ENDING)
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
 def test_a_writer_takes_views_where_its_row_says_so(row: Format) -> None:
-    assert ("views" in inspect.signature(named(row.writer)).parameters) == row.wants_views
+    assert ("views" in inspect.signature(named(row.writer)).parameters) == row.takes_views
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
@@ -86,8 +91,8 @@ def test_a_format_leaves_the_files_that_its_row_names(tmp_path: Path, row: Forma
 def test_every_format_tells_its_bytes_or_why_not(tmp_path: Path, row: Format) -> None:
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, many_splats(300))
-    found = anatomy_of(path)
-    if found.untold:
+    found = byte_breakdown_of(path)
+    if found.unknown:
         assert not found.parts
     else:
         assert {"positions", "rotations", "scales"} <= found.parts.keys()

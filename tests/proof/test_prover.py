@@ -14,7 +14,7 @@ from stages import formats
 from stages.formats import splat32
 from stages.proof import prover as proving
 from stages.proof import usd_validators
-from stages.proof.independent_readers import read_back
+from stages.proof.checks import read_back
 from stages.proof.prover import Proof, Prover, cameras_for
 from stages.scene import Splats
 from tests.small_scene import SmallScene, small_scene
@@ -258,7 +258,7 @@ def test_the_usd_librarys_own_validators_have_nothing_to_say(
     scene: SmallScene, tmp_path: Path, name: str
 ) -> None:
     formats.write(tmp_path / f"a.{name}", scene.splats)
-    assert usd_validators.complaints(tmp_path / f"a.{name}") == []
+    assert usd_validators.errors_in(tmp_path / f"a.{name}") == []
 
 
 @pytest.mark.parametrize(

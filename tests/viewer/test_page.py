@@ -14,7 +14,7 @@ from stages import formats
 from stages.formats import html
 from stages.formats.page import document
 from stages.formats.page.shots import Shot, as_plain, shots_of
-from stages.proof.independent_readers import read_back
+from stages.proof.checks import read_back
 from stages.scene import Camera, Splats, look_at
 from stages.viewer.site import site
 from tests import scenes

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stages import formats
-from stages.formats.coarse import held_by
+from stages.formats.quantisation import splats_to_write
 from stages.formats.rows import kept_rows
 from stages.measure.judge import Photograph, Score, drawing_of, scores
 from stages.measure.speed import seconds_a_frame
@@ -100,7 +100,7 @@ def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, .
         for name, row in formats.FORMATS.items():
             tell(f"writing and judging .{name}")
             path = Path(folder) / f"scene.{name}"
-            held = held_by(row, material.quantised) if material.quantised else splats
+            held = splats_to_write(row, material.quantised) if material.quantised else splats
             held = material.fitted.get(name, held)
             formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)

@@ -21,13 +21,13 @@ from stages.formats.rows import (
     logits_of,
     unit_quaternions,
 )
-from stages.formats.sog import LOG_SCALE_LIMIT, STEPS, bent, palette_size, unbent
+from stages.formats.sog import LOG_SCALE_LIMIT, STEPS, palette_size, symmetric_exp, symmetric_log
 from stages.formats.table import Format
 from stages.scene import QuantisedSplats, Splats
 
 
 @dataclass(frozen=True)
-class Bits:
+class BitDepths:
     """How many each value is told in, and a row of the palette of view-dependent colours."""
 
     position: int = 16
@@ -38,20 +38,20 @@ class Bits:
     palette: int = 16
 
 
-def of_sog(splats: Splats, bits: Bits) -> Splats:
+def quantise_for_sog(splats: Splats, bits: BitDepths) -> Splats:
     """What a .sog holds of them in so many bits, on the grids that its writer will find again."""
-    return on_grids(least_turned(splats), bits)
+    return quantise_splats(least_turned(splats), bits)
 
 
-def on_grids(splats: Splats, bits: Bits) -> Splats:
+def quantise_splats(splats: Splats, bits: BitDepths) -> Splats:
     """The same, axes named as they are."""
     exact = found = splats
     for name, count in asdict(bits).items():
-        found = told(exact, found, name, count)
+        found = quantise_attribute(exact, found, name, count)
     return found
 
 
-def told(exact: Splats, splats: Splats, name: str, bits: int) -> Splats:
+def quantise_attribute(exact: Splats, splats: Splats, name: str, bits: int) -> Splats:
     """`splats` with one of the values of `Bits` told in so many, from what it is in `exact`."""
     if not len(exact):
         return splats
@@ -77,7 +77,7 @@ def palette_bits(count: int) -> int:
     return (palette_size(count) - 1).bit_length()
 
 
-def held_by(row: Format, quantised: QuantisedSplats) -> Splats:
+def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
     """What a file of this format should hold: drawable splats, their mean colours where colours do
     not change with the view, in as many bits as were decided on."""
     splats = quantised.splats
@@ -86,21 +86,21 @@ def held_by(row: Format, quantised: QuantisedSplats) -> Splats:
         splats = replace(splats.with_sh_degree(0), sh=sh)
     splats = kept_rows(splats)[0]
     bits = quantised.decisions.get("bits")
-    if not row.coarse or not isinstance(bits, dict):
+    if not row.quantiser or not isinstance(bits, dict):
         return splats
-    found: Splats = named(row.coarse)(splats, Bits(**bits))
+    found: Splats = named(row.quantiser)(splats, BitDepths(**bits))
     return found
 
 
 def _positions(means: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
     if bits >= 16:
         return means.astype(np.float32)
-    curved = bent(means)
+    curved = symmetric_log(means)
     low, high = curved.min(axis=0), curved.max(axis=0)
     span = np.where(high > low, high - low, 1.0)
     coarse = 1 << (16 - bits)
     steps = np.minimum(np.rint((curved - low) / span * (STEPS / coarse)) * coarse, STEPS)
-    found: NDArray[np.float32] = unbent(low + span * steps / STEPS).astype(np.float32)
+    found: NDArray[np.float32] = symmetric_exp(low + span * steps / STEPS).astype(np.float32)
     return found
 
 

@@ -10,17 +10,17 @@ import pytest
 from stages import formats
 from stages.formats import FORMATS
 from stages.formats.axes import least_turned
-from stages.formats.coarse import Bits, held_by, of_sog
+from stages.formats.quantisation import BitDepths, quantise_for_sog, splats_to_write
 from stages.scene import QuantisedSplats, Splats, morton
 from stages.scene.rotations import matrices_of
 from tests.formats.truth import many_splats
 
-FEW = Bits(position=12, rotation=5, scale=5, colour=5, opacity=5, palette=6)
+FEW = BitDepths(position=12, rotation=5, scale=5, colour=5, opacity=5, palette=6)
 
 
 def test_a_file_holds_what_was_rounded_and_is_smaller(tmp_path) -> None:
     splats = many_splats(3000).with_sh_degree(0)
-    rounded = of_sog(splats, FEW)
+    rounded = quantise_for_sog(splats, FEW)
     sizes = []
     for name, held in (("a", splats), ("b", rounded)):
         path = tmp_path / f"{name}.sog"
@@ -37,7 +37,7 @@ def test_a_file_holds_what_was_rounded_and_is_smaller(tmp_path) -> None:
 
 def test_each_value_keeps_its_bits() -> None:
     splats = many_splats(3000).with_sh_degree(0)
-    rounded = of_sog(splats, FEW)
+    rounded = quantise_for_sog(splats, FEW)
     assert len(np.unique(rounded.log_scales)) <= 32
     assert len(np.unique(rounded.sh[:, 0])) <= 32
     assert len(np.unique(rounded.opacity_logits)) <= 33  # the end of the grid stays its end
@@ -47,7 +47,7 @@ def test_each_value_keeps_its_bits() -> None:
 
 def test_a_palette_of_few_rows_is_written_as_it_was_chosen(tmp_path) -> None:
     splats = many_splats(3000)
-    rounded = of_sog(splats, FEW)
+    rounded = quantise_for_sog(splats, FEW)
     kinds = rounded.sh[:, 1:].reshape(len(rounded), -1)
     assert 32 < len(np.unique(kinds, axis=0)) <= 64
     formats.write(tmp_path / "a.sog", rounded)
@@ -78,7 +78,7 @@ def test_only_formats_that_pack_are_told_in_fewer_bits() -> None:
     splats = many_splats(100)
     quantised = QuantisedSplats(splats, 3, {"bits": vars(FEW)})
     for name, row in FORMATS.items():
-        held = held_by(row, quantised)
+        held = splats_to_write(row, quantised)
         assert np.array_equal(held.means, splats.means) == (name != "sog"), name
 
 
@@ -86,7 +86,7 @@ def test_only_formats_that_pack_are_told_in_fewer_bits() -> None:
 def test_without_view_dependence_colours_are_the_mean_of_what_photographs_see(name) -> None:
     splats = many_splats(50)
     flat = np.full((50, 3), 0.25, np.float32)
-    held = held_by(FORMATS[name], QuantisedSplats(splats, 3, {}, flat))
+    held = splats_to_write(FORMATS[name], QuantisedSplats(splats, 3, {}, flat))
     assert (held.sh[:, 0] == 0.25).all() == (name == "splat")
     same = replace(splats, sh=splats.sh[:, :1], sh_degrees=splats.sh_degrees * 0)
-    assert np.array_equal(held_by(FORMATS[name], QuantisedSplats(same, 0, {})).sh, same.sh)
+    assert np.array_equal(splats_to_write(FORMATS[name], QuantisedSplats(same, 0, {})).sh, same.sh)
