@@ -41,10 +41,10 @@ def edit(
         )
     target = target or Path("scene.ply")
     row, chain = formats.format_of(target), operations.prepared(typed, target)
-    if row.streamed and not dry_run:
+    if not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
-        if target.parent.is_dir():  # `write` says so where it is not
+        if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
         scene = _opened(source)
         before, start_db = len(scene.splats), scene.psnr_db()

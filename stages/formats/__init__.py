@@ -24,7 +24,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.atomic import clear_left, make_folder
+from stages.base.atomic import clear_left
 from stages.base.lazy import named
 from stages.formats.table import BY_ENDING, FORMATS, Format, format_of
 from stages.formats.units import units_of
@@ -51,8 +51,7 @@ def write(
     views: tuple[View, ...] = (),
     coarser: Sequence[Splats] = (),
 ) -> int:
-    """Write `splats` in the format that the suffix of `path` stands for, completely or not at all;
-    the folder is made.
+    """Write `splats` in the format that the suffix of `path` stands for, completely or not at all.
 
     Args:
         path: the file to write.
@@ -65,7 +64,6 @@ def write(
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
     row = format_of(path)
-    make_folder(Path(path).parent)
     clear_left(Path(path).parent)
     more: dict[str, Any] = {"views": views} if row.takes_views else {}
     if row.streamed:

@@ -102,6 +102,13 @@ def test_unknown_endings_name_the_known_ones(tmp_path: Path, source: str, target
     assert not (tmp_path / target).exists()
 
 
+def test_the_folder_of_the_target_is_made(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(3))
+    target = tmp_path / "new" / "deep" / "a.spz"
+    converted(tmp_path / "a.ply", target)
+    assert len(formats.read(target)) == 3
+
+
 def test_a_missing_or_damaged_file_leaves_nothing_behind(tmp_path: Path) -> None:
     converted(tmp_path / "none.spz", tmp_path / "b.ply", code=3)
     (tmp_path / "a.spz").write_bytes(b"\x1f\x8bnonsense")
