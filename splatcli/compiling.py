@@ -54,7 +54,7 @@ class Compiling(Listener):
         with suppress(OSError):  # then training compiles, as it always could
             self._process = subprocess.Popen(
                 # -P: the current folder may hold anything, also a file named numpy.py.
-                [sys.executable, "-P", "-m", "stages.training.warm", self._backend],
+                [sys.executable, "-P", "-m", "stages.training.compile_kernels", self._backend],
                 stdin=subprocess.PIPE,  # it ends when this does
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

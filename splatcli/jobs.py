@@ -17,9 +17,9 @@ from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
 from stages.base.settings import Setting, settings_of
-from stages.distributed import blocks, cluster, sharing
-from stages.distributed.tasks import Engine
-from stages.raster.backends import backend_of, drawn_by
+from stages.distributed import blocks, cluster, sfm_chunks
+from stages.distributed.tasks import Executor
+from stages.raster.backends import backend_of, backend_of_settings
 from stages.run import runfolder
 from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
@@ -136,7 +136,9 @@ def settings_for(
         chosen["train"] = presets()[preset]
     found = {name: options.changed(settings, typed) for name, settings in chosen.items()}
     if typed.keys() & {"backend", "device"}:  # said now, not after an hour of other work
-        for asked in {drawn_by(each) for each in found.values() if hasattr(each, "backend")}:
+        for asked in {
+            backend_of_settings(each) for each in found.values() if hasattr(each, "backend")
+        }:
             backend_of(asked).require()
     return found
 
@@ -271,11 +273,11 @@ def in_blocks(pipeline: Pipeline, address: str | None) -> Pipeline:
     """The pipeline; if it has blocks, the cluster at `address` trains them, or this process. A
     cluster does shares of structure from motion, too."""
 
-    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Engine]:
+    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Executor]:
         seen = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
-        return cluster.engine_at(address, folder, seen, listener)
+        return cluster.open_executor(address, folder, seen, listener)
 
-    shared = pipeline if address is None else sharing.with_shares(pipeline, opened)
+    shared = pipeline if address is None else sfm_chunks.with_shares(pipeline, opened)
     return blocks.in_blocks(shared, opened)
 
 

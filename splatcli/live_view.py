@@ -14,7 +14,7 @@ from stages.run.manifest import Manifest
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
-    from stages.viewer.live import LivePage
+    from stages.viewer.live_page import LivePage
     from stages.viewer.server import LocalServer
 
 WATCHED = "train"
@@ -36,7 +36,7 @@ class Watching(Listener):
         if stage.name != WATCHED:
             return
         from stages.formats.page.shots import shots_of
-        from stages.viewer.live import LivePage
+        from stages.viewer.live_page import LivePage
         from stages.viewer.server import LocalServer
 
         sfm, seeds = self._pipeline.load("sfm"), self._pipeline.load("seed")

@@ -42,18 +42,18 @@ def splats_of(target: Path | None, strict: bool = True) -> tuple[Splats, Pipelin
 
 def _as_in_its_run(file: Path, splats: Splats) -> Splats:
     """A file says nothing of how it is drawn; the run whose export folder it lies in does."""
-    from stages.scene import look_of
+    from stages.scene import draw_settings_of
 
     views = views_around(file)
-    return replace(splats, look=look_of(tuple(views))) if views else splats
+    return replace(splats, draw_settings=draw_settings_of(tuple(views))) if views else splats
 
 
 def backend_of(pipeline: Pipeline | None) -> str:
     """The backend that a run was trained with, as it was asked for; "auto" without a run, and on a
     machine that cannot run it."""
-    from stages.raster.backends import AUTO, drawn_by, runs_here
+    from stages.raster.backends import AUTO, backend_of_settings, runs_here
 
-    asked = AUTO if pipeline is None else drawn_by(pipeline.recorded_settings()["train"])
+    asked = AUTO if pipeline is None else backend_of_settings(pipeline.recorded_settings()["train"])
     return asked if runs_here(asked) else AUTO
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from splatcli import console
 from stages.base.errors import Family, SplatError
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def along(
     them if a length is given. Raises SplatError.
     """
     from stages.scene.framing import in_front_of
-    from stages.viewer import orbit, travel
+    from stages.viewer import camera_paths, orbit
 
     cameras = [view.camera for view in views]
     if path == "orbit":
@@ -82,9 +82,9 @@ def along(
                 hint="Name the run folder, or choose --path orbit.",
                 family=Family.USAGE,
             )
-        cameras = [cameras[i] for i in travel.tour(cameras, splats)]
-        steady = travel.steadied(_travel(cameras, splats, length), _STEADY_S * length[2])
-        return [travel.levelled(camera) for camera in steady], False
+        cameras = [cameras[i] for i in camera_paths.tour(cameras, splats)]
+        steady = camera_paths.steadied(_travel(cameras, splats, length), _STEADY_S * length[2])
+        return [camera_paths.levelled(camera) for camera in steady], False
     cameras = _from_file(path)
     if length[0] is None and length[1] is None:
         return cameras, True
@@ -92,11 +92,11 @@ def along(
 
 
 def _travel(cameras: list[Camera], splats: Splats, length: Length) -> list[Camera]:
-    from stages.viewer import travel
+    from stages.viewer import camera_paths
 
-    usual = _TURN_S * travel.length_in_turns(cameras, splats)
+    usual = _TURN_S * camera_paths.length_in_turns(cameras, splats)
     frames = _frames(length, min(max(usual, _SHORTEST_S), _LONGEST_S))
-    return list(travel.through(cameras, splats, frames))
+    return list(camera_paths.through(cameras, splats, frames))
 
 
 def _frames(length: Length, usual_s: float) -> int:

@@ -14,10 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.capacity.usual import DECIDING
 from stages.formats import FORMATS, Format
-from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
 from stages.surface.table import MESHES
 
 if TYPE_CHECKING:
@@ -59,7 +64,7 @@ class ExportSettings:
             "folder, no suffix.",
         },
     )
-    fit_steps: int = field(
+    rounding_steps: int = field(
         default=45,
         metadata={
             "help": "Steps of fine-tuning after each kind of value that a format rounds (.splat, "
@@ -107,7 +112,7 @@ def run(
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
-    prover = Prover.of(splats, cameras, drawn_by(settings))
+    prover = Prover.of(splats, cameras, backend_of_settings(settings))
     fitting = _fitting(inputs, splats, settings, wanted, report) if len(splats) else None
     files, figures = [], {}
     for number, name in enumerate(wanted):
@@ -128,7 +133,7 @@ def run(
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
         files.append(file)
         figures[file.format] = {"size_bytes": file.size_bytes}
-    tell(report, drawn_by(settings))
+    report_backend(report, backend_of_settings(settings))
     report.metric("files", len(files))
     report.metric("splats", len(splats))
     report.metric("dropped", dropped)
@@ -164,25 +169,31 @@ def _fitting(
     import numpy as np
 
     from stages.capacity.rounding import Fitting
-    from stages.capacity.tuning import Tuner
-    from stages.measure.judge import load_photographs
-    from stages.measure.worth import measure_worth
+    from stages.measure.contribution import measure_contributions
+    from stages.measure.evaluation import load_evaluation_views
     from stages.scene import seen_extent, split_held_out, spread_over
+    from stages.training.finetune import FineTuner
 
     reconstruction: Reconstruction = inputs["sfm"]
     training = split_held_out(reconstruction.views)[0]
     if not (
-        settings.fit_steps and training and any(FORMATS[name].needs_finetuning for name in wanted)
+        settings.rounding_steps
+        and training
+        and any(FORMATS[name].needs_finetuning for name in wanted)
     ):
         return None
-    sat_out, backend, folder = inputs["train"].sat_out, drawn_by(settings), reconstruction.folder
-    photographs = load_photographs(folder, training, splats.look)
-    tuner = Tuner(photographs, seen_extent(reconstruction), backend, report, sat_out)
+    dropout, backend, folder = (
+        inputs["train"].dropout,
+        backend_of_settings(settings),
+        reconstruction.folder,
+    )
+    photographs = load_evaluation_views(folder, training, splats.draw_settings)
+    tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, dropout)
     seen = np.zeros(len(splats), np.int32)
-    if sat_out:  # only then it matters
-        seen = measure_worth(splats, photographs, backend).photographs
-    deciding = load_photographs(folder, spread_over(training, DECIDING), splats.look)
-    return Fitting(tuner, deciding, backend, settings.fit_steps, seen)
+    if dropout:  # only then it matters
+        seen = measure_contributions(splats, photographs, backend).photographs
+    deciding = load_evaluation_views(folder, spread_over(training, DECIDING), splats.draw_settings)
+    return Fitting(tuner, deciding, backend, settings.rounding_steps, seen)
 
 
 def fitted_in(folder: Path, ending: str) -> Splats | None:
@@ -206,17 +217,19 @@ def _write_meshes(
     wanted = [MESHES[ending] for ending in dict.fromkeys(asked) if ending in MESHES]
     if not wanted:
         return []
-    from stages.base.lazy import named
+    from stages.base.lazy import load_object
     from stages.scene import ExportedFile
     from stages.surface.files import fault_of
     from stages.surface.make import make
 
-    made = make(splats, reconstruction, settings.mesh_triangles, drawn_by(settings), report)
+    made = make(
+        splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
+    )
     report.metric("mesh", made.figures)
     files = []
     for row in wanted:
         path = folder / f"{settings.name}.{row.ending}"
-        named(row.writer)(path, made.mesh, reconstruction.units)
+        load_object(row.writer)(path, made.mesh, reconstruction.units)
         if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, path.stat().st_size))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base import threads
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
+from stages.base.text import counted
 
 if TYPE_CHECKING:
     from stages.photos.decode import Decoded, PixelBudget

@@ -11,11 +11,16 @@ from typing import TYPE_CHECKING, Any
 from stages.base.stage import Report, Stage
 from stages.capacity.usual import DECIDING, SOG_LOSS_DB
 from stages.formats.table import FORMATS
-from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
 
 if TYPE_CHECKING:
-    from stages.capacity.rounds import Outcome
-    from stages.measure.judge import Photograph
+    from stages.capacity.pruning import PruningResult
+    from stages.measure.evaluation import EvaluationView
     from stages.scene import Reconstruction, Splats, TrainedSplats
 
 
@@ -73,7 +78,7 @@ class PruneSettings:
             "max": 99,
         },
     )
-    tune_steps: int = field(
+    finetune_steps: int = field(
         default=90,
         metadata={
             "help": "Steps of fine-tuning after each round; 0 for none.",
@@ -90,48 +95,48 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report. Raises SplatError for targets that cannot be met."""
     import numpy as np
 
-    from stages.capacity import words
-    from stages.capacity.aim import Aim, felt_share
-    from stages.capacity.rounds import Shrinking
-    from stages.capacity.tuning import Tuner
-    from stages.measure.judge import load_photographs, mean_psnr_db
+    from stages.capacity import summary
+    from stages.capacity.pruning import Pruner
+    from stages.capacity.targets import Targets, felt_share
+    from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
     from stages.scene import seen_extent, split_held_out
     from stages.scene.storage import save_splats
+    from stages.training.finetune import FineTuner
 
     reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
     splats = trained.splats
     kept, held = split_held_out(reconstruction.views)
-    photographs = load_photographs(reconstruction.folder, kept, splats.look)
-    judges = load_photographs(reconstruction.folder, held, splats.look) or photographs
-    backend = drawn_by(settings)
+    photographs = load_evaluation_views(reconstruction.folder, kept, splats.draw_settings)
+    judges = load_evaluation_views(reconstruction.folder, held, splats.draw_settings) or photographs
+    backend = backend_of_settings(settings)
     before = mean_psnr_db(splats, judges, backend)
     extent = seen_extent(reconstruction)
-    tuner = Tuner(photographs, extent, backend, report, trained.sat_out)
+    tuner = FineTuner(photographs, extent, backend, report, trained.dropout)
     size_bytes = _sizes(settings, splats, photographs, reconstruction)
-    aim = Aim(
+    targets = Targets(
         settings.price,
         settings.max_loss_db,
-        felt_share(trained.by_heart),
+        felt_share(trained.overfitted),
         settings.max_splats,
         settings.max_mb * 1e6,
         settings.min_psnr,
         size_bytes,
     )
-    shrinking = Shrinking(
-        *(photographs, aim, backend, tuner, settings.rounds, settings.tune_steps, report)
+    shrinking = Pruner(
+        *(photographs, targets, backend, tuner, settings.rounds, settings.finetune_steps, report)
     )
     found = shrinking.run(splats)
     after = mean_psnr_db(found.splats, judges, backend)
-    tell(report, backend)
-    report.metric("judged_side_px", splats.look.side)
+    report_backend(report, backend)
+    report.metric("judged_side_px", splats.draw_settings.side)
     report.metric("psnr_before_db", round(before, 3))
     report.metric("psnr_db", round(after, 3))
     report.metric("psnr_change_db", round(after - before, 3))
     report.metric("tune_steps", tuner.steps)
     _report_cuts(splats, found, report)
-    report.metric("said", words.said(trained, found, settings.price, tuner.steps))
-    if more := words.more_would_pay(found, settings.price):
+    report.metric("said", summary.summarise(trained, found, settings.price, tuner.steps))
+    if more := summary.more_would_pay(found, settings.price):
         report.warn("prune-more-would-pay", more)
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)
@@ -141,7 +146,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
 def _sizes(
     settings: PruneSettings,
     splats: Splats,
-    photographs: Sequence[Photograph],
+    photographs: Sequence[EvaluationView],
     reconstruction: Reconstruction,
 ) -> Callable[[Splats], int]:
     """Measures the file that --max-mb speaks of, as one that is really written: in as few bits as
@@ -149,20 +154,20 @@ def _sizes(
     import tempfile
 
     from stages import formats
-    from stages.base.lazy import named
-    from stages.capacity.bits import fewest_bits
+    from stages.base.lazy import load_object
+    from stages.capacity.bits import choose_bits
     from stages.formats.quantisation import BitDepths
-    from stages.measure.judge import mean_psnr_db
+    from stages.measure.evaluation import mean_psnr_db
     from stages.scene import spread_over
 
     row = FORMATS[settings.mb_of]
     few: dict[str, int] = {}
     if settings.max_mb and row.quantiser:
-        deciding, backend = spread_over(photographs, DECIDING), drawn_by(settings)
-        few, _ = fewest_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
+        deciding, backend = spread_over(photographs, DECIDING), backend_of_settings(settings)
+        few, _ = choose_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
 
     def size_bytes(splats: Splats) -> int:
-        held = named(row.quantiser)(splats, BitDepths(**few)) if few else splats
+        held = load_object(row.quantiser)(splats, BitDepths(**few)) if few else splats
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"scene.{settings.mb_of}"
             formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
@@ -171,7 +176,7 @@ def _sizes(
     return size_bytes
 
 
-def _report_cuts(before: Splats, found: Outcome, report: Report) -> None:
+def _report_cuts(before: Splats, found: PruningResult, report: Report) -> None:
     """Counts, the price and the rounds as metrics; a warning where much was in the air."""
     kept = [one for one in found.rounds if one.kept]
     floaters, start = sum(one.floaters for one in kept), len(before)
@@ -183,7 +188,9 @@ def _report_cuts(before: Splats, found: Outcome, report: Report) -> None:
     report.metric("unneeded_removed", start - len(after) - floaters)
     report.metric("floater_share", round(floaters / max(start, 1), 5))
     report.metric("splats_by_sh_degree", degrees)
-    report.metric("price", asdict(found.price) | {"bits_a_number": found.price.bits_a_number})
+    report.metric(
+        "price", asdict(found.price) | {"bits_per_parameter": found.price.bits_per_parameter}
+    )
     report.metric("training_psnr_before_db", round(found.start_db, 3))
     report.metric("training_psnr_db", round(found.end_db, 3))
     report.metric("stopped_by", found.stopped_by)

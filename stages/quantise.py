@@ -16,11 +16,16 @@ from typing import TYPE_CHECKING, Any
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.capacity.usual import DECIDING, SOG_LOSS_DB
-from stages.raster.backends import backend_setting, device_setting, drawn_by, tell
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+)
 
 if TYPE_CHECKING:
-    from stages.measure.judge import Photograph
-    from stages.scene import Look, QuantisedSplats, Reconstruction, Splats
+    from stages.measure.evaluation import EvaluationView
+    from stages.scene import DrawSettings, QuantisedSplats, Reconstruction, Splats
 
 _DECISIONS, _FLAT = "decisions.json", "flat_dc.npy"
 # Colour that a splat may lose with its higher bands, in steps of 8 bits; the largest that passes.
@@ -69,14 +74,14 @@ def run(
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.capacity.bits import fewest_bits
+    from stages.capacity.bits import choose_bits
     from stages.formats import FORMATS, splat32
     from stages.formats.quantisation import splats_to_write
     from stages.measure.flat import flat_dc
     from stages.scene import QuantisedSplats, save_splats, split_held_out
 
     splats: Splats = inputs["prune"]
-    decider, judge = _measures(inputs["sfm"], splats.look, settings, report)
+    decider, judge = _measures(inputs["sfm"], splats.draw_settings, settings, report)
     raw_db = decider.psnr(splats)
     by_degree = {splats.sh_degree: raw_db}
     kept = splats
@@ -90,17 +95,21 @@ def run(
     flat = None
     if kept.sh_degree:
         views = split_held_out(inputs["sfm"].views)[0]
-        flat = flat_dc(kept, (kept.look.camera(v.camera) for v in views), drawn_by(settings))
+        flat = flat_dc(
+            kept,
+            (kept.draw_settings.camera(v.camera) for v in views),
+            backend_of_settings(settings),
+        )
     drawn = splats_to_write(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
     in_32_bytes = splat32.decode(splat32.encode(drawn))
     judged = {
         "psnr_raw_db": judge.psnr(splats),
         "psnr_kept_db": judge.psnr(kept),
-        "psnr_splat32_db": judge.psnr(replace(in_32_bytes, look=splats.look)),
+        "psnr_splat32_db": judge.psnr(replace(in_32_bytes, draw_settings=splats.draw_settings)),
     }
 
     counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
-    bits, sog_db = fewest_bits(kept, decider.psnr, settings.sog_loss_db)
+    bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
     decisions: dict[str, object] = {
         "sh_degree": kept.sh_degree,
         "bits": bits,
@@ -120,8 +129,8 @@ def run(
     report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
     report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("measured_on", judge.what)
-    report.metric("judged_side_px", splats.look.side)
-    tell(report, drawn_by(settings))
+    report.metric("judged_side_px", splats.draw_settings.side)
+    report_backend(report, backend_of_settings(settings))
     save_splats(folder, kept)
     (folder / _DECISIONS).write_text(json.dumps(decisions, indent=1) + "\n", encoding="utf-8")
     if flat is not None:
@@ -158,10 +167,13 @@ def _bytes(splats: Splats) -> int:
 
 
 def _measures(
-    reconstruction: Reconstruction, look: Look, settings: QuantiseSettings, report: Report
+    reconstruction: Reconstruction,
+    draw_settings: DrawSettings,
+    settings: QuantiseSettings,
+    report: Report,
 ) -> tuple[_Measure, _Measure]:
     """(what decides, what judges): training photographs, and those held out if there are any."""
-    from stages.measure.judge import load_photographs
+    from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out, spread_over
 
     training, held = split_held_out(reconstruction.views)
@@ -175,9 +187,14 @@ def _measures(
         )
     lent = tuple(spread_over(training, settings.max_views))
     judges, what = (held, "held out") if held else (lent, "training")
-    decider = _Measure(load_photographs(reconstruction.folder, lent, look), settings, report)
+    decider = _Measure(
+        load_evaluation_views(reconstruction.folder, lent, draw_settings), settings, report
+    )
     judge = _Measure(
-        load_photographs(reconstruction.folder, judges, look), settings, Report(), what
+        load_evaluation_views(reconstruction.folder, judges, draw_settings),
+        settings,
+        Report(),
+        what,
     )
     return decider, judge
 
@@ -186,7 +203,7 @@ def _measures(
 class _Measure:
     """Measures splats on photographs that are loaded once."""
 
-    photographs: Sequence[Photograph]
+    photographs: Sequence[EvaluationView]
     settings: QuantiseSettings
     report: Report
     what: str = "training"
@@ -194,9 +211,9 @@ class _Measure:
 
     def psnr(self, splats: Splats) -> float:
         """Mean PSNR over the photographs (dB)."""
-        from stages.measure.judge import mean_psnr_db
+        from stages.measure.evaluation import mean_psnr_db
 
-        mean = round(mean_psnr_db(splats, self.photographs, drawn_by(self.settings)), 4)
+        mean = round(mean_psnr_db(splats, self.photographs, backend_of_settings(self.settings)), 4)
         self.done += 1
         # Raw, three lower degrees, each threshold, and about as many numbers of bits.
         total = 5 + len(_THRESHOLDS_OF_255) + _BIT_TRIALS

@@ -52,7 +52,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     """
     import numpy as np
 
-    from stages.scene import Splats, logit, look_of, rgb_to_dc
+    from stages.scene import Splats, draw_settings_of, logit, rgb_to_dc
     from stages.scene.storage import save_splats
 
     reconstruction: Reconstruction = inputs["sfm"]
@@ -84,7 +84,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
         sh=rgb_to_dc(colours)[:, None, :].astype(np.float32),
         sh_degrees=np.zeros(len(points), np.uint8),
         origin=reconstruction.origin.copy(),
-        look=look_of(reconstruction.views),
+        draw_settings=draw_settings_of(reconstruction.views),
     )
     save_splats(folder, splats)
     report.metric("splats", len(splats))
@@ -101,10 +101,10 @@ def _with_agreed(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.structure.seeding.sweep import agreed_points
+    from stages.structure.seeding.plane_sweep import plane_sweep_points
 
     training, _ = split_held_out(reconstruction.views)
-    more, more_colours = agreed_points(reconstruction.folder, training, points)
+    more, more_colours = plane_sweep_points(reconstruction.folder, training, points)
     report.metric("agreed", len(more))
     return np.concatenate([points, more]), np.concatenate([colours, more_colours])
 

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 from stages.base import threads
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
+from stages.base.text import counted
 
 if TYPE_CHECKING:
     from stages.scene import Capture, Reconstruction
+    from stages.structure.chunks import ChunkExecutor
+    from stages.structure.fallbacks import Attempt, Attempts
     from stages.structure.job import Job
-    from stages.structure.ladder import Attempt, Climb
-    from stages.structure.shares import Hands
     from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PHOTOGRAPHS = 3
@@ -129,7 +129,7 @@ def run(
     settings: SfmSettings,
     folder: Path,
     report: Report,
-    hands: Hands | None = None,
+    executor: ChunkExecutor | None = None,
 ) -> Reconstruction:
     """Reconstruct the capture in inputs["ingest"]; see the module's docstring. hands: who does
     shares of features and matching (`structure.shares`), which changes no byte.
@@ -138,12 +138,19 @@ def run(
     pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
     SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
-    from stages.structure import attempts, finish, ladder, light, metric, reconstruction_files
+    from stages.structure import (
+        attempt_runner,
+        fallbacks,
+        finish,
+        light,
+        metric_scale,
+        reconstruction_files,
+    )
 
     capture: Capture = inputs["ingest"]
     _check(capture)
     if settings.scale:
-        metric.checked_distance(settings.scale, capture)  # now, not when cameras are found
+        metric_scale.check_distance(settings.scale, capture)  # now, not when cameras are found
     if (folder / _FINISHED).exists():
         return _again(folder, report)
     work = folder / _WORK
@@ -152,15 +159,15 @@ def run(
     _check_different(capture)
     base = _base_job(capture, settings, work)
     _reuse_or_clear(work, base)
-    bench = attempts.Workbench(
+    bench = attempt_runner.AttemptRunner(
         folder=work,
         base=base,
         report=report,
         deadline=time.monotonic() + 60.0 * settings.max_minutes,
         allow_partial=settings.allow_partial,
-        hands=hands,
+        executor=executor,
     )
-    climbed = ladder.climb(
+    climbed = fallbacks.try_configurations(
         bench.try_rung,
         already_exhaustive=base.matching == "exhaustive",
         out_of_time=bench.out_of_time,
@@ -170,7 +177,7 @@ def run(
     model = _accepted(best, settings, capture)
     _tell(best, climbed, capture, report)
     found = finish.finish(
-        model, capture, folder, report, metric.Known(settings.scale, settings.marker)
+        model, capture, folder, report, metric_scale.KnownScale(settings.scale, settings.marker)
     )
     reconstruction = light.with_light(found, report)
     reconstruction_files.save_reconstruction(folder, reconstruction)
@@ -190,10 +197,10 @@ def _with_known_cameras(
 ) -> Reconstruction:
     import numpy as np
 
-    from stages.structure import known, light, metric, reconstruction_files
+    from stages.structure import known_cameras, light, metric_scale, reconstruction_files
 
     deadline = time.monotonic() + 60.0 * settings.max_minutes
-    found = known.reconstruct(
+    found = known_cameras.reconstruct(
         capture,
         cameras,
         folder,
@@ -204,7 +211,9 @@ def _with_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        size=metric.Known(settings.scale, settings.marker, float(settings.metres), "--metres"),
+        size=metric_scale.KnownScale(
+            settings.scale, settings.marker, float(settings.metres), "--metres"
+        ),
         seconds_left=lambda: deadline - time.monotonic(),
     )
     found = light.with_light(found, report)
@@ -329,7 +338,7 @@ def _accepted(best: Attempt, settings: SfmSettings, capture: Capture) -> SparseM
     )
 
 
-def _tell(best: Attempt, climbed: Climb, capture: Capture, report: Report) -> None:
+def _tell(best: Attempt, climbed: Attempts, capture: Capture, report: Report) -> None:
     """Warnings about what is not as it should be."""
     assert best.result is not None
     assert best.result.model is not None
@@ -362,10 +371,10 @@ def _tell(best: Attempt, climbed: Climb, capture: Capture, report: Report) -> No
 
 def _tell_doubts(best: Attempt, report: Report) -> None:
     """What would be a failure if there were more of it."""
-    from stages.structure.gates import doubts
+    from stages.structure.gates import borderline_failures
 
     failed = {failure.code for failure in best.failures}
-    for doubt in doubts(best.figures):
+    for doubt in borderline_failures(best.figures):
         if doubt.code not in failed:
             report.warn(doubt.code, f"{doubt.given} {doubt.wanted} {doubt.hint}")
 

@@ -11,17 +11,23 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.base.words import counted
-from stages.raster.backends import backend_setting, device_setting, drawn_by, passed_over, tell
+from stages.base.text import counted
+from stages.raster.backends import (
+    backend_of_settings,
+    backend_setting,
+    device_setting,
+    report_backend,
+    unavailable_backends,
+)
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from stages.measure.judge import Photograph
+    from stages.measure.evaluation import EvaluationView
     from stages.raster.definition import MemoryFull
-    from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats
-    from stages.training.clock import Spent
+    from stages.scene import Camera, DrawSettings, Reconstruction, Splats, TrainedSplats
+    from stages.training.clock import Elapsed
     from stages.training.optimiser import Model
     from stages.training.trainer import Trainer
 
@@ -130,8 +136,10 @@ class TrainSettings:
 
 
 _LEARNT = "learnt.json"
-MOST_LENT = 4  # photographs: what more of them would tell is not worth what each is missed
-MIN_TO_LEND = 8  # photographs: of fewer, each is missed more than its advice is worth
+MAX_VALIDATION_VIEWS = (
+    4  # photographs: what more of them would tell is not worth what each is missed
+)
+MIN_VIEWS_FOR_VALIDATION = 8  # photographs: of fewer, each is missed more than its advice is worth
 
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
@@ -148,7 +156,7 @@ def run(
     from stages.raster.definition import MemoryFull
     from stages.raster.smoothing import smoothed
     from stages.scene import TrainedSplats
-    from stages.training.cap import forget_cap, lower_cap
+    from stages.training.cap import lower_cap, remove_cap
     from stages.training.checkpoint import remove_checkpoint
 
     if settings.blocks != "1":
@@ -159,29 +167,29 @@ def run(
     trainer = make_trainer(reconstruction, len(start), settings, folder, report)
     if settings.seconds:
         trainer.seconds = max(settings.seconds - (time.monotonic() - started), 1.0)
-    tell(report, trainer.backend)
+    report_backend(report, trainer.backend)
     report.metric("device", report.device)
-    report.metric("passed_over", passed_over(settings.backend))
+    report.metric("unavailable_backends", unavailable_backends(settings.backend))
     report.metric("train_photographs", len(trainer.train))
     report.metric("held_out_photographs", len(trainer.held_out))
     try:
         model = trainer.run(start)
     except MemoryFull as full:
         raise _does_not_fit(full, lower_cap(folder, full.fits).splats) from full
-    splats = finished(model, settings.sh_degree, start, trainer.look)
+    splats = finished(model, settings.sh_degree, start, trainer.draw_settings)
     if settings.smooth:
         splats = smoothed(splats, trainer.widths(splats.means))
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
-    trained = TrainedSplats(splats, trainer.sits_out, trainer.by_heart)
+    trained = TrainedSplats(splats, trainer.dropout, trainer.overfitted)
     save(folder, trained)
     remove_checkpoint(folder)
-    forget_cap(folder)
+    remove_cap(folder)
     report.metric("steps", trainer.schedule.steps)
     _report_makers(trainer, report)
     report.metric("photographs_lent", len(trainer.lent))
-    report.metric("learnt_by_heart", trainer.by_heart)
+    report.metric("learnt_by_heart", trainer.overfitted)
     if trainer.answers and trainer.gain_db is not None:
         report.metric("sitting_out_gain_db", round(trainer.gain_db, 3))
         report.metric("photographs_lent_said", [asdict(answer) for answer in trainer.answers])
@@ -239,18 +247,18 @@ def make_trainer(
     report: Report,
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
-    from stages.measure.judge import load_photographs
-    from stages.scene import look_of, seen_extent, split_held_out
-    from stages.training.cap import cap_for, splats_told
+    from stages.measure.evaluation import load_evaluation_views
+    from stages.scene import draw_settings_of, seen_extent, split_held_out
+    from stages.training.cap import cap_for, splats_determined
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
     from stages.training.views import load_views
 
     kept, held = split_held_out(reconstruction.views)
-    light = light_wanted(reconstruction, settings.light, report)
+    light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
-    look = look_of(reconstruction.views, settings.train_side, light)
-    held_out = load_photographs(reconstruction.folder, held, look)
+    draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light)
+    held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     smaller = [
         v
         for v in reconstruction.views
@@ -262,7 +270,7 @@ def make_trainer(
             f"Used at their own size, smaller than --train-side {settings.train_side}: "
             f"{counted(len(smaller), 'photograph')}. --max-side sets how large ingest keeps them.",
         )
-    told = splats_told([view.levels[-1].camera for view in train], settings.sh_degree)
+    told = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
     cap = cap_for(folder, settings.max_splats, told)
     report.metric("splat_cap", cap.splats)
     report.metric("splat_cap_from", cap.origin)
@@ -277,28 +285,32 @@ def make_trainer(
         ),
         train=train,
         held_out=held_out,
-        look=look,
+        draw_settings=draw_settings,
         cap=cap.splats,
         folder=folder,
         report=report,
         smooth=settings.smooth,
         over_any=settings.background == "any",
-        backend=drawn_by(settings),
+        backend=backend_of_settings(settings),
         within=settings.within,
         growth=settings.growth,
-        lent=lent_rows(len(train)),
+        lent=validation_rows(len(train)),
         patience_db=settings.patience,
     )
 
 
-def lent_rows(n: int) -> tuple[int, ...]:
+def validation_rows(n: int) -> tuple[int, ...]:
     """Which of `n` training photographs decide while the model grows: the fifth of every eight, so
     that they lie between the judges, or of more where that would be more than four; none where
     there are too few to lend one."""
-    return tuple(range(4, n, max(8, -(-n // MOST_LENT)))) if n >= MIN_TO_LEND else ()
+    return (
+        tuple(range(4, n, max(8, -(-n // MAX_VALIDATION_VIEWS))))
+        if n >= MIN_VIEWS_FOR_VALIDATION
+        else ()
+    )
 
 
-def light_wanted(reconstruction: Reconstruction, wanted: str, report: Report) -> bool:
+def corrects_light(reconstruction: Reconstruction, wanted: str, report: Report) -> bool:
     """Whether photographs are brought to their median light, as `TrainSettings.light` says."""
     from stages.scene.light import NOISE_EV, spread_ev
 
@@ -316,7 +328,7 @@ def light_wanted(reconstruction: Reconstruction, wanted: str, report: Report) ->
     return chosen
 
 
-def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
+def finished(model: Model, sh_degree: int, start: Splats, draw_settings: DrawSettings) -> Splats:
     """The model as splats: unit quaternions, without rows that are not finite."""
     import numpy as np
 
@@ -335,33 +347,33 @@ def finished(model: Model, sh_degree: int, start: Splats, look: Look) -> Splats:
         model.sh[good],
         np.full(int(good.sum()), sh_degree, np.uint8),
         start.origin,
-        look,
+        draw_settings,
     )
 
 
-class Judged(Protocol):
+class TrainedResult(Protocol):
     """What `write_quality` asks of whoever trained; see `Trainer`."""
 
-    held_out: Sequence[Photograph]
-    look: Look
+    held_out: Sequence[EvaluationView]
+    draw_settings: DrawSettings
     history: list[dict[str, Any]]
-    times: list[Spent]
+    times: list[Elapsed]
 
     def drawn(self, camera: Camera) -> NDArray[np.float32]: ...
 
 
 def write_quality(
-    trainer: Judged, reconstruction: Reconstruction, folder: Path, report: Report
+    trainer: TrainedResult, reconstruction: Reconstruction, folder: Path, report: Report
 ) -> None:
     """Final held-out figures into the report; table, plot and contact sheet into the folder."""
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.measure.judge import as_taken_db, inside_db, scores, spread
+    from stages.measure.evaluation import evaluate, psnr_as_taken_db, psnr_inside_masks_db, spread
     from stages.scene import split_held_out
     from stages.training.charts import contact_sheet, training_plot
 
-    found = scores(trainer.drawn, trainer.held_out, with_flip=True)
+    found = evaluate(trainer.drawn, trainer.held_out, with_flip=True)
     if found:
         values = [score.psnr_db for score in found]
         worst = min(found, key=lambda score: score.psnr_db)
@@ -377,12 +389,14 @@ def write_quality(
             "train-nothing-held-out",
             "Too few photographs to hold one out: quality was not measured.",
         )
-    if trainer.look.light and found:
+    if trainer.draw_settings.light and found:
         _, held = split_held_out(reconstruction.views)
-        plain, adapted = as_taken_db(trainer.drawn, reconstruction.folder, held, trainer.look)
+        plain, adapted = psnr_as_taken_db(
+            trainer.drawn, reconstruction.folder, held, trainer.draw_settings
+        )
         report.metric("psnr_as_taken_db", round(plain, 3))
         report.metric("psnr_adapted_db", round(adapted, 3))
-    inside = inside_db(trainer.drawn, trainer.held_out)
+    inside = psnr_inside_masks_db(trainer.drawn, trainer.held_out)
     if inside is not None:
         report.metric("psnr_inside_db", round(inside, 3))
     report.metric("held_out", [asdict(score) for score in found])
@@ -442,7 +456,7 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _LEARNT) as temporary:
-        learnt = {"sat_out": trained.sat_out, "by_heart": trained.by_heart}
+        learnt = {"dropout": trained.dropout, "overfitted": trained.overfitted}
         temporary.write_text(json.dumps(learnt) + "\n", encoding="utf-8")
 
 
@@ -454,7 +468,7 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     try:
         learnt = json.loads((folder / _LEARNT).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, bool(learnt["sat_out"]), bool(learnt["by_heart"]))
+        return TrainedSplats(splats, bool(learnt["dropout"]), bool(learnt["overfitted"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "train-folder-damaged",

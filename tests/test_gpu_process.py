@@ -26,6 +26,6 @@ def test_a_run_on_the_gpu_backend_ends_with_verified_assets(sample_run: Path, tm
     metrics = json.loads((tmp_path / "run/4-train/manifest.json").read_text())["metrics"]
     assert metrics["backend"] == "gpu"
     assert "Triton" in metrics["device"]
-    assert metrics["passed_over"] == {}
+    assert metrics["unavailable_backends"] == {}
     for name in ("scene.ply", "scene.glb"):
         sample.events(sample.splat("verify", f"run/7-export/{name}", "--json", folder=tmp_path))

@@ -10,9 +10,9 @@ from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.capacity import rounds
-from stages.capacity.aim import FELT
-from stages.measure.judge import load_photographs, mean_psnr_db
-from stages.measure.worth import Worth, beside_pictures, floaters
+from stages.capacity.targets import FELT
+from stages.measure.contribution import Contributions, floaters, near_view_frusta
+from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.scene import Splats, TrainedSplats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
@@ -31,11 +31,11 @@ def unseen(n: int) -> Splats:
 
 
 def run(
-    scene: SmallScene, trained: Splats, folder: Path, by_heart: bool = False, **settings
+    scene: SmallScene, trained: Splats, folder: Path, overfitted: bool = False, **settings
 ) -> tuple[Splats, Report]:
     """Without fine-tuning unless it is asked for: splats that stay are then the same."""
     report = Report()
-    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained, by_heart=by_heart)}
+    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained, overfitted=overfitted)}
     wanted = prune.PruneSettings(**{"tune_steps": 0, **settings})
     return prune.run(inputs, wanted, folder, report), report
 
@@ -47,7 +47,7 @@ def rows_of(part: Splats, whole: Splats) -> np.ndarray:
 
 def training_db(scene: SmallScene, found: Splats) -> float:
     training, _ = split_held_out(scene.reconstruction.views)
-    photographs = load_photographs(scene.reconstruction.folder, training, found.look)
+    photographs = load_evaluation_views(scene.reconstruction.folder, training, found.draw_settings)
     return mean_psnr_db(found, photographs, "cpu")
 
 
@@ -100,8 +100,8 @@ def test_the_loss_allowed_is_kept_and_the_price_moves_it(scene, tmp_path) -> Non
 
 
 def test_what_is_learnt_by_heart_may_lose_more_of_it(scene, tmp_path) -> None:
-    plain, _ = run(scene, scene.splats, tmp_path, by_heart=False, max_loss_db=0.02)
-    heart, _ = run(scene, scene.splats, tmp_path, by_heart=True, max_loss_db=0.02)
+    plain, _ = run(scene, scene.splats, tmp_path, overfitted=False, max_loss_db=0.02)
+    heart, _ = run(scene, scene.splats, tmp_path, overfitted=True, max_loss_db=0.02)
     assert len(heart) < len(plain)
 
 
@@ -121,14 +121,14 @@ def test_what_a_round_costs_is_foretold(scene, tmp_path) -> None:
 
 def test_fine_tuning_buys_back_what_cutting_lost(scene, tmp_path) -> None:
     cut, _ = run(scene, scene.splats, tmp_path, max_splats=150, rounds=0)
-    tuned, report = run(scene, scene.splats, tmp_path, max_splats=150, tune_steps=20)
+    tuned, report = run(scene, scene.splats, tmp_path, max_splats=150, finetune_steps=20)
     assert len(cut) == len(tuned) == 150
     assert training_db(scene, tuned) > training_db(scene, cut) + 0.5
     assert report.metrics["tune_steps"] <= 8 * 20
 
 
 def test_bands_that_were_cut_stay_cut_while_the_rest_learns(scene, tmp_path) -> None:
-    result, report = run(scene, scene.splats, tmp_path, price=20, tune_steps=10)
+    result, report = run(scene, scene.splats, tmp_path, price=20, finetune_steps=10)
     degrees = np.floor(np.sqrt(np.arange(result.sh.shape[1])))
     above = degrees[None] > result.sh_degrees[:, None]
     assert (result.sh_degrees < 2).any()
@@ -226,13 +226,15 @@ def test_the_origin_stays(scene, tmp_path) -> None:
     assert (result.origin == origin).all()
 
 
-def worth_of(photographs, sse_change, scene_depth=(4.0,)) -> Worth:
+def worth_of(photographs, sse_change, scene_depth=(4.0,)) -> Contributions:
     """A Worth with what the rules read; a splat in no photograph has no weight."""
     seen = np.asarray(photographs, np.int32)
     weight = (seen > 0).astype(np.float64)
     change, depth = np.asarray(sse_change, np.float64), np.asarray(scene_depth, np.float64)
     bands = np.zeros((len(seen), 0))
-    return Worth(change, change, weight, weight, seen, 1.0, depth, bands, bands, bands, depth)
+    return Contributions(
+        change, change, weight, weight, seen, 1.0, depth, bands, bands, bands, depth
+    )
 
 
 def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
@@ -250,4 +252,4 @@ def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:
 def test_beside_a_picture_is_a_quarter_of_its_longer_side_beyond_the_rim() -> None:
     """A camera of 64 x 48 pixels and focal length 60 sees x of -0.53 to 0.53 at depth 1."""
     scene = splats([[0, 0, 1], [0.75, 0, 1], [0.85, 0, 1], [0, 0, -1]])
-    assert beside_pictures(scene, [camera()]).tolist() == [True, True, False, False]
+    assert near_view_frusta(scene, [camera()]).tolist() == [True, True, False, False]

@@ -21,9 +21,9 @@ from stages import sfm
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.stage import Report
 from stages.scene import Capture, Reconstruction
-from stages.structure import ladder
+from stages.structure import fallbacks
 from tests import processes
-from tests.structure import bad_captures, rooms
+from tests.structure import bad_captures, room_captures
 from tests.structure.truth import TRUTH, centres, similarity
 
 FEW = sfm.SfmSettings(max_features=2000)  # enough for the sample, and quick
@@ -226,9 +226,9 @@ def away_m(found: Reconstruction, taken: Sequence[int]) -> NDArray[np.float64]:
 @pytest.mark.parametrize(
     ("make", "code"),
     [
-        (rooms.turned_over, "sfm-contradictions"),
-        (rooms.same_poster_twice, "sfm-contradictions"),
-        (rooms.weakly_linked, "sfm-separate-groups"),
+        (room_captures.turned_over, "sfm-contradictions"),
+        (room_captures.same_poster_twice, "sfm-contradictions"),
+        (room_captures.weakly_linked, "sfm-separate-groups"),
     ],
 )
 def test_a_plausible_model_that_is_wrong_is_refused(
@@ -237,7 +237,9 @@ def test_a_plausible_model_that_is_wrong_is_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ladder, "LADDER", (ladder.LADDER[0], ladder.LADDER[-1]))
+    monkeypatch.setattr(
+        fallbacks, "LADDER", (fallbacks.CONFIGURATIONS[0], fallbacks.CONFIGURATIONS[-1])
+    )
     error = failure(make(tmp_path / "in")[0], tmp_path, max_features=1500)
     assert error.code == code
 
@@ -245,7 +247,7 @@ def test_a_plausible_model_that_is_wrong_is_refused(
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_halves_that_one_weak_pair_joins_end_in_an_error_whatever_is_tried(tmp_path: Path) -> None:
-    rooms.weakly_linked(tmp_path / "photos")
+    room_captures.weakly_linked(tmp_path / "photos")
     run = str(tmp_path / "run")
     subprocess.run(processes.splat("ingest", str(tmp_path / "photos"), "--out", run), check=True)
     words = processes.splat("sfm", run, "--max-features", "1500")
@@ -271,7 +273,9 @@ def test_zooming_has_no_parallax(tmp_path: Path) -> None:
 def test_two_scenes_are_told_apart_and_one_may_be_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ladder, "LADDER", ladder.LADDER[:1])  # the others take minutes
+    monkeypatch.setattr(
+        fallbacks, "LADDER", fallbacks.CONFIGURATIONS[:1]
+    )  # the others take minutes
     capture = bad_captures.two_scenes(tmp_path / "in", each=6)
     assert failure(capture, tmp_path, max_features=1500).code == "sfm-separate-groups"
     report = Report()

@@ -20,8 +20,8 @@ from splatcli import console, jobs, options
 from stages import STAGE_NAMES
 from stages.base.atomic import replacing
 from stages.base.errors import Family, SplatError
-from stages.distributed import cluster, far
-from stages.distributed.tasks import Ending, Place, need_of
+from stages.distributed import cluster, remote
+from stages.distributed.tasks import Location, TaskResult, resources_of
 from stages.run.manifest import Manifest
 
 TABLE = "batch.csv"
@@ -55,13 +55,18 @@ def batch(
     """Bring each capture's run to its end; exit with the worst status of all. Raises SplatError
     for what concerns all of them, and Interrupted."""
     settings = jobs.fresh_settings(options.given_only(given))
-    runs = far.place_of(out)
-    photos = named(far.spread_out(captures))
-    tasks = [far.run_at(far.inside(runs, name), path, settings) for name, path in photos.items()]
-    with far.kept(runs) as here, cluster.engine_at(address, runs, photos.values()) as engine:
+    runs = remote.parse_location(out)
+    photos = named(remote.expand_locations(captures))
+    tasks = [
+        remote.task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()
+    ]
+    with (
+        remote.prepare_output(runs) as here,
+        cluster.open_executor(address, runs, photos.values()) as engine,
+    ):
         board = Board(here, runs, list(photos))
         with board.shown(quiet, as_json):
-            for number, ending in engine.results(tasks, need_of(settings["train"])):
+            for number, ending in engine.results(tasks, resources_of(settings["train"])):
                 board.ended(number, ending)
                 board.tell(number, ending, quiet, as_json)
         board.write()
@@ -70,13 +75,13 @@ def batch(
         raise typer.Exit(board.worst)
 
 
-def named(captures: Sequence[Place]) -> dict[str, Place]:
+def named(captures: Sequence[Location]) -> dict[str, Location]:
     """Captures by the name of their run folder: the folder's or the video's own. Raises SplatError
     "batch-same-name"."""
-    found: dict[str, Place] = {}
-    taken: dict[str, Place] = {}
+    found: dict[str, Location] = {}
+    taken: dict[str, Location] = {}
     for path in captures:
-        name = far.name_of(path)
+        name = remote.capture_name(path)
         if not name or name.casefold() in taken:
             other = taken.get(name.casefold(), path)
             raise SplatError(
@@ -94,17 +99,17 @@ class Board:
     """What is known of each run, on the screen and in batch.csv. out: the folder with what of the
     runs tells of them. runs: the folder that was asked for."""
 
-    def __init__(self, out: Path, runs: Place, names: Sequence[str]) -> None:
+    def __init__(self, out: Path, runs: Location, names: Sequence[str]) -> None:
         self.out, self.runs = out, runs
         self.rows = [Row(name) for name in names]
         self.worst = 0
         self.write()
 
-    def ended(self, number: int, ending: Ending) -> None:
+    def ended(self, number: int, ending: TaskResult) -> None:
         """Note how a run ended."""
         name = self.rows[number].capture
         with suppress(SplatError):  # what cannot be read is told as blanks
-            far.look(self.runs, name, self.out)
+            remote.fetch_manifests(self.runs, name, self.out)
         row = replace(figures_of(self.out / name), status=ending.code or DONE)
         self.rows[number] = row
         self.worst = max(self.worst, ending.status)
@@ -118,9 +123,9 @@ class Board:
             writer.writerow(field.name for field in fields(Row))
             writer.writerows(map(astuple, self.rows))
         if isinstance(self.runs, str):
-            far.Folder.at(self.runs).put(self.out, [TABLE])
+            remote.RemoteFolder.at(self.runs).put(self.out, [TABLE])
 
-    def tell(self, number: int, ending: Ending, quiet: bool, as_json: bool) -> None:
+    def tell(self, number: int, ending: TaskResult, quiet: bool, as_json: bool) -> None:
         """A line, or an event, for a run that ended."""
         row = self.rows[number]
         if as_json:
@@ -180,7 +185,7 @@ class Board:
                     for row in self.rows
                 ],
             )
-        console.out.print(str(far.inside(self.runs, TABLE)), markup=False)
+        console.out.print(str(remote.joined(self.runs, TABLE)), markup=False)
 
 
 def figures_of(run_folder: Path) -> Row:

@@ -13,10 +13,10 @@ from pathlib import Path
 from splatcli import console
 from stages.base import threads
 from stages.base.errors import Family
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
 
 _LITTLE_MEMORY_MIB = 2048.0
@@ -147,7 +147,7 @@ def _backend(backend: Backend) -> Check:
     try:
         if why_not := backend.why_not():
             return Check(label, f"not chosen: {why_not}", advice=_BACKEND_ADVICE)
-        named(backend.rasteriser)
+        load_object(backend.rasteriser)
     except Exception as error:
         return Check(label, f"not present ({_said(error)})", ok=False)
     return Check(label, "present")
@@ -159,6 +159,6 @@ def _gpu() -> Check:
         from stages.raster.gpu import device
 
         missing = device.missing()
-        return Check("GPU", f"{missing}; {device.built()}" if missing else device.told())
+        return Check("GPU", f"{missing}; {device.built()}" if missing else device.describe())
     except Exception as error:  # a broken driver may raise anything
         return Check("GPU", _said(error))

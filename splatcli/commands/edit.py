@@ -74,7 +74,7 @@ def _opened(source: Path) -> Edited:
     from stages.editing.operations import without_undrawable
     from stages.editing.scene import Edited
     from stages.formats import units_of
-    from stages.measure.judge import load_photographs
+    from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
     splats, pipeline = splats_of(source)
@@ -84,8 +84,8 @@ def _opened(source: Path) -> Edited:
         return Edited(splats, units_of(source))
     found = pipeline.load("sfm")
     training, held = split_held_out(found.views)
-    photographs = load_photographs(found.folder, training, splats.look)
-    judges = load_photographs(found.folder, held, splats.look) or photographs
+    photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
+    judges = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
     return Edited(
         *(splats, found.units, photographs, judges, found.views),
         backend=backend_of(pipeline),

@@ -103,16 +103,18 @@ def _cost(splats: Splats) -> dict[str, Any]:
 def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
     around the splats where there are none."""
-    from stages.measure.speed import seconds_a_frame
+    from stages.measure.speed import seconds_per_frame
     from stages.scene.framing import around
 
     if not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     views = views_of(pipeline)
     chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
-    cameras = [splats.look.camera(v.camera) for v in chosen] or around(splats, _TIMED_FRAMES, 0.9)
+    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or around(
+        splats, _TIMED_FRAMES, 0.9
+    )
     backend = backend_of(pipeline)
-    seconds = seconds_a_frame(splats, cameras, backend)
+    seconds = seconds_per_frame(splats, cameras, backend)
     return {
         "frames_a_second": round(1 / float(seconds.mean()), 2),
         "frame_size": f"{cameras[0].width} x {cameras[0].height}",

@@ -44,9 +44,9 @@ class Wanted:
 
 def render(target: Path | None, wanted: Wanted) -> None:
     """Draw what was asked for. Raises SplatError."""
-    from stages.raster.backends import AUTO, asked_for
+    from stages.raster.backends import AUTO, qualified_name
     from stages.raster.draw import renderer
-    from stages.raster.torch_device import PROCESSOR
+    from stages.raster.torch_device import CPU
     from stages.viewer import sinks
 
     kind = _kind_of(wanted)
@@ -62,7 +62,7 @@ def render(target: Path | None, wanted: Wanted) -> None:
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     backend = sources.backend_of(pipeline or sources.pipeline_around(target))
     if wanted.backend or wanted.device:
-        backend = asked_for(wanted.backend or AUTO, wanted.device or PROCESSOR)
+        backend = qualified_name(wanted.backend or AUTO, wanted.device or CPU)
     draw = renderer(splats, backend=backend)
     out = wanted.out
     facts: dict[str, Any] = {}

@@ -54,7 +54,7 @@ def material_of(pipeline: Pipeline) -> Material:
     """What is measured of a finished run. Raises SplatError (stage-not-finished, run-half-anew,
     nothing-held-out)."""
     from stages.export import fitted_in
-    from stages.measure.judge import load_photographs
+    from stages.measure.evaluation import load_evaluation_views
     from stages.measure.tradeoff.measuring import Material, deciding
     from stages.scene import split_held_out
 
@@ -74,10 +74,10 @@ def material_of(pipeline: Pipeline) -> Material:
     fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
     return Material(
         splats=splats,
-        training=load_photographs(
-            reconstruction.folder, deciding(training, splats.look), splats.look
+        training=load_evaluation_views(
+            reconstruction.folder, deciding(training, splats.draw_settings), splats.draw_settings
         ),
-        held_out=load_photographs(reconstruction.folder, held, splats.look),
+        held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
         views=reconstruction.views,
         units=reconstruction.units,
         backend=sources.backend_of(pipeline),

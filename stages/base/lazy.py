@@ -6,7 +6,7 @@ import importlib
 from typing import Any
 
 
-def named(place: str) -> Any:
+def load_object(place: str) -> Any:
     """What `place` ("stages.raster.reference_rasteriser:ReferenceRasteriser") names; its module is
     imported now. Raises ImportError or AttributeError for what is not there."""
     module, _, name = place.partition(":")

@@ -23,7 +23,7 @@ _ENTROPY = 0.9  # of the bits of a palette's numbers: about what compression lea
 _LEAST_DB = 1e-4  # a loss below it is chance
 
 
-def fewest_bits(
+def choose_bits(
     splats: Splats, psnr_db: Callable[[Splats], float], loss_db: float
 ) -> tuple[dict[str, int], float]:
     """(by attribute, in how many bits a .sog tells it; PSNR of such a file). The next bit goes

@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages import formats
-from stages.base.lazy import named
-from stages.capacity.tuning import Tuner
+from stages.base.lazy import load_object
 from stages.formats.axes import least_turned
 from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
-from stages.measure.judge import Photograph, mean_psnr_db
+from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
+from stages.training.finetune import FineTuner
 
 # Fields of `LearningRates`, what others can make up for least first; colour last, which is rounded
 # finely and in which the picture is linear.
@@ -40,8 +40,8 @@ class Fitting:
     """Fits splats to what files round. tuner: on the photographs of training; deciding: those of
     them that tell whether it was worth it. steps: see `tuned_to`; seen: see `Tuner.tuned`."""
 
-    tuner: Tuner
-    deciding: Sequence[Photograph]
+    tuner: FineTuner
+    deciding: Sequence[EvaluationView]
     backend: str
     steps: int
     seen: NDArray[np.int32]
@@ -72,7 +72,7 @@ class Fitting:
 
 
 def tuned_to(
-    rounded: Rounded, splats: Splats, tuner: Tuner, steps: int, seen: NDArray[np.int32]
+    rounded: Rounded, splats: Splats, tuner: FineTuner, steps: int, seen: NDArray[np.int32]
 ) -> Splats:
     """Splats that `rounded` leaves nearly as they are. steps: after each kind of value that it
     changes. Raises Interrupted."""
@@ -84,7 +84,7 @@ def tuned_to(
         splats = coarse
         still.append(name)
         if name != ORDER[-1]:
-            splats = tuner.tuned(splats, steps, seen, still)
+            splats = tuner.finetune(splats, steps, seen, still)
     return splats
 
 
@@ -96,9 +96,9 @@ def as_read(row: Format, splats: Splats) -> Splats:
         read = formats.read(path)
     found = read.with_sh_degree(splats.sh_degree)
     if row.order:
-        places = np.argsort(named(row.order)(splats))
+        places = np.argsort(load_object(row.order)(splats))
         found = found.take(places)
-    return replace(found, look=splats.look, origin=splats.origin)
+    return replace(found, draw_settings=splats.draw_settings, origin=splats.origin)
 
 
 def _only(name: str, coarse: Splats, splats: Splats) -> Splats:

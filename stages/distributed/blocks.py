@@ -19,20 +19,20 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Report, Stage
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.distributed import block_folders
-from stages.distributed.tasks import Engine, OpenEngine, Run, do_all, need_of
-from stages.raster.backends import drawn_by
+from stages.distributed.tasks import Executor, OpenExecutor, RunTask, resources_of, run_all
+from stages.raster.backends import backend_of_settings
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from stages.distributed.ground import Cell
-    from stages.measure.judge import Photograph
-    from stages.scene import Camera, Look, Reconstruction, Splats, TrainedSplats, View
-    from stages.training.clock import Spent
+    from stages.distributed.partition import Cell
+    from stages.measure.evaluation import EvaluationView
+    from stages.scene import Camera, DrawSettings, Reconstruction, Splats, TrainedSplats, View
+    from stages.training.clock import Elapsed
 
 FOLDER, COARSE = "blocks", "coarse"
 PHOTOGRAPHS_A_BLOCK = 250
@@ -40,7 +40,7 @@ PHOTOGRAPHS_A_BLOCK = 250
 COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4
 
 
-def in_blocks(pipeline: Pipeline, open_engine: OpenEngine) -> Pipeline:
+def in_blocks(pipeline: Pipeline, open_engine: OpenExecutor) -> Pipeline:
     """The pipeline, training in blocks where its settings ask for it."""
     plain = pipeline.layout.stage("train")
     return pipeline.with_run("train", partial(_train, pipeline, plain, open_engine))
@@ -54,7 +54,7 @@ def blocks_wanted(asked: str, photographs: int) -> int:
 def _train(
     pipeline: Pipeline,
     plain: Stage,
-    open_engine: OpenEngine,
+    open_engine: OpenExecutor,
     inputs: Mapping[str, Any],
     settings: Any,
     folder: Path,
@@ -83,31 +83,33 @@ class _Scene:
     whole: Reconstruction
     settings: Any
     root: Path
-    engine: Engine
+    engine: Executor
     report: Report
 
     def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
         """The merged splats, written to `folder` as training writes them."""
-        from stages.distributed import ground, sight
-        from stages.scene import look_of, split_held_out
-        from stages.train import light_wanted, save, write_quality
+        from stages.distributed import block_views, partition
+        from stages.scene import draw_settings_of, split_held_out
+        from stages.train import corrects_light, save, write_quality
 
         started = time.monotonic()
-        light = light_wanted(self.whole, self.settings.light, self.report)
+        light = corrects_light(self.whole, self.settings.light, self.report)
         self.settings = replace(self.settings, light="on" if light else "off")
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
-        places, weights = ground.looked_at(replace(self.whole, views=training))
-        cells = ground.cut(places, weights, blocks)
+        places, weights = partition.looked_at(replace(self.whole, views=training))
+        cells = partition.cut(places, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
-        member = sight.members(sight.shares(coarse, cells, cameras, drawn_by(self.settings)))
-        folders = self._blocks(seeds, coarse, cells, member, ground.margin(places))
+        member = block_views.members(
+            block_views.shares(coarse, cells, cameras, backend_of_settings(self.settings))
+        )
+        folders = self._blocks(seeds, coarse, cells, member, partition.margin(places))
         parts = self._parts(folders, cells, member)
-        look = look_of(self.whole.views, self.settings.train_side, light)
-        crossed = sight.crossing(member)
+        draw_settings = draw_settings_of(self.whole.views, self.settings.train_side, light)
+        crossed = block_views.crossing(member)
         crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
         teachers = [view for view in crossing if view in training]
-        trained = self._joined(parts, cells, teachers, look)
+        trained = self._joined(parts, cells, teachers, draw_settings)
         save(folder, trained)
         judged = _judged(trained.splats, self, held)
         write_quality(judged, self.whole, folder, self.report)
@@ -194,14 +196,14 @@ class _Scene:
     ) -> NDArray[np.bool_]:
         """[N] which of a block's splats are of the whole: those of its cell, at most as many."""
         from stages.distributed import merge
-        from stages.measure.judge import load_photographs
+        from stages.measure.evaluation import load_evaluation_views
 
         own = cell.holds(splats.means)
         if own.sum() <= most:
             return own
         training = [view for view in views if view.role != "test"]
-        photographs = load_photographs(self.whole.folder, training, splats.look)
-        return merge.shown_most(splats, own, most, photographs, drawn_by(self.settings))
+        photographs = load_evaluation_views(self.whole.folder, training, splats.draw_settings)
+        return merge.shown_most(splats, own, most, photographs, backend_of_settings(self.settings))
 
     def _begin(
         self, name: str, part: Reconstruction, seeds: Splats, coarse: Splats, wide: Cell
@@ -225,11 +227,11 @@ class _Scene:
     def _run(self, names: Sequence[str], most_splats: int) -> None:
         """Train in the run folders of these names. Raises SplatError for the first that failed,
         once the others have ended."""
-        tasks = [Run(self.root / name, until="train") for name in names]
-        do_all(
+        tasks = [RunTask(self.root / name, until="train") for name in names]
+        run_all(
             self.engine,
             tasks,
-            need_of(replace(self.settings, max_splats=most_splats)),
+            resources_of(replace(self.settings, max_splats=most_splats)),
             self.report.stop_requested,
             lambda done: self.report.progress(done, len(names), "blocks"),
             hint="Give the same command again: blocks that are finished are kept.",
@@ -240,30 +242,30 @@ class _Scene:
         parts: Sequence[TrainedSplats],
         cells: Sequence[Cell],
         crossing: Sequence[View],
-        look: Look,
+        draw_settings: DrawSettings,
     ) -> TrainedSplats:
         """The blocks as one, their seams put right by the photographs that cross them. In the
         report, how many splats each gave: they lie block after block."""
         import numpy as np
 
-        from stages.capacity.tuning import Tuner
         from stages.distributed import merge
-        from stages.measure.judge import load_photographs
+        from stages.measure.evaluation import load_evaluation_views
         from stages.scene import TrainedSplats, seen_extent
+        from stages.training.finetune import FineTuner
 
-        degree, backend = self.settings.sh_degree, drawn_by(self.settings)
+        degree, backend = self.settings.sh_degree, backend_of_settings(self.settings)
         given = [part.splats.with_sh_degree(degree) for part in parts]
-        splats, counts = merge.merged(given, cells, look)
-        sat_out = np.mean([part.sat_out for part in parts]) > 0.5
-        by_heart = np.mean([part.by_heart for part in parts]) > 0.5
-        found = TrainedSplats(splats, bool(sat_out), bool(by_heart))
+        splats, counts = merge.merged(given, cells, draw_settings)
+        dropout = np.mean([part.dropout for part in parts]) > 0.5
+        overfitted = np.mean([part.overfitted for part in parts]) > 0.5
+        found = TrainedSplats(splats, bool(dropout), bool(overfitted))
         seam = merge.at_seams(splats, counts, cells)
         gone = np.zeros(len(splats), bool)
         if crossing:
             self.report.progress(0, 1, "seams")
-            photographs = load_photographs(self.whole.folder, crossing, look)
+            photographs = load_evaluation_views(self.whole.folder, crossing, draw_settings)
             extent = seen_extent(self.whole)
-            tuner = Tuner(photographs, extent, backend, self.report, found.sat_out)
+            tuner = FineTuner(photographs, extent, backend, self.report, found.dropout)
             splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
         ends = np.cumsum([0, *counts])
         left = [int((~gone[i:j]).sum()) for i, j in pairwise(ends)]
@@ -276,13 +278,13 @@ class _Scene:
 
 @dataclass
 class _Judged:
-    """See `stages.train.Judged`."""
+    """See `stages.train.TrainedResult`."""
 
     draw: Callable[[Camera], Any]
-    held_out: Sequence[Photograph]
-    look: Look
+    held_out: Sequence[EvaluationView]
+    draw_settings: DrawSettings
     history: list[dict[str, Any]]
-    times: list[Spent]
+    times: list[Elapsed]
 
     def drawn(self, camera: Camera) -> NDArray[np.float32]:
         image: NDArray[np.float32] = self.draw(camera)
@@ -290,11 +292,11 @@ class _Judged:
 
 
 def _judged(splats: Splats, scene: _Scene, held: Sequence[View]) -> _Judged:
-    from stages.measure.judge import drawing_of, load_photographs
+    from stages.measure.evaluation import image_renderer, load_evaluation_views
 
-    photographs = load_photographs(scene.whole.folder, held, splats.look)
-    draw = drawing_of(splats, drawn_by(scene.settings))
-    return _Judged(draw, photographs, splats.look, [], [])
+    photographs = load_evaluation_views(scene.whole.folder, held, splats.draw_settings)
+    draw = image_renderer(splats, backend_of_settings(scene.settings))
+    return _Judged(draw, photographs, splats.draw_settings, [], [])
 
 
 class _Told(Listener):

@@ -22,7 +22,15 @@ from typing import Any
 
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, Interrupted, SplatError
-from stages.distributed.tasks import Ending, Engine, InTurn, Need, Place, Task, work_on
+from stages.distributed.tasks import (
+    Executor,
+    Location,
+    Resources,
+    SerialExecutor,
+    Task,
+    TaskResult,
+    run_task,
+)
 from stages.run.pipeline import Listener
 
 LOCAL = re.compile(r"local:([1-9]\d{0,3})")
@@ -40,7 +48,7 @@ def edition() -> str:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Worker:
     """What a worker says of itself. edition: "" where there is no splat. unseen: of the paths asked
     for, those that it does not see. cpus, memory_mib: of its machine, for tasks."""
 
@@ -52,15 +60,15 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Cluster:
+class RayExecutor:
     """Workers that were asked and can do the work."""
 
     ray: Any
-    workers: tuple[Answer, ...]
+    workers: tuple[Worker, ...]
 
     def results(
-        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
-    ) -> Iterator[tuple[int, Ending]]:
+        self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
+    ) -> Iterator[tuple[int, TaskResult]]:
         """See `tasks.Engine`. Raises SplatError "cluster-too-small"."""
         cpus, memory_mib = self.share(len(tasks), need)
         do = self.ray.remote(_with_threads).options(
@@ -78,7 +86,7 @@ class Cluster:
             for reference in ready:
                 yield waiting.pop(reference), self._ending(reference)
 
-    def share(self, tasks: int, need: Need) -> tuple[int, float]:
+    def share(self, tasks: int, need: Resources) -> tuple[int, float]:
         """(CPUs, MiB) for each of as many tasks: processors are shared, memory is what it takes.
         Raises SplatError "cluster-too-small": Ray would wait for ever."""
         least = min(worker.memory_mib for worker in self.workers)
@@ -97,37 +105,40 @@ class Cluster:
         fewest = min(worker.cpus for worker in self.workers)
         return max(1, min(fewest, every // tasks)), memory_mib
 
-    def _ending(self, reference: Any) -> Ending:
+    def _ending(self, reference: Any) -> TaskResult:
         try:
-            found: Ending = self.ray.get(reference)
+            found: TaskResult = self.ray.get(reference)
             return found
         except self.ray.exceptions.RayError as error:
             said = str(error).strip().splitlines()[0]
-            return Ending(int(Family.RESOURCES), "worker-lost", f"Its worker was lost: {said}")
+            return TaskResult(int(Family.RESOURCES), "worker-lost", f"Its worker was lost: {said}")
 
 
-def _with_threads(task: Task, threads: int) -> Ending:
+def _with_threads(task: Task, threads: int) -> TaskResult:
     os.environ["SPLAT_THREADS"] = str(threads)
-    ending = work_on(task)
+    ending = run_task(task)
     where = f" (On {socket.gethostname()}.)"  # whose disk is full, say
     return replace(ending, said=ending.said + where) if ending.status else ending
 
 
 @contextmanager
-def engine_at(
-    address: str | None, folder: Place, paths: Iterable[Place], listener: Listener | None = None
-) -> Iterator[Engine]:
+def open_executor(
+    address: str | None,
+    folder: Location,
+    paths: Iterable[Location],
+    listener: Listener | None = None,
+) -> Iterator[Executor]:
     """What does the work in `folder`: a cluster, or without an address this process, which tells
     the listener. Raises as `opened`."""
     if address is None:
-        yield InTurn(listener)
+        yield SerialExecutor(listener)
         return
-    with opened(address, folder, paths) as found:
+    with connect(address, folder, paths) as found:
         yield found
 
 
 @contextmanager
-def opened(address: str, folder: Place, paths: Iterable[Place]) -> Iterator[Cluster]:
+def connect(address: str, folder: Location, paths: Iterable[Location]) -> Iterator[RayExecutor]:
     """The cluster at `address` ("local:N": N workers of this machine, started and ended here).
 
     Each of its machines must have this splat, and see `folder` (which exists, and may be written
@@ -144,13 +155,13 @@ def opened(address: str, folder: Place, paths: Iterable[Place]) -> Iterator[Clus
             here = [path for path in (token, *local) if path is not None]
             answers = _asked(ray, [*map(str, here), *far])
             check(answers, edition(), token)
-        yield Cluster(ray, tuple(answers))
+        yield RayExecutor(ray, tuple(answers))
     finally:
         ray.shutdown()
 
 
 @contextmanager
-def _token(folder: Place) -> Iterator[Path | None]:
+def _token(folder: Location) -> Iterator[Path | None]:
     """A file that is new there; none at a URL."""
     if isinstance(folder, str):
         yield None
@@ -159,7 +170,7 @@ def _token(folder: Place) -> Iterator[Path | None]:
         yield Path(file.name)
 
 
-def check(answers: Sequence[Answer], ours: str, token: Path | None = None) -> None:
+def check(answers: Sequence[Worker], ours: str, token: Path | None = None) -> None:
     """Raises SplatError (cluster-other-splat, cluster-folder-unseen) for workers that cannot."""
     for answer in answers:
         if answer.edition != ours:
@@ -229,7 +240,7 @@ def _not_found(address: str, why: str) -> SplatError:
     )
 
 
-def _asked(ray: Any, paths: list[str]) -> list[Answer]:
+def _asked(ray: Any, paths: list[str]) -> list[Worker]:
     """What each machine of the cluster that takes tasks says. Raises SplatError."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -249,7 +260,7 @@ def _asked(ray: Any, paths: list[str]) -> list[Answer]:
     except (ray.exceptions.RayError, TimeoutError) as error:
         raise _not_found("this address", str(error).strip().splitlines()[0]) from error
     return [
-        Answer(
+        Worker(
             f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})",
             *(found, tuple(unseen)),
             cpus=int(node["Resources"]["CPU"]),

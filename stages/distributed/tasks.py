@@ -18,10 +18,10 @@ from stages.run.failures import as_splat_error
 from stages.run.pipeline import Listener, Pipeline
 
 if TYPE_CHECKING:
-    from stages.structure.shares import Share
+    from stages.structure.chunks import Chunk
 
 
-Place: TypeAlias = Path | str  # a path, or a URL
+Location: TypeAlias = Path | str  # a path, or a URL
 
 
 class Task(Protocol):
@@ -35,7 +35,7 @@ class Task(Protocol):
 
 
 @dataclass(frozen=True)
-class Run:
+class RunTask:
     """What `splat process PHOTOS --out RUN_FOLDER` does; without photos, it goes on with the run
     folder. settings: by stage name, the recorded ones where left out. until: the last stage."""
 
@@ -54,23 +54,23 @@ class Run:
 
 
 @dataclass(frozen=True)
-class OfStructure:
+class ChunkTask:
     """A share of features or matches."""
 
-    share: Share
+    share: Chunk
 
     @property
     def folder(self) -> Path:
         return self.share.out.parent
 
     def work(self, listener: Listener | None = None) -> None:
-        from stages.structure.shares import do
+        from stages.structure.chunks import run_chunk
 
-        do(self.share)
+        run_chunk(self.share)
 
 
 @dataclass(frozen=True)
-class Ending:
+class TaskResult:
     """How it went. status: exit status; code, said: of the error, "" if there was none."""
 
     status: int = 0
@@ -79,53 +79,53 @@ class Ending:
 
 
 @dataclass(frozen=True)
-class Need:
+class Resources:
     """What one task takes. memory_mib: None for all that one machine has."""
 
     memory_mib: float | None
     gpus: int = 0
 
 
-def need_of(train: Any) -> Need:
+def resources_of(train: Any) -> Resources:
     """What a run with these settings of training takes at most."""
     from stages.training.density import needed_mib
 
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
-    return Need(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))
+    return Resources(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))
 
 
-class Engine(Protocol):
+class Executor(Protocol):
     """Brings tasks to their ends, one or several at a time."""
 
     def results(
-        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
-    ) -> Iterator[tuple[int, Ending]]:
+        self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
+    ) -> Iterator[tuple[int, TaskResult]]:
         """(which task, how it ended), as they end. Raises SplatError, and Interrupted where `stop`
         is set, or a signal stopped what was being done at a safe place."""
 
 
-OpenEngine = Callable[[Path, Listener], AbstractContextManager[Engine]]
+OpenExecutor = Callable[[Path, Listener], AbstractContextManager[Executor]]
 """open_engine(folder, listener): what does the work in that folder."""
 
 
-def work_on(task: Task, listener: Listener | None = None) -> Ending:
+def run_task(task: Task, listener: Listener | None = None) -> TaskResult:
     """Do it, in this process. A failure is an ending; only Interrupted is raised."""
     try:
         task.work(listener)
     except Interrupted:
         raise
     except SplatError as error:
-        return ending_of(error)
+        return error_result(error)
     except Exception as error:
         known = as_splat_error(error, "the run", task.folder)
-        return ending_of(known or error)
-    return Ending()
+        return error_result(known or error)
+    return TaskResult()
 
 
-def do_all(
-    engine: Engine,
+def run_all(
+    engine: Executor,
     tasks: Sequence[Task],
-    need: Need,
+    need: Resources,
     stop: Event,
     tick: Callable[[int], None],
     hint: str,
@@ -147,24 +147,24 @@ def do_all(
         raise failed
 
 
-def ending_of(error: Exception) -> Ending:
+def error_result(error: Exception) -> TaskResult:
     """An error as figures and words."""
     if isinstance(error, SplatError):
-        return Ending(int(error.family), error.code, error.given)
+        return TaskResult(int(error.family), error.code, error.given)
     said = str(error).splitlines()[0] if str(error) else "no more is known"
-    return Ending(CRASHED, "bug", f"{type(error).__name__}: {said}.")
+    return TaskResult(CRASHED, "bug", f"{type(error).__name__}: {said}.")
 
 
-class InTurn:
+class SerialExecutor:
     """One task after the other, in this process."""
 
     def __init__(self, listener: Listener | None = None) -> None:
         self.listener = listener
 
     def results(
-        self, tasks: Sequence[Task], need: Need, stop: Event | None = None
-    ) -> Iterator[tuple[int, Ending]]:
+        self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
+    ) -> Iterator[tuple[int, TaskResult]]:
         for number, task in enumerate(tasks):
             if stop is not None and stop.is_set():
                 raise Interrupted(f"before {task.folder}")
-            yield number, work_on(task, self.listener)
+            yield number, run_task(task, self.listener)

@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.atomic import partial_prefix
 from stages.base.errors import Family, SplatError
-from stages.editing import expression, floaters, levels, regions, transform
+from stages.editing import expression, levels, regions, transform
 from stages.editing.decimate import FAR, NEAR, decimated
 from stages.editing.joining import joined
 from stages.editing.scene import Edited
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
 from stages.formats.rows import chosen, kept_rows
-from stages.measure.worth import floaters as hanging
+from stages.measure import floaters
+from stages.measure.contribution import floaters as hanging
 from stages.scene import Splats
 
 Operation = Callable[[Edited], Edited]
@@ -116,7 +117,7 @@ def _without_floaters(scene: Edited) -> Edited:
     if len(scene.photographs):
         gone = hanging(scene.splats, scene.worth(), scene.cameras())
     else:
-        gone = floaters.alone(scene.splats)
+        gone = floaters.isolated_splats(scene.splats)
     return scene.but(chosen(scene.splats, ~gone))
 
 

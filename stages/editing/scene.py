@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from stages.editing.decimate import Appraisal
 from stages.editing.transform import Similarity
-from stages.measure.judge import Photograph, mean_psnr_db
-from stages.measure.worth import Worth, beside_pictures, measure_worth
+from stages.measure.contribution import Contributions, measure_contributions, near_view_frusta
+from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.raster.backends import AUTO
 from stages.scene import Splats, View
 
@@ -27,8 +27,8 @@ class Edited:
 
     splats: Splats
     units: str = "arbitrary"
-    photographs: Sequence[Photograph] = ()
-    judges: Sequence[Photograph] = ()
+    photographs: Sequence[EvaluationView] = ()
+    judges: Sequence[EvaluationView] = ()
     views: tuple[View, ...] = ()
     moved: Similarity = field(default_factory=Similarity)
     backend: str = AUTO
@@ -55,9 +55,11 @@ class Edited:
     def views_there(self) -> tuple[View, ...]:
         return tuple(replace(v, camera=self.moved.of_camera(v.camera)) for v in self.views)
 
-    def worth(self) -> Worth:
+    def worth(self) -> Contributions:
         """Of each splat to the photographs of training; there must be some."""
-        return measure_worth(self.splats, _Moved(self.photographs, self.moved), self.backend)
+        return measure_contributions(
+            self.splats, _Moved(self.photographs, self.moved), self.backend
+        )
 
     def appraise(self, splats: Splats) -> Appraisal:
         """Squared error, and nothing beyond a picture's rim is left out that the next view would
@@ -65,7 +67,7 @@ class Edited:
         on, here they do not. The sample's 31,741 at a half are 22.1 dB held out by error, 21.6 by
         change."""
         worth = self.but(splats).worth()
-        unseen = (worth.photographs == 0) & beside_pictures(splats, self.cameras())
+        unseen = (worth.photographs == 0) & near_view_frusta(splats, self.cameras())
         alone: NDArray[np.float64] = np.where(unseen, np.inf, worth.sse_change)
         return Appraisal(worth.weight + _UNSEEN, alone)
 
@@ -73,20 +75,20 @@ class Edited:
         return [photograph.camera for photograph in _Moved(self.photographs, self.moved)]
 
 
-class _Moved(Sequence[Photograph]):
+class _Moved(Sequence[EvaluationView]):
     """Photographs taken elsewhere; read when they are wanted."""
 
-    def __init__(self, photographs: Sequence[Photograph], where: Similarity) -> None:
+    def __init__(self, photographs: Sequence[EvaluationView], where: Similarity) -> None:
         self._photographs, self._where = photographs, where
 
     def __len__(self) -> int:
         return len(self._photographs)
 
     @overload
-    def __getitem__(self, number: int) -> Photograph: ...
+    def __getitem__(self, number: int) -> EvaluationView: ...
     @overload
-    def __getitem__(self, number: slice) -> Sequence[Photograph]: ...
-    def __getitem__(self, number: int | slice) -> Photograph | Sequence[Photograph]:
+    def __getitem__(self, number: slice) -> Sequence[EvaluationView]: ...
+    def __getitem__(self, number: int | slice) -> EvaluationView | Sequence[EvaluationView]:
         if isinstance(number, slice):
             return [self[i] for i in range(len(self))[number]]
         photograph = self._photographs[number]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stages.base import scratch
 from stages.base.blocks import passing
 from stages.raster.reference import sh_basis
-from stages.scene import Camera, Look, Splats
+from stages.scene import Camera, DrawSettings, Splats
 from stages.scene.far import recentred
 from stages.scene.rotations import quaternions_of
 
@@ -43,8 +43,8 @@ class Similarity:
         pose[:3, 3] = self.scale * camera.world_to_camera[:3, 3] - rotation @ self.offset
         return replace(camera, world_to_camera=pose)
 
-    def of_look(self, look: Look) -> Look:
-        return replace(look, near=look.near * self.scale)
+    def draw_settings(self, draw_settings: DrawSettings) -> DrawSettings:
+        return replace(draw_settings, near=draw_settings.near * self.scale)
 
     def of_splats(self, splats: Splats) -> Splats:
         """The splats there. What is nowhere near the origin of their file is told from an origin
@@ -74,7 +74,7 @@ class Similarity:
             log_scales=logs,
             sh=sh,
             origin=linear @ splats.origin + shift + 0.0,
-            look=self.of_look(splats.look),
+            draw_settings=self.draw_settings(splats.draw_settings),
         )
 
     def _shift(self, splats: Splats) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import clear_left
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats.table import BY_ENDING, FORMATS, Format, format_of
 from stages.formats.units import units_of
 
@@ -68,7 +68,7 @@ def write(
     more: dict[str, Any] = {"views": views} if row.takes_views else {}
     if row.streamed:
         more["coarser"] = coarser
-    dropped: int = named(row.writer)(Path(path), splats, units=units, **more)
+    dropped: int = load_object(row.writer)(Path(path), splats, units=units, **more)
     return dropped
 
 
@@ -80,7 +80,7 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     """
     from stages.formats.rows import damage_kept
 
-    reader = named(format_of(path).reader)
+    reader = load_object(format_of(path).reader)
     with nullcontext() if strict else damage_kept():
         splats: Splats = reader(Path(path))
     return splats

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import codebook, smallest_three
 from stages.formats.axes import least_turned
 from stages.formats.rows import (
@@ -88,7 +88,7 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
     bits = quantised.decisions.get("bits")
     if not row.quantiser or not isinstance(bits, dict):
         return splats
-    found: Splats = named(row.quantiser)(splats, BitDepths(**bits))
+    found: Splats = load_object(row.quantiser)(splats, BitDepths(**bits))
     return found
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 DRAWS = 10_000
 CONFIDENCE = 0.95
 _SEED = 0  # equal differences get equal intervals, today and tomorrow
-BETTER, WORSE, NOT_TOLD_APART = "better", "worse", "not told apart"
+BETTER, WORSE, INCONCLUSIVE = "better", "worse", "not told apart"
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Difference:
         """ "better" or "worse" where the interval leaves 0 out, else "not told apart"."""
         if self.low > 0:
             return BETTER
-        return WORSE if self.high < 0 else NOT_TOLD_APART
+        return WORSE if self.high < 0 else INCONCLUSIVE
 
 
 def paired_difference(differences: NDArray[np.floating]) -> Difference:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.worth import colours_by_degree
+from stages.measure.contribution import colours_by_degree
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import WEIGHT, splat_arrays
 from stages.raster.draw import settings_of

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.judge import Photograph, decibels
+from stages.measure.evaluation import EvaluationView, capped_psnr_db
 from stages.scene import Camera
 
 STEP_PX = 0.5
@@ -94,7 +94,7 @@ def _framings(draw: Draw, camera: Camera, depth: float) -> list[Framing]:
     return [Framing(label, *shimmer(draw, *view)) for label, view in views.items()]
 
 
-def small_psnr_db(draw: Draw, photographs: Iterable[Photograph]) -> tuple[float, float]:
+def small_psnr_db(draw: Draw, photographs: Iterable[EvaluationView]) -> tuple[float, float]:
     """Mean PSNR of pictures a quarter as large a side: (drawn so, drawn whole and scaled down)."""
     found = []
     for photograph in photographs:
@@ -104,7 +104,7 @@ def small_psnr_db(draw: Draw, photographs: Iterable[Photograph]) -> tuple[float,
         fx, fy, cx, cy = (x / FEWER for x in (camera.fx, camera.fy, camera.cx, camera.cy))
         small = Camera(truth.shape[1], truth.shape[0], fx, fy, cx, cy, camera.world_to_camera)
         for drawn in (draw(small), blocks(np.clip(draw(camera), 0.0, 1.0))):
-            found.append(decibels(drawn, truth, None if counts is None else counts[..., 0]))
+            found.append(capped_psnr_db(drawn, truth, None if counts is None else counts[..., 0]))
     drawn_small, scaled_down = np.reshape(found, (-1, 2)).mean(axis=0)
     return float(drawn_small), float(scaled_down)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.photos.decode import DENIED
 from stages.photos.find import RAW_ADVICE, Findings
 from stages.scene import TRANSPARENT, Photo

@@ -7,7 +7,7 @@ from typing import Any
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.photos.decode import Decoded
 from stages.photos.exif import Exif
 from stages.photos.find import Source

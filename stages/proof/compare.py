@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.blocks import blocks
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, Format
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows, extent_of, matched_rows
@@ -87,7 +87,7 @@ def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows
     """How a format may have sorted either side; made one by one, as the first often fits."""
     for row in formats:
         if row.order:
-            order = named(row.order)
+            order = load_object(row.order)
             yield order(truth)
             yield np.argsort(order(file))
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stages.base.blocks import blocks
 from stages.formats import BY_ENDING, format_of
 from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
-from stages.measure.judge import CAP_DB, decibels
+from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
@@ -117,7 +117,7 @@ class Prover:
     def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:
         found = differences(self.splats, content, *names)
         by_camera = self._decibels(content, found.rows)
-        worst = min(by_camera, default=CAP_DB)
+        worst = min(by_camera, default=IDENTICAL_DB)
         figures = {
             "verify_db": round(worst, 2),
             "verify_mean_db": round(float(np.mean(by_camera)), 2) if by_camera else worst,
@@ -141,7 +141,7 @@ class Prover:
         draw = renderer(content.splats.take(drawn), settings_of(self.splats), self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
-            decibels(draw(camera).image, np.clip(picture, 0.0, 1.0))
+            capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))
             for camera, picture in zip(moved, self.pictures, strict=True)
         ]
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
-from stages.base.lazy import named
-from stages.raster.torch_device import DEVICES, PROCESSOR
+from stages.base.lazy import load_object
+from stages.raster.torch_device import CPU, DEVICES
 
 if TYPE_CHECKING:
     from stages.base.stage import Report
@@ -37,24 +37,24 @@ class Backend:
     name: str
     rasteriser: str
     what: str
-    step: str = "stages.training.plain_step:PlainStep"
+    step: str = "stages.training.reference_step:ReferenceStep"
     obstacle: str = ""
     told: str = ""
     devices: tuple[str, ...] = ()
-    on: str = PROCESSOR
+    on: str = CPU
 
     def where(self) -> str:
         """What it runs on, for a manifest."""
-        return str(named(self.told)(*self._device())) if self.told else PROCESSOR
+        return str(load_object(self.told)(*self._device())) if self.told else CPU
 
     def made(self) -> Rasteriser:
         """A new rasteriser. Raises SplatError where what it runs on is not there."""
-        found: Rasteriser = named(self.rasteriser)(*self._device())
+        found: Rasteriser = load_object(self.rasteriser)(*self._device())
         return found
 
     def require(self) -> None:
         """Raises SplatError where what it runs on is not there; asks no more than that takes."""
-        if self.obstacle or self.on != PROCESSOR:
+        if self.obstacle or self.on != CPU:
             self.made()
 
     def _device(self) -> tuple[str, ...]:
@@ -62,7 +62,7 @@ class Backend:
 
     def why_not(self) -> str:
         """Why "auto" passes it over here; "" where it does not."""
-        return str(named(self.obstacle)()) if self.obstacle else ""
+        return str(load_object(self.obstacle)()) if self.obstacle else ""
 
 
 # "auto" takes the first that nothing stands against.
@@ -72,8 +72,8 @@ BACKENDS = (
         "stages.raster.gpu.rasteriser:GpuRasteriser",
         "Triton kernels",
         step="stages.training.gpu_step:GpuStep",
-        obstacle="stages.raster.gpu.device:obstacle",
-        told="stages.raster.gpu.device:told",
+        obstacle="stages.raster.gpu.device:why_unavailable",
+        told="stages.raster.gpu.device:describe",
     ),
     Backend(
         "cpu",
@@ -85,7 +85,7 @@ BACKENDS = (
         "reference",
         "stages.raster.reference_rasteriser:ReferenceRasteriser",
         "torch, slow",
-        told="stages.raster.torch_device:told",
+        told="stages.raster.torch_device:describe",
         devices=DEVICES,
     ),
 )
@@ -99,11 +99,11 @@ def backend_of(name: str) -> Backend:
         if backend.name == wanted or (wanted == AUTO and not backend.why_not()):
             if on and on not in backend.devices:
                 break
-            return replace(backend, on=on or PROCESSOR)
+            return replace(backend, on=on or CPU)
     raise ValueError(f"backend {name!r}, wanted one of {', '.join(CHOICES)}")
 
 
-def passed_over(name: str) -> dict[str, str]:
+def unavailable_backends(name: str) -> dict[str, str]:
     """Why "auto" did not take the backends before the one that it takes; {} for another name."""
     chosen = [b.name for b in BACKENDS].index(backend_of(name).name) if name == AUTO else 0
     return {backend.name: backend.why_not() for backend in BACKENDS[:chosen]}
@@ -124,10 +124,10 @@ def runs_here(name: str) -> bool:
     return True
 
 
-def asked_for(backend: str, device: str = PROCESSOR) -> str:
+def qualified_name(backend: str, device: str = CPU) -> str:
     """What the options --backend and --device ask for together, in one word. Raises SplatError
     (option-device) for a device of a backend that takes none."""
-    if device == PROCESSOR:
+    if device == CPU:
         return backend
     able = [each.name for each in BACKENDS if device in each.devices]
     if backend in able:
@@ -136,18 +136,18 @@ def asked_for(backend: str, device: str = PROCESSOR) -> str:
         "option-device",
         given=f"--device {device} with --backend {backend}, which knows itself what it runs on.",
         wanted=f"--device goes with --backend {' or '.join(able)}.",
-        hint=f"Add --backend {able[0]}, or leave --device away (--device {PROCESSOR} where a run "
+        hint=f"Add --backend {able[0]}, or leave --device away (--device {CPU} where a run "
         "remembers another).",
         family=Family.USAGE,
     )
 
 
-def drawn_by(settings: Any) -> str:
+def backend_of_settings(settings: Any) -> str:
     """What a stage's settings ask to draw with. Raises SplatError (option-device)."""
-    return asked_for(settings.backend, settings.device)
+    return qualified_name(settings.backend, settings.device)
 
 
-def tell(report: Report, name: str) -> None:
+def report_backend(report: Report, name: str) -> None:
     """Into a stage's report: which backend the name stands for here, and what it runs on."""
     chosen = backend_of(name)
     report.metric("backend", chosen.name)
@@ -164,4 +164,4 @@ def backend_setting() -> Any:
 def device_setting() -> Any:
     """The `device` field beside it."""
     help = f"What --backend reference runs on, as torch names it: {', '.join(DEVICES)}."
-    return field(default=PROCESSOR, metadata={"help": help, "choices": DEVICES, "midway": True})
+    return field(default=CPU, metadata={"help": help, "choices": DEVICES, "midway": True})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stages.raster.backends import AUTO, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings, Rendering, splat_arrays
 from stages.scene import Camera, Splats
-from stages.scene.look import near_plane_of
+from stages.scene.draw_settings import near_plane_of
 
 
 def render(
@@ -60,5 +60,5 @@ def renderer(
 
 def settings_of(splats: Splats) -> RasterSettings:
     """How these splats are drawn: by their own look, or by their size where they have none."""
-    near = splats.look.near or near_plane_of(splats.means)
-    return RasterSettings(near=near, background=(splats.look.background,) * 3)
+    near = splats.draw_settings.near or near_plane_of(splats.means)
+    return RasterSettings(near=near, background=(splats.draw_settings.background,) * 3)

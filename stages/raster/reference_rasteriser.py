@@ -37,7 +37,7 @@ from stages.raster.reference import (
     render_projected,
     weights_of,
 )
-from stages.raster.torch_device import PROCESSOR, device_named, widest
+from stages.raster.torch_device import CPU, device_named, widest
 from stages.scene import Camera
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -60,7 +60,7 @@ class ReferenceRasteriser:
     """Draws and differentiates in torch on any of its devices, in float64 where that has it. Keeps
     nothing between two passes: the way back draws again, block by block, with gradients."""
 
-    def __init__(self, on: str = PROCESSOR) -> None:
+    def __init__(self, on: str = CPU) -> None:
         """on: one of `torch_device.DEVICES`. Raises SplatError where it is not there."""
         self.device = device_named(on)
         self.dtype = widest(self.device)

@@ -6,8 +6,8 @@ from typing import Any
 
 from stages.base.errors import Family, SplatError
 
-PROCESSOR = "cpu"
-DEVICES = (PROCESSOR, "cuda", "mps", "xpu")
+CPU = "cpu"
+DEVICES = (CPU, "cuda", "mps", "xpu")
 
 
 def is_there(name: str) -> bool:
@@ -15,7 +15,7 @@ def is_there(name: str) -> bool:
     import torch
 
     known = torch.backends if name == "mps" else torch
-    return name == PROCESSOR or bool(getattr(known, name).is_available())
+    return name == CPU or bool(getattr(known, name).is_available())
 
 
 def device_named(name: str) -> Any:
@@ -45,12 +45,12 @@ def widest(device: Any) -> Any:
     return torch.float64
 
 
-def told(name: str) -> str:
+def describe(name: str) -> str:
     """What the device is, in a few words. Raises SplatError where it is not there."""
     import torch
 
-    if name == PROCESSOR:
-        return PROCESSOR
+    if name == CPU:
+        return CPU
     device_named(name)
     made = getattr(torch, name)
     model = made.get_device_name() if hasattr(made, "get_device_name") else "Apple GPU"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from stages.base.stage import Stage
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.run.digests import FileRecords, differences
 from stages.run.manifest import Manifest, plain, write_json
 

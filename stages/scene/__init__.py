@@ -19,7 +19,7 @@ from stages.scene.capture import (
     split_held_out,
     spread_over,
 )
-from stages.scene.look import Look, look_of, near_plane
+from stages.scene.draw_settings import DrawSettings, draw_settings_of, near_plane
 from stages.scene.splats import (
     SH_C0,
     QuantisedSplats,
@@ -40,7 +40,7 @@ __all__ = [
     "Capture",
     "ExportedAssets",
     "ExportedFile",
-    "Look",
+    "DrawSettings",
     "Photo",
     "QuantisedSplats",
     "Reconstruction",
@@ -52,7 +52,7 @@ __all__ = [
     "load_splats",
     "logit",
     "look_at",
-    "look_of",
+    "draw_settings_of",
     "near_plane",
     "numbers_of",
     "rgb_to_dc",

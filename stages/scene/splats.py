@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
-from stages.scene.look import Look
+from stages.scene.draw_settings import DrawSettings
 
 SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
@@ -36,7 +36,7 @@ class Splats:
     sh: NDArray[np.floating]
     sh_degrees: NDArray[np.uint8]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    look: Look = field(default_factory=Look)
+    draw_settings: DrawSettings = field(default_factory=DrawSettings)
 
     def __post_init__(self) -> None:
         n = len(self.means)
@@ -109,13 +109,13 @@ class Splats:
 
 @dataclass(frozen=True)
 class TrainedSplats:
-    """Splats as trained. sat_out: whether splats sat steps out towards the end, see
-    `training.trial`. by_heart: whether photographs were learnt by heart: what these lose hardly any
+    """Splats as trained. dropout: whether splats sat steps out towards the end, see
+    `training.trial`. overfitted: whether photographs were learnt by heart: what these lose hardly any
     other view feels."""
 
     splats: Splats
-    sat_out: bool = False
-    by_heart: bool = False
+    dropout: bool = False
+    overfitted: bool = False
 
 
 @dataclass(frozen=True)

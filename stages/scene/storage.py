@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.errors import Family, SplatError
-from stages.scene.look import Look
+from stages.scene.draw_settings import DrawSettings
 from stages.scene.splats import Splats
 
 MAGIC = b"SPLATS3\n"
@@ -41,8 +41,8 @@ def save_splats(path: Path, splats: Splats) -> Path:
             array = np.ascontiguousarray(getattr(splats, name))
             array = array.astype(array.dtype.newbyteorder("<"), copy=False)
             npy.write_array(file, array, version=(1, 0), allow_pickle=False)
-        look = np.array(astuple(splats.look), "<f8")
-        npy.write_array(file, look, version=(1, 0), allow_pickle=False)
+        draw_settings = np.array(astuple(splats.draw_settings), "<f8")
+        npy.write_array(file, draw_settings, version=(1, 0), allow_pickle=False)
     return target
 
 
@@ -61,8 +61,8 @@ def load_splats(path: Path) -> Splats:
             near, side, grey, light = _read_array(file, size, "look").astype(np.float64)
             if file.read(1):
                 raise ValueError("bytes follow its end")
-        look = Look(float(near), int(side), float(grey), bool(light))
-        return Splats(**arrays, look=look)  # type: ignore[arg-type]
+        draw_settings = DrawSettings(float(near), int(side), float(grey), bool(light))
+        return Splats(**arrays, draw_settings=draw_settings)  # type: ignore[arg-type]
     except (OSError, ValueError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise SplatError(

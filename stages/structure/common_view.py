@@ -15,7 +15,7 @@ _PARALLEL = 0.02  # smallest eigenvalue a camera: below, axes meet nowhere in pa
 _SHARE = 0.5  # of the cameras must see a point
 
 
-def seen_by(cameras: Sequence[Camera], points: NDArray[np.float64]) -> NDArray[np.int32]:
+def count_views(cameras: Sequence[Camera], points: NDArray[np.float64]) -> NDArray[np.int32]:
     """[P] how many cameras have each point in their picture."""
     count = np.zeros(len(points), np.int32)
     for camera in cameras:
@@ -52,7 +52,7 @@ def random_points(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     lengths = radius * np.cbrt(random.uniform(size=(len(directions), 1)))
     points = middle + lengths * directions
-    points = points[seen_by(cameras, points) >= _SHARE * len(cameras)]
+    points = points[count_views(cameras, points) >= _SHARE * len(cameras)]
     for camera, empty in zip(cameras, outside, strict=False):
         if empty is not None:
             points = points[~_in_empty_space(camera, empty, points)]

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from stages.base import memory
 from stages.base.memory import MIB
-from stages.structure import blank_database
 from stages.structure import database as sqlite
-from stages.structure.job import Job, shares_path
-from stages.structure.ticks import Ticks
+from stages.structure import new_database
+from stages.structure.job import Job, chunks_path
+from stages.structure.worker_progress import ProgressWriter
 
 LARGEST_SIDE = 3200  # pixels; larger photographs are made smaller for finding features
 LAYERS = 3  # of an octave
@@ -32,26 +32,26 @@ _LENGTH = 512.0  # of a descriptor
 Features = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
-def extract(job: Job) -> None:
+def extract_features(job: Job) -> None:
     """SIFT features of every photograph into the job's database; goes on where it stopped, with
     what finished shares hold."""
     path = Path(job.database)
     if not path.exists():
-        blank_database.create(path, job)
-    sqlite.gather(path, sorted(shares_path(job).glob("*.db")))
+        new_database.create(path, job)
+    sqlite.gather(path, sorted(chunks_path(job).glob("*.db")))
     have = sqlite.photographs_with_features(path)
     missing = [position for position in range(len(job.names)) if position not in have]
     _extract(job, missing, len(have))
 
 
-def extract_share(job: Job) -> None:
+def extract_chunk(job: Job) -> None:
     """Those of the job's share of the photographs, into a database of their own."""
-    blank_database.create(Path(job.database), job, job.photographs)
+    new_database.create(Path(job.database), job, job.photographs)
     _extract(job, list(job.photographs), 0)
 
 
 def _extract(job: Job, missing: list[int], have: int) -> None:
-    ticks = Ticks(Path(job.progress))
+    ticks = ProgressWriter(Path(job.progress))
     cv2.setNumThreads(1)  # a thread a photograph is quicker than several
     with pycolmap.Database.open(job.database) as database:
         for done, (position, (keypoints, descriptors)) in enumerate(_found(job, missing), 1):
@@ -70,7 +70,7 @@ def _found(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
         for position in positions:
             root, mask = Path(job.images_root), job.masks[position] if job.masks else ""
             arguments = root / job.names[position], job.max_features, job.peak_threshold
-            future = pool.submit(find, *arguments, root / mask if mask else None)
+            future = pool.submit(sift_features, *arguments, root / mask if mask else None)
             waiting.append((position, future))
             if len(waiting) > threads:
                 position, future = waiting.pop(0)
@@ -86,7 +86,9 @@ def _threads(job: Job) -> int:
     return max(1, int(min(job.threads, 0.5 * available_mib / (pixels * _PIXEL_BYTES / MIB))))
 
 
-def find(photograph: Path, most: int, peak_threshold: float, mask: Path | None = None) -> Features:
+def sift_features(
+    photograph: Path, most: int, peak_threshold: float, mask: Path | None = None
+) -> Features:
     """(keypoints, descriptors) of a picture on disk, largest first, in COLMAP's conventions.
 
     keypoints [N, 4] float32: x, y (pixels, pixel centres at +0.5), scale (pixels), orientation

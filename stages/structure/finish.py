@@ -14,10 +14,10 @@ from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.scene import TRANSPARENT, Camera, Capture, Photo, Reconstruction, View
-from stages.structure.levelling import upright
-from stages.structure.metric import NOTHING, Known, find_metric
+from stages.structure.levelling import level_and_recentre
+from stages.structure.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric_scale
 from stages.structure.sparse_model import SparseModel, point_errors
-from stages.structure.undistort import Pinhole, maps, pinhole_for, undistorted_px
+from stages.structure.undistortion import Pinhole, maps, pinhole_for, undistorted_px
 
 COLMAP = "colmap"
 IMAGES = f"{COLMAP}/images"
@@ -34,7 +34,7 @@ def finish(
     capture: Capture,
     folder: Path,
     report: Report,
-    known: Known = NOTHING,
+    known: KnownScale = UNKNOWN_SCALE,
 ) -> Reconstruction:
     """Level, recentre and measure `model`, write undistorted pictures and a COLMAP model of them,
     and return the reconstruction (not stored yet: see `reconstruction_files`). known: of its size.
@@ -42,7 +42,7 @@ def finish(
     Raises Interrupted, and SplatError "sfm-photo-unreadable" if a photograph has gone.
     """
     shutil.rmtree(folder / COLMAP, ignore_errors=True)  # of an interrupted run, perhaps of others
-    model, levelled = upright(model)
+    model, levelled = level_and_recentre(model)
     photos = {photo.image: photo for photo in capture.photos}
     ordered = [photos[name] for name in model.names]
     pinholes = [
@@ -54,7 +54,7 @@ def finish(
     cameras = _cameras(model, pinholes)
     names = [photo.name for photo in ordered]
     places = [folder / IMAGES / picture for picture in pictures]
-    metric = find_metric(known, capture, names, cameras, places, levelled, report)
+    metric = find_metric_scale(known, capture, names, cameras, places, levelled, report)
     if metric is not None:
         poses, points = metric.poses(model.world_to_camera), metric.points(model.points)
         model = replace(model, world_to_camera=poses, points=points)

@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from statistics import median
 
-from stages.base.words import counted
+from stages.base.text import counted
 
 CALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC = 2, 4, 5, 6  # COLMAP's TwoViewGeometry
 
 
 @dataclass(frozen=True)
-class Figures:
+class ModelStatistics:
     """What is known of one reconstruction.
 
     photographs: given; registered: in the largest model; models: sizes of all models found.
@@ -58,7 +58,7 @@ class Figures:
 
 
 @dataclass(frozen=True)
-class Limits:
+class Thresholds:
     """Where the gates stand. Each figure is explained at `Figures`.
 
     Measured on bad captures: turning on the spot gives triangulation angles of 2.2 degrees; a date
@@ -118,9 +118,9 @@ _APART = (
 )
 
 
-def check_keypoints(counts: list[int], limits: Limits | None = None) -> list[Failure]:
+def check_keypoints(counts: list[int], limits: Thresholds | None = None) -> list[Failure]:
     """Before matching: enough features in the typical photograph?"""
-    limits = limits or Limits()
+    limits = limits or Thresholds()
     typical = median(counts) if counts else 0
     if typical >= limits.keypoints:
         return []
@@ -136,13 +136,13 @@ def check_keypoints(counts: list[int], limits: Limits | None = None) -> list[Fai
 
 
 def check_pairs(
-    pairs: list[tuple[int, int, int, int]], photographs: int, limits: Limits | None = None
+    pairs: list[tuple[int, int, int, int]], photographs: int, limits: Thresholds | None = None
 ) -> list[Failure]:
     """After matching: do the photographs hang together, and were they taken from several places?
 
     pairs: (first, second, inliers, configuration) as `database.verified_pairs` gives them.
     """
-    limits = limits or Limits()
+    limits = limits or Thresholds()
     if not pairs:
         return [
             Failure(
@@ -158,7 +158,7 @@ def check_pairs(
     turning = sum(config in (PANORAMIC, PLANAR_OR_PANORAMIC) for _, _, _, config in pairs)
     if turning >= limits.same_place_share * len(pairs):
         failures.append(_no_parallax("Nearly all pairs of photographs"))
-    groups = groups_of(pairs, photographs)
+    groups = connected_groups(pairs, photographs)
     if len(groups[0]) < limits.registered_share * photographs:
         others = [len(group) for group in groups[1:] if len(group) > 1]
         single = sum(len(group) == 1 for group in groups)
@@ -166,7 +166,7 @@ def check_pairs(
     return failures
 
 
-def groups_of(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[list[int]]:
+def connected_groups(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[list[int]]:
     """Photographs that are linked by matches, directly or through others; largest group first."""
     parent = list(range(photographs))
 
@@ -184,9 +184,9 @@ def groups_of(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[
     return sorted(groups.values(), key=lambda group: (-len(group), group))
 
 
-def check_model(figures: Figures, limits: Limits | None = None) -> list[Failure]:
+def check_model(figures: ModelStatistics, limits: Thresholds | None = None) -> list[Failure]:
     """After mapping: every gate that the largest model fails, the gravest first."""
-    limits = limits or Limits()
+    limits = limits or Thresholds()
     if figures.timed_out:
         return [_timed_out(figures)]
     if figures.models and not figures.points:
@@ -198,12 +198,12 @@ def check_model(figures: Figures, limits: Limits | None = None) -> list[Failure]
     return [failure for check in checks for failure in check(figures, limits)]
 
 
-def doubts(figures: Figures) -> list[Failure]:
+def borderline_failures(figures: ModelStatistics) -> list[Failure]:
     """What is too little to refuse a model, and too much to be silent about it."""
-    return _check_unity(figures, Limits(contradicting_share=0.02, link_points=100))
+    return _check_unity(figures, Thresholds(contradicting_share=0.02, link_points=100))
 
 
-def _check_geometry(figures: Figures, limits: Limits) -> list[Failure]:
+def _check_geometry(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
     angle, baseline = figures.median_triangulation_angle_deg, figures.baseline_over_depth
     if angle < limits.triangulation_angle_deg:
         return [_no_parallax(f"Points are seen under an angle of {angle:.1f} degrees: photographs")]
@@ -212,7 +212,7 @@ def _check_geometry(figures: Figures, limits: Limits) -> list[Failure]:
     return []
 
 
-def _check_camera(figures: Figures, limits: Limits) -> list[Failure]:
+def _check_camera(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
     failures = []
     hint = (
         "Look for something that stays in the same place of every picture (a date stamp, a frame, "
@@ -240,7 +240,7 @@ def _check_camera(figures: Figures, limits: Limits) -> list[Failure]:
     return failures
 
 
-def _check_registered(figures: Figures, limits: Limits) -> list[Failure]:
+def _check_registered(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
     share = figures.registered / max(1, figures.photographs)
     if share >= limits.registered_share:
         return []
@@ -257,7 +257,7 @@ def _check_registered(figures: Figures, limits: Limits) -> list[Failure]:
     ]
 
 
-def _check_support(figures: Figures, limits: Limits) -> list[Failure]:
+def _check_support(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
     """Enough points, seen often enough, accurately enough?"""
     failures = []
     texture = "Add texture to blank surfaces (patterned paper, cloth), and take more photographs."
@@ -305,7 +305,7 @@ def _check_support(figures: Figures, limits: Limits) -> list[Failure]:
     return failures
 
 
-def _check_unity(figures: Figures, limits: Limits) -> list[Failure]:
+def _check_unity(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
     """Do pairs of photographs, and the parts of the model, belong together?"""
     failures = []
     odd, checked = figures.pairs_contradicting, figures.pairs_checked
@@ -345,7 +345,7 @@ def _check_unity(figures: Figures, limits: Limits) -> list[Failure]:
     return failures
 
 
-def _pair_of(figures: Figures) -> str:
+def _pair_of(figures: ModelStatistics) -> str:
     return " and ".join(figures.contradicting)
 
 
@@ -371,7 +371,7 @@ def _separate(largest: int, others: list[int], single: int, photographs: int) ->
     )
 
 
-def _no_model(figures: Figures) -> Failure:
+def _no_model(figures: ModelStatistics) -> Failure:
     return Failure(
         "sfm-no-model",
         f"No arrangement of the {figures.photographs} photographs could be found"
@@ -385,7 +385,7 @@ def _no_model(figures: Figures) -> Failure:
     )
 
 
-def _timed_out(figures: Figures) -> Failure:
+def _timed_out(figures: ModelStatistics) -> Failure:
     return Failure(
         "sfm-timed-out",
         f"The search was cut off with {figures.registered} of {figures.photographs} photographs "

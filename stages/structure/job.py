@@ -82,32 +82,32 @@ class Job:
         return cls(**data)
 
 
-def known_path(job: Job) -> Path:
+def known_cameras_path(job: Job) -> Path:
     """Of the steps "neighbours" and "triangulation": what is known of the cameras of `job.names`.
     intrinsics [V, 4] fx, fy, cx, cy; sizes [V, 2]; world_to_camera [V, 4, 4]; pairs [Q, 2]."""
     return Path(job.database).with_suffix(".known.npz")
 
 
-def looked_path(job: Job) -> Path:
+def compared_pairs_path(job: Job) -> Path:
     """Where matching says how many pairs it looked at before it chose some."""
     return Path(job.database).with_suffix(".looked")
 
 
-def alike_path(job: Job) -> Path:
+def similarity_path(job: Job) -> Path:
     """Where matching keeps what its first look found: alike [P, P]."""
     return Path(job.database).with_suffix(".alike.npz")
 
 
-def words_path(job: Job) -> Path:
+def vocabulary_path(job: Job) -> Path:
     """Where matching keeps the vocabulary of the whole job: [W, 128]."""
     return Path(job.source or job.database).with_suffix(".words.npy")
 
 
-def chosen_path(job: Job) -> Path:
+def selected_pairs_path(job: Job) -> Path:
     """Where the step "choosing" leaves the pairs to match next, as JSON."""
     return Path(job.database).with_suffix(".chosen.json")
 
 
-def shares_path(job: Job) -> Path:
+def chunks_path(job: Job) -> Path:
     """The folder for finished shares of the job."""
     return Path(job.database).with_suffix(".shares")

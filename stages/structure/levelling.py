@@ -53,7 +53,7 @@ def subject_centre(model: SparseModel) -> NDArray[np.float64]:
     return np.median(np.repeat(model.points[good], tracks[good], axis=0), axis=0)
 
 
-def upright(model: SparseModel) -> tuple[SparseModel, bool]:
+def level_and_recentre(model: SparseModel) -> tuple[SparseModel, bool]:
     """(the model in the new world, whether it was levelled).
 
     The new world has the subject's centre at the origin and, where levelled, up = -Y, with the

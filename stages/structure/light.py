@@ -40,7 +40,7 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
     observed = model.observed_points, model.observing_views, model.observed_px
     steps, total = itertools.count(1), len(pictures) + HALVES * 3
-    found, differ = measured_light(
+    found, differ = measure_light(
         pictures, *observed, tick=lambda: report.progress(next(steps), total, "measuring light")
     )
     lights = [
@@ -56,7 +56,7 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
     return replace(reconstruction, views=tuple(views))
 
 
-def measured_light(
+def measure_light(
     pictures: Sequence[Path],
     points: NDArray[np.int32],
     views: NDArray[np.int32],

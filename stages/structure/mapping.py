@@ -12,11 +12,11 @@ import numpy as np
 import pycolmap
 
 from stages.structure import database as sqlite
-from stages.structure.agreement import fitting_shares
+from stages.structure.epipolar import inlier_ratios
 from stages.structure.job import Job
 from stages.structure.placing import Placing
 from stages.structure.sparse_model import SparseModel, save_model
-from stages.structure.ticks import Ticks
+from stages.structure.worker_progress import ProgressWriter
 
 # Of a smaller model that may contradict the largest.
 CREDIBLE_VIEWS, CREDIBLE_SHARE, CREDIBLE_POINTS = 4, 0.1, 20  # points: for each view
@@ -24,7 +24,7 @@ SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without 
 MOST_MODELS = 8
 LOOSE_INLIERS = 15
 PAIR_INLIERS = 30  # fewer may be chance, and say nothing against a model
-SETTLING_ROUNDS = 25
+ROBUST_ADJUSTMENT_ITERATIONS = 25
 _LEAST_NOISE = 0.05  # px
 
 
@@ -38,7 +38,7 @@ def map_photographs(job: Job) -> None:
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     started = time.monotonic()
-    with Placing(Ticks(Path(job.progress)), len(job.names)) as placing:
+    with Placing(ProgressWriter(Path(job.progress)), len(job.names)) as placing:
         if job.mapper == "global":
             models = _global(job, scratch)
         else:
@@ -68,7 +68,7 @@ def _settle(model: pycolmap.Reconstruction) -> None:
     usual = model.compute_mean_reprojection_error()
     options.ceres.loss_function_scale = max(usual, _LEAST_NOISE)
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.max_num_iterations = SETTLING_ROUNDS
+    options.ceres.solver_options.max_num_iterations = ROBUST_ADJUSTMENT_ITERATIONS
     options.print_summary = False
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
@@ -227,7 +227,7 @@ def _pairs(
     job: Job, model: pycolmap.Reconstruction, position: dict[int, int]
 ) -> dict[str, np.ndarray]:
     """How many of the matches that two photographs alone agree on fit the model."""
-    ticks = Ticks(Path(job.progress))
+    ticks = ProgressWriter(Path(job.progress))
     straight: dict[int, np.ndarray] = {}  # pixels of a pinhole without a principal point
     focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
     lenses = np.array([(focal[i], focal[i], 0.0, 0.0) for i in position])
@@ -249,7 +249,7 @@ def _pairs(
                     straight[image] = focal[image] * np.asarray(camera.cam_from_img(pixels))
             a, b = (straight[image][matches[:, k]] for k, image in enumerate(both))
             pairs.append((position[both[0]], position[both[1]]))
-            shares += fitting_shares([(*pairs[-1], a, b)], lenses, poses, side).tolist()
+            shares += inlier_ratios([(*pairs[-1], a, b)], lenses, poses, side).tolist()
     return {
         "pairs": np.array(pairs, np.int32).reshape(-1, 2),
         "pair_fits": np.nan_to_num(np.array(shares, np.float64), nan=1.0),

@@ -14,19 +14,25 @@ import pycolmap
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.structure import blank_database, nearest, pairs, retrieval
 from stages.structure import database as sqlite
+from stages.structure import descriptor_matching, new_database, pairs, retrieval
 from stages.structure.job import (
     Job,
-    alike_path,
-    chosen_path,
-    looked_path,
-    shares_path,
-    words_path,
+    chunks_path,
+    compared_pairs_path,
+    selected_pairs_path,
+    similarity_path,
+    vocabulary_path,
 )
 from stages.structure.pairs import Pair
-from stages.structure.ticks import Ticks
-from stages.structure.words import SAMPLE, Sorted, sort_by_word, two_words, vocabulary
+from stages.structure.vocabulary import (
+    SAMPLED_DESCRIPTORS,
+    FeatureIndex,
+    build_vocabulary,
+    index_by_word,
+    word_pairs,
+)
+from stages.structure.worker_progress import ProgressWriter
 
 FIRST_LOOK = 1000  # features: the largest, which are seen from farthest
 FIRST_COMPARED = 64  # see `words.COMPARED`; a first look need not be right about single features
@@ -35,7 +41,7 @@ MOST_TRIALS = 3000  # where few matches fit, as between pictures of other places
 _KEPT = 256  # photographs whose sorted features stay in memory
 
 
-def match(job: Job) -> None:
+def match_all(job: Job) -> None:
     """Match and verify pairs of photographs; pairs that the database holds are not done again."""
     with _matcher(job, job.database) as matcher:
         for wanted in _rounds(job, matcher.album, matcher.inliers):
@@ -48,11 +54,11 @@ def match_pairs(job: Job, wanted: list[Pair]) -> None:
         matcher.run(wanted)
 
 
-def choose(job: Job) -> None:
+def select_pairs(job: Job) -> None:
     """Take in what finished shares hold, and leave the pairs to match next (`chosen_path`): none
     once `match` would find nothing to do."""
     database = Path(job.database)
-    sqlite.gather(database, sorted(shares_path(job).glob("*.db")))
+    sqlite.gather(database, sorted(chunks_path(job).glob("*.db")))
     inliers = sqlite.inliers_of_pairs(database)
     missing: list[Pair] = []
     with sqlite.Features(database) as features:
@@ -62,12 +68,12 @@ def choose(job: Job) -> None:
             missing = [pair for pair in wanted if pair not in inliers]
             if missing:
                 break
-    chosen_path(job).write_text(json.dumps(missing))
+    selected_pairs_path(job).write_text(json.dumps(missing))
 
 
-def match_share(job: Job) -> None:
+def match_chunk(job: Job) -> None:
     """Match and verify the job's share of the pairs, into a database of their own."""
-    blank_database.create(Path(job.database), job, ())
+    new_database.create(Path(job.database), job, ())
     sqlite.take_cameras(Path(job.database), Path(job.source))
     with _matcher(job, job.source, still=True) as matcher:
         matcher.run(list(job.pairs))
@@ -88,14 +94,14 @@ def _rounds(job: Job, album: _Album, inliers: Mapping[Pair, int]) -> Iterator[li
     """Pairs to match, each list once the ones before are matched. inliers: of those that are."""
     photographs = len(job.names)
     if job.matching == "exhaustive":
-        yield pairs.every(photographs)
+        yield pairs.exhaustive_pairs(photographs)
     elif job.matching == "sequential":
-        yield pairs.sequential(photographs)
+        yield pairs.sequential_pairs(photographs)
     else:
         alike = _first_look(job, album)
-        first = pairs.promising(alike)
+        first = pairs.initial_pairs(alike)
         yield first
-        yield pairs.closing_gaps(alike, first, {pair: inliers[pair] for pair in first})
+        yield pairs.linking_pairs(alike, first, {pair: inliers[pair] for pair in first})
 
 
 class _Album:
@@ -109,25 +115,28 @@ class _Album:
 
     def _vocabulary(self) -> NDArray[np.float32]:
         """Of all photographs; kept beside the database, for shares and for another time."""
-        path, photographs = words_path(self._job), len(self._job.names)
+        path, photographs = vocabulary_path(self._job), len(self._job.names)
         if not path.exists():
-            ticks, each = Ticks(Path(self._job.progress)), max(1, SAMPLE // photographs)
+            ticks, each = (
+                ProgressWriter(Path(self._job.progress)),
+                max(1, SAMPLED_DESCRIPTORS // photographs),
+            )
             rows = []
             for i in range(photographs):
                 rows.append(_spread(self._features.descriptors(i), each))
                 ticks.write("sorting features", i + 1, 2 * photographs)
             with replacing(path) as partial:
-                np.save(partial, vocabulary(np.concatenate(rows)))
+                np.save(partial, build_vocabulary(np.concatenate(rows)))
         found: NDArray[np.float32] = np.load(path)
         return found
 
-    def largest(self, position: int) -> tuple[Sorted, NDArray[np.int64]]:
+    def largest(self, position: int) -> tuple[FeatureIndex, NDArray[np.int64]]:
         """For a first look: the largest features, and what words they are."""
         first, words = self._features.descriptors(position)[:FIRST_LOOK], self.words()
-        return sort_by_word(first, words, FIRST_COMPARED), two_words(first, words)
+        return index_by_word(first, words, FIRST_COMPARED), word_pairs(first, words)
 
-    def _sorted(self, position: int) -> Sorted:
-        return sort_by_word(self._features.descriptors(position), self.words())
+    def _sorted(self, position: int) -> FeatureIndex:
+        return index_by_word(self._features.descriptors(position), self.words())
 
 
 class _Matcher:
@@ -139,7 +148,7 @@ class _Matcher:
         self.inliers = sqlite.inliers_of_pairs(Path(job.database))
         self._job, self._database, self._features = job, database, features
         self._cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
-        self._ticks = Ticks(Path(job.progress))
+        self._ticks = ProgressWriter(Path(job.progress))
 
     def run(self, wanted: list[Pair]) -> None:
         """Match the `wanted` pairs, less those that are matched."""
@@ -164,7 +173,9 @@ class _Matcher:
         known = self._features.matches(first, second)
         matches = known
         if matches is None:
-            matches = nearest.matches(self.album.sorted(first), self.album.sorted(second))
+            matches = descriptor_matching.match_descriptors(
+                self.album.sorted(first), self.album.sorted(second)
+            )
         geometry = pycolmap.TwoViewGeometry()
         if len(matches) >= FEWEST_INLIERS:
             found = pycolmap.estimate_two_view_geometry(
@@ -183,12 +194,12 @@ class _Matcher:
 def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
     """[P, P] matches among the largest features of each two photographs that may look alike; none
     of others. It is kept for another time, and how many were looked at for the parent."""
-    photographs, kept = len(job.names), alike_path(job)
+    photographs, kept = len(job.names), similarity_path(job)
     if kept.exists():
         found: NDArray[np.int32] = np.load(kept)["alike"]
         return found
     album.words()
-    ticks = Ticks(Path(job.progress))
+    ticks = ProgressWriter(Path(job.progress))
     alike = np.zeros((photographs, photographs), np.int32)
     sorted_, held = [], []
     with ThreadPoolExecutor(job.threads) as pool:
@@ -196,17 +207,17 @@ def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
             sorted_.append(largest)
             held.append(words)
             ticks.write("sorting features", photographs + done, 2 * photographs)
-        wanted = retrieval.candidates(
+        wanted = retrieval.candidate_pairs(
             held, lambda done: ticks.write("comparing words", done, photographs)
         )
 
         def look(pair: Pair) -> int:
-            return len(nearest.matches(sorted_[pair[0]], sorted_[pair[1]]))
+            return len(descriptor_matching.match_descriptors(sorted_[pair[0]], sorted_[pair[1]]))
 
         for done, (pair, count) in enumerate(zip(wanted, pool.map(look, wanted), strict=True), 1):
             alike[pair] = count
             ticks.write("looking for pairs", done, len(wanted))
-    looked_path(job).write_text(str(len(wanted)))
+    compared_pairs_path(job).write_text(str(len(wanted)))
     alike += alike.T
     with replacing(kept) as partial:
         np.savez_compressed(partial, alike=alike)

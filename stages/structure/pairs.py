@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure.gates import groups_of
+from stages.structure.gates import connected_groups
 
 Pair = tuple[int, int]
 
@@ -20,18 +20,18 @@ FEWEST_LINKS = 3
 MOST_TO_CLOSE_GAPS = 20  # pairs, for each photograph of the capture
 
 
-def every(photographs: int) -> list[Pair]:
+def exhaustive_pairs(photographs: int) -> list[Pair]:
     """All pairs."""
     return list(itertools.combinations(range(photographs), 2))
 
 
-def sequential(photographs: int) -> list[Pair]:
+def sequential_pairs(photographs: int) -> list[Pair]:
     """Neighbours in order of the capture, and some that are farther apart."""
     steps = [*range(1, NEIGHBOURS + 1), *(2**k for k in range(5, photographs.bit_length()))]
     return sorted((i, i + step) for step in steps for i in range(photographs - step))
 
 
-def promising(alike: NDArray[np.int32]) -> list[Pair]:
+def initial_pairs(alike: NDArray[np.int32]) -> list[Pair]:
     """The pairs to begin with: the best few of each photograph, and the next in order.
 
     alike [P, P] symmetric: matches that a first look found.
@@ -44,7 +44,7 @@ def promising(alike: NDArray[np.int32]) -> list[Pair]:
     return sorted(pairs)
 
 
-def closing_gaps(
+def linking_pairs(
     alike: NDArray[np.int32], matched: Iterable[Pair], inliers: dict[Pair, int]
 ) -> list[Pair]:
     """Pairs to match besides: all others of photographs with few links, and all between groups
@@ -56,7 +56,9 @@ def closing_gaps(
     links = [pair for pair, count in inliers.items() if count >= LINK_INLIERS]
     degree = np.bincount(np.array(links, np.int64).reshape(-1), minlength=photographs)
     group = np.zeros(photographs, np.int64)
-    for number, members in enumerate(groups_of([(*pair, 0, 0) for pair in links], photographs)):
+    for number, members in enumerate(
+        connected_groups([(*pair, 0, 0) for pair in links], photographs)
+    ):
         group[members] = number
     few = degree < FEWEST_LINKS
     apart = few[:, None] | few[None, :] | (group[:, None] != group[None, :])

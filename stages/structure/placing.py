@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from types import TracebackType
 
-from stages.structure.ticks import Ticks
+from stages.structure.worker_progress import ProgressWriter
 
 LONG_S = 0.5  # between two photographs: so long mostly if all cameras were adjusted between them
 ENDING = 0.4  # of all the time: what follows when all are placed, adjusting all of them once more
@@ -27,7 +27,7 @@ class Placing:
     """
 
     def __init__(
-        self, ticks: Ticks, total: int, clock: Callable[[], float] = time.monotonic
+        self, ticks: ProgressWriter, total: int, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._ticks, self._total, self._clock = ticks, total, clock
         self._ended = threading.Event()

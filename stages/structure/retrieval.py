@@ -18,7 +18,7 @@ NEIGHBOURS = 4  # in order of the capture, either way
 _AT_ONCE = 64  # photographs compared with all others between two ticks
 
 
-def candidates(
+def candidate_pairs(
     held: Sequence[NDArray[np.int64]], tick: Callable[[int], None] = lambda done: None
 ) -> list[tuple[int, int]]:
     """Pairs (first, second) to look at: the most alike of each photograph, and neighbours.

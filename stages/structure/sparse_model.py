@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure.gates import Figures, Limits
-from stages.structure.links import loosest_link
+from stages.structure.gates import ModelStatistics, Thresholds
+from stages.structure.view_graph import weakest_cut
 
 _SAMPLED_POINTS = 4000  # angles need every pair of rays of a point: a sample is enough
 _SAMPLED_RAYS = 24
@@ -116,11 +116,11 @@ def load_result(folder: Path) -> MappingResult:
     return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
 
 
-def without_odd_views(model: SparseModel, limits: Limits | None = None) -> SparseModel:
+def without_implausible_views(model: SparseModel, limits: Thresholds | None = None) -> SparseModel:
     """The model less photographs whose poses are guesses: those that see too few points, and the
     few (a tenth at most) whose camera came out implausible. If more cameras are implausible, the
     whole model is, and the gates shall see it."""
-    limits = limits or Limits()
+    limits = limits or Thresholds()
     seen = np.bincount(model.observing_views, minlength=len(model.names))
     keep = seen >= FEWEST_OBSERVATIONS
     with np.errstate(invalid="ignore"):
@@ -215,12 +215,12 @@ def baseline_over_depth(model: SparseModel) -> float:
     return 2.0 * float(np.percentile(spread, 90)) / max(depth, 1e-300)
 
 
-def measure(result: MappingResult, photographs: int, mapper: str) -> Figures:
+def model_statistics(result: MappingResult, photographs: int, mapper: str) -> ModelStatistics:
     """The figures that the gates look at."""
     model = result.model
     sizes = tuple(len(group) for group in result.groups)
     if model is None or not model.names:
-        return Figures(
+        return ModelStatistics(
             photographs=photographs, models=sizes, mapper=mapper, timed_out=result.timed_out
         )
     sample = np.arange(0, len(model.points), max(1, len(model.points) // _SAMPLED_POINTS))
@@ -228,8 +228,8 @@ def measure(result: MappingResult, photographs: int, mapper: str) -> Figures:
     errors = point_errors(model)
     seen = np.bincount(model.observing_views, minlength=len(model.names))
     against = np.flatnonzero(model.pair_fits < FITS)
-    link = loosest_link(model.observed_points, model.observing_views, len(model.names))
-    return Figures(
+    link = weakest_cut(model.observed_points, model.observing_views, len(model.names))
+    return ModelStatistics(
         photographs=photographs,
         registered=len(model.names),
         models=sizes,

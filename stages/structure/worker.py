@@ -17,17 +17,17 @@ def main(arguments: list[str]) -> int:
     """Run the job named on the command line. Returns the exit status (0: done)."""
     die_with_parent()
     job = Job.read(Path(arguments[0]))
-    from stages.structure import features, known_worker, mapping, matching
+    from stages.structure import features, known_cameras_worker, mapping, matching
 
     steps = {
-        "features": features.extract,
-        "matching": matching.match,
+        "features": features.extract_features,
+        "matching": matching.match_all,
         "mapping": mapping.map_photographs,
-        "neighbours": known_worker.match_neighbours,
-        "triangulation": known_worker.triangulate,
-        "choosing": matching.choose,
-        "features share": features.extract_share,
-        "matching share": matching.match_share,
+        "neighbours": known_cameras_worker.match_neighbours,
+        "triangulation": known_cameras_worker.triangulate,
+        "choosing": matching.select_pairs,
+        "features share": features.extract_chunk,
+        "matching share": matching.match_chunk,
     }
     steps[job.step](job)
     return 0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.surface.mesh import Mesh
 from stages.surface.table import MeshFormat
 
@@ -19,7 +19,7 @@ def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
     """What is wrong with a file that should hold `mesh`, as the independent reader finds it; "" if
     nothing is."""
     try:
-        vertices, faces = named(row.independent_reader)(path)
+        vertices, faces = load_object(row.independent_reader)(path)
     except Exception as error:  # whatever another parser raises: the file is wrong
         return f"another reader refused it ({error})"
     if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):

@@ -44,7 +44,7 @@ def cap_for(folder: Path, max_splats: int, told: int) -> Cap:
     return _kept(min(held, Cap(told, PHOTOGRAPHS), key=lambda cap: cap.splats), folder)
 
 
-def splats_told(cameras: Sequence[Camera], sh_degree: int) -> int:
+def splats_determined(cameras: Sequence[Camera], sh_degree: int) -> int:
     """How many splats of `sh_degree` have no more numbers than the photographs of `cameras`: with
     more, some are told by nothing."""
     numbers = sum(3 * camera.width * camera.height for camera in cameras)
@@ -56,7 +56,7 @@ def lower_cap(folder: Path, splats: int) -> Cap:
     return _kept(Cap(splats, DEVICE_MEMORY), folder)
 
 
-def fitted(model: Model, cap: int) -> Model:
+def most_opaque(model: Model, cap: int) -> Model:
     """The model, or of too large a one those splats that hide most."""
     if len(model) <= cap:
         return model
@@ -70,7 +70,7 @@ def _kept(cap: Cap, folder: Path) -> Cap:
     return cap
 
 
-def forget_cap(folder: Path) -> None:
+def remove_cap(folder: Path) -> None:
     """Of a finished run, whose manifest says what it was."""
     (folder / FILE_NAME).unlink(missing_ok=True)
 

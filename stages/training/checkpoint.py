@@ -13,9 +13,9 @@ import numpy as np
 from numpy.lib import format as npy
 
 from stages.base.atomic import replacing
-from stages.training.clock import Spent
+from stages.training.clock import Elapsed
 from stages.training.optimiser import Model
-from stages.training.trial import Answer, Trial
+from stages.training.validation import Answer, Trial
 
 FILE_NAME = "checkpoint.bin"
 MAGIC = b"SPLATCP9"
@@ -23,7 +23,7 @@ KEPT = "model-{}.bin"  # after so many steps
 
 
 @dataclass(frozen=True)
-class Maker:
+class Provenance:
     """What made the steps from `step` on: a backend, on a device."""
 
     step: int
@@ -32,7 +32,7 @@ class Maker:
 
 
 @dataclass(frozen=True)
-class Saved:
+class TrainingState:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
     done by then), see `schedule.Schedule`. history: as logged. trial, answers, stopped: whether
     lent photographs are being asked, what they said, and whether growth ended for it. times: of
@@ -44,11 +44,11 @@ class Saved:
     trial: Trial | None
     answers: list[Answer]
     stopped: bool
-    times: list[Spent]
-    makers: list[Maker]
+    times: list[Elapsed]
+    makers: list[Provenance]
 
 
-def save_checkpoint(folder: Path, model: Model, saved: Saved) -> None:
+def save_checkpoint(folder: Path, model: Model, saved: TrainingState) -> None:
     """Write the state after a step; a checkpoint that stands there stays until this is whole.
 
     Random numbers depend on the seed and the step alone, so they need no place.
@@ -61,7 +61,7 @@ def save_checkpoint(folder: Path, model: Model, saved: Saved) -> None:
     os.replace(temporary, folder / FILE_NAME)
 
 
-def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
+def load_checkpoint(folder: Path) -> tuple[Model, TrainingState] | None:
     """What was saved, or None where there is none, or something of it is missing or damaged."""
     try:
         with (folder / FILE_NAME).open("rb") as file:
@@ -72,15 +72,15 @@ def load_checkpoint(folder: Path) -> tuple[Model, Saved] | None:
     except (OSError, ValueError, EOFError, MemoryError):
         return None
     steps, since, share = header["plan"]
-    saved = Saved(
+    saved = TrainingState(
         int(header["step"]),
         (int(steps), int(since), float(share)),
         header["history"],
         Trial(**_with_tuples(header["trial"])) if header["trial"] else None,
         [Answer(**_with_tuples(answer)) for answer in header["answers"]],
         header["stopped"],
-        [Spent(**t) for t in header["times"]],
-        [Maker(**maker) for maker in header["makers"]],
+        [Elapsed(**t) for t in header["times"]],
+        [Provenance(**maker) for maker in header["makers"]],
     )
     asked_of = [saved.trial.begun] if saved.trial else []
     asked_of += [answer.step for answer in saved.answers]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Spent:
+class Elapsed:
     """Wall seconds, and CPU seconds of all threads of this process."""
 
     seconds: float = 0.0
@@ -17,12 +17,12 @@ class Spent:
 class Clock:
     """Runs from when it is made, on top of what was spent before."""
 
-    def __init__(self, before: Spent | None = None) -> None:
-        self._before = before or Spent()
+    def __init__(self, before: Elapsed | None = None) -> None:
+        self._before = before or Elapsed()
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
-    def spent(self) -> Spent:
-        return Spent(
+    def spent(self) -> Elapsed:
+        return Elapsed(
             self._before.seconds + time.monotonic() - self._wall,
             self._before.cpu_seconds + time.process_time() - self._cpu,
         )

@@ -10,7 +10,7 @@ from stages.training.dropout import FACTORS, FEW, LARGEST_SHARE, STRIDE, Dropout
 _LOW = 0xFFFFFFFF  # 64-bit integers hold what 32-bit ones would overflow to
 
 
-def resting(dropout: Dropout, seen: Tensor) -> Tensor:
+def dropped(dropout: Dropout, seen: Tensor) -> Tensor:
     """[N] bool: see `Dropout.resting`. seen [N] int32."""
     n = len(seen)
     if n == 0:

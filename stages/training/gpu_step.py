@@ -21,8 +21,8 @@ from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
 from stages.scene import Camera
 from stages.training import gpu_kernels
 from stages.training.dropout import INVISIBLE, Dropout
-from stages.training.gpu_dropout import resting
-from stages.training.gpu_photograph import Resident, resident
+from stages.training.gpu_dropout import dropped
+from stages.training.gpu_target import GpuTarget, gpu_target_of
 from stages.training.loss import SSIM_WEIGHT
 from stages.training.optimiser import (
     LearningRates,
@@ -73,7 +73,7 @@ class GpuStep:
         self._arrivals = Arrivals(
             self.device, (0 if interpreted() else LAG) if lag is None else lag
         )
-        self._photographs: dict[int, Resident] = {}
+        self._photographs: dict[int, GpuTarget] = {}
         self._corrections = self._on_device(bias_corrections())
         self._unsmoothed = torch.zeros(0, device=self.device)
         self._on_host: Model | None = None
@@ -151,13 +151,13 @@ class GpuStep:
         widths, rows = self._smoothing if smooth else self._unsmoothed, self._scene.rows
         if dropout is not None:
             rows = rows.clone()
-            rows[:, OPACITY].masked_fill_(resting(dropout, self._gradient_count), INVISIBLE)
+            rows[:, OPACITY].masked_fill_(dropped(dropout, self._gradient_count), INVISIBLE)
         return Scene(rows, self._scene.bands, widths)
 
-    def _resident(self, level: Level) -> Resident:
+    def _resident(self, level: Level) -> GpuTarget:
         key = id(level.means)  # which stay the same object, however often a level is read
         if key not in self._photographs:
-            self._photographs[key] = resident(level, self.device)
+            self._photographs[key] = gpu_target_of(level, self.device)
         return self._photographs[key]
 
     def _adam(

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.raster.backends import backend_of, rasteriser_of
 from stages.raster.definition import Rasteriser, RasterSettings
 from stages.scene import Camera
@@ -50,5 +50,5 @@ class TrainingStep(Protocol):
 def step_of(backend: str) -> TrainingStep:
     """The training step of the backend `backend` or "auto". Raises ValueError."""
     chosen = backend_of(backend)
-    made: TrainingStep = named(chosen.step)(rasteriser_of(chosen.name))
+    made: TrainingStep = load_object(chosen.step)(rasteriser_of(chosen.name))
     return made

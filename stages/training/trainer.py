@@ -15,34 +15,34 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.measure.images import psnr
-from stages.measure.judge import Photograph, scores, spread
+from stages.measure.evaluation import EvaluationView, evaluate, evaluation_subset
+from stages.measure.image_metrics import psnr
 from stages.raster.backends import AUTO, backend_of, rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import TRANSPARENT, Camera, Look, Splats, morton
-from stages.training.cap import fitted, lower_cap
+from stages.scene import TRANSPARENT, Camera, DrawSettings, Splats, morton
+from stages.training.cap import lower_cap, most_opaque
 from stages.training.checkpoint import (
-    Maker,
-    Saved,
+    Provenance,
+    TrainingState,
     keep_model,
     kept_model,
     load_checkpoint,
     save_checkpoint,
 )
-from stages.training.clock import Clock, Spent
-from stages.training.colours import Recolouring, worth_settling
+from stages.training.clock import Clock, Elapsed
+from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.density import Within
 from stages.training.dropout import Dropout
-from stages.training.frugal_step import FrugalStep
-from stages.training.open_air import open_air
+from stages.training.free_space import known_free_space
+from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
-from stages.training.pace import Pace
 from stages.training.schedule import Schedule
 from stages.training.step import TrainingStep, step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
-from stages.training.trial import (
+from stages.training.time_limit import TimeLimit
+from stages.training.validation import (
     DOUBT_DB,
     SURE_DB,
     Answer,
@@ -72,8 +72,8 @@ class Trainer:
 
     schedule: Schedule
     train: list[TrainingView]
-    held_out: Sequence[Photograph]
-    look: Look
+    held_out: Sequence[EvaluationView]
+    draw_settings: DrawSettings
     cap: int
     folder: Path
     report: Report
@@ -89,8 +89,8 @@ class Trainer:
     def __post_init__(self) -> None:
         self.stepper: TrainingStep = step_of(self.backend)
         if self.backend == AUTO:
-            self.stepper = FrugalStep(self.stepper, self._memory_full)
-        self.makers: list[Maker] = []
+            self.stepper = MemoryLimitedStep(self.stepper, self._memory_full)
+        self.makers: list[Provenance] = []
         self._strategy = STRATEGIES[self.growth](self.schedule.extent, len(self.train))
         if self.within:
             self._strategy = Within(self._strategy, self.within)
@@ -99,9 +99,11 @@ class Trainer:
         self.stopped = False  # by the last of them: training went back to the one before
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
-        self._onlookers = [self.held_out[i] for i in spread(len(self.held_out))]
+        self._onlookers = [self.held_out[i] for i in evaluation_subset(len(self.held_out))]
         self.history: list[dict[str, Any]] = []
-        self.times: list[Spent] = []  # of each entry of the history, kept apart: no two runs agree
+        self.times: list[
+            Elapsed
+        ] = []  # of each entry of the history, kept apart: no two runs agree
 
     def run(self, start: Splats) -> Model:
         """Train from `start`, or go on from the folder's checkpoint; the finished model.
@@ -109,16 +111,16 @@ class Trainer:
         Raises Interrupted at a step boundary, checkpoint written, when the report asks to stop.
         """
         self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
-        self.clock, self._pace = Clock(), Pace(self.seconds)
+        self.clock, self._pace = Clock(), TimeLimit(self.seconds)
         step = self._begin(start)
-        self._open_air = open_air(start.means, self._full_cameras)
+        self._open_air = known_free_space(start.means, self._full_cameras)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
             loss = self.step(step)
             if not self.trial:
                 self._adapt(step)
             step += 1
-            if step == self.schedule.steps and worth_settling(self.sits_out, len(self.train)):
+            if step == self.schedule.steps and needs_colour_refit(self.dropout, len(self.train)):
                 self._recolour()
             if not self.trial:
                 if self.schedule.passes(step, EVALUATIONS):
@@ -142,7 +144,7 @@ class Trainer:
         rasteriser = rasteriser_of(backend_of(self.backend).name)
         settings = self.settings(self.schedule.sh_degree)
         widths = model.smoothing if self.smooth else NO_SMOOTHING
-        self.stepper.load(Recolouring(rasteriser, settings, self._full_size, widths).of(model))
+        self.stepper.load(ColourRefit(rasteriser, settings, self._full_size, widths).of(model))
 
     def _full_size(self) -> Iterator[Level]:
         return (view.levels[-1] for view in self.train)
@@ -167,12 +169,12 @@ class Trainer:
         )
 
     @property
-    def sits_out(self) -> bool:
+    def dropout(self) -> bool:
         """Whether splats sit steps out from where growth ends, as lent photographs told."""
         return self.gain_db is not None and self.gain_db > DOUBT_DB
 
     @property
-    def by_heart(self) -> bool:
+    def overfitted(self) -> bool:
         """Whether photographs are learnt by heart, as lent ones told."""
         return self.gain_db is not None and self.gain_db > SURE_DB
 
@@ -191,7 +193,7 @@ class Trainer:
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock, self.makers = Clock(spent), told.makers
-            model = fitted(model, self.cap)
+            model = most_opaque(model, self.cap)
             self.report.metric("resumed_from_step", step)
         else:
             model, step = self._first(start), 0
@@ -202,7 +204,7 @@ class Trainer:
     def _take_over(self, step: int) -> None:
         """Enter who makes the steps from here on, and say so where somebody else began."""
         chosen = backend_of(self.backend)
-        maker, before = Maker(step, chosen.name, chosen.where()), self.makers[-1:]
+        maker, before = Provenance(step, chosen.name, chosen.where()), self.makers[-1:]
         if any(replace(maker, step=one.step) == one for one in before):
             return
         self.makers.append(maker)
@@ -218,7 +220,7 @@ class Trainer:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
         told = self.trial, self.answers, self.stopped
-        saved = Saved(step, plan, self.history, *told, times, self.makers)
+        saved = TrainingState(step, plan, self.history, *told, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
     def _first(self, start: Splats) -> Model:
@@ -229,12 +231,14 @@ class Trainer:
         return new_model(*(np.array(a, np.float32, order="C") for a in start.arrays))
 
     def settings(self, degree: int) -> RasterSettings:
-        grey = self.look.background
-        return RasterSettings(near=self.look.near, sh_degree=degree, background=(grey,) * 3)
+        grey = self.draw_settings.background
+        return RasterSettings(
+            near=self.draw_settings.near, sh_degree=degree, background=(grey,) * 3
+        )
 
     def widths(self, means: NDArray[np.floating]) -> NDArray[np.float32]:
         """[N] of the smoothing filter, from all training photographs at full size."""
-        return smoothing_widths(means, self._full_cameras, self.look.near)
+        return smoothing_widths(means, self._full_cameras, self.draw_settings.near)
 
     @property
     def _full_cameras(self) -> list[Camera]:
@@ -264,8 +268,8 @@ class Trainer:
     def _dropout(self, step: int) -> Dropout | None:
         """Once the model grows no more: before that, who sits out would be pulled at less than it
         deserves."""
-        sits_out = self.trial.sits_out if self.trial else self.sits_out
-        if not sits_out or self._course.grows(step):
+        dropout = self.trial.dropout if self.trial else self.dropout
+        if not dropout or self._course.grows(step):
             return None
         return Dropout(len(self.train), self.schedule.key(step))
 
@@ -301,7 +305,7 @@ class Trainer:
             return step
         came_to = tuple(self._db(row) for row in self.lent)
         self.stepper.load(kept_model(self.folder, begun))
-        if not self.trial.sits_out:
+        if not self.trial.dropout:
             self.trial = replace(self.trial, plain_db=came_to)
             return begun
         self.answers.append(Answer(begun, len(self.stepper), self.trial.plain_db, came_to))
@@ -325,7 +329,7 @@ class Trainer:
         """PSNR of a photograph, as the model is."""
         level = self.train[row].levels[-1]
         image = np.clip(self.drawn(level.camera), 0.0, 1.0).transpose(2, 0, 1)
-        asked = target_of(level, image, (self.look.background,) * 3)
+        asked = target_of(level, image, (self.draw_settings.background,) * 3)
         return psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1))
 
     def _adapt(self, step: int) -> None:
@@ -360,7 +364,7 @@ class Trainer:
 
     def _record(self, step: int) -> None:
         began = self.clock.spent().seconds
-        found = scores(self.drawn, self._onlookers)
+        found = evaluate(self.drawn, self._onlookers)
         entry: dict[str, Any] = {"step": step, "splats": len(self.model)}
         self._pace.reserve = LAST_WORDS * (self.clock.spent().seconds - began)
         if found:

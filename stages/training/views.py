@@ -10,7 +10,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.judge import load_photograph
+from stages.measure.evaluation import load_evaluation_view
 from stages.photos.album import Album
 from stages.scene import Camera, View
 from stages.scene.light import Light
@@ -95,7 +95,7 @@ def load_views(
             levels = _Stored(album)
             for _, scale in RESOLUTIONS:
                 camera = view.camera.fitted(max(16, round(train_side * scale)))
-                photograph = load_photograph(folder, view, camera)
+                photograph = load_evaluation_view(folder, view, camera)
                 planar = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
                 means = channel_means(planar)
                 masked = photograph.mask, view.outside

@@ -37,7 +37,7 @@ from stages.scene import Camera, Splats
 from stages.training.gpu_step import GpuStep
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.plain_step import photograph_loss
+from stages.training.reference_step import photograph_loss
 from stages.training.views import Level
 from tests.benchmarks.scenes import random_scene, view
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
@@ -210,7 +210,7 @@ def show(lines: list[dict[str, Any]]) -> None:
         size = f"{line['bytes_a_splat']:,.0f} a splat" if "bytes_a_splat" in line else "-"
         table.add_row(*what, *cells, line.get("failed", size))
     console = Console(width=160)
-    console.print(device.told())
+    console.print(device.describe())
     console.print(table)
 
 
@@ -223,7 +223,7 @@ def main() -> None:
     device.require()
     gate()
     lines = measure(TOY if asked.toy else SCENES, asked.rounds)
-    asked.out.write_text(json.dumps({"device": device.told(), "lines": lines}, indent=2))
+    asked.out.write_text(json.dumps({"device": device.describe(), "lines": lines}, indent=2))
     show(lines)
 
 

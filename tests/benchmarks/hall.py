@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sample_captures.make import look_at
 from sample_captures.render import Lens, Shape
 from tests.benchmarks.caster import Boxes
-from tests.structure.rooms import prints
+from tests.structure.room_captures import prints
 
 AROUND = 25  # photographs of a pillar
 APART, REACH = 3.0, 1.6  # metres between pillars, and from a pillar to the camera
@@ -106,13 +106,13 @@ def through_run(run: Path, photographs: int, width: int) -> Walk:
     """From one photograph's place to the next, on a smooth way, all along a finished run's."""
     from splatcli.sources import splats_of
     from stages.raster.draw import renderer
-    from stages.viewer import travel
+    from stages.viewer import camera_paths
 
     splats, pipeline = splats_of(run)
     assert pipeline is not None, "a run folder is wanted"
     cameras = [view.camera for view in pipeline.load("sfm").views]
-    order = travel.tour(cameras, splats)
-    way = travel.through([cameras[i] for i in order], splats, photographs)
+    order = camera_paths.tour(cameras, splats)
+    way = camera_paths.through([cameras[i] for i in order], splats, photographs)
     height = round(way[0].height * width / way[0].width)
     cameras = [camera.resized(width, height) for camera in way]
     draw = renderer(splats)

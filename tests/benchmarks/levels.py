@@ -17,7 +17,7 @@ import numpy as np
 
 from stages import formats
 from stages.editing import levels
-from stages.measure.judge import decibels
+from stages.measure.evaluation import capped_psnr_db
 from stages.raster.draw import renderer, settings_of
 from stages.scene import Camera, Splats, look_at
 from stages.scene.framing import around
@@ -61,8 +61,12 @@ def main(path: Path, fewest: int = 2000) -> None:
             truth = truth_of(full, camera, smooth)
             whole = np.clip(renderer(full, smooth)(camera).image, 0, 1)
             drawn = renderer(level, smooth)(camera).image
-            row = [decibels(drawn, whole), decibels(whole, truth), decibels(drawn, truth)]
-            row += [decibels(renderer(s, plain)(camera).image, truth) for s in (full, level)]
+            row = [
+                capped_psnr_db(drawn, whole),
+                capped_psnr_db(whole, truth),
+                capped_psnr_db(drawn, truth),
+            ]
+            row += [capped_psnr_db(renderer(s, plain)(camera).image, truth) for s in (full, level)]
             rows.append(row)
         a, b, c, d, e = np.mean(rows, axis=0)
         print(f"| {len(level):,} | {a:.1f} | {b:.1f}, {c:.1f} | {d:.1f}, {e:.1f} |")

@@ -18,9 +18,9 @@ import numpy as np
 
 from sample_captures.make import HERE
 from stages.base.memory import PeakMemory, resident_mib
-from stages.measure.judge import Photograph, load_photograph, load_photographs
+from stages.measure.evaluation import EvaluationView, load_evaluation_view, load_evaluation_views
 from stages.raster.definition import RasterSettings
-from stages.scene import Camera, Look, View
+from stages.scene import Camera, DrawSettings, View
 from stages.training import views as training_views
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.step import step_of
@@ -42,12 +42,12 @@ def pictures(folder: Path) -> list[str]:
 
 
 @functools.cache
-def _decoded(folder: Path, image: str, width: int, height: int) -> Photograph:
+def _decoded(folder: Path, image: str, width: int, height: int) -> EvaluationView:
     where = camera(width, height)
-    return load_photograph(folder, View(image, image, where), where)
+    return load_evaluation_view(folder, View(image, image, where), where)
 
 
-def _decoded_once(folder: Path, view: View, where: Camera) -> Photograph:
+def _decoded_once(folder: Path, view: View, where: Camera) -> EvaluationView:
     return _decoded(folder, view.image, where.width, where.height)
 
 
@@ -68,7 +68,9 @@ def main() -> None:
         with PeakMemory() as memory:
             begun = time.monotonic()
             train = load_views(folder, views[: count * 7 // 8], max(SIZE), folder)
-            judges = load_photographs(folder, views[count * 7 // 8 :], Look(0.1, max(SIZE)))
+            judges = load_evaluation_views(
+                folder, views[count * 7 // 8 :], DrawSettings(0.1, max(SIZE))
+            )
             print(f"{len(train)} + {len(judges)} photographs: {time.monotonic() - begun:.0f} s")
             order = np.random.default_rng(0).permutation(len(train))
             for number in order[:STEPS]:

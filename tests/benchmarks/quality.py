@@ -32,11 +32,16 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.cameras.table import read_cameras
 from stages.measure.bootstrap import paired_difference
-from stages.measure.judge import Photograph, drawing_of, load_photographs, scores
+from stages.measure.evaluation import (
+    EvaluationView,
+    evaluate,
+    image_renderer,
+    load_evaluation_views,
+)
 from stages.run.pipeline import Pipeline
-from stages.scene import Reconstruction, Splats, look_of, split_held_out
+from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
 from stages.sfm import SfmSettings
-from stages.train import PRESETS, TrainSettings, light_wanted
+from stages.train import PRESETS, TrainSettings, corrects_light
 from tests.benchmarks.sample_judges import judges_in, render_judges
 from tests.sample import PHOTOS
 
@@ -55,7 +60,7 @@ class Cell:
     splats: int
     cpu_seconds: float
     wall_seconds: float
-    scores: list[dict[str, Any]]
+    evaluate: list[dict[str, Any]]
 
 
 class Capture:
@@ -69,15 +74,18 @@ class Capture:
         self.seeds: Splats = pipeline.load("seed")
         self.judges = self._judges(out, side)
 
-    def _judges(self, out: Path, side: int) -> tuple[Photograph, ...]:
-        light = light_wanted(self.reconstruction, TrainSettings().light, Report())
-        look = look_of(self.reconstruction.views, side, light)
+    def _judges(self, out: Path, side: int) -> tuple[EvaluationView, ...]:
+        light = corrects_light(self.reconstruction, TrainSettings().light, Report())
+        draw_settings = draw_settings_of(self.reconstruction.views, side, light)
         _, held = split_held_out(self.reconstruction.views)
-        found = tuple(load_photographs(self.reconstruction.folder, held, look))
+        found = tuple(load_evaluation_views(self.reconstruction.folder, held, draw_settings))
         if self.name != SAMPLE:
             return found
         render_judges(out / "judges")
-        return (*load_photographs(out / "judges", judges_in(self.reconstruction), look), *found)
+        return (
+            *load_evaluation_views(out / "judges", judges_in(self.reconstruction), draw_settings),
+            *found,
+        )
 
 
 def with_its_cameras(photos: Path) -> SfmSettings:
@@ -139,10 +147,12 @@ def made(capture: Capture, preset: str, seed: int, folder: Path) -> tuple[Splats
     return outputs["quantise"].splats, cpu, wall
 
 
-def judged(splats: Splats, judges: Sequence[Photograph], side: int) -> list[dict[str, Any]]:
+def judged(splats: Splats, judges: Sequence[EvaluationView], side: int) -> list[dict[str, Any]]:
     """What each judge says of them at a size."""
-    draw = drawing_of(replace(splats, look=replace(splats.look, side=side)), "auto")
-    return [asdict(score) for score in scores(draw, judges, with_flip=True)]
+    draw = image_renderer(
+        replace(splats, draw_settings=replace(splats.draw_settings, side=side)), "auto"
+    )
+    return [asdict(score) for score in evaluate(draw, judges, with_flip=True)]
 
 
 def _cpu_seconds() -> float:

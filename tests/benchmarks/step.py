@@ -19,7 +19,7 @@ from rich.table import Table
 from stages.base.stage import Report
 from stages.raster.definition import gradient_columns
 from stages.raster.kernels.pool import Pool
-from stages.scene import Camera, Look, Splats
+from stages.scene import Camera, DrawSettings, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import Model, new_model
 from stages.training.schedule import Schedule
@@ -55,7 +55,14 @@ class Stepper:
         schedule = Schedule(10_000, 1e-3, splats.sh_degree, len(splats), 0)
         folder = Path(tempfile.gettempdir())
         self.trainer = Trainer(
-            schedule, [photo], [], Look(1e-5), len(splats), folder, Report(), backend=backend
+            schedule,
+            [photo],
+            [],
+            DrawSettings(1e-5),
+            len(splats),
+            folder,
+            Report(),
+            backend=backend,
         )
         step: Any = self.trainer.stepper
         self.rasteriser = step.rasteriser

@@ -11,13 +11,13 @@ import pytest
 from stages import export, formats
 from stages.base.stage import Report
 from stages.capacity.rounding import ORDER, as_read, tuned_to
-from stages.capacity.tuning import Tuner
 from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import least_turned
 from stages.formats.quantisation import BitDepths, quantise_splats
-from stages.measure.judge import load_photographs, mean_psnr_db
+from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats, TrainedSplats, seen_extent, split_held_out
+from stages.training.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene
 
 FEW = BitDepths(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)
@@ -29,13 +29,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
     return small_scene(tmp_path_factory.mktemp("photos"), noise=0.0)
 
 
-def tuner(scene: SmallScene, sits_out: bool = False) -> Tuner:
-    return Tuner(photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), sits_out)
+def tuner(scene: SmallScene, dropout: bool = False) -> FineTuner:
+    return FineTuner(
+        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), dropout
+    )
 
 
 def photographs(scene: SmallScene, held_out: bool = False):
     views = split_held_out(scene.reconstruction.views)[held_out]
-    return load_photographs(scene.reconstruction.folder, views, scene.splats.look)
+    return load_evaluation_views(scene.reconstruction.folder, views, scene.splats.draw_settings)
 
 
 def nothing_seen(splats: Splats) -> np.ndarray:
@@ -43,11 +45,11 @@ def nothing_seen(splats: Splats) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sits_out", [False, True])
-def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, sits_out: bool) -> None:
+def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, dropout: bool) -> None:
     splats, everything = scene.splats, set(ORDER)
     for moving in ORDER:
         still = everything - {moving}
-        found = tuner(scene, sits_out).tuned(splats, 3, nothing_seen(splats), still)
+        found = tuner(scene, dropout).finetune(splats, 3, nothing_seen(splats), still)
         same = {
             "means": np.array_equal(found.means, splats.means),
             "quaternions": np.array_equal(found.quaternions, splats.quaternions),
@@ -99,8 +101,8 @@ def test_compact_files_hold_splats_that_were_fitted_to_them_if_that_helps(
     scene: SmallScene, tmp_path: Path
 ) -> None:
     wanted = ("ply", *ROUNDING)
-    fitted = exported(scene, tmp_path / "fitted", formats=wanted, fit_steps=10)
-    plain = exported(scene, tmp_path / "plain", formats=wanted, fit_steps=0)
+    fitted = exported(scene, tmp_path / "fitted", formats=wanted, rounding_steps=10)
+    plain = exported(scene, tmp_path / "plain", formats=wanted, rounding_steps=0)
     assert export.fitted_in(tmp_path / "fitted", "ply") is None
     assert fitted["sog"]["fitted_db"] > fitted["sog"]["plain_db"] + 0.5
     for name in ROUNDING:
@@ -110,14 +112,16 @@ def test_compact_files_hold_splats_that_were_fitted_to_them_if_that_helps(
         assert export.fitted_in(tmp_path / "plain", name) is None
         read = formats.read(tmp_path / "fitted" / f"scene.{name}")
         drawn = mean_psnr_db(
-            replace(read, look=scene.splats.look, origin=held.origin), photographs(scene), "cpu"
+            replace(read, draw_settings=scene.splats.draw_settings, origin=held.origin),
+            photographs(scene),
+            "cpu",
         )
         better = max(fitted[name]["plain_db"], fitted[name]["fitted_db"])
         assert drawn == pytest.approx(better, abs=0.02)
 
 
 def test_a_file_does_not_depend_on_what_else_is_written(scene: SmallScene, tmp_path: Path) -> None:
-    exported(scene, tmp_path / "alone", formats=("sog",), fit_steps=10)
-    exported(scene, tmp_path / "others", formats=("splat", "spz", "sog"), fit_steps=10)
+    exported(scene, tmp_path / "alone", formats=("sog",), rounding_steps=10)
+    exported(scene, tmp_path / "others", formats=("splat", "spz", "sog"), rounding_steps=10)
     alone, others = (tmp_path / name / "scene.sog" for name in ("alone", "others"))
     assert alone.read_bytes() == others.read_bytes()

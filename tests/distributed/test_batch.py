@@ -16,7 +16,7 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.distributed import cluster
-from stages.distributed.tasks import Need
+from stages.distributed.tasks import Resources
 from stages.run.lock import locked
 from tests.cli.pretence import failing_at
 
@@ -131,8 +131,8 @@ def test_nothing_imports_ray_unless_a_cluster_is_asked_for() -> None:
     assert done.stdout.strip() == "False"
 
 
-def answer(**changes) -> cluster.Answer:
-    return replace(cluster.Answer("b7", "2", (), 4, 9000.0), **changes)
+def answer(**changes) -> cluster.Worker:
+    return replace(cluster.Worker("b7", "2", (), 4, 9000.0), **changes)
 
 
 def test_a_worker_with_another_splat_is_refused_and_both_are_named(tmp_path) -> None:
@@ -180,11 +180,11 @@ def test_a_worker_without_splat_can_answer(monkeypatch, tmp_path) -> None:
 def test_tasks_share_the_processors_and_take_the_memory_they_need(
     tasks, workers, memory_mib, wanted
 ) -> None:
-    found = cluster.Cluster(None, tuple(workers))
-    assert found.share(tasks, Need(memory_mib)) == wanted
+    found = cluster.RayExecutor(None, tuple(workers))
+    assert found.share(tasks, Resources(memory_mib)) == wanted
 
 
 def test_a_run_that_no_worker_has_the_memory_for_is_refused() -> None:
     """Ray would wait for such a worker for ever."""
     with pytest.raises(SplatError, match="20,000 MiB, and no worker has more than 9,000"):
-        cluster.Cluster(None, (answer(),)).share(1, Need(20_000.0))
+        cluster.RayExecutor(None, (answer(),)).share(1, Resources(20_000.0))

@@ -13,8 +13,8 @@ import pytest
 from splatcli import jobs
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Interrupted, SplatError
-from stages.distributed import blocks, sight
-from stages.distributed.tasks import Ending, InTurn
+from stages.distributed import block_views, blocks
+from stages.distributed.tasks import SerialExecutor, TaskResult
 from stages.run.pipeline import Listener, Pipeline
 from stages.scene import save_splats, split_held_out
 from stages.structure.reconstruction_files import save_reconstruction
@@ -156,7 +156,9 @@ def test_auto_means_a_block_for_so_many_photographs(asked, photographs, wanted) 
 def test_a_block_that_no_photograph_shows_is_the_coarse_model_s(
     tmp_path, photos, monkeypatch
 ) -> None:
-    monkeypatch.setattr(sight, "members", lambda share: np.array([[True], [False]]) & (share >= 0))
+    monkeypatch.setattr(
+        block_views, "members", lambda share: np.array([[True], [False]]) & (share >= 0)
+    )
     manifest = trained(tmp_path / "run", photos, blocks="2", steps=20).manifest("train")
     assert manifest is not None
     folders = [row["run_folder"] for row in manifest.metrics["blocks"]]
@@ -171,11 +173,11 @@ def test_blocks_need_a_number_of_splats_to_share(tmp_path, photos) -> None:
 
 
 def test_a_block_that_fails_is_named(tmp_path, photos) -> None:
-    class Half(InTurn):
+    class Half(SerialExecutor):
         def results(self, tasks, need, stop=None):
             for number, ending in super().results(tasks, need, stop):
                 full = tasks[number].run_folder.name == "2"
-                yield number, Ending(6, "disk-full", "No room.") if full else ending
+                yield number, TaskResult(6, "disk-full", "No room.") if full else ending
 
     pipeline = pipeline_at(tmp_path / "run", photos)
     blocks.in_blocks(pipeline, lambda folder, listener: nullcontext(Half()))

@@ -9,7 +9,7 @@ import pytest
 
 from stages.editing.decimate import Appraisal, decimated
 from stages.editing.moments import Moments, merged
-from stages.measure.judge import decibels
+from stages.measure.evaluation import capped_psnr_db
 from stages.raster.definition import ALPHA_MAX
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, look_at
@@ -88,9 +88,9 @@ def test_from_afar_a_tenth_of_the_splats_shows_the_same() -> None:
     camera = from_afar(20)
     picture = render(full, camera).image
     assert picture.max() > 0.3
-    assert decibels(render(few, camera).image, np.clip(picture, 0, 1)) > 40
+    assert capped_psnr_db(render(few, camera).image, np.clip(picture, 0, 1)) > 40
     left_out = full.take(np.arange(0, 4000, 10))
-    assert decibels(render(left_out, camera).image, np.clip(picture, 0, 1)) < 30
+    assert capped_psnr_db(render(left_out, camera).image, np.clip(picture, 0, 1)) < 30
 
 
 def test_colours_that_differ_are_merged_last() -> None:

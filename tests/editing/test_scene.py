@@ -12,9 +12,9 @@ import pytest
 from stages.editing.operations import done, prepared
 from stages.editing.scene import Edited
 from stages.editing.syntax import ParsedOperation
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.raster.draw import render
-from stages.scene import Camera, Look, Splats, View, look_at
+from stages.scene import Camera, DrawSettings, Splats, View, look_at
 from tests import scenes
 
 
@@ -26,7 +26,7 @@ def room(n: int = 1500) -> Splats:
     sh = r.normal(0, 0.2, (n, 4, 3)).astype(np.float32)
     sh[:, 0] = splats.sh[:, 0]
     degrees = np.full(n, 1, np.uint8)
-    return replace(splats, sh=sh, sh_degrees=degrees, look=Look(near=0.2))
+    return replace(splats, sh=sh, sh_degrees=degrees, draw_settings=DrawSettings(near=0.2))
 
 
 def cameras(count: int = 6) -> list[Camera]:
@@ -41,7 +41,7 @@ def scene(splats: Splats) -> Edited:
     photographs, views = [], []
     for number, camera in enumerate(cameras()):
         pixels = np.rint(255 * np.clip(render(splats, camera).image, 0, 1)).astype(np.uint8)
-        photographs.append(Photograph(str(number), camera, pixels))
+        photographs.append(EvaluationView(str(number), camera, pixels))
         views.append(View(str(number), "", camera))
     return Edited(splats, "metres", photographs, photographs[:2], tuple(views))
 

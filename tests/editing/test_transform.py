@@ -11,7 +11,7 @@ import torch
 from stages.editing.transform import Similarity, about, upright
 from stages.raster.definition import RasterSettings
 from stages.raster.reference import parameters_of, render_tensors
-from stages.scene import Look, Splats
+from stages.scene import DrawSettings, Splats
 from tests import scenes
 
 TURN = about(np.array([0.3, -1.0, 0.5]), 77.0)
@@ -65,12 +65,14 @@ def test_a_half_turn_about_x_is_the_one_that_files_with_y_up_get() -> None:
 
 
 def test_the_origin_goes_along() -> None:
-    splats = replace(exact(5, 1), origin=np.array([100.0, 0, 0]), look=Look(near=0.5))
+    splats = replace(
+        exact(5, 1), origin=np.array([100.0, 0, 0]), draw_settings=DrawSettings(near=0.5)
+    )
     where = Similarity(2.0, about(np.array([0, 0, 1.0]), 90), np.array([1.0, 2, 3]))
     there = where.of_splats(splats)
     world = (splats.means + splats.origin) @ (2 * where.rotation.T) + where.offset
     np.testing.assert_allclose(there.means + there.origin, world, atol=1e-12)
-    assert there.look.near == 1.0
+    assert there.draw_settings.near == 1.0
 
 
 def test_splats_moved_far_away_keep_their_digits() -> None:

@@ -65,7 +65,7 @@ def keep(row: Row, found: list[Measured], real: str) -> None:
     """Put one row's numbers in the place of those kept before."""
     every = _read()
     numbers = [[m.what, float(f"{m.error:.3g}"), m.bound, m.note] for m in found]
-    told = {"where": device.told(), "numbers": numbers}
+    told = {"where": device.describe(), "numbers": numbers}
     column = {**every.get(real, {}), str(row.number): told}
     every[real] = {number: column[number] for number in sorted(column, key=int)}
     _write(every)

@@ -15,7 +15,7 @@ from stages.formats import usd_read
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Camera, Reconstruction, Splats, View, look_at, scene_extent
-from stages.structure.levelling import upright
+from stages.structure.levelling import level_and_recentre
 from tests.extremes.measured import Measured, difference, worst
 from tests.extremes.oracles import centre_in_picture, means2d
 from tests.scenes import PARAMETERS, camera, cloud, join, splats
@@ -83,7 +83,7 @@ def _shifted(which):
     model, shift = _model(), OFFSETS[which]
     poses = model.world_to_camera.copy()
     poses[:, :3, 3] -= poses[:, :3, :3] @ shift
-    return upright(replace(model, world_to_camera=poses, points=model.points + shift))[0]
+    return level_and_recentre(replace(model, world_to_camera=poses, points=model.points + shift))[0]
 
 
 @functools.cache

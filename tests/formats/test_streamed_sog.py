@@ -19,7 +19,7 @@ from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import sog, streamed_sog
 from stages.formats.rows import drawable
-from stages.measure.judge import decibels
+from stages.measure.evaluation import capped_psnr_db
 from stages.proof.checks import read_back
 from stages.raster.draw import renderer, settings_of
 from stages.scene import Camera, Splats, look_at
@@ -219,7 +219,7 @@ def test_a_level_looks_like_the_scene_where_its_splats_are_a_pixel() -> None:
         camera = camera_at(at_one_pixel(level))
         picture = renderer(full, settings)(camera).image
         assert picture.max() > 0.3
-        found = decibels(renderer(level, settings)(camera).image, np.clip(picture, 0, 1))
+        found = capped_psnr_db(renderer(level, settings)(camera).image, np.clip(picture, 0, 1))
         assert found > 40, len(level)
         share = len(level) / len(full)
         assert math.log(share, 4) <= -1

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE, paired_difference
+from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE, paired_difference
 
 
 def test_a_thing_is_not_told_apart_from_itself():
     found = paired_difference(np.zeros(8))
-    assert (found.mean, found.low, found.high, found.verdict) == (0, 0, 0, NOT_TOLD_APART)
+    assert (found.mean, found.low, found.high, found.verdict) == (0, 0, 0, INCONCLUSIVE)
 
 
 def test_a_gain_in_every_photograph_is_better_and_its_negative_worse():
@@ -22,12 +22,12 @@ def test_a_gain_in_every_photograph_is_better_and_its_negative_worse():
 
 
 def test_one_lucky_photograph_tells_nothing_apart():
-    assert paired_difference(np.array([3.0, 0, 0, 0, 0])).verdict == NOT_TOLD_APART
+    assert paired_difference(np.array([3.0, 0, 0, 0, 0])).verdict == INCONCLUSIVE
 
 
 def test_one_photograph_says_nothing_of_others():
     found = paired_difference(np.full((1, 5), 2.0))
-    assert (found.low, found.high, found.verdict) == (-math.inf, math.inf, NOT_TOLD_APART)
+    assert (found.low, found.high, found.verdict) == (-math.inf, math.inf, INCONCLUSIVE)
 
 
 def test_seeds_that_disagree_widen_the_interval_though_photographs_agree():
@@ -35,7 +35,7 @@ def test_seeds_that_disagree_widen_the_interval_though_photographs_agree():
     disagreeing = paired_difference(np.tile([0.0, 0.3, 0.6], (12, 1)))
     assert agreeing.verdict == BETTER
     assert disagreeing.mean == pytest.approx(agreeing.mean)
-    assert disagreeing.verdict == NOT_TOLD_APART
+    assert disagreeing.verdict == INCONCLUSIVE
 
 
 def test_equal_differences_get_equal_intervals():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.measure.shimmer import (
     at_resolution,
     from_distance,
@@ -85,7 +85,7 @@ def test_fine_splats_thicken_in_small_pictures_and_not_in_pictures_scaled_down()
     splats = sheet(2, 0.3)
     draw = drawing(splats)
     pixels = (np.clip(draw(CAMERA), 0, 1) * 255 + 0.5).astype(np.uint8)
-    small, scaled = small_psnr_db(draw, [Photograph("a", CAMERA, pixels)])
+    small, scaled = small_psnr_db(draw, [EvaluationView("a", CAMERA, pixels)])
     assert scaled > 45
     assert small < scaled - 10
 
@@ -97,7 +97,8 @@ def test_what_is_not_judged_does_not_judge_small_pictures_either() -> None:
     cut_off[:9] = True
     pixels[:9] = 255
     whole, kept = (
-        small_psnr_db(draw, [Photograph("a", CAMERA, pixels, cut_off=c)]) for c in (None, cut_off)
+        small_psnr_db(draw, [EvaluationView("a", CAMERA, pixels, cut_off=c)])
+        for c in (None, cut_off)
     )
     assert whole[1] < 20
     assert kept[1] > 45

@@ -12,7 +12,7 @@ from torch.overrides import TorchFunctionMode
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.raster import reference, torch_device
-from stages.raster.backends import asked_for, backend_of, rasteriser_of, tell
+from stages.raster.backends import backend_of, qualified_name, rasteriser_of, report_backend
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.reference_rasteriser import ReferenceRasteriser
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
@@ -105,16 +105,16 @@ def test_float64_is_given_up_where_the_device_refuses_it(monkeypatch: pytest.Mon
 def test_a_device_that_is_not_there_is_named_with_those_that_are(name, monkeypatch) -> None:
     monkeypatch.setattr(torch_device, "is_there", lambda asked: asked == "cpu")
     with pytest.raises(SplatError, match=f"--device {name}") as told:
-        rasteriser_of(asked_for("reference", name))
+        rasteriser_of(qualified_name("reference", name))
     assert told.value.code == "raster-no-device"
     assert told.value.wanted == "One that is there: cpu."
 
 
 def test_only_a_backend_that_takes_devices_is_given_one() -> None:
-    assert asked_for("gpu", "cpu") == "gpu"
-    assert asked_for("reference", "mps") == "reference@mps"
+    assert qualified_name("gpu", "cpu") == "gpu"
+    assert qualified_name("reference", "mps") == "reference@mps"
     with pytest.raises(SplatError, match="--backend reference") as told:
-        asked_for("auto", "cuda")
+        qualified_name("auto", "cuda")
     assert told.value.code == "option-device"
     with pytest.raises(ValueError, match="cpu@cuda"):
         backend_of("cpu@cuda")
@@ -124,6 +124,6 @@ def test_a_manifest_says_what_a_stage_drew_on(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(torch_device, "is_there", lambda name: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Some Card")
     report = Report()
-    tell(report, "reference@cuda")
+    report_backend(report, "reference@cuda")
     assert report.metrics["backend"] == "reference"
     assert report.device.startswith("Some Card, torch ")

@@ -18,7 +18,7 @@ from PIL import Image
 
 from stages import formats, quantise, sfm
 from stages.formats.rows import kept_rows
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.proof.checks import read_back
 from stages.proof.compare import differences
 from stages.raster.draw import render

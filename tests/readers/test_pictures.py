@@ -11,7 +11,7 @@ import pytest
 from stages import formats
 from stages.editing import levels
 from stages.formats.rows import degrees_in_use
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.scene import Splats
 from tests.readers.engines import (

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stages.scene import look_at
 from stages.structure.sparse_model import SparseModel
-from stages.structure.undistort import distort
+from stages.structure.undistortion import distort
 
 FOCAL, K = 500.0, -0.05
 SIZE = (640, 480)

@@ -7,7 +7,7 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.scene import Camera, look_at
-from stages.structure.common_view import random_points, seen_by
+from stages.structure.common_view import count_views, random_points
 
 MIDDLE = np.array([5.0, -2.0, 7.0])
 
@@ -30,7 +30,7 @@ def test_points_fill_a_ball_that_the_cameras_see() -> None:
     assert radius == pytest.approx(1.285, abs=1e-3)
     distance = np.linalg.norm(points - MIDDLE, axis=1)
     assert 0.99 * radius < distance.max() <= radius
-    assert (seen_by(around(), points) == 12).all()
+    assert (count_views(around(), points) == 12).all()
     assert len(points) == 20_000
 
 

@@ -24,7 +24,7 @@ def spot(width: int, height: int, x: float, y: float, sigma: float) -> np.ndarra
 def found_in(picture: np.ndarray, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     path = folder / "é.png"
     cv2.imencode(".png", picture)[1].tofile(path)
-    return features.find(path, 1000, 0.0045)
+    return features.sift_features(path, 1000, 0.0045)
 
 
 @pytest.mark.parametrize("sigma", [1.5, 4.0, 9.0])
@@ -61,7 +61,7 @@ def test_a_turned_picture_has_turned_features(tmp_path: Path) -> None:
 
 
 def test_descriptors_are_roots_of_histograms_and_the_largest_come_first() -> None:
-    keypoints, descriptors = features.find(jobs.SAMPLE / "IMG_0001.jpg", 500, 0.0045)
+    keypoints, descriptors = features.sift_features(jobs.SAMPLE / "IMG_0001.jpg", 500, 0.0045)
     assert len(keypoints) == len(descriptors) == 500
     assert descriptors.dtype == np.uint8
     lengths = np.linalg.norm(descriptors.astype(float), axis=1)
@@ -108,8 +108,8 @@ def test_nothing_is_found_where_a_mask_is_black(tmp_path: Path) -> None:
     mask[:, 130:] = 255
     for name, pixels in (("a.png", picture), ("mask.png", mask)):
         cv2.imencode(".png", pixels)[1].tofile(tmp_path / name)
-    everywhere, _ = features.find(tmp_path / "a.png", 1000, 0.0045)
-    keypoints, _ = features.find(tmp_path / "a.png", 1000, 0.0045, tmp_path / "mask.png")
+    everywhere, _ = features.sift_features(tmp_path / "a.png", 1000, 0.0045)
+    keypoints, _ = features.sift_features(tmp_path / "a.png", 1000, 0.0045, tmp_path / "mask.png")
     assert everywhere[:, 0].min() < 65
     assert len(keypoints)
     assert keypoints[:, 0].min() > 130

@@ -10,16 +10,16 @@ from stages.structure.gates import (
     CALIBRATED,
     PANORAMIC,
     PLANAR,
-    Figures,
+    ModelStatistics,
+    borderline_failures,
     check_keypoints,
     check_model,
     check_pairs,
-    doubts,
-    groups_of,
+    connected_groups,
 )
 
 # Measured with pycolmap 4.2.1 on photographs 1600 px wide.
-BANANA = Figures(
+BANANA = ModelStatistics(
     photographs=16,
     registered=15,
     models=(15,),
@@ -46,12 +46,12 @@ PLUSH = replace(
 DRONE = replace(BANANA, median_triangulation_angle_deg=5.0, baseline_over_depth=0.4)
 
 
-def codes(figures: Figures) -> list[str]:
+def codes(figures: ModelStatistics) -> list[str]:
     return [failure.code for failure in check_model(figures)]
 
 
 @pytest.mark.parametrize("figures", [BANANA, PLUSH, DRONE], ids=["banana", "plush", "drone"])
-def test_good_captures_pass(figures: Figures) -> None:
+def test_good_captures_pass(figures: ModelStatistics) -> None:
     assert codes(figures) == []
 
 
@@ -132,14 +132,14 @@ def test_a_few_contradicting_pairs_are_chance() -> None:
 
 
 def test_what_is_too_little_to_refuse_is_said() -> None:
-    assert doubts(PLUSH) == []
+    assert borderline_failures(PLUSH) == []
     few = replace(PLUSH, pairs_checked=100, pairs_contradicting=5, contradicting=("a", "b"))
     assert codes(few) == []
-    assert [failure.code for failure in doubts(few)] == ["sfm-contradictions"]
-    assert "a and b" in doubts(few)[0].given
+    assert [failure.code for failure in borderline_failures(few)] == ["sfm-contradictions"]
+    assert "a and b" in borderline_failures(few)[0].given
     loose = replace(PLUSH, link_points=60, link_views=12)
     assert codes(loose) == []
-    assert [failure.code for failure in doubts(loose)] == ["sfm-weak-link"]
+    assert [failure.code for failure in borderline_failures(loose)] == ["sfm-weak-link"]
 
 
 def test_error_limit_grows_with_the_photographs() -> None:
@@ -174,7 +174,7 @@ def test_pairs_that_only_turn_are_no_parallax_but_a_flat_field_is_fine() -> None
 
 def test_unconnected_groups_are_named_by_size() -> None:
     pairs = [*chain(6), (6, 7, 50, CALIBRATED)]
-    assert groups_of(pairs, 9) == [[0, 1, 2, 3, 4, 5], [6, 7], [8]]
+    assert connected_groups(pairs, 9) == [[0, 1, 2, 3, 4, 5], [6, 7], [8]]
     (failure,) = check_pairs(pairs, 9)
     assert failure.code == "sfm-separate-groups"
     assert "6, 2" in failure.given

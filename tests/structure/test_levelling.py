@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stages.scene import look_at
-from stages.structure.levelling import up_direction, upright
+from stages.structure.levelling import level_and_recentre, up_direction
 from stages.structure.sparse_model import reprojection_errors
 from tests.structure.synthetic import orbit_model, random_rotation
 
@@ -88,7 +88,7 @@ def test_the_model_is_moved_rigidly_and_the_subject_comes_to_the_origin() -> Non
     poses[:, :3, 3] -= poses[:, :3, :3] @ shift
     moved = replace(model, points=points, world_to_camera=poses)
 
-    found, levelled = upright(moved)
+    found, levelled = level_and_recentre(moved)
 
     assert levelled
     assert np.allclose(reprojection_errors(found), reprojection_errors(model), atol=1e-9)

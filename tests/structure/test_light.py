@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.scene import Camera
 from stages.scene.light import NOISE_EV, spread_ev
-from stages.structure.light import ALIKE, measured_light
+from stages.structure.light import ALIKE, measure_light
 
 SPOTS, VIEWS, CELL = 300, 6, 8
 COLUMNS = 20
@@ -49,27 +49,27 @@ def photographs(folder: Path, ev: np.ndarray, hidden: float = 0.1, shiny: bool =
 
 def test_a_stop_and_a_tint_are_told_though_some_spots_disagree(tmp_path: Path) -> None:
     ev = np.array([[1, 1, 1], [-1, -1, -1], [0, 0, 0], [0.3, 0, -0.4], [0, 0, 0], [0.5, 0.5, 0.5]])
-    found, _ = measured_light(*photographs(tmp_path, ev))
+    found, _ = measure_light(*photographs(tmp_path, ev))
     np.testing.assert_allclose(found, ev - np.median(ev, axis=0), atol=0.06)
 
 
 def test_spots_of_all_kinds_tell_the_same_light_but_not_the_same_shine(tmp_path: Path) -> None:
     ev = np.linspace(-0.5, 0.5, VIEWS)[:, None] * np.ones(3)
-    found, differ = measured_light(*photographs(tmp_path, ev, hidden=0.0))
+    found, differ = measure_light(*photographs(tmp_path, ev, hidden=0.0))
     assert differ < 0.2 * spread_ev([tuple(row) for row in found.tolist()])
-    found, differ = measured_light(*photographs(tmp_path, 0 * ev, hidden=0.0, shiny=True))
+    found, differ = measure_light(*photographs(tmp_path, 0 * ev, hidden=0.0, shiny=True))
     assert differ > ALIKE * spread_ev([tuple(row) for row in found.tolist()])
 
 
 def test_even_light_is_within_a_cameras_noise(tmp_path: Path) -> None:
-    found, _ = measured_light(*photographs(tmp_path, np.zeros((VIEWS, 3))))
+    found, _ = measure_light(*photographs(tmp_path, np.zeros((VIEWS, 3))))
     assert spread_ev([tuple(row) for row in found.tolist()]) < NOISE_EV
 
 
 def test_a_photograph_that_shares_no_spot_is_not_known(tmp_path: Path) -> None:
     files, points, views, px = photographs(tmp_path, np.zeros((VIEWS, 3)))
     alone = views != 2
-    found, _ = measured_light(files, points[alone], views[alone], px[alone])
+    found, _ = measure_light(files, points[alone], views[alone], px[alone])
     assert np.isnan(found[2]).all()
     assert np.isfinite(np.delete(found, 2, 0)).all()
 
@@ -82,7 +82,7 @@ def test_a_photograph_is_brought_back_to_what_the_median_one_shows(
     truth = rng.uniform(0.02, 0.5, (20, 30, 3))
     where = Camera(30, 20, 30.0, 30.0, 15.0, 10.0, np.eye(4))
     as_taken = np.rint(seen(truth * 2.0 ** np.array(light)) * 255).astype(np.uint8)
-    even = Photograph("a", where, as_taken).in_median_light(light)
+    even = EvaluationView("a", where, as_taken).in_median_light(light)
     kept = even.kept
     assert kept is not None
     assert kept.mean() > 0.3

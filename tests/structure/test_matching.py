@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from stages.structure import database as sqlite
-from stages.structure import ticks
+from stages.structure import worker_progress
 from stages.structure.job import Job
-from stages.structure.pairs import every
+from stages.structure.pairs import exhaustive_pairs
 from tests.structure import sample_jobs as jobs
 
 PHOTOGRAPHS = 9
@@ -60,8 +60,8 @@ def test_three_threads_find_what_one_finds(
     job = matching(features, tmp_path, "exhaustive", 3)
     jobs.work(job)
     assert (found(job, "matches"), found(job, "two_view_geometries")) == whole
-    assert len(whole[0]) == len(every(PHOTOGRAPHS))
-    assert ticks.read(Path(job.progress)) == ("matching", 36, 36)
+    assert len(whole[0]) == len(exhaustive_pairs(PHOTOGRAPHS))
+    assert worker_progress.read_progress(Path(job.progress)) == ("matching", 36, 36)
 
 
 def test_what_was_found_before_is_kept_and_the_missing_added(
@@ -108,5 +108,7 @@ def test_photographs_without_features_match_nothing(features: Job, tmp_path: Pat
         connection.commit()
     jobs.work(job)
     inliers = sqlite.inliers_of_pairs(Path(job.database))
-    assert {pair for pair in inliers if 3 in pair} == {p for p in every(PHOTOGRAPHS) if 3 in p}
+    assert {pair for pair in inliers if 3 in pair} == {
+        p for p in exhaustive_pairs(PHOTOGRAPHS) if 3 in p
+    }
     assert all(count == 0 for pair, count in inliers.items() if 3 in pair)

@@ -16,18 +16,18 @@ def around(photographs: int, reach: int = 6) -> NDArray[np.int32]:
 
 
 def test_every_pair_is_there_once() -> None:
-    assert pairs.every(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert pairs.exhaustive_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 
 def test_sequences_are_compared_with_neighbours_and_far_ones() -> None:
-    found = pairs.sequential(200)
+    found = pairs.sequential_pairs(200)
     assert len(set(found)) == len(found)
     assert all(0 <= first < second < 200 for first, second in found)
     assert {second - first for first, second in found} == {*range(1, 21), 32, 64, 128}
 
 
 def test_a_walk_is_compared_along_it_and_where_it_closes() -> None:
-    found = pairs.promising(around(300))
+    found = pairs.initial_pairs(around(300))
     assert (0, 299) in found
     assert (0, 6) in found
     assert (0, 150) not in found
@@ -36,38 +36,38 @@ def test_a_walk_is_compared_along_it_and_where_it_closes() -> None:
 
 def test_pairs_grow_with_photographs_and_not_with_their_square() -> None:
     alike = np.full((400, 400), 50, np.int32)
-    assert len(pairs.promising(alike)) <= 400 * (pairs.BEST + 1)
-    nothing_linked = pairs.closing_gaps(alike, [], {})
+    assert len(pairs.initial_pairs(alike)) <= 400 * (pairs.BEST + 1)
+    nothing_linked = pairs.linking_pairs(alike, [], {})
     assert len(nothing_linked) <= 400 * pairs.MOST_TO_CLOSE_GAPS
 
 
 def test_neighbours_are_compared_even_if_nothing_looks_alike() -> None:
-    assert pairs.promising(np.zeros((4, 4), np.int32)) == [(0, 1), (1, 2), (2, 3)]
+    assert pairs.initial_pairs(np.zeros((4, 4), np.int32)) == [(0, 1), (1, 2), (2, 3)]
 
 
 def test_a_lonely_photograph_is_compared_with_all_and_nothing_twice() -> None:
     alike = around(12)
-    matched = pairs.promising(alike)
+    matched = pairs.initial_pairs(alike)
     inliers = {pair: 0 if 5 in pair else 200 for pair in matched}
-    more = pairs.closing_gaps(alike, matched, inliers)
-    assert more == [p for p in pairs.every(12) if 5 in p and p not in matched]
+    more = pairs.linking_pairs(alike, matched, inliers)
+    assert more == [p for p in pairs.exhaustive_pairs(12) if 5 in p and p not in matched]
 
 
 def test_groups_that_nothing_links_are_compared_with_each_other() -> None:
     alike = np.zeros((12, 12), np.int32)
-    matched = [(i, j) for i, j in pairs.every(12) if (i < 5) == (j < 5)]
-    more = pairs.closing_gaps(alike, matched, dict.fromkeys(matched, 90))
-    assert more == [(i, j) for i, j in pairs.every(12) if (i < 5) != (j < 5)]
+    matched = [(i, j) for i, j in pairs.exhaustive_pairs(12) if (i < 5) == (j < 5)]
+    more = pairs.linking_pairs(alike, matched, dict.fromkeys(matched, 90))
+    assert more == [(i, j) for i, j in pairs.exhaustive_pairs(12) if (i < 5) != (j < 5)]
 
 
 def test_of_too_many_those_that_look_most_alike_are_compared() -> None:
     alike = np.zeros((100, 100), np.int32)
     alike[3, 70] = alike[70, 3] = 9
-    more = pairs.closing_gaps(alike, [], {})
+    more = pairs.linking_pairs(alike, [], {})
     assert (3, 70) in more
     assert len(more) == 100 * pairs.MOST_TO_CLOSE_GAPS
 
 
 def test_where_all_hang_together_nothing_is_added() -> None:
-    matched = pairs.promising(around(40))
-    assert pairs.closing_gaps(around(40), matched, dict.fromkeys(matched, 100)) == []
+    matched = pairs.initial_pairs(around(40))
+    assert pairs.linking_pairs(around(40), matched, dict.fromkeys(matched, 100)) == []

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stages.structure.placing import Placing
-from stages.structure.ticks import Ticks, read
+from stages.structure.worker_progress import ProgressWriter, read_progress
 
 PHOTOGRAPHS = 300
 PLACING_S, ADJUSTING_S = 0.15, 0.05  # each photograph; each photograph that is there
@@ -36,7 +36,7 @@ class Clock:
 def placed(folder: Path, at_the_end: float = AT_THE_END["usual"]) -> Clock:
     """A whole mapping as COLMAP does it. at_the_end: adjustments when all are placed."""
     clock = Clock()
-    placing = Placing(Ticks(folder / "ticks"), PHOTOGRAPHS, clock)
+    placing = Placing(ProgressWriter(folder / "ticks"), PHOTOGRAPHS, clock)
     placing.began()
     adjusted = 2
     for count in range(3, PHOTOGRAPHS + 1):
@@ -69,16 +69,16 @@ def test_the_time_left_can_be_believed(share: float, tmp_path: Path) -> None:
 
 def test_it_is_told_while_the_mapper_is_silent(tmp_path: Path) -> None:
     path = tmp_path / "ticks"
-    with Placing(Ticks(path), 5) as placing:
+    with Placing(ProgressWriter(path), 5) as placing:
         placing.began()
-        while (told := read(path)) is None or told[1] < 1:
+        while (told := read_progress(path)) is None or told[1] < 1:
             pass
     assert told == ("placing photographs", 1, 5)
 
 
 def test_settling_what_is_placed_is_told_of(tmp_path: Path) -> None:
     clock = Clock()
-    placing = Placing(Ticks(tmp_path / "ticks"), PHOTOGRAPHS, clock)
+    placing = Placing(ProgressWriter(tmp_path / "ticks"), PHOTOGRAPHS, clock)
     placing.began()
     for _ in range(PHOTOGRAPHS // 2):  # the others cannot be placed
         clock.spend(PLACING_S, placing)

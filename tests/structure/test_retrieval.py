@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure import retrieval, words
-from stages.structure.pairs import every
+from stages.structure import retrieval, vocabulary
+from stages.structure.pairs import exhaustive_pairs
 
 
 def walk_past(places: NDArray[np.integer], each: int = 60) -> list[NDArray[np.int64]]:
@@ -20,26 +20,26 @@ def walk_past(places: NDArray[np.integer], each: int = 60) -> list[NDArray[np.in
 
 
 def test_of_few_photographs_every_pair_is_looked_at() -> None:
-    assert retrieval.candidates(walk_past(np.arange(30))) == every(30)
+    assert retrieval.candidate_pairs(walk_past(np.arange(30))) == exhaustive_pairs(30)
 
 
 def test_a_place_that_is_passed_again_is_found_among_many() -> None:
     there_and_back = np.concatenate([np.arange(200), np.arange(200)[::-1]])
-    found = set(retrieval.candidates(walk_past(there_and_back)))
+    found = set(retrieval.candidate_pairs(walk_past(there_and_back)))
     assert all((i, 399 - i) in found for i in range(200))
     assert all((i, i + 4) in found for i in range(396))
 
 
 def test_pairs_grow_with_photographs_and_not_with_their_square() -> None:
     most = retrieval.CANDIDATES + retrieval.NEIGHBOURS
-    assert len(retrieval.candidates(walk_past(np.arange(400)))) <= 400 * most
+    assert len(retrieval.candidate_pairs(walk_past(np.arange(400)))) <= 400 * most
 
 
 def test_words_that_all_hold_tell_nothing_and_no_words_do_no_harm() -> None:
     common, none = np.zeros(100, np.int64), np.empty(0, np.int64)
     held = [common] * 60 + [none] * 40
     held[3] = held[90] = np.array([7, 8, 9])
-    found = retrieval.candidates(held)
+    found = retrieval.candidate_pairs(held)
     assert (3, 90) in found
     assert {i for pair in found for i in pair} == set(range(100))
 
@@ -49,5 +49,5 @@ def test_a_feature_is_the_two_words_nearest_to_it() -> None:
     near = np.zeros((2, 128), np.uint8)
     near[0, [1, 3]] = 180, 120
     near[1, [3, 1]] = 180, 120
-    assert words.two_words(near, vocabulary).tolist() == [7, 7]
-    assert words.two_words(near, vocabulary[:1]).tolist() == [0, 0]
+    assert vocabulary.word_pairs(near, vocabulary).tolist() == [7, 7]
+    assert vocabulary.word_pairs(near, vocabulary[:1]).tolist() == [0, 0]

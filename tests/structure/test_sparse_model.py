@@ -12,11 +12,11 @@ from stages.structure.sparse_model import (
     MappingResult,
     SparseModel,
     load_result,
-    measure,
+    model_statistics,
     reprojection_errors,
     save_model,
     triangulation_angles,
-    without_odd_views,
+    without_implausible_views,
 )
 from tests.structure.synthetic import orbit_model
 
@@ -37,7 +37,7 @@ def test_points_behind_a_camera_have_infinite_error() -> None:
 def test_figures_of_a_half_circle() -> None:
     model = orbit_model(views=7, points=200)
     result = MappingResult(model, (model.names,), timed_out=False)
-    figures = measure(result, 8, "incremental")
+    figures = model_statistics(result, 8, "incremental")
     assert (figures.photographs, figures.registered, figures.points) == (8, 7, 200)
     assert figures.mean_track_length == 7
     # Opposite ends, 4 away and 1 up: 2 atan(4) = 152 degrees in the middle, less around it.
@@ -53,7 +53,7 @@ def test_pairs_that_the_model_contradicts_are_counted_and_one_is_named() -> None
     model = orbit_model(views=6, points=40)
     fits = np.array([0.9, 0.5, 0.1, 1.0, 0.0])
     result = MappingResult(replace(model, pair_fits=fits), (model.names,), timed_out=False)
-    figures = measure(result, 6, "incremental")
+    figures = model_statistics(result, 6, "incremental")
     assert figures.pairs_contradicting == 2
     assert figures.contradicting == ("02.jpg", "03.jpg")
 
@@ -65,7 +65,9 @@ def test_cameras_in_one_place_have_no_baseline_and_no_angle() -> None:
     poses[:, :3, 3] = -np.einsum("vij,j->vi", poses[:, :3, :3], centre)
     still = replace(model, world_to_camera=poses)
     assert triangulation_angles(still, np.arange(40)).max() < 1e-5
-    figures = measure(MappingResult(still, (model.names,), timed_out=False), 6, "incremental")
+    figures = model_statistics(
+        MappingResult(still, (model.names,), timed_out=False), 6, "incremental"
+    )
     assert figures.baseline_over_depth < 1e-9
 
 
@@ -80,13 +82,13 @@ def test_views_with_hardly_any_points_go_and_the_rest_stays_consistent() -> None
         observing_views=model.observing_views[keep],
         observed_px=model.observed_px[keep],
     )
-    kept = without_odd_views(thin)
+    kept = without_implausible_views(thin)
     assert kept.names == ("00.jpg", "01.jpg", "03.jpg", "04.jpg", "05.jpg")
     assert len(kept.points) == 90
     assert reprojection_errors(kept).max() < 1e-9
     assert (kept.tracks == 5).all()
     assert kept.pairs.max() == 4
-    assert without_odd_views(model) is model
+    assert without_implausible_views(model) is model
 
 
 def two_cameras(views: int, odd: int, k: float) -> SparseModel:
@@ -102,14 +104,17 @@ def two_cameras(views: int, odd: int, k: float) -> SparseModel:
 
 
 def test_one_photograph_with_an_absurd_lens_goes_and_many_are_left_for_the_gates() -> None:
-    one = without_odd_views(two_cameras(12, 1, k=-3.0))
+    one = without_implausible_views(two_cameras(12, 1, k=-3.0))
     assert len(one.names) == 11
     assert len(one.camera_params) == 1
     assert one.view_cameras.max() == 0
-    assert len(without_odd_views(two_cameras(12, 1, k=0.1)).names) == 12
-    many = without_odd_views(two_cameras(12, 4, k=-3.0))
+    assert len(without_implausible_views(two_cameras(12, 1, k=0.1)).names) == 12
+    many = without_implausible_views(two_cameras(12, 4, k=-3.0))
     assert len(many.names) == 12
-    assert measure(MappingResult(many, (many.names,), False), 12, "incremental").distortion == -3.0
+    assert (
+        model_statistics(MappingResult(many, (many.names,), False), 12, "incremental").distortion
+        == -3.0
+    )
 
 
 def test_a_saved_result_comes_back_equal(tmp_path: Path) -> None:
@@ -127,4 +132,4 @@ def test_nothing_found_is_a_result_too(tmp_path: Path) -> None:
     save_model(tmp_path / "m", None, groups=[], timed_out=False)
     result = load_result(tmp_path / "m")
     assert result.model is None
-    assert measure(result, 5, "incremental").registered == 0
+    assert model_statistics(result, 5, "incremental").registered == 0

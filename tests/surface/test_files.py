@@ -14,7 +14,7 @@ from pygltflib import GLTF2
 
 from stages import formats
 from stages.base.errors import SplatError
-from stages.base.lazy import named
+from stages.base.lazy import load_object
 from stages.surface.files import fault_of
 from stages.surface.mesh import Mesh
 from stages.surface.table import MESHES
@@ -32,7 +32,7 @@ def tent() -> Mesh:
 def write(path: Path, mesh: Mesh, units: str = "metres") -> str:
     """Write by the table; what the independent reader has to say of it."""
     row = MESHES[path.name.removeprefix("a.")]
-    named(row.writer)(path, mesh, units)
+    load_object(row.writer)(path, mesh, units)
     return fault_of(path, row, mesh)
 
 

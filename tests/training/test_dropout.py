@@ -12,7 +12,7 @@ from stages.training.cpu_step import CpuStep
 from stages.training.dropout import LARGEST_SHARE, Dropout, noise
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.plain_step import PlainStep
+from stages.training.reference_step import ReferenceStep
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 
@@ -51,12 +51,12 @@ def test_a_device_lets_the_same_splats_rest():
     seen = np.random.default_rng(2).integers(0, 40, 5000).astype(np.int32)
     for key in (0, 1, 0xFFFFFFFF):
         wanted = Dropout(VIEWS, key).resting(seen)
-        found = gpu_dropout.resting(Dropout(VIEWS, key), torch.tensor(seen))
+        found = gpu_dropout.dropped(Dropout(VIEWS, key), torch.tensor(seen))
         np.testing.assert_array_equal(found.numpy(), wanted)
-    assert len(gpu_dropout.resting(Dropout(VIEWS, 1), torch.zeros(0, dtype=torch.int32))) == 0
+    assert len(gpu_dropout.dropped(Dropout(VIEWS, 1), torch.zeros(0, dtype=torch.int32))) == 0
 
 
-@pytest.mark.parametrize("step_class", [CpuStep, PlainStep])
+@pytest.mark.parametrize("step_class", [CpuStep, ReferenceStep])
 def test_what_rests_is_not_moved_and_the_others_do_its_part(step_class):
     scene = cloud(80, 40, 30, degree=0)
     where = camera(40, 30)

@@ -20,7 +20,7 @@ from stages.training.dropout import Dropout
 from stages.training.gpu_step import GpuStep, image_loss
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.plain_step import PlainStep, photograph_loss
+from stages.training.reference_step import ReferenceStep, photograph_loss
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 from tests.tolerances import LOSS_GRADIENT
@@ -55,7 +55,7 @@ def stepper(lag: int | None = None) -> GpuStep:
 @pytest.mark.parametrize("degree", [0, 1])
 def test_two_steps_leave_what_the_definition_leaves(degree):
     settings = RasterSettings(near=0.1, sh_degree=degree)
-    plain = PlainStep(ReferenceRasteriser())
+    plain = ReferenceStep(ReferenceRasteriser())
     plain.load(start())
     found = stepper()
     for _ in range(2):
@@ -74,7 +74,7 @@ def test_two_steps_leave_what_the_definition_leaves(degree):
 )
 def test_masks_and_light_ask_what_the_definition_asks(outside, light):
     settings = RasterSettings(near=0.1, sh_degree=0, background=(0.2, 0.9, 0.4))
-    plain, found = PlainStep(ReferenceRasteriser()), stepper()
+    plain, found = ReferenceStep(ReferenceRasteriser()), stepper()
     plain.load(start())
     photograph = masked(outside, light)
     losses = [s.step(photograph, settings, RATES, smooth=False) for s in (found, plain)]
@@ -167,7 +167,7 @@ def test_a_model_moves_between_backends_whole():
     other._on_host = None  # so that it comes from the device
     for name, kept in vars(model).items():
         np.testing.assert_array_equal(getattr(other.model(), name), kept)
-    plain = PlainStep(ReferenceRasteriser())
+    plain = ReferenceStep(ReferenceRasteriser())
     plain.load(other.model())
     losses = [s.step(level(), SETTINGS, RATES, smooth=False) for s in (made, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)

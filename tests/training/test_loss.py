@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from stages.measure.images import psnr, ssim
+from stages.measure.image_metrics import psnr, ssim
 from stages.raster.kernels.pool import Pool
 from stages.training.loss import image_loss
 from tests.tolerances import LOSS_GRADIENT

@@ -11,7 +11,7 @@ import pytest
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
-from stages.scene import IGNORE, TRANSPARENT, Look, Splats
+from stages.scene import IGNORE, TRANSPARENT, DrawSettings, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.schedule import RESOLUTIONS, Schedule
@@ -68,8 +68,8 @@ def trained(outside: str, folder: Path) -> Splats:
     view = TrainingView("a", tuple(level(np.clip(picture, 0, 1), outside) for _ in RESOLUTIONS))
     start = join(red, dark)
     schedule = Schedule(steps=200, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
-    look = Look(near=0.1)
-    made = Trainer(schedule, [view], [], look, len(start), folder, Report())
+    draw_settings = DrawSettings(near=0.1)
+    made = Trainer(schedule, [view], [], draw_settings, len(start), folder, Report())
     model = made.run(start)
     arrays = model.means, model.quaternions, model.log_scales, model.opacity_logits, model.sh
     return Splats(*arrays, np.zeros(len(model), np.uint8))
@@ -99,8 +99,8 @@ def test_what_is_black_is_there_if_a_scene_is_for_any_background(
     black = replace(level(np.zeros((48, 48, 3)), ""), mask=None)
     view = TrainingView("a", tuple(black for _ in RESOLUTIONS))
     schedule = Schedule(steps=150, extent=10.0, sh_degree=0, n_start=9, seed=0)
-    look = Look(near=0.1)
-    made = Trainer(schedule, [view], [], look, 9, tmp_path, Report(), over_any=over_any)
+    draw_settings = DrawSettings(near=0.1)
+    made = Trainer(schedule, [view], [], draw_settings, 9, tmp_path, Report(), over_any=over_any)
     model = made.run(start)
     opacities = 1 / (1 + np.exp(-model.opacity_logits))
     assert (opacities.mean() > 0.7) == over_any

@@ -11,17 +11,17 @@ from splatcli.summary import headline
 from stages import train
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
-from stages.measure.images import psnr
-from stages.measure.judge import Photograph, scores
+from stages.measure.evaluation import EvaluationView, evaluate
+from stages.measure.image_metrics import psnr
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.smoothing import smoothing_widths
-from stages.scene import Look, Splats, look_at, split_held_out
+from stages.scene import DrawSettings, Splats, look_at, split_held_out
 from stages.train import TrainSettings, finished
 from stages.training import cap
 from stages.training.checkpoint import MAGIC
-from stages.training.clock import Clock, Spent
+from stages.training.clock import Clock, Elapsed
 from stages.training.density import AdaptiveDensity
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -37,16 +37,18 @@ def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, back
     # of an extent of 10, no splat of these toys is large enough to be pruned as a giant
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=degree, n_start=len(start), seed=0)
     judges = [
-        Photograph(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
+        EvaluationView(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
         for view in views
     ]
     report = report or Report()
-    return Trainer(schedule, views, judges, Look(near=0.1), cap, folder, report, backend=backend)
+    return Trainer(
+        schedule, views, judges, DrawSettings(near=0.1), cap, folder, report, backend=backend
+    )
 
 
 def psnr_of(trained):
     """Of the first photograph, drawn as it is now."""
-    return scores(trained.drawn, trained.held_out)[0].psnr_db
+    return evaluate(trained.drawn, trained.held_out)[0].psnr_db
 
 
 def disc_and_square():
@@ -173,7 +175,7 @@ def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path, mon
             self.steps = 0
 
         def spent(self):
-            return Spent(0.01 * self.steps)
+            return Elapsed(0.01 * self.steps)
 
     monkeypatch.setattr("stages.training.trainer.Clock", StepClock)
     timed, start = small_problem(tmp_path, "limited", steps=60)
@@ -197,7 +199,7 @@ def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its
 
     def stop(label, done, total, numbers):
         if done == 20:
-            t.clock = Clock(Spent(100.0, 300.0))  # as if it had taken so long
+            t.clock = Clock(Elapsed(100.0, 300.0))  # as if it had taken so long
             report.stop_requested.set()
 
     report.listener = stop
@@ -220,13 +222,13 @@ def test_looking_on_does_not_change_what_is_trained(tmp_path):
     drawn: list[np.ndarray] = []
     report = Report()
 
-    def look(draw):
+    def draw_settings(draw):
         width, height = (97, 61) if len(drawn) % 2 else (19, 23)
         where = camera(width, height, matrix=look_at(np.array([2.0, -1, -3]), np.zeros(3)))
         drawn.append(draw(where))
         assert drawn[-1].shape == (height, width, 3)
 
-    report.onlooker = look
+    report.onlooker = draw_settings
     watched, start = small_problem(tmp_path, "watched", report, steps=150)
     found = watched.run(start)
     assert len(drawn) == 150
@@ -242,7 +244,7 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     where = camera(48, 36)
     seen = []
     report.onlooker = lambda draw: seen.append(draw(where))
-    trained = finished(t.run(start), 1, start, t.look)
+    trained = finished(t.run(start), 1, start, t.draw_settings)
     settings = t.settings(t.schedule.sh_degree)
     image = render(trained, where, settings, backend="reference").image
     levels = np.rint(np.clip(image, 0, 1) * 255)
@@ -294,7 +296,7 @@ def test_a_run_that_loses_every_splat_ends(tmp_path):
     faint = np.full(len(start), -12.0, np.float32)
     model = t.run(replace(start, opacity_logits=faint))
     assert len(model) == 0
-    assert len(finished(model, 1, start, t.look)) == 0
+    assert len(finished(model, 1, start, t.draw_settings)) == 0
     assert t.history[-1]["splats"] == 0
 
 
@@ -414,8 +416,8 @@ def test_no_more_is_modelled_than_the_photographs_tell(tmp_path, monkeypatch):
     """60 x 40 pixels of three numbers each; a splat of degree 1 has 23, one of degree 3 has 59."""
     small = camera(width=60, height=40)
     monkeypatch.setattr(cap, "FEWEST", 10)
-    assert cap.splats_told([small] * 5, 1) == 5 * 60 * 40 * 3 // 23
-    assert cap.splats_told([small] * 5, 3) == 5 * 60 * 40 * 3 // 59
+    assert cap.splats_determined([small] * 5, 1) == 5 * 60 * 40 * 3 // 23
+    assert cap.splats_determined([small] * 5, 3) == 5 * 60 * 40 * 3 // 59
     monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
     assert cap.cap_for(tmp_path, 0, 610) == cap.Cap(610, cap.PHOTOGRAPHS)
     assert cap.cap_for(tmp_path, 0, 10**9).splats == 610  # it stays as it began

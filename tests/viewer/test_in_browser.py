@@ -12,7 +12,7 @@ from PIL import Image
 
 from stages import formats
 from stages.formats import ply
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.viewer.server import LocalServer
 from stages.viewer.site import site
 from tests.viewer.browser import Browser

@@ -19,12 +19,12 @@ import pytest
 from PIL import Image
 
 from stages.formats.page.shots import shots_of
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Splats
 from stages.scene.framing import depth_of_interest
-from stages.viewer.live import LivePage
+from stages.viewer.live_page import LivePage
 from stages.viewer.server import LocalServer
 from tests import processes, sample
 from tests.tolerances import LIVE_PICTURE_DB

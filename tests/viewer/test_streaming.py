@@ -15,7 +15,7 @@ from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import streamed_sog
 from stages.formats.table import CHUNK
-from stages.measure.images import psnr
+from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.scene import Camera, View, look_at
 from stages.viewer.server import Item, LocalServer

@@ -13,12 +13,12 @@ import numpy as np
 from stages import formats
 from stages.formats.quantisation import splats_to_write
 from stages.formats.rows import kept_rows
-from stages.measure.judge import Photograph, Score, drawing_of, scores
-from stages.measure.speed import seconds_a_frame
+from stages.measure.contribution import Contributions, floaters, measure_contributions
+from stages.measure.evaluation import EvaluationView, Score, evaluate, image_renderer
+from stages.measure.speed import seconds_per_frame
 from stages.measure.tradeoff.points import Moment, Point, Trade, change_db, mean_db
 from stages.measure.tradeoff.thin import Thin, measure_thin
-from stages.measure.worth import Worth, floaters, measure_worth
-from stages.scene import Look, QuantisedSplats, Splats, View, split_held_out, spread_over
+from stages.scene import DrawSettings, QuantisedSplats, Splats, View, split_held_out, spread_over
 
 # Shares of the splats that are left, each taken from the one before: what single splats are worth
 # no longer adds up where many go at once.
@@ -39,8 +39,8 @@ class Material:
     by format, what its file holds where export fine-tuned it."""
 
     splats: Splats
-    training: Sequence[Photograph]
-    held_out: Sequence[Photograph]
+    training: Sequence[EvaluationView]
+    held_out: Sequence[EvaluationView]
     views: tuple[View, ...]
     units: str
     backend: str
@@ -59,7 +59,7 @@ def measure_trade(material: Material, tell: Tell) -> Trade:
     own_scores = _scores(material, splats)
     own = _point(material, "as it is", splats, own_scores, own_scores)
     tell("finding what each splat is worth")
-    worth = measure_worth(splats, material.training, material.backend)
+    worth = measure_contributions(splats, material.training, material.backend)
     return Trade(
         own=own,
         moments=_moments(material.history),
@@ -73,14 +73,14 @@ def measure_trade(material: Material, tell: Tell) -> Trade:
 
 
 def _scores(material: Material, splats: Splats) -> list[Score]:
-    return scores(drawing_of(splats, material.backend), material.held_out)
+    return evaluate(image_renderer(splats, material.backend), material.held_out)
 
 
 def _point(
     material: Material, label: str, splats: Splats, found: list[Score], own: list[Score]
 ) -> Point:
     cameras = [photograph.camera for photograph in material.held_out[:TIMED_FRAMES]]
-    seconds = float(np.median(seconds_a_frame(splats, cameras, material.backend)))
+    seconds = float(np.median(seconds_per_frame(splats, cameras, material.backend)))
     change = change_db(found, own)
     return Point(label, len(splats), mean_db(found), change, frame_s=seconds)
 
@@ -104,7 +104,7 @@ def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, .
             held = material.fitted.get(name, held)
             formats.write(path, held, units=material.units, views=material.views)
             size = row.size_bytes(path)
-            read = replace(formats.read(path), look=splats.look)
+            read = replace(formats.read(path), draw_settings=splats.draw_settings)
             for file in row.files(path):
                 file.unlink()
             found = own if _same(read, splats) else _scores(material, read)
@@ -121,7 +121,7 @@ def _same(a: Splats, b: Splats) -> bool:
     )
 
 
-def _thin(material: Material, worth: Worth, tell: Tell) -> Thin:
+def _thin(material: Material, worth: Contributions, tell: Tell) -> Thin:
     tell("looking where the capture is thin")
     cameras = [photograph.camera for photograph in material.training]
     return measure_thin(
@@ -134,7 +134,7 @@ def _thin(material: Material, worth: Worth, tell: Tell) -> Thin:
     )
 
 
-def _fewer(material: Material, own: list[Score], worth: Worth, tell: Tell) -> list[Point]:
+def _fewer(material: Material, own: list[Score], worth: Contributions, tell: Tell) -> list[Point]:
     """Fewer and fewer splats: first goes what changes the training pictures least. worth: of
     all."""
     splats, points = material.splats, []
@@ -144,16 +144,16 @@ def _fewer(material: Material, own: list[Score], worth: Worth, tell: Tell) -> li
             continue
         tell(f"leaving {share:.0%} of the splats")
         if len(splats) < len(material.splats):
-            worth = measure_worth(splats, material.training, material.backend)
+            worth = measure_contributions(splats, material.training, material.backend)
         splats = splats.take(np.sort(np.argsort(-worth.picture_change, kind="stable")[:count]))
         points.append(_point(material, f"{share:.0%}", splats, _scores(material, splats), own))
     return points
 
 
-def deciding(views: Sequence[View], look: Look) -> list[View]:
+def deciding(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
     """Those photographs of training that decide, at the size that they are judged at."""
     if not views:
         return []
-    camera = look.camera(views[0].camera)
+    camera = draw_settings.camera(views[0].camera)
     most = round(DECIDING_PIXELS / (camera.width * camera.height))
     return spread_over(views, max(_LEAST_DECIDING, most))

@@ -9,9 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from stages.base.errors import Family, SplatError
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.measure.bootstrap import Difference, paired_difference
-from stages.measure.judge import Photograph, Score, drawing_of, load_photographs, scores
+from stages.measure.evaluation import (
+    EvaluationView,
+    Score,
+    evaluate,
+    image_renderer,
+    load_evaluation_views,
+)
 from stages.measure.tradeoff.points import change_db
 from stages.scene import Reconstruction, Splats, View, split_held_out
 
@@ -31,11 +37,11 @@ class Side:
         """By name: views that this run did not learn from."""
         return {view.name: view for view in split_held_out(self.reconstruction.views)[1]}
 
-    def photographs(self, names: Sequence[str], side_px: int) -> tuple[Photograph, ...]:
+    def photographs(self, names: Sequence[str], side_px: int) -> tuple[EvaluationView, ...]:
         """Each from where this run saw it. Raises SplatError."""
-        views, look = self.held_out, replace(self.splats.look, side=side_px)
+        views, draw_settings = self.held_out, replace(self.splats.draw_settings, side=side_px)
         chosen = [views[n] for n in names]
-        return tuple(load_photographs(self.reconstruction.folder, chosen, look))
+        return tuple(load_evaluation_views(self.reconstruction.folder, chosen, draw_settings))
 
 
 @dataclass(frozen=True)
@@ -44,8 +50,8 @@ class Pairing:
     side_px: longer side of every picture."""
 
     sides: tuple[Side, Side]
-    photographs: tuple[tuple[Photograph, ...], tuple[Photograph, ...]]
-    scores: tuple[tuple[Score, ...], tuple[Score, ...]]
+    photographs: tuple[tuple[EvaluationView, ...], tuple[EvaluationView, ...]]
+    evaluate: tuple[tuple[Score, ...], tuple[Score, ...]]
     psnr: Difference
     ssim: Difference
     side_px: int
@@ -69,7 +75,7 @@ def pair(first: Side, second: Side) -> Pairing:
     side_px = min(_side(one, name) for one in both for name in names)
     photographs = (first.photographs(names, side_px), second.photographs(names, side_px))
     found_a, found_b = (
-        tuple(scores(drawing_of(one.splats, one.backend), seen))
+        tuple(evaluate(image_renderer(one.splats, one.backend), seen))
         for one, seen in zip(both, photographs, strict=True)
     )
     ssim = np.array([b.ssim - a.ssim for a, b in zip(found_a, found_b, strict=True)])
@@ -84,7 +90,7 @@ def pair(first: Side, second: Side) -> Pairing:
 
 
 def _side(one: Side, name: str) -> int:
-    camera = one.splats.look.camera(one.held_out[name].camera)
+    camera = one.splats.draw_settings.camera(one.held_out[name].camera)
     return max(camera.width, camera.height)
 
 

@@ -7,7 +7,7 @@ import io
 from pathlib import Path
 
 from stages.base.atomic import replacing
-from stages.measure.judge import Score, drawing_of
+from stages.measure.evaluation import Score, image_renderer
 from stages.measure.tradeoff import pages
 from stages.measure.tradeoff.pair import Pairing, verdict
 
@@ -61,7 +61,7 @@ def _table(pairing: Pairing) -> str:
 
 
 def _pictures(pairing: Pairing) -> list[str]:
-    draw = [drawing_of(side.splats, side.backend) for side in pairing.sides]
+    draw = [image_renderer(side.splats, side.backend) for side in pairing.sides]
     rows = []
     for i, (seen_a, seen_b) in enumerate(zip(*pairing.photographs, strict=True)):
         shown = [(f"{seen_a.name}: the photograph", seen_a.image)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.measure.bootstrap import Difference, paired_difference
-from stages.measure.judge import Score
+from stages.measure.evaluation import Score
 
 if TYPE_CHECKING:
     from stages.measure.tradeoff.thin import Thin

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.base.atomic import replacing
-from stages.measure.judge import drawing_of
+from stages.measure.evaluation import image_renderer
 from stages.measure.tradeoff import pages, thin_words, words
 from stages.measure.tradeoff.measuring import Material
 from stages.measure.tradeoff.plots import write_plots
@@ -122,7 +122,7 @@ def _framings(trade: Trade) -> str:
 def _worst(trade: Trade, material: Material) -> str:
     """The worst photograph, what is drawn of it, and what lies between."""
     photograph = next(p for p in material.held_out if p.name == trade.worst.name)
-    drawn = drawing_of(material.splats, material.backend)(photograph.camera)
+    drawn = image_renderer(material.splats, material.backend)(photograph.camera)
     drawn, truth = np.clip(drawn, 0.0, 1.0), photograph.image
     return pages.pictures(
         (

@@ -18,7 +18,7 @@ from stages.measure.coverage import (
     patches_of,
     thin_places,
 )
-from stages.measure.judge import Photograph, drawing_of
+from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.shimmer import Framing, framings, shimmer, small_psnr_db
 from stages.scene import Camera, Splats, View, look_at, spread_over
 from stages.scene.framing import depth_of_interest
@@ -49,17 +49,17 @@ def measure_thin(
     splats: Splats,
     training: Sequence[View],
     levelled: bool,
-    held_out: Sequence[Photograph],
+    held_out: Sequence[EvaluationView],
     hanging: NDArray[np.bool_],
     backend: str,
 ) -> Thin:
     """hanging [N]: which splats are floaters; the others as in `Material`."""
     chosen = spread_over(training, MOST_PHOTOGRAPHS)
-    cameras = tuple(splats.look.camera(view.camera) for view in chosen)
+    cameras = tuple(splats.draw_settings.camera(view.camera) for view in chosen)
     patches = patches_of(splats, cameras, backend)
     ring = around(cameras, patches, levelled) if len(patches.centres) else None
     empty = gaps(ring, patches) if ring else ()
-    draw = drawing_of(splats, backend)
+    draw = image_renderer(splats, backend)
     seen = [photograph.camera for photograph in spread_over(held_out, FRAMED)]
     framed = framings(draw, [(c, depth_of_interest(c, splats.means)) for c in seen])
     if ring and ring.inward and empty:

@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.measure.coverage import FEW_PHOTOGRAPHS, SMALL_ANGLE_DEG, Around, Gap, Place
 from stages.measure.tradeoff.points import Trade
 from stages.measure.tradeoff.thin import Thin

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from stages.base.words import counted
+from stages.base.text import counted
 from stages.measure.bootstrap import Difference
 from stages.measure.tradeoff.points import Moment, Point, Trade, knee, time_to
 

@@ -31,7 +31,7 @@ def interpreted() -> bool:
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 
-def obstacle() -> str:
+def why_unavailable() -> str:
     """Why the backend "gpu" is not to be chosen here by itself; "" where it is."""
     return "Triton's interpreter is on, for tests" if interpreted() else missing()
 
@@ -97,7 +97,7 @@ def _no_triton() -> str:
     return "" if importlib.util.find_spec("triton") else "Triton is not installed"
 
 
-def told() -> str:
+def describe() -> str:
     """Card, memory, driver, torch and Triton, in one line; of the interpreter as well."""
     import torch
 

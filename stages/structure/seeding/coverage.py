@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
-from stages.structure.seeding.places import cells, centres, seen, unprojected
-from stages.structure.seeding.witnesses import Witnesses
+from stages.structure.seeding.projection import cells, pixel_centres, unproject, visible_points
+from stages.structure.seeding.visibility import VisibilityConstraints
 
 CELLS = 32  # along the longer side of a photograph
 MARGIN = 0.25  # of the longer side: how far beyond its rim a photograph is continued
@@ -65,7 +65,7 @@ def fill_cells(
     among them; the space before a camera is empty, and stays so.
     """
     filling = _Filling(points, [(c.centre, _clearance(c, points)) for c in cameras])
-    witnesses = Witnesses(views, points)
+    witnesses = VisibilityConstraints(views, points)
     ordered = sorted(views, key=lambda v: v.name)
     for view in ordered:
         _fill(filling, folder, view, 0, witnesses, ordered)
@@ -83,23 +83,23 @@ def _fill(
     folder: Path,
     view: View,
     margin: int,
-    witnesses: Witnesses,
+    witnesses: VisibilityConstraints,
     views: list[View],
 ) -> None:
     """Fill the empty cells of one photograph; with a margin, those beyond its rim."""
     small = view.camera.fitted(CELLS)
     camera = _widened(small, margin)
-    _, pixels, _ = seen(camera, np.concatenate([filling.points, *filling.places]))
-    measured = _thinned(*seen(camera, filling.points)[1:])
+    _, pixels, _ = visible_points(camera, np.concatenate([filling.points, *filling.places]))
+    measured = _thinned(*visible_points(camera, filling.points)[1:])
     empty = _empty_cells(camera, pixels)
     if len(measured[1]) < PLANE_POINTS or len(empty) == 0:
         return
     depth = _interpolated(empty, *measured)
     if margin:
-        free = ~_in_a_picture(unprojected(camera, empty, depth), views)
+        free = ~_in_a_picture(unproject(camera, empty, depth), views)
     else:
         depth, free = _believed(view, camera, empty, depth, measured[1], witnesses)
-    places = unprojected(camera, empty, depth)
+    places = unproject(camera, empty, depth)
     for centre, distance in filling.clear:
         free &= np.linalg.norm(places - centre, axis=1) > distance
     picture = load_image(folder / view.image, small.width, small.height)
@@ -119,15 +119,15 @@ def _believed(
     at: NDArray[np.float64],
     depth: NDArray[np.float64],
     measured: NDArray[np.float64],
-    witnesses: Witnesses,
+    witnesses: VisibilityConstraints,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """(depth [K], whether to fill [K]): what nothing confirms is moved back to where the
     photograph's view ends, if no other contradicts that."""
-    places = unprojected(camera, at, depth)
+    places = unproject(camera, at, depth)
     believed = witnesses.confirm(places, view.name) & witnesses.anchored(places)
     end = float(np.percentile(measured, FARTHEST))
     behind = np.where(believed, depth, np.maximum(depth, end))
-    _, before = witnesses.ask(unprojected(camera, at, behind), view.name)
+    _, before = witnesses.ask(unproject(camera, at, behind), view.name)
     return behind, believed | ((before == 0) & (behind > depth))
 
 
@@ -135,14 +135,14 @@ def _in_a_picture(places: NDArray[np.float64], views: list[View]) -> NDArray[np.
     """[K] whether some photograph looks there."""
     shown = np.zeros(len(places), bool)
     for view in views:
-        shown[seen(view.camera, places)[0]] = True
+        shown[visible_points(view.camera, places)[0]] = True
     return shown
 
 
 def _clearance(camera: Camera, points: NDArray[np.float64]) -> float:
     """How far around a camera nothing is to be guessed: half of the depth at which it begins to
     see something (the fifth percentile: a few measured points are always misplaced)."""
-    _, _, depths = seen(camera, points)
+    _, _, depths = visible_points(camera, points)
     return CLEARANCE * float(np.percentile(depths, 5)) if len(depths) else 0.0
 
 
@@ -170,7 +170,7 @@ def _empty_cells(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.floa
     """[K, 2] centres of the cells (the camera's pixels) in which no point lands."""
     hits = np.zeros((camera.height, camera.width), bool)
     hits[cells(pixels)] = True
-    return centres(*np.nonzero(~hits))
+    return pixel_centres(*np.nonzero(~hits))
 
 
 def _interpolated(

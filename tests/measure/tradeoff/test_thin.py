@@ -9,21 +9,21 @@ from typing import Any, cast
 
 import numpy as np
 
-from stages.measure.judge import Photograph
+from stages.measure.evaluation import EvaluationView
 from stages.measure.tradeoff.points import Trade
 from stages.measure.tradeoff.thin import Thin, measure_thin
 from stages.measure.tradeoff.thin_words import about_coverage, about_framing
-from stages.scene import Look, View
+from stages.scene import DrawSettings, View
 from tests.measure.rings import ball, camera, place, ring, surface
 
 
 def thin_of(headings: Sequence[int], height: int = 20, hanging: Iterable[int] = ()) -> Thin:
     """Photographs around a ball, named by where they stand: "at 40.jpg"."""
-    splats = replace(surface(ball()), look=Look(near=0.01, side=96))
+    splats = replace(surface(ball()), draw_settings=DrawSettings(near=0.01, side=96))
     cameras = ring(headings, height)
     views = [View(f"at {h}.jpg", "", c) for h, c in zip(headings, cameras, strict=True)]
     grey = np.full((72, 96, 3), 128, np.uint8)
-    judge = Photograph("judge", camera(place(0)), grey)
+    judge = EvaluationView("judge", camera(place(0)), grey)
     mask = np.isin(np.arange(len(splats)), list(hanging))
     return measure_thin(splats, views, True, [judge], mask, "cpu")
 

@@ -11,14 +11,14 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.formats import FORMATS
-from stages.measure.bootstrap import BETTER, NOT_TOLD_APART, WORSE
-from stages.measure.judge import load_photographs
+from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
+from stages.measure.evaluation import load_evaluation_views
 from stages.measure.tradeoff import words
 from stages.measure.tradeoff.measuring import SHARES, Material, deciding, measure_trade
 from stages.measure.tradeoff.pair import Side, pair, verdict
 from stages.measure.tradeoff.pair_report import write_pair
 from stages.measure.tradeoff.report import write_report
-from stages.scene import Camera, Look, QuantisedSplats, View, split_held_out, spread_over
+from stages.scene import Camera, DrawSettings, QuantisedSplats, View, split_held_out, spread_over
 from tests.small_scene import small_scene
 
 COURSE = [
@@ -34,13 +34,13 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def material(scene):
-    look = Look(near=0.01, side=72)
+    draw_settings = DrawSettings(near=0.01, side=72)
     reconstruction = scene.reconstruction
     training, held = (
-        load_photographs(reconstruction.folder, views, look)
+        load_evaluation_views(reconstruction.folder, views, draw_settings)
         for views in split_held_out(reconstruction.views)
     )
-    splats = replace(scene.splats, look=look)
+    splats = replace(scene.splats, draw_settings=draw_settings)
     return Material(
         splats, training, held, reconstruction.views, "metres", "cpu", True, COURSE, ("ply", "spz")
     )
@@ -87,7 +87,7 @@ def test_splats_go_by_their_worth_to_photographs_that_do_not_judge(trade, materi
 
 
 def test_worth_leaves_a_better_picture_than_chance(trade, material) -> None:
-    from stages.measure.judge import mean_psnr_db
+    from stages.measure.evaluation import mean_psnr_db
 
     half = next(point for point in trade.counts if point.splats == 125)
     chance = material.splats.take(np.random.default_rng(1).permutation(250)[:125])
@@ -166,13 +166,19 @@ def test_a_single_judge_makes_no_interval_and_no_fuss(scene, material, tmp_path)
 
 
 def side(scene, name: str, splats=None) -> Side:
-    look = Look(near=0.01, side=72)
-    return Side(name, replace(splats or scene.splats, look=look), scene.reconstruction, "cpu", {})
+    draw_settings = DrawSettings(near=0.01, side=72)
+    return Side(
+        name,
+        replace(splats or scene.splats, draw_settings=draw_settings),
+        scene.reconstruction,
+        "cpu",
+        {},
+    )
 
 
 def test_a_run_is_not_told_apart_from_itself(scene) -> None:
     found = pair(side(scene, "a"), side(scene, "b"))
-    assert (found.psnr.mean, found.psnr.verdict) == (0, NOT_TOLD_APART)
+    assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
     assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): not told apart." in verdict(found)
 
 
@@ -184,7 +190,9 @@ def test_a_worse_run_is_told_as_worse_and_the_other_way_round_as_better(scene) -
 
 def test_both_are_judged_at_the_smaller_size(scene) -> None:
     small = side(scene, "small")
-    small = replace(small, splats=replace(small.splats, look=Look(near=0.01, side=40)))
+    small = replace(
+        small, splats=replace(small.splats, draw_settings=DrawSettings(near=0.01, side=40))
+    )
     found = pair(side(scene, "large"), small)
     assert found.side_px == 40
     assert {max(p.pixels.shape[:2]) for seen in found.photographs for p in seen} == {40}
@@ -214,9 +222,11 @@ def test_few_are_taken_from_all_over() -> None:
 
 def test_all_photographs_decide_where_time_allows() -> None:
     views = [View(str(i), "", camera(800, 600)) for i in range(60)]
-    assert len(deciding(views, Look(side=480))) == 60
-    assert len(deciding(views, Look(side=800))) == 50
-    assert len(deciding([replace(v, camera=camera(8000, 6000)) for v in views], Look())) == 24
+    assert len(deciding(views, DrawSettings(side=480))) == 60
+    assert len(deciding(views, DrawSettings(side=800))) == 50
+    assert (
+        len(deciding([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings())) == 24
+    )
 
 
 def camera(width: int, height: int) -> Camera:

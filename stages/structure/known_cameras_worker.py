@@ -1,0 +1,165 @@
+"""Matches and points for cameras that are known, in the worker process (imports pycolmap)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from stages.scene.similarity import similarity
+from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
+from stages.structure.job import Job, known_cameras_path
+from stages.structure.mapping import observations
+from stages.structure.matching import match_pairs
+
+# Of each round of refinement: points may lie so many times as far off as usual. Rough poses give no
+# points to begin with otherwise.
+REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
+FEWEST_MATCHES = 30  # of a pair that is asked whether poses are right
+
+
+def match_neighbours(job: Job) -> None:
+    """Match and verify the pairs of the job's known cameras, whose lenses are known exactly."""
+    known = np.load(known_cameras_path(job))
+    with pycolmap.Database.open(job.database) as database:
+        for number, lens in enumerate(zip(known["intrinsics"], known["sizes"], strict=True), 1):
+            database.update_camera(_camera(number, *lens))
+    match_pairs(job, [(int(first), int(second)) for first, second in known["pairs"]])
+
+
+def triangulate(job: Job) -> None:
+    """Leave in `job.out`: agreement.json, how well matches fit the poses and what others would fit
+    better (see `agreement`); points.npz, what the matches and the poses give."""
+    known = np.load(known_cameras_path(job))
+    out = Path(job.out)
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    pairs = _matched_points(Path(job.database))
+    lens, poses = known["intrinsics"], known["world_to_camera"]
+    side = float(known["sizes"].max())
+    found = {
+        "pairs": len(pairs),
+        "matches": sum(len(pair[2]) for pair in pairs),
+        "given": median_inlier_ratio(pairs, lens, poses, side),
+        "roughly": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
+        "others": {
+            name: median_inlier_ratio(pairs, lens, turned, side)
+            for name, turned in likely_mistakes(poses)
+        },
+    }
+    if job.refine:
+        poses = _refined(job, known, out / "colmap")
+        found["refined"] = median_inlier_ratio(pairs, lens, poses, side)
+        known = {**known, "world_to_camera": poses}
+    (out / "agreement.json").write_text(json.dumps(found), encoding="utf-8")
+    _save_points(_triangulated(job, known, out / "colmap"), poses, out / "points.npz")
+
+
+def _camera(number: int, lens: NDArray[np.float64], size: NDArray[np.int32]) -> pycolmap.Camera:
+    width, height = int(size[0]), int(size[1])
+    camera = pycolmap.Camera(
+        camera_id=number, model="PINHOLE", width=width, height=height, params=lens
+    )
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDArray[np.float64]]]:
+    """(first, second, pixels in the first [N, 2], in the second) of each pair with matches enough
+    that pass a fundamental matrix of their own, whatever the poses are."""
+    found = []
+    with pycolmap.Database.open(path) as database:
+        ids, geometries = database.read_two_view_geometries()
+        keypoints: dict[int, NDArray[np.float64]] = {}
+        for pair_id, geometry in zip(ids, geometries, strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            matches = np.asarray(geometry.inlier_matches)
+            if len(matches) < FEWEST_MATCHES:
+                continue
+            for image in (first, second):
+                if image not in keypoints:
+                    keypoints[image] = database.read_keypoints(image)[:, :2].astype(np.float64)
+            a, b = keypoints[first][matches[:, 0]], keypoints[second][matches[:, 1]]
+            found.append((first - 1, second - 1, a, b))
+    return found
+
+
+def _refined(job: Job, known: Mapping[str, Any], scratch: Path) -> NDArray[np.float64]:
+    """[V, 4, 4] the poses, moved to where the matches want them; the lenses stay as they are. What
+    the first rounds believe may lie far off, since the poses do. The world stays the given one: the
+    similarity that brings the new centres nearest the old ones is taken out."""
+    given = np.asarray(known["world_to_camera"], np.float64)
+    poses = given
+    for slack in REFINEMENTS:
+        model = _triangulated(job, {**known, "world_to_camera": poses}, scratch, slack)
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_focal_length = options.refine_extra_params = False
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+        options.ceres.solver_options.num_threads = 1
+        options.print_summary = False
+        pycolmap.bundle_adjustment(model, options)
+        poses = given.copy()
+        for number in sorted(model.reg_image_ids()):
+            poses[number - 1, :3] = model.images[number].cam_from_world().matrix()
+    scale, turn, shift = similarity(_centres(poses), _centres(given))
+    rotations = poses[:, :3, :3] @ turn.T
+    centres = scale * _centres(poses) @ turn.T + shift
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centres)
+    return poses
+
+
+def _centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(-np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]))
+
+
+def _triangulated(
+    job: Job, known: Mapping[str, Any], scratch: Path, slack: float = 1.0
+) -> pycolmap.Reconstruction:
+    """Points of the matches, the poses held. slack: times as far off as usual that they may lie."""
+    scratch.mkdir()
+    model = pycolmap.Reconstruction()
+    for number, (name, lens, size, pose) in enumerate(
+        zip(job.names, known["intrinsics"], known["sizes"], known["world_to_camera"], strict=True),
+        1,
+    ):
+        model.add_camera_with_trivial_rig(_camera(number, lens, size))
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = job.seed
+    triangulation = options.triangulation
+    triangulation.random_seed = job.seed
+    triangulation.create_max_angle_error *= slack
+    triangulation.continue_max_angle_error *= slack
+    triangulation.merge_max_reproj_error *= slack
+    triangulation.complete_max_reproj_error *= slack
+    options.mapper.filter_max_reproj_error *= slack
+    model = pycolmap.triangulate_points(
+        model, job.database, job.images_root, scratch, options=options
+    )
+    model.extract_colors_for_all_images(job.images_root, num_threads=1)
+    model.update_point_3d_errors()
+    shutil.rmtree(scratch)
+    return model
+
+
+def _save_points(model: pycolmap.Reconstruction, poses: NDArray[np.float64], path: Path) -> None:
+    ids = sorted(model.point3D_ids())
+    points = [model.points3D[i] for i in ids]
+    position = {image_id: image_id - 1 for image_id in sorted(model.reg_image_ids())}
+    np.savez(
+        path,
+        points=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        colours=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        errors_px=np.array([point.error for point in points], np.float64),
+        world_to_camera=poses,
+        **observations(model, points, position),  # type: ignore[arg-type]
+    )

@@ -1,0 +1,192 @@
+"""Which photograph a camera of a file belongs to: by name, as far as other programs keep names."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report
+from stages.base.text import counted
+from stages.cameras.camera_file import CameraFile
+from stages.cameras.lens import Lens
+from stages.photos.find import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
+from stages.scene import Camera, Capture, Photo, View
+
+_NAMED = 6
+_SUFFIXES = LOSSY | LOSSLESS | RAW | OTHER_PICTURES
+_FEWEST = 3
+_SHAPE_TOLERANCE = 0.01
+_PARTIAL = "--allow-partial goes on with those that have both."
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """A photograph, its camera in the photograph's own pixels, its lens, and its role."""
+
+    photo: Photo
+    camera: Camera
+    lens: Lens
+    role: str
+
+
+def match_cameras(
+    found: CameraFile, capture: Capture, split: bool, allow_partial: bool, report: Report
+) -> list[PosedPhoto]:
+    """The photographs that have a camera, in the capture's order.
+
+    split: whether the file's own train and test photographs are kept, and all others left out.
+    Raises SplatError, also for those that lack their counterpart unless `allow_partial`; a split
+    that leaves photographs out (a benchmark's maps of depth beside them) is no reason.
+    """
+    if split and not {view.role for view in found.views} >= {"train", "test"}:
+        raise _no_split()
+    wanted = [i for i, v in enumerate(found.views) if not split or v.role in ("train", "test")]
+    views = [found.views[i] for i in wanted]
+    matches, missing = _matched(views, capture.photos)
+    without = [p.name for i, p in enumerate(capture.photos) if i not in matches.values()]
+    allowed = allow_partial or (split and not missing)
+    _check_missing(missing, without, len(matches), allowed, report)
+    posed = []
+    for number, position in sorted(matches.items(), key=lambda match: match[1]):
+        view, photo = views[number], capture.photos[position]
+        lens = found.lenses[wanted[number]]
+        posed.append(PosedPhoto(photo, _fitted(view, photo), lens, view.role if split else ""))
+    return posed
+
+
+def _matched(views: Sequence[View], photos: Sequence[Photo]) -> tuple[dict[int, int], list[str]]:
+    """(photograph by view, names of views without one). A name agrees from its end on: the more
+    folders of it are equal the better, and its suffix may be another or missing."""
+    by_stem: dict[str, list[int]] = defaultdict(list)
+    for position, photo in enumerate(photos):
+        for name in {photo.name, photo.picture}:
+            by_stem[_parts(name)[0]].append(position)
+    matches: dict[int, int] = {}
+    missing: list[str] = []
+    owner: dict[int, str] = {}
+    for number, view in enumerate(views):
+        candidates = set(by_stem.get(_parts(view.name)[0], ()))
+        scores = {i: _agreement(view.name, photos[i]) for i in candidates}
+        best = [i for i in sorted(scores) if scores[i] == max(scores.values())]
+        if not best:
+            missing.append(view.name)
+        elif len(best) > 1:
+            raise _ambiguous(view.name, [photos[i].name for i in best])
+        elif best[0] in owner:
+            raise _twice(owner[best[0]], view.name, photos[best[0]].name)
+        else:
+            matches[number] = best[0]
+            owner[best[0]] = view.name
+    return matches, missing
+
+
+def _parts(name: str) -> list[str]:
+    """The name without its suffix, then its folders from the innermost on, folded."""
+    plain = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+    path = PurePosixPath(plain)
+    stem = path.stem if path.suffix in _SUFFIXES else path.name
+    return [stem, *reversed([part for part in path.parent.parts if part not in (".", "..")])]
+
+
+def _suffix(name: str) -> str:
+    return PurePosixPath(name).suffix.casefold()
+
+
+def _agreement(name: str, photo: Photo) -> tuple[int, bool, bool]:
+    """The larger the better: folders in common, whether the suffix is the same, too."""
+    mine, theirs = _parts(name)[1:], _parts(photo.name)[1:]
+    common = 0
+    for a, b in zip(mine, theirs, strict=False):
+        if a != b:
+            break
+        common += 1
+    return common, _suffix(name) == _suffix(photo.name), len(theirs) == common
+
+
+def _fitted(view: View, photo: Photo) -> Camera:
+    """The camera on the photograph's own pixels: ingest may have made it smaller."""
+    camera = view.camera
+    shape = camera.width * photo.height / (camera.height * photo.width)
+    rounding = 1.0 / min(photo.width, photo.height)
+    if abs(shape - 1.0) <= _SHAPE_TOLERANCE + rounding:
+        return camera.resized(photo.width, photo.height)
+    swapped = abs(camera.height * photo.height / (camera.width * photo.width) - 1.0) < 0.02
+    raise SplatError(
+        "cameras-other-shape",
+        given=f"The camera of {photo.name} is for pictures of {camera.width} x {camera.height}, "
+        f"the photograph has {photo.width} x {photo.height}.",
+        wanted="Cameras of these photographs, in their shape.",
+        hint="The photograph's EXIF turns it upright and the camera is for it lying: turn the "
+        "pixels themselves, and find the cameras again."
+        if swapped
+        else "Name the photographs that the cameras were found from, not cropped.",
+    )
+
+
+def _check_missing(
+    missing: list[str], without: list[str], matched: int, allow_partial: bool, report: Report
+) -> None:
+    told = []
+    if missing:
+        told.append(
+            f"{counted(len(missing), 'camera')} of the file "
+            f"{'names' if len(missing) == 1 else 'name'} photographs that are not there "
+            f"({_listed(missing)})"
+        )
+    if without:
+        has = "has" if len(without) == 1 else "have"
+        told.append(
+            f"{counted(len(without), 'photograph')} {has} no camera in the file "
+            f"({_listed(without)})"
+        )
+    if not told:
+        return
+    given = "; ".join(told) + "."
+    code = "cameras-without-photographs" if missing else "cameras-missing"
+    if matched < _FEWEST or not allow_partial:
+        raise SplatError(
+            code,
+            given=given if matched else f"No photograph has a camera in the file: {given}",
+            wanted="A camera for every photograph, and a photograph for every camera, by name.",
+            hint="Name the photographs' folder that the file speaks of. " + _PARTIAL,
+        )
+    report.warn(code, f"{given} What has no counterpart is left out.")
+
+
+def _listed(names: list[str]) -> str:
+    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(name[:80] for name in names[:_NAMED]) + rest
+
+
+def _ambiguous(name: str, photos: list[str]) -> SplatError:
+    return SplatError(
+        "cameras-ambiguous",
+        given=f"The camera of {name[:80]} may belong to any of {_listed(photos)}.",
+        wanted="Names that tell the photographs apart.",
+        hint="Name the folder of photographs that holds only one of them.",
+    )
+
+
+def _twice(first: str, second: str, photo: str) -> SplatError:
+    return SplatError(
+        "cameras-of-one-name",
+        given=f"Two cameras of the file, {first[:80]} and {second[:80]}, are those of {photo}.",
+        wanted="One camera for each photograph.",
+        hint="Remove the one that is not meant.",
+    )
+
+
+def _no_split() -> SplatError:
+    return SplatError(
+        "cameras-without-split",
+        given="--split was asked for, and the cameras' file does not say which photographs are "
+        "for training and which for testing.",
+        wanted="transforms_train.json and transforms_test.json, or a file with train_filenames "
+        "and test_filenames.",
+        hint="Leave --split away: then one photograph in eight is held out.",
+        family=Family.USAGE,
+    )

@@ -1,0 +1,224 @@
+"""How large the world is, and where north: from what is known of it, or from GPS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report
+from stages.scene import Camera, Capture, Photo
+from stages.structure.markers import marker_sides
+
+_FEWEST_GPS = 5
+_AGREEING_SHARE = 0.6  # of the photographs with GPS
+_WORST_RESIDUAL = 0.15  # of how far the cameras spread: beyond, GPS says nothing about the scene
+_WORST_SPREAD = 0.05  # of the sides of markers, which are all of one size
+_PAIRS = 2000  # tried, at most
+# WGS 84: half axis in metres, eccentricity squared
+_AXIS, _ECCENTRICITY2 = 6_378_137.0, 6.69437999014e-3
+
+
+@dataclass(frozen=True)
+class KnownScale:
+    """What is said of the size. distance: two photographs' names and how far apart they are,
+    metres; or nothing. marker: side of the printed markers, metres; 0 for none. stated: metres of
+    one unit of a world that came with its cameras, 0 where nobody says; stated_by: who does."""
+
+    distance: Sequence[str] = ()
+    marker: float = 0.0
+    stated: float = 0.0
+    stated_by: str = ""
+
+
+UNKNOWN_SCALE = KnownScale()
+
+
+@dataclass(frozen=True)
+class MetricScale:
+    """metres: of one unit of the world. heading: rotation about the vertical, radians, after which
+    +Z is north and +X east; 0 where that is not known. source: in words."""
+
+    metres: float
+    heading: float
+    source: str
+
+    @property
+    def turn(self) -> NDArray[np.float64]:
+        """[3, 3] new world from old, without its scale; about y, which points down."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+    def poses(self, world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[V, 4, 4] of the same cameras in the new world."""
+        moved = np.array(world_to_camera)
+        moved[:, :3, :3] = moved[:, :3, :3] @ self.turn.T
+        moved[:, :3, 3] *= self.metres
+        return moved
+
+    def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[P, 3] in the new world."""
+        return np.asarray(self.metres * points @ self.turn.T)
+
+
+def find_metric_scale(
+    known: KnownScale,
+    capture: Capture,
+    names: Sequence[str],
+    cameras: Sequence[Camera],
+    pictures: Sequence[Path],
+    levelled: bool,
+    report: Report,
+) -> MetricScale | None:
+    """What is known of the size of the world of `cameras`, pinholes, of the capture's photographs
+    `names`, whose undistorted `pictures` lie on disk. Where the user says nothing, the cameras'
+    file may, or GPS. None where nothing says.
+
+    Raises SplatError for a distance or a marker that cannot be used.
+    """
+    centres = np.array([camera.centre for camera in cameras])
+    if known.distance:
+        metric: MetricScale | None = _from_distance(known.distance, capture, names, centres)
+    elif known.marker:
+        metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
+    elif known.stated:
+        metric = MetricScale(known.stated, 0.0, known.stated_by)
+    else:
+        photos = {photo.name: photo for photo in capture.photos}
+        metric = _from_gps([photos[name] for name in names], centres, levelled, report)
+    report.metric("metres_from", metric.source if metric else "nothing")
+    report.metric("metres_per_unit", metric.metres if metric else None)
+    return metric
+
+
+def check_distance(asked: Sequence[str], capture: Capture) -> float:
+    """The metres of what was asked. Raises SplatError where it cannot be of this capture."""
+    *ends, said = asked
+    try:
+        metres = float(said)
+    except ValueError:
+        metres = math.nan
+    if not (math.isfinite(metres) and metres > 0):
+        raise _unusable(f"{said} is no distance in metres")
+    for name in ends:
+        if name not in {photo.name for photo in capture.photos}:
+            raise _unusable(f"{name} is no photograph of the capture")
+    return metres
+
+
+def _from_distance(
+    asked: Sequence[str], capture: Capture, names: Sequence[str], centres: NDArray[np.float64]
+) -> MetricScale:
+    metres = check_distance(asked, capture)
+    first, second, _ = asked
+    for name in (first, second):
+        if name not in names:
+            raise _unusable(f"{name} could not be placed")
+    a, b = (centres[list(names).index(name)] for name in (first, second))
+    apart = float(np.linalg.norm(a - b))
+    spread = float(np.linalg.norm(centres - np.median(centres, axis=0), axis=1).max())
+    if apart < 1e-3 * spread:
+        raise _unusable(f"{first} and {second} were taken from the same place")
+    return MetricScale(metres / apart, 0.0, f"{first} and {second} are {metres:g} m apart")
+
+
+def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> MetricScale:
+    report.metric("markers", len(sides) // 4)
+    if not len(sides):
+        raise _no_marker("no ArUco marker was found in two photographs that see it from two sides")
+    side = float(np.median(sides))
+    spread = float(np.median(np.abs(sides / side - 1.0)))
+    report.metric("marker_sides_spread", round(spread, 5))
+    if spread > _WORST_SPREAD:
+        raise _no_marker(f"the sides of {len(sides) // 4} markers differ by {spread:.0%}")
+    return MetricScale(metres / side, 0.0, f"{len(sides) // 4} markers of {metres:g} m")
+
+
+def _from_gps(
+    photos: Sequence[Photo], centres: NDArray[np.float64], levelled: bool, report: Report
+) -> MetricScale | None:
+    """From horizontal positions alone: heights by GPS are worse than the photographs' level."""
+    rows = [i for i, photo in enumerate(photos) if photo.gps is not None]
+    report.metric("with_gps", len(rows))
+    if not levelled or len(rows) < _FEWEST_GPS:
+        return None
+    earth = east_north([photos[i].gps or (0.0, 0.0) for i in rows])
+    here = centres[rows, 0] + 1j * centres[rows, 2]  # x and z: east and north, once turned
+    there = earth[:, 0] + 1j * earth[:, 1]
+    factor, inliers, residual = fit_similarity_2d(here, there)
+    spread = float(np.sqrt(np.mean(np.abs(there - there.mean()) ** 2)))
+    report.metric("gps_residual_m", round(residual, 3))
+    report.metric("gps_agreeing", int(inliers.sum()))
+    report.metric("gps_spread_m", round(spread, 3))
+    agreed = inliers.sum() >= max(_FEWEST_GPS, _AGREEING_SHARE * len(rows))
+    if not agreed or residual > _WORST_RESIDUAL * spread or abs(factor) == 0:
+        return None
+    # (x + iz) e^(i angle) turns x to z; `turn` has the opposite sign for its angle.
+    return MetricScale(
+        float(abs(factor)),
+        -float(np.angle(factor)),
+        f"GPS of {int(inliers.sum())} photographs, {residual:.2g} m off",
+    )
+
+
+def fit_similarity_2d(
+    here: NDArray[np.complex128], there: NDArray[np.complex128]
+) -> tuple[complex, NDArray[np.bool_], float]:
+    """(factor, who agrees [N], their RMS distance) of the similarity that takes most of `here` [N]
+    to `there` [N] in the plane: the best of those through two, refined (least median, Rousseeuw
+    1984)."""
+    first, second = np.triu_indices(len(here), 1)
+    chosen = np.linspace(0, len(first) - 1, min(len(first), _PAIRS)).astype(int)
+    best, least = 0j, math.inf
+    for i, j in zip(first[chosen], second[chosen], strict=True):
+        if abs(here[j] - here[i]) == 0:
+            continue
+        factor = (there[j] - there[i]) / (here[j] - here[i])
+        off = float(np.median(np.abs(there - there[i] - factor * (here - here[i]))))
+        if off < least:
+            best, least, anchor = factor, off, i
+    if not math.isfinite(least):
+        return 0j, np.zeros(len(here), np.bool_), math.inf
+    inliers = np.abs(there - there[anchor] - best * (here - here[anchor])) <= 3.0 * least + 1e-9
+    a, b = here[inliers] - here[inliers].mean(), there[inliers] - there[inliers].mean()
+    factor = complex((a.conj() @ b) / max(float((a.conj() @ a).real), 1e-300))
+    return factor, inliers, float(np.sqrt(np.mean(np.abs(b - factor * a) ** 2)))
+
+
+def east_north(places: Sequence[tuple[float, float]]) -> NDArray[np.float64]:
+    """[N, 2] metres east and north of the median of `places` (latitude, longitude in degrees)."""
+    degrees = np.array(places, np.float64)
+    longitude = np.unwrap(degrees[:, 1], period=360.0)  # across the 180th meridian
+    latitude = np.radians(degrees[:, 0])
+    middle = float(np.median(latitude))
+    bend = 1.0 - _ECCENTRICITY2 * math.sin(middle) ** 2
+    north = _AXIS * (1.0 - _ECCENTRICITY2) / bend**1.5 * (latitude - middle)
+    east = _AXIS / math.sqrt(bend) * np.cos(middle) * np.radians(longitude - np.median(longitude))
+    return np.stack([east, north], axis=1)
+
+
+def _no_marker(why: str) -> SplatError:
+    return SplatError(
+        "sfm-marker",
+        given=f"--marker cannot be used: {why}.",
+        wanted="Printed ArUco markers of one size, flat, sharp, with their white margin; alone or "
+        "on a ChArUco board.",
+        hint="Leave --marker away, or say a distance with --scale instead.",
+        family=Family.RECONSTRUCTION,
+    )
+
+
+def _unusable(why: str) -> SplatError:
+    return SplatError(
+        "sfm-scale",
+        given=f"--scale cannot be used: {why}.",
+        wanted="Two photographs, as the capture names them, that were taken at different places, "
+        "and the distance between their cameras in metres: --scale A.jpg B.jpg 0.85",
+        hint="Choose two that stand far apart: then a centimetre more or less matters little.",
+        family=Family.USAGE,
+    )

@@ -1,0 +1,91 @@
+"""What bands of colour are worth, against drawing without them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.capacity.selection import Removal
+from stages.measure.contribution import colours_by_degree, measure_contributions, squared_error
+from stages.measure.evaluation import image_renderer, load_evaluation_views
+from stages.scene import Splats
+from tests.formats.truth import colour, many_splats
+from tests.small_scene import small_scene
+
+
+def without(splats: Splats, row: int, degree: int, added: np.ndarray) -> Splats:
+    """One splat cut to a degree, its colour moved."""
+    degrees, shift = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
+    degrees[row], shift[row] = degree, added
+    return Removal(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).of(splats)
+
+
+def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) -> None:
+    scene = small_scene(tmp_path, views=4, n=60)
+    # no colour at its end, where it is not linear any more
+    splats = replace(scene.splats, sh=scene.splats.sh * np.float32(0.3))
+    photographs = load_evaluation_views(
+        scene.reconstruction.folder, scene.reconstruction.views, splats.draw_settings
+    )
+    worth = measure_contributions(splats, photographs, "cpu")
+    assert worth.sse == pytest.approx(squared_error(splats, photographs, "cpu"), rel=1e-5)
+    for row in (0, 10, 20):
+        for degree in (0, 1):
+            cut = without(splats, row, degree, worth.truncated_colour[row, degree])
+            change = squared_error(cut, photographs, "cpu") - worth.sse
+            assert worth.truncated_sse_change[row, degree] == pytest.approx(
+                change, rel=2e-3, abs=1e-5
+            )
+            plain = without(splats, row, degree, np.zeros(3))
+            assert not np.array_equal(plain.sh[row, 0], cut.sh[row, 0])
+
+
+def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> None:
+    scene = small_scene(tmp_path, views=4, n=60)
+    photographs = load_evaluation_views(
+        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
+    )
+    worth = measure_contributions(scene.splats, photographs, "cpu")
+    assert (worth.picture_change >= 0).all()
+    draw = image_renderer(scene.splats, "cpu")
+    for row in (0, 10, 20):
+        fewer = image_renderer(scene.splats.take(np.arange(60) != row), "cpu")
+        changes = [fewer(p.camera).astype(float) - draw(p.camera) for p in photographs]
+        wanted = sum(np.square(change).sum() for change in changes)
+        assert worth.picture_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
+
+
+def test_worth_goes_on_from_what_other_photographs_told(tmp_path) -> None:
+    scene = small_scene(tmp_path, views=6, n=60)
+    photographs = load_evaluation_views(
+        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
+    )
+    whole = measure_contributions(scene.splats, photographs, "cpu")
+    others = measure_contributions(scene.splats, photographs[:4], "cpu")
+    found = measure_contributions(scene.splats, photographs[4:], "cpu", others)
+    for name in (
+        "sse_change",
+        "picture_change",
+        "weight",
+        "truncated_sse_change",
+        "truncated_picture_change",
+    ):
+        np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-9)
+    assert (found.photographs == whole.photographs).all()
+    assert found.sse == pytest.approx(whole.sse)
+    assert (found.scene_depth == whole.scene_depth).all()
+    assert (found.psnr_db == whole.psnr_db[4:]).all()
+
+
+def test_colours_by_degree_are_the_definition_s() -> None:
+    splats, centre = many_splats(6), np.array([0.3, -4.0, 1.0])
+    found = colours_by_degree(splats, centre)
+    for i in range(0, len(splats), 5):
+        direction = splats.means[i] - centre
+        for degree in range(splats.sh_degree + 1):
+            sh = splats.sh[i].astype(float).copy()
+            sh[(degree + 1) ** 2 :] = 0
+            wanted = np.maximum(colour(sh, direction), 0)
+            np.testing.assert_allclose(found[i, degree], wanted, atol=1e-6)

@@ -1,0 +1,105 @@
+"""Points that photographs agree on: on surfaces, where there is something to compare."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages.scene import Camera, View, look_at
+from stages.structure.seeding.plane_sweep import plane_sweep_points
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
+WALL, PLATE, HALF = 6.0, 4.0, 0.7  # depths of a wall and of a square plate before it
+EYES = [(x, y, 0.0) for x in (-0.9, -0.3, 0.3, 0.9) for y in (-0.3, 0.3)]
+
+
+def texture(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).uniform(30, 225, (96, 96, 3)).astype(np.float32)
+    return cv2.resize(noise, (768, 768), interpolation=cv2.INTER_CUBIC).clip(0, 255)
+
+
+def capture(folder: Path, plain: bool = False) -> tuple[tuple[View, ...], np.ndarray]:
+    """(photographs of the wall and the plate, a few points measured on them)."""
+    paints = [np.full((768, 768, 3), 90, np.float32) if plain else texture(s) for s in (1, 2)]
+    made = []
+    for number, eye in enumerate(np.array(EYES)):
+        camera = Camera(
+            WIDTH, HEIGHT, FOCAL, FOCAL, 80.0, 60.0, look_at(eye, np.array([0.0, 0.0, 5.0]))
+        )
+        rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        rays = np.stack([(columns - 80) / FOCAL, (rows - 60) / FOCAL, np.ones_like(rows)], -1)
+        rays = rays @ camera.world_to_camera[:3, :3]
+        image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+        for depth, paint in zip((WALL, PLATE), paints, strict=True):
+            at = eye + rays * ((depth - eye[2]) / rays[..., 2:])
+            where = ((at[..., :2] + 5) / 10 * 768).astype(np.float32)
+            colours = cv2.remap(paint, where[..., 0], where[..., 1], cv2.INTER_LINEAR)
+            shown = np.abs(at[..., :2]).max(-1) < (HALF if depth == PLATE else np.inf)
+            image[shown] = colours[shown]
+        name = f"{number}.png"
+        Image.fromarray(np.uint8(image)).save(folder / name)
+        made.append(View(name, name, camera))
+    random = np.random.default_rng(5)
+    near, far = random.uniform(-HALF, HALF, (40, 2)), random.uniform(-2.0, 2.0, (80, 2))
+    far = far[np.abs(far).max(1) > 1.2 * HALF]
+    points = np.concatenate([np.c_[near, np.full(40, PLATE)], np.c_[far, np.full(len(far), WALL)]])
+    return tuple(made), points
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("sweep")
+    views, points = capture(folder)
+    return folder, views, points, *plane_sweep_points(folder, views, points)
+
+
+def test_agreed_points_lie_on_the_surfaces(found) -> None:
+    _, _, points, more, _ = found
+    on_plate = (np.abs(more[:, 2] / PLATE - 1) < 0.03) & (np.abs(more[:, :2]).max(1) < 1.1 * HALF)
+    on_wall = np.abs(more[:, 2] / WALL - 1) < 0.03
+    assert len(more) > 5 * len(points)
+    assert on_plate.sum() > 200
+    assert (on_plate | on_wall).mean() > 0.98
+
+
+def test_agreed_points_have_the_colour_of_their_place(found) -> None:
+    _, _, _, more, colours = found
+    wall = np.abs(more[:, 2] / WALL - 1) < 0.01
+    where = ((more[wall, :2] + 5) / 10 * 768).astype(np.float32)
+    wanted = cv2.remap(texture(1), where[:, :1], where[:, 1:], cv2.INTER_LINEAR)[:, 0] / 255
+    assert np.median(np.abs(colours[wall] - wanted)) < 0.05
+
+
+def test_nothing_more_is_found_where_points_already_are(found) -> None:
+    folder, views, points, more, _ = found
+    again, _ = plane_sweep_points(folder, views, np.concatenate([points, more]))
+    assert len(again) < 0.1 * len(more)
+
+
+def test_the_order_of_the_photographs_decides_nothing(found) -> None:
+    folder, views, points, more, colours = found
+    again, again_colours = plane_sweep_points(folder, views[::-1], points)
+    assert again.tobytes() == more.tobytes()
+    assert again_colours.tobytes() == colours.tobytes()
+
+
+def test_plain_surfaces_give_no_points(tmp_path: Path) -> None:
+    views, points = capture(tmp_path, plain=True)
+    flat_wall = plane_sweep_points(tmp_path, views, points)[0]
+    inside = np.abs(flat_wall[:, :2]).max(1) > 1.5 * HALF  # away from the plate's edge
+    assert not inside.any()
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_too_few_photographs_agree_on_nothing(tmp_path: Path, number: int) -> None:
+    views, points = capture(tmp_path)
+    more, colours = plane_sweep_points(tmp_path, views[:number], points)
+    assert more.shape == (0, 3)
+    assert colours.shape == (0, 3)
+
+
+def test_without_measured_points_nothing_is_found(tmp_path: Path) -> None:
+    views, _ = capture(tmp_path)
+    assert len(plane_sweep_points(tmp_path, views, np.zeros((0, 3)))[0]) == 0

@@ -1,0 +1,90 @@
+"""Colours once more, for all photographs at once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.raster.cpu.rasteriser import CpuRasteriser
+from stages.raster.definition import RasterSettings, splat_arrays
+from stages.scene import IGNORE, look_at
+from stages.training.colour_refit import ColourRefit
+from stages.training.loss import channel_means
+from stages.training.optimiser import Model, new_model
+from stages.training.views import Level
+from tests.scenes import camera, cloud
+
+SETTINGS = RasterSettings(sh_degree=1)
+NO_WIDTHS = np.zeros(0, np.float32)
+
+
+@pytest.fixture
+def truth() -> Model:
+    return new_model(*splat_arrays(cloud(80, 40, 30, degree=1)))
+
+
+def pictures_of(model: Model) -> list[Level]:
+    """Three photographs of `model`, from three sides."""
+    found = []
+    for x in (-1.0, 0.0, 1.0):
+        where = camera(40, 30, matrix=look_at(np.array([x, 0.0, -1.0]), np.array([0.0, 0.0, 5.0])))
+        image = CpuRasteriser().forward(model.arrays, where, SETTINGS).image[:3]
+        pixels = np.rint(image.clip(0, 1) * 255).astype(np.uint8)
+        found.append(Level(where, pixels, channel_means(pixels)))
+    return found
+
+
+def recoloured(model: Model, levels: list[Level]) -> Model:
+    return ColourRefit(CpuRasteriser(), SETTINGS, lambda: levels, NO_WIDTHS).of(model)
+
+
+def squared_error(model: Model, levels: list[Level]) -> float:
+    images = (CpuRasteriser().forward(model.arrays, p.camera, SETTINGS).image[:3] for p in levels)
+    return sum(
+        float(np.square(image - level.pixels / 255).sum())
+        for image, level in zip(images, levels, strict=True)
+    )
+
+
+def paler(model: Model) -> Model:
+    return replace(model, sh=(0.5 * model.sh).astype(np.float32))
+
+
+def test_one_step_takes_out_most_of_what_colours_alone_got_wrong(truth):
+    levels = pictures_of(truth)
+    before, after = paler(truth), recoloured(paler(truth), levels)
+    assert squared_error(after, levels) < 0.25 * squared_error(before, levels)
+
+
+def test_again_and_again_it_never_gets_worse(truth):
+    levels, model = pictures_of(truth), paler(truth)
+    errors = [squared_error(model, levels)]
+    for _ in range(4):
+        model = recoloured(model, levels)
+        errors.append(squared_error(model, levels))
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_nothing_but_colours_moves(truth):
+    after = recoloured(paler(truth), pictures_of(truth))
+    for name, array in vars(truth).items():
+        assert (name == "sh") != np.array_equal(getattr(after, name), array)
+
+
+def test_bands_above_a_splats_own_degree_stay_empty(truth):
+    levels, flat = pictures_of(truth), paler(truth)
+    flat.sh_degrees[:] = 0
+    flat.sh[:, 1:] = 0.0
+    assert not recoloured(flat, levels).sh[:, 1:].any()
+
+
+def test_what_is_masked_asks_for_nothing(truth):
+    levels = [
+        replace(level, mask=np.zeros((30, 40), np.uint8), outside=IGNORE)
+        for level in pictures_of(truth)
+    ]
+    np.testing.assert_array_equal(recoloured(paler(truth), levels).sh, paler(truth).sh)
+
+
+def test_no_photograph_leaves_colours_as_they_are(truth):
+    np.testing.assert_array_equal(recoloured(truth, []).sh, truth.sh)

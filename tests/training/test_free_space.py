@@ -1,0 +1,131 @@
+"""What hangs before surfaces that the start knows, where hardly anybody looks, goes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.base.stage import Report
+from stages.scene import DrawSettings, look_at
+from stages.training.free_space import ENOUGH, WITNESSES, known_free_space
+from stages.training.optimiser import new_model
+from stages.training.schedule import Schedule
+from stages.training.trainer import CLEARINGS, Trainer
+from tests.scenes import camera, splats
+from tests.training.pictures import view_of
+
+FAR = 10.0  # a wall, before all cameras
+
+
+def wall(z=FAR, width=8.0, n=41):
+    at = np.linspace(-width, width, n)
+    xs, ys = np.meshgrid(at, at)
+    means = np.stack([xs.ravel(), ys.ravel(), np.full(n * n, z)], 1)
+    return splats(means, scales=2 * width / n, opacities=0.1, rgb=(0.5, 0.5, 0.5))
+
+
+def cameras(n):
+    """Beside each other, a tenth of a unit apart, all of them before the wall."""
+    straight = camera(64, 48)
+    return [
+        replace(straight, world_to_camera=look_at(np.array([x, 0, 0]), np.array([x, 0, 1.0])))
+        for x in 0.1 * np.arange(n)
+    ]
+
+
+def held(means, n=2, start=None):
+    air = known_free_space((wall() if start is None else start).means, cameras(n))
+    return air.holds(np.array(means, np.float32).reshape(-1, 3)).tolist()
+
+
+def test_what_is_nearer_than_half_of_the_way_to_the_wall_hangs_in_the_air():
+    assert held([(0, 0, 4.8), (0, 0, 0.5), (0.5, -0.5, 3.0)]) == [True, True, True]
+
+
+def test_what_is_at_the_wall_or_not_far_before_it_or_hidden_behind_it_does_not():
+    assert held([(0, 0, FAR), (0, 0, 0.6 * FAR), (0, 0, 2 * FAR)]) == [False, False, False]
+
+
+def test_where_no_photograph_looks_nothing_is_known():
+    assert held([(0, 0, -4.8), (50.0, 0, 4.8)]) == [False, False]
+    assert held([(0, 0, 4.8)], n=0) == [False]
+    assert held([], n=2) == []
+    assert held([(np.nan, 0, 4.8), (0, 0, np.inf)]) == [False, False]
+
+
+def test_where_the_start_has_nothing_nothing_is_known():
+    aside = wall()
+    aside.means[:, 0] += 100.0
+    assert held([(0, 0, 4.8)], start=aside) == [False]
+    assert held([(0, 0, 4.8)], start=wall().take(np.arange(0))) == [False]
+
+
+@pytest.mark.parametrize("n", [ENOUGH, ENOUGH + 3])
+def test_what_enough_photographs_look_past_and_keep_is_there_though_the_start_missed_it(n):
+    assert held([(0, 0, 4.8)], n=n) == [False]
+
+
+def test_one_photograph_is_no_witness():
+    assert held([(0, 0, 4.8)], n=1) == [False]
+    assert held([(0, 0, 4.8)], n=WITNESSES) == [True]
+
+
+def test_what_one_photograph_has_a_surface_at_stays_whatever_others_look_past():
+    post = np.concatenate([wall().means, np.array([[0.0, 0.0, 4.8]], np.float32)])
+    beside, at_the_post = (2.0, 0.0, 4.8), (0.0, 0.0, 4.9)
+    air = known_free_space(post, cameras(2))
+    assert air.holds(np.array([beside, at_the_post])).tolist() == [True, False]
+
+
+def test_depths_are_of_cells_whatever_the_photographs_size():
+    for photograph in (camera(4000, 3000, focal=4000.0), camera(64, 48)):
+        (depths,) = known_free_space(wall().means, [photograph]).depths
+        assert depths.shape == (24, 32)
+        np.testing.assert_allclose(depths, FAR)
+
+
+def test_a_start_with_rows_that_are_no_numbers_is_as_good_without_them():
+    start = wall()
+    start.means[::7] = np.nan
+    start.means[3] = np.inf
+    assert held([(0, 0, 4.8), (0, 0, FAR)], start=start) == [True, False]
+
+
+class Clouds:
+    """A strategy that hangs a splat before the cameras whenever it is asked to grow."""
+
+    def __init__(self):
+        self.made = 0
+
+    def prune(self, model, settled):
+        return model
+
+    def grow(self, model, budget, rng):
+        self.made += 1
+        more = new_model(*(a[:1].copy() for a in model.arrays))
+        more.means[:] = 0.0, 0.0, 3.0
+        return model.joined(more)
+
+
+@pytest.mark.parametrize("steps", [1, 60, 403])
+def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, steps):
+    start = wall()
+    pictures = np.full((48, 64, 3), 0.5, np.float32)
+    views = [view_of(f"{k}", pictures, one) for k, one in enumerate(cameras(3))]
+    schedule = Schedule(steps=steps, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
+    made = Trainer(
+        *(schedule, views, [], DrawSettings(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
+    )
+    made._strategy = Clouds()
+    model = made.run(start)
+    assert made._strategy.made == sum(schedule.densifies_after(step) for step in range(steps))
+    assert len(model) == len(start)
+    assert (model.means[:, 2] > 0.5 * FAR).all()
+
+
+def test_it_is_looked_for_a_few_times_in_a_run_and_at_its_end():
+    for steps in (7, 3000, 30_000):
+        schedule = Schedule(steps=steps, extent=1.0, sh_degree=0, n_start=1, seed=0)
+        asked = [step for step in range(steps) if schedule.passes(step + 1, CLEARINGS)]
+        assert len(asked) == min(steps, CLEARINGS)
+        assert asked[-1] == steps - 1

@@ -1,0 +1,87 @@
+"""Runs that end when their time is up, or when nothing is left to gain."""
+
+import numpy as np
+import pytest
+
+from stages.training.schedule import GROWTH_ENDS, RESOLUTIONS, SETTLE_TO, Schedule
+from stages.training.time_limit import TimeLimit
+
+
+def schedule(steps=3000):
+    return Schedule(steps=steps, extent=1.0, sh_degree=2, n_start=1000, seed=0)
+
+
+def simulated(seconds, cost, steps=100_000):
+    """(seconds that a run takes, its schedule at the end), if a step at a share costs `cost`."""
+    plan, pace = schedule(steps), TimeLimit(seconds, reserve=1.0)
+    spent, step = 0.0, 0
+    while step < plan.steps:
+        spent += cost(plan.share(step))
+        step += 1
+        if step < plan.steps and (new := pace.steps(step, spent)):
+            plan = plan.replanned(step, new)
+    return spent + 1.0, plan
+
+
+@pytest.mark.parametrize("seconds", [20.0, 60.0, 900.0])
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda share: 0.02,
+        lambda share: 0.02 if share < 0.2 else 0.09,  # pictures at half size come first
+        lambda share: 0.02 + 0.2 * min(share, 0.5),  # splats become more
+        lambda share: 0.05 * (1 + 0.8 * np.sin(40 * share)),  # another program on the machine
+    ],
+)
+def test_a_run_with_a_time_limit_ends_within_a_tenth_of_it_and_goes_through_all_of_its_course(
+    seconds, cost
+):
+    took, plan = simulated(seconds, cost)
+    assert took == pytest.approx(seconds, rel=0.1)
+    assert plan.share(plan.steps) == pytest.approx(1.0)
+    assert plan.rate_factor(plan.steps) == pytest.approx(SETTLE_TO * plan.boost)
+
+
+def test_steps_that_take_a_second_each_still_end_in_time():
+    took, _ = simulated(60.0, lambda share: 1.0)
+    assert 30 < took < 66
+
+
+def test_steps_that_do_not_count_are_not_taken_for_a_slow_machine():
+    pace = TimeLimit(100.0)
+    assert pace.steps(10, 1.0) is None
+    assert pace.steps(110, 11.0) == 110 + 890  # a tenth of a second each
+    pace.restart()  # ten seconds went into what did not count
+    assert pace.steps(110, 21.0) is None
+    assert pace.steps(210, 31.0) == 210 + 690
+
+
+def test_a_plan_that_is_never_changed_is_the_share_of_steps():
+    plan = schedule(400)
+    assert [plan.share(step) for step in (0, 100, 400)] == [0.0, 0.25, 1.0]
+    assert sum(plan.passes(step, 10) for step in range(1, 401)) == 10
+
+
+def test_a_changed_plan_goes_on_from_where_the_run_is_and_ends_at_its_end():
+    plan = schedule(1000).replanned(300, 600)
+    assert plan.share(300) == pytest.approx(0.3)
+    assert plan.share(450) == pytest.approx(0.65)
+    assert plan.share(600) == 1.0
+    again = schedule(1000).as_planned(plan.steps, *plan.since)
+    assert again == plan
+
+
+def test_pictures_are_whole_to_the_very_end_of_any_plan():
+    plan = schedule(1000)
+    for step in range(10, 990, 7):
+        plan = plan.replanned(step, 1000)
+    assert {plan.level(step) for step in range(990, 1001)} == {len(RESOLUTIONS) - 1}
+
+
+def test_a_run_that_grows_no_more_is_as_long_as_if_that_had_been_the_plan():
+    plan = schedule(3000).grown(600)
+    assert plan.share(600) == GROWTH_ENDS
+    assert plan.steps == round(600 / GROWTH_ENDS)
+    assert not any(plan.densifies_after(step) for step in range(600, plan.steps))
+    late = schedule(3000)
+    assert late.grown(2500) is late
