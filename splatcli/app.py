@@ -15,6 +15,7 @@ from splatcli.folders import find_run_folder
 from splatcli.options import number, option, with_parameters
 from splatcli.usage import Commands
 from stages import STAGE_NAMES
+from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.settings import Setting
 from stages.formats import FORMATS
 from stages.raster.backends import CHOICES
@@ -67,7 +68,7 @@ Cluster = Annotated[
         metavar="ADDRESS",
         help="Ray cluster that takes runs, or one run's blocks and shares of its matching "
         "(HOST:PORT, ray://HOST:PORT, auto), or local:N for N workers of this machine: "
-        'pip install "splat\\[cluster]".',
+        f"{install_command('cluster').replace('[', chr(92) + '[')}.",
         show_default="this process",
     ),
 ]
@@ -106,6 +107,24 @@ _STAGE_EXAMPLES = {
 
 def _example(line: str) -> str:
     return f"Example: {line}"
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"{NAME} {VERSION}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    pass
 
 
 def process(

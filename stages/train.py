@@ -419,7 +419,7 @@ def write_quality(
     training_plot(folder / "training.png", trainer.history)
     rows = []
     worst_row = min(range(len(found)), key=lambda i: found[i].psnr_db, default=0)
-    for i in sorted({*spread(len(found)), worst_row}) if found else ():
+    for i in sorted({*evaluation_subset(len(found)), worst_row}) if found else ():
         photograph = trainer.held_out[i]
         image = np.clip(trainer.drawn(photograph.camera), 0.0, 1.0)
         rows.append((photograph.name, found[i].psnr_db, image, photograph.image))

@@ -189,7 +189,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 ) -> None:
     trained = join(scene.splats, unseen(5), floater_before(scene, 1))
     usual, _ = run(scene, trained, tmp_path)
-    monkeypatch.setattr(rounds, "LOOKED_AT", 4)
+    monkeypatch.setattr(pruning, "LOOKED_AT", 4)
     result, report = run(scene, trained, tmp_path)
     assert len(result) == pytest.approx(len(usual), rel=0.15)
     assert training_db(scene, result) > training_db(scene, usual) - 0.3
@@ -202,7 +202,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 def test_what_only_a_photograph_sees_that_does_not_decide_stays(
     scene, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(rounds, "LOOKED_AT", 1)  # of nine, the first
+    monkeypatch.setattr(pruning, "LOOKED_AT", 1)  # of nine, the first
     result, _ = run(scene, scene.splats, tmp_path)
     far = scene.reconstruction.views[5].camera
     seen = [Splats.take(s, far.project(s.means)[1] < 3) for s in (scene.splats, result)]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from splatcli import console
 from stages.base import threads
+from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family
 from stages.base.lazy import load_object
 from stages.base.libraries import modules_of, needed, versions
@@ -50,7 +51,7 @@ def show(as_json: bool = False) -> int:
 
 def checks() -> Iterator[Check]:
     """Every check, in the order shown."""
-    yield Check("splat", versions().get("splat", "not installed as a package"))
+    yield Check(NAME, VERSION)
     yield Check("python", f"{platform.python_version()} on {platform.platform()}")
     yield from map(_library, needed())
     yield Check("threads", f"{threads.count()} of {os.cpu_count()} cores (SPLAT_THREADS sets it)")
@@ -68,7 +69,7 @@ def checks() -> Iterator[Check]:
 
 
 def _library(distribution: str) -> Check:
-    modules, advice = modules_of(distribution), "Install splat again: pip install ."
+    modules, advice = modules_of(distribution), f"Install {NAME} again: {install_command()}"
     if not modules:
         return Check(distribution, "not installed", ok=False, advice=advice)
     try:

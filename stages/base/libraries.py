@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import platform
 import re
+import tomllib
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution, requires, version
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
-_SPLAT = "splat"
+from stages.base.distribution import NAME, VERSION
+
+_PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 
 
 def needed() -> tuple[str, ...]:
-    """Names of the distributions that splat depends on, as its own metadata says; () if it runs
-    from a folder of sources that was never installed."""
+    """Names of the distributions that the project depends on, without its extras.
+
+    They come from the installed metadata, or from `pyproject.toml` in a checkout that was never
+    installed; () if there is neither.
+    """
     try:
-        lines = requires(_SPLAT) or []
+        lines = requires(NAME) or []
     except PackageNotFoundError:
-        return ()
+        if not _PYPROJECT.is_file():
+            return ()
+        lines = tomllib.loads(_PYPROJECT.read_text(encoding="utf-8"))["project"]["dependencies"]
     always = (line for line in lines if not re.search(r"\bextra\s*==", line))
     return tuple(re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in always)
 
 
 def modules_of(name: str) -> tuple[str, ...]:
-    """What a distribution installs to be imported: ("cv2",) for OpenCV. () if it is missing."""
+    """The modules that a distribution installs: ("cv2",) for OpenCV. () if it is missing."""
     try:
         files = distribution(name).files or []
     except PackageNotFoundError:
@@ -38,9 +46,10 @@ def modules_of(name: str) -> tuple[str, ...]:
 
 @cache
 def versions() -> dict[str, str]:
-    """Installed versions by distribution name; missing ones left out. Imports none of them."""
-    found = {"python": platform.python_version()}
-    for name in (_SPLAT, *needed()):
+    """Versions by distribution name, with Python's and the project's own; missing ones are left
+    out. No library is imported."""
+    found = {"python": platform.python_version(), NAME: VERSION}
+    for name in needed():
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -15,12 +15,12 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 from stages import STAGE_NAMES, load_stage
+from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.distributed.tasks import (
     Executor,
@@ -44,7 +44,7 @@ _MIB = 1024 * 1024
 def edition() -> str:
     """What must be the same everywhere for the bytes to be: splat's version and its stages'."""
     stages = ".".join(str(load_stage(name).version) for name in STAGE_NAMES)
-    return f"{version('splat')} (stages {stages})"
+    return f"{VERSION} (stages {stages})"
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def check(answers: Sequence[Worker], ours: str, token: Path | None = None) -> No
                 "cluster-other-splat",
                 given=f"The worker {answer.host} has {theirs}; here it is splat {ours}.",
                 wanted="The same splat everywhere: another one makes other bytes.",
-                hint='Install the same on all of them: pip install "splat[cluster]"',
+                hint=f"Install the same on all of them: {install_command('cluster')}",
                 family=Family.USAGE,
             )
         if answer.unseen:
@@ -208,7 +208,7 @@ def _ray() -> Any:
             "cluster-not-installed",
             given="--cluster needs Ray, which is not installed.",
             wanted="The extra that brings it.",
-            hint='pip install "splat[cluster]"; or leave --cluster away: the result is the same.',
+            hint=f"{install_command('cluster')}; or leave --cluster away: the result is the same.",
             family=Family.USAGE,
         ) from None
 
@@ -271,8 +271,11 @@ def _asked(ray: Any, paths: list[str]) -> list[Worker]:
 
 
 def question() -> Callable[[list[str]], tuple[str, list[str]]]:
-    """(edition, paths that are not seen), for a worker that may have no splat: a function of a
-    function, so that it travels as itself and not as a name to import."""
+    """The function that a worker runs to describe itself: (edition, paths that it does not see).
+
+    It is a nested function, so that it is sent as code: a worker without the project could not
+    import it."""
+    name = NAME
 
     def seen(path: str) -> bool:
         import os
@@ -297,7 +300,7 @@ def question() -> Callable[[list[str]], tuple[str, list[str]]]:
             found = cluster.edition()
         except (ImportError, AttributeError):
             try:
-                found = importlib.metadata.version("splat")
+                found = importlib.metadata.version(name)
             except importlib.metadata.PackageNotFoundError:
                 found = ""
         return found, [path for path in paths if not seen(path)]

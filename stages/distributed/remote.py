@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from stages.base.atomic import make_folder
+from stages.base.distribution import install_command
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Stage
 from stages.distributed.tasks import Location, RunTask
@@ -94,7 +95,7 @@ class RemoteFolder:
         except ImportError as error:
             ours = error.name == "fsspec"
             said = "fsspec is missing, which reads it" if ours else str(error)
-            hint = 'pip install "splat[cluster]"' if ours else "Install it wherever runs are done."
+            hint = install_command("cluster") if ours else "Install it wherever runs are done."
             raise _error("url-not-installed", url, said, hint) from error
         except ValueError as error:
             hint = "Name a protocol that fsspec knows, such as s3://, gs:// or sftp://."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import struct
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.blocks import passing
+from stages.base.distribution import VERSION
 from stages.base.errors import Family, SplatError
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -133,7 +133,7 @@ def _document(
 def asset(units: str, origin: NDArray[np.float64], made: str = "", **more: Any) -> dict[str, Any]:
     """The `asset` of a document of ours. origin [3]: in the file's axes. made: what the generator
     made, in brackets after its name. more: for the extras."""
-    generator = f"splat {importlib.metadata.version('splat')}{made and f' ({made})'}"
+    generator = f"splat {VERSION}{made and f' ({made})'}"
     extras: dict[str, Any] = {"units": units, **more}
     if origin.any():
         extras["splat_origin"] = [float(v) for v in origin]

@@ -1,11 +1,10 @@
-"""The backends, in one list, and the choice among them.
+"""The list of rendering backends, and the choice among them.
 
-A new backend is one module and one line here: a class as `definition.Rasteriser` describes it. If
-it also wants a training step of its own, with parameters and moments where its kernels are, it
-names that class too (`training.step.TrainingStep`); else training makes do with forward and
-backward. What this list names is imported when it is first used.
+To add a backend: write a class with the methods of `definition.Rasteriser` and add one row to
+`BACKENDS`. A backend that also has training kernels gets a row in `training.steps`; the others
+train through `forward` and `backward`. Modules named in the list are imported at first use.
 
-A backend that runs on several devices of torch is asked for with the one it is to run on:
+A backend may run on several torch devices. Its full name then has the device after an "@":
 "reference@cuda".
 """
 
@@ -23,15 +22,25 @@ if TYPE_CHECKING:
     from stages.raster.definition import Rasteriser
 
 AUTO = "auto"
-_AT = "@"
+_DEVICE_MARK = "@"
 
 
 @dataclass(frozen=True)
 class Backend:
-    """rasteriser, step: "module:Class". what: for help, a few words. obstacle: "module:function"
-    that says why "auto" passes it over here, "" where it does not; none for one that always runs.
-    told: "module:function" that says what it runs on; none for the processor. devices: of torch, if
-    it is to be told one: its class takes the name, and so does `told`; on: the one asked for.
+    """One row of the list.
+
+    Functions and classes are named as "module:attribute".
+
+    Args:
+        name: as given to --backend.
+        rasteriser: the class that draws.
+        summary: a few words for the help text.
+        availability: function that returns why "auto" must skip the backend on this machine, or ""
+            if it can be used. Empty for a backend that always runs.
+        description: function that describes the hardware; empty for the CPU. Takes the device if
+            `devices` is not empty, as `rasteriser` does.
+        devices: torch devices that the backend can run on, if it runs on more than one.
+        device: the one of `devices` that was requested.
     """
 
     name: str
@@ -65,7 +74,7 @@ class Backend:
         return str(load_object(self.obstacle)()) if self.obstacle else ""
 
 
-# "auto" takes the first that nothing stands against.
+# "auto" takes the first that is available.
 BACKENDS = (
     Backend(
         "gpu",
@@ -81,6 +90,7 @@ BACKENDS = (
         "compiled kernels",
         step="stages.training.cpu_step:CpuStep",
     ),
+    Backend("cpu", "stages.raster.cpu.rasteriser:CpuRasteriser", "compiled kernels"),
     Backend(
         "reference",
         "stages.raster.reference_rasteriser:ReferenceRasteriser",
@@ -94,10 +104,10 @@ CHOICES = (AUTO, *(backend.name for backend in BACKENDS))
 
 def backend_of(name: str) -> Backend:
     """The backend of that name, or the one that "auto" takes. Raises ValueError for another."""
-    wanted, _, on = name.partition(_AT)
+    base_name, _, device = name.partition(_DEVICE_MARK)
     for backend in BACKENDS:
-        if backend.name == wanted or (wanted == AUTO and not backend.why_not()):
-            if on and on not in backend.devices:
+        if backend.name == base_name or (base_name == AUTO and not backend.why_unavailable()):
+            if device and device not in backend.devices:
                 break
             return replace(backend, on=on or CPU)
     raise ValueError(f"backend {name!r}, wanted one of {', '.join(CHOICES)}")
@@ -106,13 +116,15 @@ def backend_of(name: str) -> Backend:
 def unavailable_backends(name: str) -> dict[str, str]:
     """Why "auto" did not take the backends before the one that it takes; {} for another name."""
     chosen = [b.name for b in BACKENDS].index(backend_of(name).name) if name == AUTO else 0
-    return {backend.name: backend.why_not() for backend in BACKENDS[:chosen]}
+    return {backend.name: backend.why_unavailable() for backend in BACKENDS[:chosen]}
 
 
 def rasteriser_of(name: str) -> Rasteriser:
-    """A rasteriser of the backend `name` or "auto". Raises ValueError for an unknown one, and
-    SplatError where what it runs on is not there."""
-    return backend_of(name).made()
+    """A new rasteriser of the backend `name` or "auto".
+
+    Raises ValueError for an unknown name, and SplatError if the hardware that it needs is absent.
+    """
+    return backend_of(name).create()
 
 
 def runs_here(name: str) -> bool:
@@ -131,10 +143,10 @@ def qualified_name(backend: str, device: str = CPU) -> str:
         return backend
     able = [each.name for each in BACKENDS if device in each.devices]
     if backend in able:
-        return f"{backend}{_AT}{device}"
+        return f"{backend}{_DEVICE_MARK}{device}"
     raise SplatError(
         "option-device",
-        given=f"--device {device} with --backend {backend}, which knows itself what it runs on.",
+        given=f"--device {device} with --backend {backend}, which chooses its own device.",
         wanted=f"--device goes with --backend {' or '.join(able)}.",
         hint=f"Add --backend {able[0]}, or leave --device away (--device {CPU} where a run "
         "remembers another).",
@@ -151,13 +163,13 @@ def report_backend(report: Report, name: str) -> None:
     """Into a stage's report: which backend the name stands for here, and what it runs on."""
     chosen = backend_of(name)
     report.metric("backend", chosen.name)
-    report.device = chosen.where()
+    report.device = chosen.describe()
 
 
 def backend_setting() -> Any:
-    """The `backend` field of a stage's settings: one checked choice everywhere."""
-    words = ", ".join(f"{backend.name} ({backend.what})" for backend in BACKENDS)
-    help = f"What draws: {AUTO} (the fastest), {words}."
+    """The field `backend` of a stage's settings."""
+    choices = ", ".join(f"{backend.name} ({backend.summary})" for backend in BACKENDS)
+    help = f"Rendering backend: {AUTO} (the fastest available), {choices}."
     return field(default=AUTO, metadata={"help": help, "choices": CHOICES, "midway": True})
 
 

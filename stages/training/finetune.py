@@ -20,7 +20,7 @@ from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.dropout import Dropout
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.step import step_of
+from stages.training.steps import step_of
 from stages.training.views import Level
 
 # Of the rates that the recipe begins with: a round starts at the first and ends at the second.

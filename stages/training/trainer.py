@@ -38,7 +38,8 @@ from stages.training.free_space import known_free_space
 from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, Model, empty_model, new_model
 from stages.training.schedule import Schedule
-from stages.training.step import TrainingStep, step_of
+from stages.training.step import TrainingStep
+from stages.training.steps import step_of
 from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
 from stages.training.time_limit import TimeLimit

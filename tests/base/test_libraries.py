@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import tomllib
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
 
 from stages.base import libraries
+from stages.base.distribution import NAME, VERSION
 
 PYPROJECT = Path(__file__).parent.parent.parent / "pyproject.toml"
 
@@ -22,8 +24,27 @@ def test_every_dependency_and_no_extra_is_in_the_manifests_libraries() -> None:
     assert set(libraries.needed()) == set(declared()), (
         "The metadata differ from pyproject.toml: is splat installed as it stands?"
     )
-    assert set(libraries.versions()) == {"python", "splat", *declared()}
+    assert set(libraries.versions()) == {"python", NAME, *declared()}
+    assert libraries.versions()[NAME] == VERSION
     assert libraries.versions()["zstandard"][0].isdigit()
+
+
+def test_pyproject_names_the_distribution_as_the_code_does() -> None:
+    project = tomllib.loads(PYPROJECT.read_text("utf-8"))
+    assert project["project"]["name"] == NAME
+    assert project["project"]["dynamic"] == ["version"]
+    version = project["tool"]["setuptools"]["dynamic"]["version"]
+    assert version == {"attr": "stages.base.distribution.VERSION"}
+
+
+def test_a_checkout_that_is_not_installed_knows_its_dependencies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def not_installed(name: str) -> list[str]:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(libraries, "requires", not_installed)
+    assert list(libraries.needed()) == declared()
 
 
 def test_dependencies_are_read_less_extras_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ from stages.raster.definition import RasterSettings
 from stages.scene import Camera, DrawSettings, View
 from stages.training import views as training_views
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.step import step_of
+from stages.training.steps import step_of
 from stages.training.views import load_views
 from tests.scenes import camera, cloud
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from stages import STAGE_NAMES
+from stages.base.distribution import NAME, VERSION
 from tests import processes
 from tests.cli.help_text import help_of
 
@@ -140,3 +141,7 @@ def test_readme_command_exists(words: list[str]) -> None:
 def test_readme_names_every_command() -> None:
     named = {word for words in readme_commands() for word in words[1:]}
     assert set(COMMANDS) <= named
+
+
+def test_version_is_the_distributions(splat) -> None:
+    assert splat("--version").stdout.strip() == f"{NAME} {VERSION}"

@@ -116,7 +116,7 @@ def test_without_ray_a_cluster_is_refused_and_nothing_else(splat, captures, monk
     monkeypatch.setattr(importlib, "import_module", without_ray)
     result = splat("batch", *captures, "--cluster", "local:2")
     assert result.exit_code == 2
-    assert 'pip install "splat[cluster]"' in result.stderr
+    assert 'pip install "splatcli[cluster]"' in result.stderr
     assert splat("batch", *captures).exit_code == 0
 
 
@@ -156,7 +156,7 @@ def test_a_worker_without_splat_can_answer(monkeypatch, tmp_path) -> None:
     real = builtins.__import__
 
     def without_splat(name, *others):
-        if name.startswith("splatcli"):
+        if name.startswith(("splatcli", "stages")):
             raise ImportError(name)
         return real(name, *others)
 

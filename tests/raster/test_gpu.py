@@ -171,7 +171,7 @@ def test_every_kernel_compiles_within_its_registers(target):
 def test_auto_passes_the_interpreter_over_and_says_why(monkeypatch):
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     assert backend_of("auto").name == "cpu"
-    assert "interpreter" in backends.BACKENDS[0].why_not()
+    assert "interpreter" in backends.BACKENDS[0].why_unavailable()
 
 
 @pytest.mark.parametrize(

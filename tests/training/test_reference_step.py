@@ -13,7 +13,7 @@ from stages.scene import IGNORE, TRANSPARENT, Splats
 from stages.scene.light import Light
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.step import step_of
+from stages.training.steps import step_of
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 

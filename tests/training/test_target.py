@@ -15,7 +15,7 @@ from stages.scene import IGNORE, TRANSPARENT, DrawSettings, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.schedule import RESOLUTIONS, Schedule
-from stages.training.step import step_of
+from stages.training.steps import step_of
 from stages.training.trainer import Trainer
 from stages.training.views import Level, TrainingView
 from tests.scenes import BACKENDS, camera, cloud, join, splats
