@@ -369,7 +369,12 @@ def write_quality(
     import numpy as np
 
     from stages.base.atomic import replacing
-    from stages.measure.evaluation import evaluate, psnr_as_taken_db, psnr_inside_masks_db, spread
+    from stages.measure.evaluation import (
+        evaluate,
+        evaluation_subset,
+        psnr_as_taken_db,
+        psnr_inside_masks_db,
+    )
     from stages.scene import split_held_out
     from stages.training.charts import contact_sheet, training_plot
 

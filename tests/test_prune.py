@@ -9,7 +9,7 @@ import pytest
 from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
-from stages.capacity import rounds
+from stages.capacity import pruning
 from stages.capacity.targets import FELT
 from stages.measure.contribution import Contributions, floaters, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db

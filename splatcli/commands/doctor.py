@@ -146,8 +146,8 @@ def _camera_files() -> list[str]:
 def _backend(backend: Backend) -> Check:
     label = f"backend {backend.name}"
     try:
-        if why_not := backend.why_not():
-            return Check(label, f"not chosen: {why_not}", advice=_BACKEND_ADVICE)
+        if why := backend.why_unavailable():
+            return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
         load_object(backend.rasteriser)
     except Exception as error:
         return Check(label, f"not present ({_said(error)})", ok=False)

@@ -21,8 +21,8 @@ def summarise(
     told = [
         f"Price: the photographs of training hold {price.samples:,} colour values, worth "
         f"{price.independent_samples:,.0f} independent ones; so a number costs "
-        f"{price.bits_per_parameter:.1f} bits, and one dB is worth {price.bits_per_db / 8e3:,.0f} kB "
-        f"(dial at {dial:g})."
+        f"{price.bits_per_parameter:.1f} bits, and one dB is worth "
+        f"{price.bits_per_db / 8e3:,.0f} kB (dial at {dial:g})."
     ]
     kept = [one for one in found.rounds if one.kept]
     if not kept:
@@ -33,8 +33,8 @@ def summarise(
         f"Cut: {counted(len(start) - len(after), 'splat')} of {len(start):,}"
         f"{f' ({floaters:,} of them floaters)' if floaters else ''}; of the {len(after):,} left, "
         f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
-        f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning in all: "
-        f"{found.end_db - found.start_db:+.2f} dB on the photographs of training; other views "
+        f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning in "
+        f"all: {found.end_db - found.start_db:+.2f} dB on the photographs of training; other views "
         f"feel at most {felt_share(before.overfitted):.0%} of that."
     )
     why = _WHY.get(found.stopped_by, "the rounds that were asked for were done")

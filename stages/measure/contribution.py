@@ -31,8 +31,10 @@ class Contributions:
     sse: summed squared error now. scene_depth, psnr_db [photographs]: median depth of each picture,
     and how near it is.
 
-    truncated_sse_change, truncated_picture_change [N, L]: the same two if its colour kept only the bands up to degree
-    0..L - 1, the mean of what is lost baked in: truncated_colour [N, L, 3], what that adds to its colour.
+    truncated_sse_change, truncated_picture_change [N, L]: the same two if its colour kept only
+    the bands up to degree
+    0..L - 1, the mean of what is lost baked in: truncated_colour [N, L, 3],
+    what that adds to its colour.
     bands: the sums that this was told from. others: what it went on from, included in all but
     psnr_db.
     """
@@ -150,7 +152,9 @@ class _Bands:
         self.squares[rows] += q
 
     def cuts(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """(truncated_sse_change, truncated_picture_change, truncated_colour) of `Worth`: with s added to the colour, each
+        """(truncated_sse_change, truncated_picture_change, truncated_colour) of `Worth`: with s
+        added to the
+        colour, each
         photograph's error changes by 2 (d + s) g + (d + s)^2 q; s is what makes the mean of d,
         weighted by q, zero."""
         with np.errstate(invalid="ignore", divide="ignore"):

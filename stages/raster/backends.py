@@ -45,33 +45,33 @@ class Backend:
 
     name: str
     rasteriser: str
-    what: str
-    step: str = "stages.training.reference_step:ReferenceStep"
-    obstacle: str = ""
-    told: str = ""
+    summary: str
+    availability: str = ""
+    description: str = ""
     devices: tuple[str, ...] = ()
-    on: str = CPU
+    device: str = CPU
 
-    def where(self) -> str:
-        """What it runs on, for a manifest."""
-        return str(load_object(self.told)(*self._device())) if self.told else CPU
+    def describe(self) -> str:
+        """The hardware that it runs on, for a manifest. Raises SplatError where it is absent."""
+        return str(load_object(self.description)(*self._device())) if self.description else CPU
 
-    def made(self) -> Rasteriser:
-        """A new rasteriser. Raises SplatError where what it runs on is not there."""
-        found: Rasteriser = load_object(self.rasteriser)(*self._device())
-        return found
+    def create(self) -> Rasteriser:
+        """A new rasteriser. Raises SplatError if the hardware that it needs is absent."""
+        rasteriser: Rasteriser = load_object(self.rasteriser)(*self._device())
+        return rasteriser
 
     def require(self) -> None:
-        """Raises SplatError where what it runs on is not there; asks no more than that takes."""
-        if self.obstacle or self.on != CPU:
-            self.made()
+        """Raises SplatError if the hardware that it needs is absent. Imports no more than that
+        check needs."""
+        if self.availability or self.device != CPU:
+            self.create()
+
+    def why_unavailable(self) -> str:
+        """Why "auto" does not choose it on this machine; "" if it may."""
+        return str(load_object(self.availability)()) if self.availability else ""
 
     def _device(self) -> tuple[str, ...]:
-        return (self.on,) if self.devices else ()
-
-    def why_not(self) -> str:
-        """Why "auto" passes it over here; "" where it does not."""
-        return str(load_object(self.obstacle)()) if self.obstacle else ""
+        return (self.device,) if self.devices else ()
 
 
 # "auto" takes the first that is available.
@@ -80,22 +80,15 @@ BACKENDS = (
         "gpu",
         "stages.raster.gpu.rasteriser:GpuRasteriser",
         "Triton kernels",
-        step="stages.training.gpu_step:GpuStep",
-        obstacle="stages.raster.gpu.device:why_unavailable",
-        told="stages.raster.gpu.device:describe",
-    ),
-    Backend(
-        "cpu",
-        "stages.raster.cpu.rasteriser:CpuRasteriser",
-        "compiled kernels",
-        step="stages.training.cpu_step:CpuStep",
+        availability="stages.raster.gpu.device:why_unavailable",
+        description="stages.raster.gpu.device:describe",
     ),
     Backend("cpu", "stages.raster.cpu.rasteriser:CpuRasteriser", "compiled kernels"),
     Backend(
         "reference",
         "stages.raster.reference_rasteriser:ReferenceRasteriser",
         "torch, slow",
-        told="stages.raster.torch_device:describe",
+        description="stages.raster.torch_device:describe",
         devices=DEVICES,
     ),
 )
@@ -109,12 +102,12 @@ def backend_of(name: str) -> Backend:
         if backend.name == base_name or (base_name == AUTO and not backend.why_unavailable()):
             if device and device not in backend.devices:
                 break
-            return replace(backend, on=on or CPU)
+            return replace(backend, device=device or CPU)
     raise ValueError(f"backend {name!r}, wanted one of {', '.join(CHOICES)}")
 
 
 def unavailable_backends(name: str) -> dict[str, str]:
-    """Why "auto" did not take the backends before the one that it takes; {} for another name."""
+    """Why "auto" skipped each backend before the one that it takes; {} for any other name."""
     chosen = [b.name for b in BACKENDS].index(backend_of(name).name) if name == AUTO else 0
     return {backend.name: backend.why_unavailable() for backend in BACKENDS[:chosen]}
 
@@ -137,8 +130,8 @@ def runs_here(name: str) -> bool:
 
 
 def qualified_name(backend: str, device: str = CPU) -> str:
-    """What the options --backend and --device ask for together, in one word. Raises SplatError
-    (option-device) for a device of a backend that takes none."""
+    """The backend's full name from the options --backend and --device. Raises SplatError
+    (option-device) for a backend that cannot run on that device."""
     if device == CPU:
         return backend
     able = [each.name for each in BACKENDS if device in each.devices]
@@ -148,19 +141,20 @@ def qualified_name(backend: str, device: str = CPU) -> str:
         "option-device",
         given=f"--device {device} with --backend {backend}, which chooses its own device.",
         wanted=f"--device goes with --backend {' or '.join(able)}.",
-        hint=f"Add --backend {able[0]}, or leave --device away (--device {CPU} where a run "
+        hint=f"Add --backend {able[0]}, or leave --device out (--device {CPU} if the run folder "
         "remembers another).",
         family=Family.USAGE,
     )
 
 
 def backend_of_settings(settings: Any) -> str:
-    """What a stage's settings ask to draw with. Raises SplatError (option-device)."""
+    """Full name of the backend that a stage's settings choose. Raises
+    SplatError (option-device)."""
     return qualified_name(settings.backend, settings.device)
 
 
 def report_backend(report: Report, name: str) -> None:
-    """Into a stage's report: which backend the name stands for here, and what it runs on."""
+    """Record in a stage's report which backend `name` stands for here, and its hardware."""
     chosen = backend_of(name)
     report.metric("backend", chosen.name)
     report.device = chosen.describe()
@@ -174,6 +168,6 @@ def backend_setting() -> Any:
 
 
 def device_setting() -> Any:
-    """The `device` field beside it."""
-    help = f"What --backend reference runs on, as torch names it: {', '.join(DEVICES)}."
+    """The field `device` of a stage's settings."""
+    help = f"Torch device for --backend reference: {', '.join(DEVICES)}."
     return field(default=CPU, metadata={"help": help, "choices": DEVICES, "midway": True})

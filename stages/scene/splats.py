@@ -109,9 +109,12 @@ class Splats:
 
 @dataclass(frozen=True)
 class TrainedSplats:
-    """Splats as trained. dropout: whether splats sat steps out towards the end, see
-    `training.trial`. overfitted: whether photographs were learnt by heart: what these lose hardly any
-    other view feels."""
+    """The result of training.
+
+    dropout: whether some splats were dropped from each of the last steps (`training.dropout`).
+    overfitted: whether training views are reproduced much better than other views. Other views
+        then hardly change when splats are removed that the training views need.
+    """
 
     splats: Splats
     dropout: bool = False

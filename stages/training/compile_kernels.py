@@ -1,4 +1,4 @@
-"""`python -m stages.training.compile_kernels cpu`: compile the kernels that a run draws and trains with.
+"""`python -m stages.training.compile_kernels cpu`: compile the kernels of a run.
 
 By drawing a single splat and learning from it, so that they are compiled for the very types that
 training gives them. Whoever runs it beside other work waits for its end before drawing: what two

@@ -7,8 +7,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.lazy import load_object
-from stages.raster.backends import backend_of, rasteriser_of
 from stages.raster.definition import Rasteriser, RasterSettings
 from stages.scene import Camera
 from stages.training.dropout import Dropout
@@ -45,10 +43,3 @@ class TrainingStep(Protocol):
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         """[H, W, 3] of the model as it is; the caller's own."""
-
-
-def step_of(backend: str) -> TrainingStep:
-    """The training step of the backend `backend` or "auto". Raises ValueError."""
-    chosen = backend_of(backend)
-    made: TrainingStep = load_object(chosen.step)(rasteriser_of(chosen.name))
-    return made

@@ -205,7 +205,7 @@ class Trainer:
     def _take_over(self, step: int) -> None:
         """Enter who makes the steps from here on, and say so where somebody else began."""
         chosen = backend_of(self.backend)
-        maker, before = Provenance(step, chosen.name, chosen.where()), self.makers[-1:]
+        maker, before = Provenance(step, chosen.name, chosen.describe()), self.makers[-1:]
         if any(replace(maker, step=one.step) == one for one in before):
             return
         self.makers.append(maker)

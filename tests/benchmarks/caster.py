@@ -1,4 +1,5 @@
-"""The rooms' ray caster (`tests.structure.room_captures.picture`) compiled: a thousand photographs of a
+"""The rooms' ray caster (`tests.structure.room_captures.picture`) compiled: a thousand
+photographs of a
 hall of boxes in minutes instead of an hour."""
 
 from __future__ import annotations

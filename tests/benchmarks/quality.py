@@ -60,7 +60,7 @@ class Cell:
     splats: int
     cpu_seconds: float
     wall_seconds: float
-    evaluate: list[dict[str, Any]]
+    scores: list[dict[str, Any]]
 
 
 class Capture:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure import descriptor_matching, features, vocabulary
+from stages.structure import descriptor_matching, features
+from stages.structure.vocabulary import build_vocabulary, index_by_word
 from tests.structure.sample_jobs import SAMPLE
 
 
@@ -28,9 +29,9 @@ def compared_with_all(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> se
 def test_nearly_all_matches_are_found_and_hardly_others() -> None:
     photographs = sorted(SAMPLE.glob("*.jpg"))
     first, second = (features.sift_features(photographs[i], 3000, 0.0045)[1] for i in (0, 2))
-    vocabulary = vocabulary.build_vocabulary(np.concatenate([first, second])[::2])
+    vocabulary = build_vocabulary(np.concatenate([first, second])[::2])
     found = descriptor_matching.match_descriptors(
-        vocabulary.index_by_word(first, vocabulary), vocabulary.index_by_word(second, vocabulary)
+        index_by_word(first, vocabulary), index_by_word(second, vocabulary)
     )
     wanted = compared_with_all(first, second)
     got = {(int(i), int(j)) for i, j in found}
@@ -46,15 +47,15 @@ def test_a_picture_matches_itself_feature_by_feature() -> None:
     histograms = random.exponential(size=(400, 128)) ** 2
     roots = np.sqrt(histograms / histograms.sum(axis=1, keepdims=True))
     descriptors = np.rint(512 * roots).clip(0, 255).astype(np.uint8)
-    own = vocabulary.index_by_word(descriptors, vocabulary.build_vocabulary(descriptors))
+    own = index_by_word(descriptors, build_vocabulary(descriptors))
     assert (descriptor_matching.match_descriptors(own, own) == np.arange(400)[:, None]).all()
 
 
 def test_no_features_match_nothing() -> None:
     none = np.empty((0, 128), np.uint8)
-    vocabulary = vocabulary.build_vocabulary(none)
-    empty = vocabulary.index_by_word(none, vocabulary)
-    some = vocabulary.index_by_word(np.full((5, 128), 45, np.uint8), vocabulary)
+    vocabulary = build_vocabulary(none)
+    empty = index_by_word(none, vocabulary)
+    some = index_by_word(np.full((5, 128), 45, np.uint8), vocabulary)
     assert (
         descriptor_matching.match_descriptors(empty, some).shape
         == descriptor_matching.match_descriptors(some, empty).shape
@@ -63,4 +64,4 @@ def test_no_features_match_nothing() -> None:
 
 
 def test_the_vocabulary_of_few_features_is_small() -> None:
-    assert len(vocabulary.build_vocabulary(np.eye(7, 128, dtype=np.uint8) * 200)) == 7
+    assert len(build_vocabulary(np.eye(7, 128, dtype=np.uint8) * 200)) == 7

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure import retrieval, vocabulary
+from stages.structure import retrieval
 from stages.structure.pairs import exhaustive_pairs
+from stages.structure.vocabulary import word_pairs
 
 
 def walk_past(places: NDArray[np.integer], each: int = 60) -> list[NDArray[np.int64]]:
@@ -49,5 +50,5 @@ def test_a_feature_is_the_two_words_nearest_to_it() -> None:
     near = np.zeros((2, 128), np.uint8)
     near[0, [1, 3]] = 180, 120
     near[1, [3, 1]] = 180, 120
-    assert vocabulary.word_pairs(near, vocabulary).tolist() == [7, 7]
-    assert vocabulary.word_pairs(near, vocabulary[:1]).tolist() == [0, 0]
+    assert word_pairs(near, vocabulary).tolist() == [7, 7]
+    assert word_pairs(near, vocabulary[:1]).tolist() == [0, 0]

@@ -222,13 +222,13 @@ def test_looking_on_does_not_change_what_is_trained(tmp_path):
     drawn: list[np.ndarray] = []
     report = Report()
 
-    def draw_settings(draw):
+    def keep(draw):
         width, height = (97, 61) if len(drawn) % 2 else (19, 23)
         where = camera(width, height, matrix=look_at(np.array([2.0, -1, -3]), np.zeros(3)))
         drawn.append(draw(where))
         assert drawn[-1].shape == (height, width, 3)
 
-    report.onlooker = draw_settings
+    report.onlooker = keep
     watched, start = small_problem(tmp_path, "watched", report, steps=150)
     found = watched.run(start)
     assert len(drawn) == 150

@@ -51,7 +51,7 @@ class Pairing:
 
     sides: tuple[Side, Side]
     photographs: tuple[tuple[EvaluationView, ...], tuple[EvaluationView, ...]]
-    evaluate: tuple[tuple[Score, ...], tuple[Score, ...]]
+    scores: tuple[tuple[Score, ...], tuple[Score, ...]]
     psnr: Difference
     ssim: Difference
     side_px: int
