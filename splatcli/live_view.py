@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from splatcli import console
 from splatcli.commands.view import open_page
-from stages.base.stage import Draw, Numbers, Stage
+from stages.base.stage import DrawView, Numbers, Stage
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Listener, Pipeline
 
@@ -62,7 +62,7 @@ class Watching(Listener):
             self._progress = (done, total)
             self._page.progressed(label, done, total, numbers)
 
-    def drawable(self, stage: Stage, draw: Draw) -> None:
+    def drawable(self, stage: Stage, draw: DrawView) -> None:
         if self._page is None:
             return
         done, total = self._progress

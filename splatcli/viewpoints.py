@@ -31,10 +31,10 @@ def views_of(pipeline: Pipeline | None) -> tuple[View, ...]:
 def one_camera(splats: Splats, views: Sequence[View], wanted: str | None) -> Camera:
     """The camera of a photograph by name or number; the first, or one in front of the splats, if
     none is named. Raises SplatError "render-camera"."""
-    from stages.scene.framing import in_front_of
+    from stages.scene.framing import front_camera
 
     if wanted is None:
-        return views[0].camera if views else in_front_of(splats)
+        return views[0].camera if views else front_camera(splats)
     by_name = {view.name: view.camera for view in views}
     if wanted in by_name:
         return by_name[wanted]
@@ -61,12 +61,12 @@ def along(
     path: "orbit", "capture", or a camera file: its cameras as they are, or a smooth path through
     them if a length is given. Raises SplatError.
     """
-    from stages.scene.framing import in_front_of
+    from stages.scene.framing import front_camera
     from stages.viewer import camera_paths, orbit
 
     cameras = [view.camera for view in views]
     if path == "orbit":
-        cameras = cameras or [in_front_of(splats)]
+        cameras = cameras or [front_camera(splats)]
         half = orbit.arc_seen(cameras, splats)[1]
         if half < math.pi:
             _tell_swing(2 * math.degrees(half))

@@ -171,7 +171,7 @@ def _fitting(
     from stages.capacity.rounding import Fitting
     from stages.measure.contribution import measure_contributions
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import seen_extent, split_held_out, spread_over
+    from stages.scene import evenly_spaced, split_held_out, training_extent
     from stages.training.finetune import FineTuner
 
     reconstruction: Reconstruction = inputs["sfm"]
@@ -188,11 +188,13 @@ def _fitting(
         reconstruction.folder,
     )
     photographs = load_evaluation_views(folder, training, splats.draw_settings)
-    tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, dropout)
+    tuner = FineTuner(photographs, training_extent(reconstruction), backend, report, dropout)
     seen = np.zeros(len(splats), np.int32)
     if dropout:  # only then it matters
         seen = measure_contributions(splats, photographs, backend).photographs
-    deciding = load_evaluation_views(folder, spread_over(training, DECIDING), splats.draw_settings)
+    deciding = load_evaluation_views(
+        folder, evenly_spaced(training, DECIDING), splats.draw_settings
+    )
     return Fitting(tuner, deciding, backend, settings.rounding_steps, seen)
 
 

@@ -272,7 +272,7 @@ def _film_key(film: str, width: int, height: int) -> str:
 def _with_twins(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
     """The photographs, each of a group of near-duplicates knowing the group's first."""
     first = {index: photos[group[0]].name for group in groups for index in group}
-    return tuple(replace(photo, twin=first.get(i, "")) for i, photo in enumerate(photos))
+    return tuple(replace(photo, duplicate_of=first.get(i, "")) for i, photo in enumerate(photos))
 
 
 def _report_capture(

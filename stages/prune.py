@@ -99,7 +99,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     from stages.capacity.pruning import Pruner
     from stages.capacity.targets import Targets, felt_share
     from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
-    from stages.scene import seen_extent, split_held_out
+    from stages.scene import split_held_out, training_extent
     from stages.scene.storage import save_splats
     from stages.training.finetune import FineTuner
 
@@ -111,7 +111,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     judges = load_evaluation_views(reconstruction.folder, held, splats.draw_settings) or photographs
     backend = backend_of_settings(settings)
     before = mean_psnr_db(splats, judges, backend)
-    extent = seen_extent(reconstruction)
+    extent = training_extent(reconstruction)
     tuner = FineTuner(photographs, extent, backend, report, trained.dropout)
     size_bytes = _sizes(settings, splats, photographs, reconstruction)
     targets = Targets(
@@ -158,12 +158,12 @@ def _sizes(
     from stages.capacity.bits import choose_bits
     from stages.formats.quantisation import BitDepths
     from stages.measure.evaluation import mean_psnr_db
-    from stages.scene import spread_over
+    from stages.scene import evenly_spaced
 
     row = FORMATS[settings.mb_of]
     few: dict[str, int] = {}
     if settings.max_mb and row.quantiser:
-        deciding, backend = spread_over(photographs, DECIDING), backend_of_settings(settings)
+        deciding, backend = evenly_spaced(photographs, DECIDING), backend_of_settings(settings)
         few, _ = choose_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
 
     def size_bytes(splats: Splats) -> int:

@@ -174,7 +174,7 @@ def _measures(
 ) -> tuple[_Measure, _Measure]:
     """(what decides, what judges): training photographs, and those held out if there are any."""
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import split_held_out, spread_over
+    from stages.scene import evenly_spaced, split_held_out
 
     training, held = split_held_out(reconstruction.views)
     if not training:
@@ -185,7 +185,7 @@ def _measures(
             hint="Run `splat sfm` again.",
             family=Family.RUN_FOLDER,
         )
-    lent = tuple(spread_over(training, settings.max_views))
+    lent = tuple(evenly_spaced(training, settings.max_views))
     judges, what = (held, "held out") if held else (lent, "training")
     decider = _Measure(
         load_evaluation_views(reconstruction.folder, lent, draw_settings), settings, report

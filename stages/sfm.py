@@ -254,7 +254,7 @@ def _check_different(capture: Capture) -> None:
     """Near-duplicates would be searched for minutes before the same is said."""
     from stages.structure.gates import MOVE
 
-    different = len({photo.twin or photo.name for photo in capture.photos})
+    different = len({photo.duplicate_of or photo.name for photo in capture.photos})
     if different < _FEWEST_PHOTOGRAPHS:
         raise SplatError(
             "sfm-no-parallax",

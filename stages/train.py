@@ -248,7 +248,7 @@ def make_trainer(
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import draw_settings_of, seen_extent, split_held_out
+    from stages.scene import draw_settings_of, split_held_out, training_extent
     from stages.training.cap import cap_for, splats_determined
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
@@ -278,7 +278,7 @@ def make_trainer(
     return Trainer(
         schedule=Schedule(
             steps=settings.steps,
-            extent=seen_extent(reconstruction),
+            extent=training_extent(reconstruction),
             sh_degree=settings.sh_degree,
             n_start=min(n_start, cap.splats),
             seed=settings.seed,

@@ -1,4 +1,4 @@
-"""No pixel of a photograph that judges reaches the asset; and a photograph with a twin judges not.
+"""No pixel of a photograph that judges reaches the asset; and a photograph with a duplicate_of judges not.
 
 Structure from motion is before all this: it has to place the judges too, and sees all photographs.
 """
@@ -75,7 +75,9 @@ def test_no_pixel_of_a_judge_reaches_the_asset(
 
 
 def views(*twins: str) -> tuple[View, ...]:
-    return tuple(View(f"{i:02d}", f"{i:02d}", camera(), twin) for i, twin in enumerate(twins))
+    return tuple(
+        View(f"{i:02d}", f"{i:02d}", camera(), duplicate_of) for i, duplicate_of in enumerate(twins)
+    )
 
 
 def test_the_first_of_every_eight_judges() -> None:

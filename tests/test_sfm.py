@@ -187,7 +187,8 @@ def test_the_same_photograph_many_times_has_no_parallax(tmp_path: Path) -> None:
 def test_near_duplicates_are_refused_before_anything_is_searched(tmp_path: Path) -> None:
     capture = bad_captures.sample(6)
     photos = [
-        replace(photo, twin=capture.photos[i // 3].name) for i, photo in enumerate(capture.photos)
+        replace(photo, duplicate_of=capture.photos[i // 3].name)
+        for i, photo in enumerate(capture.photos)
     ]
     error = failure(replace(capture, photos=tuple(photos)), tmp_path)
     assert error.code == "sfm-no-parallax"

@@ -108,7 +108,7 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    from stages.base.blocks import watched
+    from stages.base.blocks import progress_reported_to
 
     columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
     with Progress(*columns, console=console.err, transient=True) as bar:
@@ -122,5 +122,5 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
         def pass_over(rows: int, total: int) -> None:
             bar.update(task, completed=rows, total=total)
 
-        with watched(pass_over):
+        with progress_reported_to(pass_over):
             yield show

@@ -104,13 +104,13 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
     around the splats where there are none."""
     from stages.measure.speed import seconds_per_frame
-    from stages.scene.framing import around
+    from stages.scene.framing import orbit_cameras
 
     if not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
     views = views_of(pipeline)
     chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
-    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or around(
+    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or orbit_cameras(
         splats, _TIMED_FRAMES, 0.9
     )
     backend = backend_of(pipeline)

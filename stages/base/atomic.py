@@ -28,7 +28,7 @@ def _machine() -> str:
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
-def clear_left(folder: Path) -> None:
+def remove_abandoned_files(folder: Path) -> None:
     """Delete what processes of this machine that were killed left half-written in `folder`."""
     if os.name != "posix":  # elsewhere to ask whether a process runs would end it
         return

@@ -14,7 +14,7 @@ from stages.capacity.targets import Targets
 from stages.measure.contribution import Contributions, measure_contributions, squared_error
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
-from stages.scene import Splats, spread_over
+from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 
 BACK_OFFS = 3  # times that a round may ask for half as much
@@ -74,7 +74,7 @@ class Pruner:
 
     def __post_init__(self) -> None:
         every = range(len(self.photographs))
-        self.decide = spread_over(every, LOOKED_AT)
+        self.decide = evenly_spaced(every, LOOKED_AT)
         self.others = sorted(set(every) - set(self.decide))
         # in the order in which worth tells of photographs
         self.cameras = [self.tuner.cameras[i] for i in (*self.others, *self.decide)]

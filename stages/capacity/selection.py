@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.measure.contribution import Contributions, floaters, near_view_frusta
-from stages.scene import SH_C0, Camera, Splats, morton, numbers_of
+from stages.scene import SH_C0, Camera, Splats, morton, parameters_per_splat
 
 SPLATS_A_ROUND = 0.10  # predictions for single splats add up only while few go at once,
 NEIGHBOURS = 4  # and of so many side by side only one: they stand in for each other
@@ -61,7 +61,7 @@ def choose(
     floating = floaters(splats, worth, list(cameras))
     free = floating | (~seen & ~beside)
     alone = worth.sse_change if harm else worth.picture_change
-    ratio = alone / numbers_of(splats.sh_degrees)
+    ratio = alone / parameters_per_splat(splats.sh_degrees)
     ratio[~seen & beside] = np.finfo(np.float64).max
     ratio[free] = -np.inf
     order = np.argsort(ratio, kind="stable")
@@ -81,7 +81,7 @@ def choose(
 def _first_of_neighbours(splats: Splats, ratio: NDArray[np.float64]) -> NDArray[np.bool_]:
     """[N] the one of each few neighbours that is worth least."""
     place = np.empty(len(splats), np.int64)
-    place[morton.order(splats)] = np.arange(len(splats)) // NEIGHBOURS
+    place[morton.morton_order(splats)] = np.arange(len(splats)) // NEIGHBOURS
     order = np.lexsort((ratio, place))
     first = np.zeros(len(splats), bool)
     first[order[np.flatnonzero(np.diff(place[order], prepend=-1))]] = True
@@ -100,11 +100,11 @@ def _cut_bands(
     degrees, colour = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     best, to = np.full(len(splats), np.inf), np.zeros(len(splats), np.int64)
     numbers, change = (
-        numbers_of(degrees),
+        parameters_per_splat(degrees),
         worth.truncated_sse_change if harm else worth.truncated_picture_change,
     )
     for degree in range(splats.sh_degree):
-        saved = numbers - numbers_of(np.full(1, degree))
+        saved = numbers - parameters_per_splat(np.full(1, degree))
         ratio = np.where(saved > 0, change[:, degree] / np.maximum(saved, 1), np.inf)
         better = (ratio < best) & ~gone
         best[better], to[better] = ratio[better], degree

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks, passing
+from stages.base.blocks import blocks, reported_blocks
 from stages.editing.moments import Moments, costs, merged
 from stages.scene import Splats, logit, morton
 
@@ -59,7 +59,7 @@ def decimated(
 def _round(splats: Splats, most: int, number: int, appraise: Appraise | None) -> Splats:
     # nothing but the order depends on these axes: they may be rounded
     axes = np.linalg.qr(np.random.default_rng([11, number]).normal(size=(3, 3)))[0]
-    order = morton.order_of(splats.means @ axes.astype(splats.means.dtype))
+    order = morton.morton_order_of(splats.means @ axes.astype(splats.means.dtype))
     worth = appraise(splats) if appraise else None
     partners, cost = _partners(splats, order, worth)
     places = np.arange(len(order))
@@ -91,7 +91,7 @@ def _partners(
         cheapest[to][better] = cost[better]
         partners[to][better] = to.start + better + step
 
-    for block in passing(count, _BLOCK):
+    for block in reported_blocks(count, _BLOCK):
         rows = order[block.start : block.stop + _NEXT]
         part = Moments.of(splats, rows)
         weights = part.masses if worth is None else worth.weights[rows]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.base.errors import Family, SplatError
 from stages.scene import Splats, dc_to_rgb
 
@@ -66,7 +66,7 @@ class Expression:
     def holds(self, splats: Splats) -> NDArray[np.bool_]:
         """[N] for which splats it is true; never for values that are not numbers."""
         found = np.empty(len(splats), bool)
-        for rows in passing(len(splats)):
+        for rows in reported_blocks(len(splats)):
             with np.errstate(all="ignore"):
                 found[rows] = _value(self.tree, splats.take(rows))
         return found

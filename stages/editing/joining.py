@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.scene import Splats
 
 _FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
@@ -25,7 +25,7 @@ def joined(first: Splats, second: Splats) -> Splats:
     arrays: dict[str, Any] = {n: _empty(first, n, count, width) for n in _FIELDS}
     start = 0
     for part, offset in parts:
-        for rows in passing(len(part)):
+        for rows in reported_blocks(len(part)):
             there = slice(start + rows.start, start + rows.stop)
             for name in _FIELDS:
                 values = getattr(part, name)[rows]

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, Kind, reading
-from stages.base.blocks import passing
+from stages.base.bad_files import BadFileError, FileKind, reading
+from stages.base.blocks import reported_blocks
 from stages.base.errors import Family, SplatError
 from stages.scene import Splats
 
 Inside = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points [M, 3] -> [M]
-_HULL = Kind(
+_HULL = FileKind(
     "edit-hull-unreadable",
     "the points of a hull",
     "A .json with a list of [x, y, z], or a .ply with vertices; at least four, not in one plane.",
@@ -35,7 +35,7 @@ class Region:
     def holds(self, splats: Splats) -> NDArray[np.bool_]:
         """[N] whose centres lie inside."""
         found = np.empty(len(splats), bool)
-        for rows in passing(len(splats)):
+        for rows in reported_blocks(len(splats)):
             found[rows] = self.inside(splats.means[rows].astype(np.float64))
         return found
 

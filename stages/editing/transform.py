@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.raster.reference import sh_basis
 from stages.scene import Camera, DrawSettings, Splats
-from stages.scene.far import recentred
+from stages.scene.recentring import recentred
 from stages.scene.rotations import quaternions_of
 
 _SAMPLE = 4096
@@ -60,7 +60,7 @@ class Similarity:
         turns = not np.array_equal(self.rotation, np.eye(3))
         if turns and splats.sh_degree:
             sh = scratch.empty(splats.sh.shape, splats.sh.dtype)
-        for rows in passing(len(splats)):
+        for rows in reported_blocks(len(splats)):
             there = splats.means[rows].astype(np.float64) @ linear.T + self.offset
             means[rows] = there - shift
             logs[rows] = splats.log_scales[rows] + np.log(self.scale)

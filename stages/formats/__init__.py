@@ -24,7 +24,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.atomic import clear_left
+from stages.base.atomic import remove_abandoned_files
 from stages.base.lazy import load_object
 from stages.formats.table import BY_ENDING, FORMATS, Format, format_of
 from stages.formats.units import units_of
@@ -64,7 +64,7 @@ def write(
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
     row = format_of(path)
-    clear_left(Path(path).parent)
+    remove_abandoned_files(Path(path).parent)
     more: dict[str, Any] = {"views": views} if row.takes_views else {}
     if row.streamed:
         more["coarser"] = coarser

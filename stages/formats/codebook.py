@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks, passing
+from stages.base.blocks import blocks, reported_blocks
 
 SIZE = 256
 _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
@@ -89,13 +89,13 @@ def of_vectors(
     sample = np.sort(rng.permutation(rows)[:_SAMPLE])
     coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)
     cluster = np.empty(len(rows), np.int32)
-    for part in passing(len(rows)):
+    for part in reported_blocks(len(rows)):
         cluster[part] = _assigned(vectors[rows[part]], coarse)
     # the rows of one cluster after the other, in their order
     rows = rows[np.argsort(cluster, kind="stable")]
     ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
     used = 1
-    for k in passing(len(coarse), 1):
+    for k in reported_blocks(len(coarse), 1):
         members = rows[ends[k.start - 1] if k.start else 0 : ends[k.start]]
         if not len(members):
             continue
@@ -112,7 +112,7 @@ def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[n
     """(row of the first of each kind, of which kind each is), told apart by 64 bits of a sum."""
     factors = np.random.default_rng(1).integers(1, 1 << 63, vectors.shape[1], np.uint64) | 1
     sums = np.empty(len(vectors), np.uint64)
-    for rows in passing(len(vectors)):
+    for rows in reported_blocks(len(vectors)):
         bits = np.ascontiguousarray(vectors[rows] + np.float32(0)).view(np.uint32)  # -0 is 0
         sums[rows] = (bits * factors).sum(axis=1)
     _, first, which = np.unique(sums, return_index=True, return_inverse=True)

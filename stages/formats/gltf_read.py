@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError, reading
 from stages.formats.rows import checked, joined, logits_of, logs_of
 from stages.scene import Splats
-from stages.scene.far import recentred
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
+from stages.scene.recentring import recentred
 
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {5120: "i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -58,7 +58,7 @@ def read(path: Path) -> Splats:
         splats = joined(parts)
         del parts
         means, origin = recentred(splats.means.astype(np.float64), origin)
-        return checked(turned(replace(splats, means=means, origin=origin), reuse=True))
+        return checked(flipped(replace(splats, means=means, origin=origin), reuse=True))
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import tell
+from stages.base.blocks import report_progress
 from stages.formats import ply
 from stages.formats.page import document
 from stages.formats.page.shots import shots_of
@@ -124,7 +124,7 @@ def unzipped(path: Path) -> Iterator[bytes]:
                 while data:
                     yield unpacker.decompress(data, _INFLATED_AT_ONCE)
                     data = unpacker.unconsumed_tail
-                    tell(page.tell(), size)
+                    report_progress(page.tell(), size)
         except (zlib.error, binascii.Error) as error:
             raise BadFileError(f"the splats in it are damaged ({error})") from error
     if not unpacker.eof:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.bad_files import BadFileError
-from stages.base.blocks import blocks, passing
+from stages.base.blocks import blocks, reported_blocks
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
 
@@ -80,7 +80,7 @@ def chosen(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
         values = getattr(splats, name)
         arrays[name] = scratch.empty((count, *values.shape[1:]), values.dtype)
     start = 0
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         mask = keep[rows]
         there = slice(start, start + int(mask.sum()))
         for name in _FIELDS:

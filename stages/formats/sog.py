@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.atomic import replacing
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import codebook, smallest_three
 from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
@@ -41,7 +41,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     cannot be written.
     """
     splats, dropped = kept_rows(splats)
-    found = members(splats, morton.order(splats), units)
+    found = members(splats, morton.morton_order(splats), units)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
         for name, content in found.items():
             _add(package, name, content)
@@ -106,7 +106,7 @@ def _positions(
         low, high = (symmetric_log(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
     span = np.where(high > low, high - low, 1.0)
     halves = np.empty((2, len(splats), 3), np.uint8)
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         steps = np.rint((symmetric_log(splats.means[places[rows]]) - low) / span * STEPS).astype(
             np.uint16
         )
@@ -133,7 +133,7 @@ def _shapes(
     book = codebook.of_numbers(np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
     meta["scales"] = {"codebook": _written(book), "files": ["scales.webp"]}
     scales, turns = (np.empty((len(splats), n), np.uint8) for n in (3, 4))
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         part = splats.take(places[rows])
         scales[rows] = codebook.nearest(book, part.log_scales)
         largest, others = smallest_three.split(unit_quaternions(part.quaternions))
@@ -149,7 +149,7 @@ def _colours(
     book = codebook.of_numbers(np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT))
     meta["sh0"] = {"codebook": _written(book), "files": ["sh0.webp"]}
     pixels = np.empty((len(splats), 4), np.uint8)
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         part = splats.take(places[rows])
         pixels[rows, :3] = codebook.nearest(book, part.sh[:, 0])
         pixels[rows, 3] = np.rint(255 * linear_opacities(part))
@@ -166,7 +166,7 @@ def _rest(
 ) -> dict[str, NDArray[np.uint8]]:
     count = splats.sh.shape[1] - 1
     vectors = scratch.empty((len(splats), count, 3))
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
     size = palette_size(len(splats))
     palette, labels = codebook.of_vectors(vectors.reshape(len(splats), -1), size)

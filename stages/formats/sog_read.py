@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
 from stages.formats.rows import allocated, checked, logits_of
 from stages.scene import Splats
@@ -105,7 +105,7 @@ class Source:
         splats = replace(
             allocated(count, math.isqrt(1 + palette.shape[1]) - 1), origin=_origin(meta)
         )
-        for rows in passing(count):
+        for rows in reported_blocks(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
             bent = ends[0] + (ends[1] - ends[0]) * steps

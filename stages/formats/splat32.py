@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats.rows import (
     LOG_SCALE_MIN,
     allocated,
@@ -91,7 +91,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     splats, dropped = kept_rows(splats)
     splats, places = splats.with_sh_degree(0), order(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        for rows in passing(len(splats)):
+        for rows in reported_blocks(len(splats)):
             file.write(encode(splats.take(places[rows])).tobytes())
     return dropped
 
@@ -105,7 +105,7 @@ def read(path: Path) -> Splats:
             raise BadFileError(f"its {size} bytes are no multiple of {RECORD.itemsize}")
         splats = allocated(size // RECORD.itemsize, 0)
         with path.open("rb") as file:
-            for rows in passing(len(splats)):
+            for rows in reported_blocks(len(splats)):
                 block = decode(np.fromfile(file, RECORD, rows.stop - rows.start))
                 for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
                     getattr(splats, name)[rows] = getattr(block, name)

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
 from stages.formats.inflate import Inflated, check_size, unpacked
 from stages.formats.rows import allocated, checked, logits_of, unit_quaternions
 from stages.scene import Splats
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
 
 HEADER = struct.Struct("<4sIIBBBB")
 MAGIC = b"NGSP"
@@ -61,7 +61,7 @@ def read(path: Path) -> Splats:
         size = path.stat().st_size
         content = _plain(file, size) if plain else _gzipped(file, size)
         splats = _decoded(content)
-        return checked(turned(splats, reuse=True) if content.upright else splats)
+        return checked(flipped(splats, reuse=True) if content.upright else splats)
 
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:
@@ -149,7 +149,7 @@ def _decoded(content: _Content) -> Splats:
     """The splats in the file's axes."""
     positions, opacities, colours, scales, rotations, sh = content.arrays
     splats = allocated(len(positions), content.degree)
-    for rows in passing(len(positions)):
+    for rows in reported_blocks(len(positions)):
         out = splats.take(rows)
         padded = np.zeros((len(out), 3, 4), np.uint8)
         padded[:, :, 1:] = positions[rows].reshape(-1, 3, 3)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
 from stages.formats.rows import allocated, checked, kept_rows
 from stages.formats.sog_read import Source, in_folder, in_zip
@@ -131,7 +131,7 @@ def _cut(levels: Sequence[Splats]) -> _Tree:
                 below = [part[side] for part, side in zip(rows, sides, strict=True)]
                 above = [part[~side] for part, side in zip(rows, sides, strict=True)]
                 return node(below, depth + 1), node(above, depth + 1)
-        curves = (morton.order_of(levels[i].means[part]) for i, part in enumerate(rows))
+        curves = (morton.morton_order_of(levels[i].means[part]) for i, part in enumerate(rows))
         return _Leaf(tuple(part[curve] for part, curve in zip(rows, curves, strict=True)))
 
     return node([np.arange(len(level)) for level in levels], 0)
@@ -157,7 +157,7 @@ def _write_chunks(folder: Path, tree: _Tree, levels: Sequence[Splats], units: st
             _write_chunk(folder / f"{level}_{number}", splats.take(rows), units)
             number, held = number + 1, []
 
-        for index in passing(len(leaves), 1):
+        for index in reported_blocks(len(leaves), 1):
             rows = leaves[index.start].rows[level]
             if not len(rows):
                 continue
@@ -202,7 +202,7 @@ def _described(tree: _Tree, levels: Sequence[Splats], places: _Places) -> dict[s
 
 def _box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
     lows, highs = [], []
-    for part in passing(len(rows)):
+    for part in reported_blocks(len(rows)):
         some = rows[part]
         sizes = np.exp(splats.log_scales[some].astype(np.float64))
         reach = (np.abs(matrices_of(splats.quaternions[some])) * sizes[:, None, :]).sum(axis=2)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError, reading
 from stages.formats.rows import checked, damage_kept, joined, keeps_damage, logits_of, logs_of
 from stages.scene import Splats, load_splats, save_splats
-from stages.scene.far import recentred
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
+from stages.scene.recentring import recentred
 
 _TYPE = "ParticleField3DGaussianSplat"
 _REFUSED = 3  # exit status of the child when it found what is wrong
@@ -78,7 +78,7 @@ def parse(path: Path) -> Splats:
     splats = joined(parts)
     del parts
     means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
-    return checked(turned(replace(splats, means=means, origin=origin), reuse=True))
+    return checked(flipped(replace(splats, means=means, origin=origin), reuse=True))
 
 
 def _open(path: Path) -> Any:
@@ -129,7 +129,7 @@ def _splats(prim: Any) -> Splats:
 
 
 def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
-    """[N, width] float32, not to be changed: the attribute, or its twin in half precision where
+    """[N, width] float32, not to be changed: the attribute, or its duplicate_of in half precision where
     only that is set."""
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
         value = attribute.Get() if attribute else None

@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 
 from stages.measure.evaluation import EvaluationView, capped_psnr_db, image_renderer
 from stages.raster.backends import rasteriser_of
-from stages.raster.definition import CHANGE, LARGEST, PULL, SQUARES, WEIGHT, splat_arrays
-from stages.raster.draw import settings_of
+from stages.raster.definition import (
+    ERROR_CHANGE,
+    LARGEST_WEIGHT,
+    SQUARED_WEIGHT,
+    WEIGHT,
+    WEIGHTED_RESIDUAL,
+    splat_arrays,
+)
+from stages.raster.draw import raster_settings_of
 from stages.raster.reference import sh_basis
 from stages.scene import Camera, Splats
 
@@ -84,7 +91,7 @@ def measure_contributions(
         seen_in, sse = others.photographs.copy(), others.sse
         depths = others.scene_depth.tolist()
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
-    settings, bands = settings_of(splats), _Bands(splats, others.bands if others else ())
+    settings, bands = raster_settings_of(splats), _Bands(splats, others.bands if others else ())
     for photograph in photographs:
         forward = rasteriser.forward(arrays, photograph.camera, settings, depths=True)
         drawn, truth = forward.image[:3].transpose(1, 2, 0), photograph.image
@@ -95,14 +102,14 @@ def measure_contributions(
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
         depths.append(float(np.median(solid)) if solid.size else np.inf)
-        alone = rasteriser.contributions(forward, np.zeros_like(residual))[:, CHANGE]
+        alone = rasteriser.contributions(forward, np.zeros_like(residual))[:, ERROR_CHANGE]
         found = rasteriser.contributions(forward, residual)
         rows = forward.visible
-        change[rows] += found[:, CHANGE]
+        change[rows] += found[:, ERROR_CHANGE]
         picture[rows] += alone
         weight[rows] += found[:, WEIGHT]
-        largest[rows] = np.maximum(largest[rows], found[:, LARGEST])
-        seen_in[rows] += found[:, LARGEST] >= SEEN
+        largest[rows] = np.maximum(largest[rows], found[:, LARGEST_WEIGHT])
+        seen_in[rows] += found[:, LARGEST_WEIGHT] >= SEEN
         bands.add(photograph.camera.centre, rows, found)
     truncated_sse_change, truncated_picture_change, truncated_colour = bands.cuts()
     return Contributions(
@@ -144,7 +151,7 @@ class _Bands:
             return
         every = colours_by_degree(self.splats.take(rows), centre)
         d = every[:, :-1] - every[:, -1:]
-        g, q = found[:, None, PULL:], found[:, SQUARES, None, None]
+        g, q = found[:, None, WEIGHTED_RESIDUAL:], found[:, SQUARED_WEIGHT, None, None]
         self.linear[rows] += d * g
         self.square[rows] += d * d * q
         self.shift[rows] += d * q

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import render, settings_of
+from stages.raster.draw import raster_settings_of, render
 from stages.scene import Camera, Splats, look_at
 
 FEW_PHOTOGRAPHS = 3  # one sees, two measure, the third confirms
@@ -69,7 +69,11 @@ class Patches:
 def patches_of(splats: Splats, cameras: Sequence[Camera], backend: str) -> Patches:
     """Patches of `splats` as the cameras see them; none where they see nothing."""
     small = [camera.fitted(_SIDE_PX) for camera in cameras]
-    rasteriser, arrays, settings = rasteriser_of(backend), splat_arrays(splats), settings_of(splats)
+    rasteriser, arrays, settings = (
+        rasteriser_of(backend),
+        splat_arrays(splats),
+        raster_settings_of(splats),
+    )
     pixels = np.zeros((len(splats), len(small)), np.float32)
     for column, camera in enumerate(small):
         forward = rasteriser.forward(arrays, camera, settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.scene import Splats
 
 _NEIGHBOURS = 8
@@ -25,11 +25,11 @@ def isolated_splats(splats: Splats) -> NDArray[np.bool_]:
     tree = KDTree(splats.means.astype(np.float64))
     nearest = np.empty((len(splats), count), np.int32)
     far = np.empty(len(splats))
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         distances, found = tree.query(splats.means[rows].astype(np.float64), count + 1)
         nearest[rows], far[rows] = found[:, 1:], distances[:, -1]
     found_alone = np.empty(len(splats), bool)
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         usual = np.median(far[nearest[rows]], axis=1)
         reach = _REACH * np.exp(splats.log_scales[rows].max(axis=1).astype(np.float64))
         found_alone[rows] = far[rows] > np.maximum(_ALONE * usual, reach)

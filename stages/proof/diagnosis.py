@@ -15,7 +15,7 @@ from stages.proof.compare import Differences, rotations_apart
 from stages.proof.content import FileContent
 from stages.proof.matching import extent_of
 from stages.scene import Splats
-from stages.scene.turn import FLIP, turned
+from stages.scene.flip import FLIP, flipped
 
 _WORDS = {
     "position": "positions",
@@ -43,7 +43,7 @@ def explained(splats: Splats, content: FileContent, found: Differences) -> str:
     truth, file = splats.take(found.rows[rows]), content.splats.take(rows)
     pairs = [(truth, file)]
     if content.world_from_file[1, 1] < 0:  # the mistake was made after the turn, or before
-        pairs = [(turned(truth), file), (truth, turned(file))]
+        pairs = [(flipped(truth), file), (truth, flipped(file))]
     for tried, name in ((_quaternions, "rotation"), (_sh, "sh")):
         if name in found.wrong:
             what = _joined(what, next(filter(None, (tried(*pair) for pair in pairs)), ""))
@@ -111,7 +111,7 @@ def _sh(truth: Splats, file: Splats) -> str:
     right, given = (s.with_sh_degree(degree).sh[:, 1:].astype(np.float64) for s in (truth, file))
     n = len(given)
     tried = [
-        ("they look as if not turned with the axes", turned(file).with_sh_degree(degree).sh[:, 1:])
+        ("they look as if not turned with the axes", flipped(file).with_sh_degree(degree).sh[:, 1:])
     ]
     # a reader may have made room for more bands than the file holds
     for width in {(d + 1) ** 2 - 1 for d in range(1, degree + 1)}:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import forget, passing
+from stages.base.blocks import release_mapped_pages, reported_blocks
 from stages.proof.content import logits, splats_by_rows, splats_of
 from stages.scene import Splats
 
@@ -43,7 +43,7 @@ def ply(path: Path) -> Splats:
         "opacity_logits": scratch.empty((count,)),
         "sh": scratch.empty((count, per_channel + 1, 3)),
     }
-    for part in passing(count, _PLY_ROWS):
+    for part in reported_blocks(count, _PLY_ROWS):
         rows = vertex.data[part]
         for i in range(3):
             arrays["means"][part, i] = rows["xyz"[i]]
@@ -54,7 +54,7 @@ def ply(path: Path) -> Splats:
         for i in range(4):
             arrays["quaternions"][part, i] = rows[f"rot_{i}"]
         arrays["opacity_logits"][part] = rows["opacity"]
-        forget(vertex.data)
+        release_mapped_pages(vertex.data)
     return splats_of(**arrays)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks, passing
+from stages.base.blocks import blocks, reported_blocks
 from stages.scene import Splats, dc_to_rgb
 from stages.scene.quantiles import quantiles
 
@@ -52,7 +52,7 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
     unit = _APART * extent / _SHARPER
     for index in (np.arange(n), *orders):
         apart, odd = np.empty(n, np.float32), np.empty(n, bool)
-        for rows in passing(n):
+        for rows in reported_blocks(n):
             moved = np.abs(truth.means[index[rows]] - file.means[rows])
             apart[rows] = moved.max(axis=1, initial=0.0)
             unlike = _unlike(values[0][index[rows]], values[1][rows])

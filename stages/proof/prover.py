@@ -24,9 +24,9 @@ from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
-from stages.raster.draw import renderer, settings_of
-from stages.scene import Camera, Splats, View, split_held_out, spread_over
-from stages.scene.framing import around
+from stages.raster.draw import raster_settings_of, renderer
+from stages.scene import Camera, Splats, View, evenly_spaced, split_held_out
+from stages.scene.framing import orbit_cameras
 
 _SIDE_PX = 480
 _CAMERAS = 3
@@ -59,8 +59,8 @@ def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...
     training, held = split_held_out(tuple(views))
     chosen = held or training
     if not chosen:
-        return tuple(camera.fitted(_SIDE_PX) for camera in around(splats, _CAMERAS, _MIDDLE))
-    return tuple(view.camera.fitted(_SIDE_PX) for view in spread_over(chosen, _CAMERAS))
+        return tuple(camera.fitted(_SIDE_PX) for camera in orbit_cameras(splats, _CAMERAS, _MIDDLE))
+    return tuple(view.camera.fitted(_SIDE_PX) for view in evenly_spaced(chosen, _CAMERAS))
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Prover:
         came_as: str = "",
     ) -> Prover:
         drawn = _middle(splats)
-        draw = renderer(splats.take(drawn), settings_of(splats), backend)
+        draw = renderer(splats.take(drawn), raster_settings_of(splats), backend)
         pictures = tuple(draw(camera).image for camera in cameras)
         return cls(splats, drawn, cameras, pictures, backend, came_as)
 
@@ -138,7 +138,7 @@ class Prover:
         file's splats into ours: so the turn of positions, rotations and SH is checked by something
         other than itself."""
         drawn = self.drawn if isinstance(self.drawn, slice) else self.drawn[rows]
-        draw = renderer(content.splats.take(drawn), settings_of(self.splats), self.backend)
+        draw = renderer(content.splats.take(drawn), raster_settings_of(self.splats), self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
             capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))

@@ -14,7 +14,7 @@ from stages.base.errors import Interrupted
 from stages.base.libraries import versions
 from stages.base.memory import PeakMemory
 from stages.base.stage import (
-    Draw,
+    DrawView,
     Numbers,
     Report,
     Stage,
@@ -37,7 +37,7 @@ class Listener:
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         """As `Report.progress`."""
 
-    def drawable(self, stage: Stage, draw: Draw) -> None:
+    def drawable(self, stage: Stage, draw: DrawView) -> None:
         """As `Report.offer`."""
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
@@ -71,7 +71,7 @@ def attempt(
     report.listener = lambda label, done, total, numbers: listener.progressed(
         stage, label, done, total, numbers
     )
-    report.onlooker = lambda draw: listener.drawable(stage, draw)
+    report.preview = lambda draw: listener.drawable(stage, draw)
     usage = _Usage(space.partial)
     try:
         with PeakMemory(tick=usage.note) as memory:

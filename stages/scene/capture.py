@@ -29,7 +29,7 @@ class Photo:
     focal_px: focal length from EXIF in pixels of the normalised picture, or None.
     camera: a key that is equal for photographs of the same camera, lens setting and size.
     sharpness: the higher the sharper; comparable within one capture.
-    twin: the first photograph of those that show nearly the same as this one; "" if none does.
+    duplicate_of: the first photograph of those that show nearly the same as this one; "" if none does.
     log2_luminance: log2 of the median linear luminance. exposure_ev: EV at ISO 100 from EXIF.
     mask: a grey picture of the same size, relative to the capture's folder; "" for none. 0 is
         outside. outside: what that means: IGNORE (nobody knows what is there) or TRANSPARENT
@@ -46,7 +46,7 @@ class Photo:
     sharpness: float
     log2_luminance: float
     exposure_ev: float | None
-    twin: str = ""
+    duplicate_of: str = ""
     mask: str = ""
     outside: str = ""
     gps: tuple[float, float] | None = None
@@ -68,7 +68,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """A registered photograph, undistorted. image: relative to the reconstruction's folder. twin:
+    """A registered photograph, undistorted. image: relative to the reconstruction's folder. duplicate_of:
     as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody does. mask,
     outside: as in `Photo`, the mask relative to the reconstruction's folder. light: see
     `scene.light`; None where it could not be measured."""
@@ -76,7 +76,7 @@ class View:
     name: str
     image: str
     camera: Camera
-    twin: str = ""
+    duplicate_of: str = ""
     role: str = ""
     mask: str = ""
     outside: str = ""
@@ -109,7 +109,7 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
     """(training, held out): of every eight by name the first is held out, to judge and for nothing
     else. Where views have roles, those for "test" are.
 
-    A photograph that has a twin would be judged by how well its twin was learnt: the first of the
+    A photograph that has a duplicate_of would be judged by how well its duplicate_of was learnt: the first of the
     eight that has none takes its place. Fewer than 4 views are too few to spare one: then nothing
     is held out.
     """
@@ -120,13 +120,13 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
     if len(ordered) < 4:
         return ordered, ()
     eights = (ordered[i : i + HELD_OUT_EVERY] for i in range(0, len(ordered), HELD_OUT_EVERY))
-    alone = ([view for view in eight if not view.twin] for eight in eights)
+    alone = ([view for view in eight if not view.duplicate_of] for eight in eights)
     held = tuple(eight[0] for eight in alone if eight)
     names = {view.name for view in held}
     return tuple(view for view in ordered if view.name not in names), held
 
 
-def spread_over(items: Sequence[Item], most: int) -> list[Item]:
+def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:
     """At most so many of them, evenly: photographs next to each other say the same."""
     count = min(most, len(items))
     return [items[i * len(items) // count] for i in range(count)]
@@ -142,7 +142,7 @@ def scene_extent(views: tuple[View, ...]) -> float:
     return max(1.1 * float(np.percentile(distances, 95, method="lower")), 1e-6)
 
 
-def seen_extent(reconstruction: Reconstruction) -> float:
+def training_extent(reconstruction: Reconstruction) -> float:
     """What training measures strides and sizes by, world units: `scene_extent`, or how far away the
     median camera sees its median point, if that is more. Cameras close together, of a phone held
     almost still, tell little about the size of what is before them."""

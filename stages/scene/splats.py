@@ -137,7 +137,7 @@ class QuantisedSplats:
     flat_dc: NDArray[np.floating] | None = None
 
 
-def numbers_of(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
+def parameters_per_splat(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
     """[N] how many numbers a splat of each degree is: place, rotation, scales and opacity, and
     three for each term of its colour."""
     return np.asarray(3 + 4 + 3 + 1 + 3 * (sh_degrees.astype(np.int64) + 1) ** 2)

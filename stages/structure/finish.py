@@ -68,7 +68,7 @@ def finish(
                 photo.name,
                 f"{IMAGES}/{picture}",
                 camera,
-                photo.twin,
+                photo.duplicate_of,
                 mask=mask_file(photo),
                 outside=photo.outside,
             )

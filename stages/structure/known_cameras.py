@@ -449,7 +449,7 @@ def _finished(
                 one.photo.name,
                 f"{IMAGES}/{picture}",
                 camera,
-                one.photo.twin,
+                one.photo.duplicate_of,
                 one.role,
                 mask_file(one.photo),
                 one.photo.outside,

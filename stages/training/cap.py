@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.base.atomic import replacing
 from stages.base.memory import available_mib
-from stages.scene import Camera, numbers_of
+from stages.scene import Camera, parameters_per_splat
 from stages.training.density import FEWEST, splat_cap
 from stages.training.optimiser import Model
 
@@ -48,7 +48,7 @@ def splats_determined(cameras: Sequence[Camera], sh_degree: int) -> int:
     """How many splats of `sh_degree` have no more numbers than the photographs of `cameras`: with
     more, some are told by nothing."""
     numbers = sum(3 * camera.width * camera.height for camera in cameras)
-    return max(FEWEST, numbers // int(numbers_of(np.array(sh_degree))))
+    return max(FEWEST, numbers // int(parameters_per_splat(np.array(sh_degree))))
 
 
 def lower_cap(folder: Path, splats: int) -> Cap:

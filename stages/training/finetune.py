@@ -13,7 +13,7 @@ from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
-from stages.raster.draw import settings_of
+from stages.raster.draw import raster_settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
@@ -63,7 +63,7 @@ class FineTuner:
         model = new_model(*(np.array(a, np.float32, order="C") for a in splats.arrays))
         model.sh_degrees[:], model.gradient_count[:] = splats.sh_degrees, seen
         self.stepper.load(model)
-        settings = replace(settings_of(splats), sh_degree=splats.sh_degree)
+        settings = replace(raster_settings_of(splats), sh_degree=splats.sh_degree)
         for number in range(steps):
             if self.report.stop_requested.is_set():
                 raise Interrupted("stopped while fine-tuning")

@@ -228,7 +228,7 @@ class Trainer:
         start = start.with_sh_degree(self.schedule.sh_degree)
         if len(start) > self.cap:
             start = start.take(np.linspace(0, len(start) - 1, self.cap).round().astype(np.int64))
-        start = start.take(morton.order(start))
+        start = start.take(morton.morton_order(start))
         return new_model(*(np.array(a, np.float32, order="C") for a in start.arrays))
 
     def settings(self, degree: int) -> RasterSettings:
@@ -351,7 +351,7 @@ class Trainer:
         model = self._strategy.prune(model, self.schedule.prunes_giants(step))
         budget = min(self.schedule.budget(step, self.cap), self.cap)  # which may have been lowered
         model = self._strategy.grow(model, budget, self.schedule.rng(step))
-        return model.take(morton.order_of(model.means))
+        return model.take(morton.morton_order_of(model.means))
 
     def _tick(self, step: int, loss: float) -> None:
         numbers: dict[str, float | int | str] = {

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.stage import Draw
+from stages.base.stage import DrawView
 from stages.scene import Camera
 
 SHARE = 0.2  # of the worker's time, at most, goes into pictures
@@ -77,7 +77,7 @@ class Pictures:
         """Whether somebody was there a moment ago."""
         return self._clock() - self._seen < LOOKING_S
 
-    def offer(self, draw: Draw, step: int) -> None:
+    def offer(self, draw: DrawView, step: int) -> None:
         """Draw what is wanted, if anything is and the time for it has come."""
         if self._wishes.empty() or self._clock() < self._not_before:
             return
@@ -86,7 +86,7 @@ class Pictures:
             wish.picture = self._drawn(draw, wish.camera, step)
             wish.answered.set()
 
-    def offer_last(self, draw: Draw, step: int) -> None:
+    def offer_last(self, draw: DrawView, step: int) -> None:
         """The work is done: one more picture for whoever is looking, which stays."""
         if self._camera is not None and self.watched():
             self._last = self._drawn(draw, self._camera, step)
@@ -98,7 +98,7 @@ class Pictures:
         while not self._wishes.empty():
             self._wishes.get_nowait().answered.set()
 
-    def _drawn(self, draw: Draw, camera: Camera, step: int) -> Picture | None:
+    def _drawn(self, draw: DrawView, camera: Camera, step: int) -> Picture | None:
         start = self._clock()
         try:
             pixels = draw(camera)

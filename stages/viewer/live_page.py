@@ -22,7 +22,7 @@ from stages.base.stage import Numbers
 from stages.formats.page import document
 from stages.formats.page.shots import Shot
 from stages.scene import Camera, View
-from stages.scene.framing import depth_of_interest
+from stages.scene.framing import median_depth
 from stages.viewer.live_frames import Picture, Pictures
 from stages.viewer.server import Answer, Item
 from stages.viewer.site import with_photographs
@@ -124,7 +124,7 @@ def _plain(shot: Shot, points: NDArray[np.floating]) -> dict[str, Any]:
         "held_out": shot.held_out,
         **{name: getattr(camera, name) for name in ("width", "height", "fx")},
         "place": camera.world_to_camera[:3].ravel().tolist(),
-        "depth": depth_of_interest(camera, points),
+        "depth": median_depth(camera, points),
     }
 
 

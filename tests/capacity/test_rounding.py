@@ -16,7 +16,7 @@ from stages.formats import FORMATS
 from stages.formats.axes import least_turned
 from stages.formats.quantisation import BitDepths, quantise_splats
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
-from stages.scene import QuantisedSplats, Splats, TrainedSplats, seen_extent, split_held_out
+from stages.scene import QuantisedSplats, Splats, TrainedSplats, split_held_out, training_extent
 from stages.training.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene
 
@@ -31,7 +31,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SmallScene:
 
 def tuner(scene: SmallScene, dropout: bool = False) -> FineTuner:
     return FineTuner(
-        photographs(scene), seen_extent(scene.reconstruction), "cpu", Report(), dropout
+        photographs(scene), training_extent(scene.reconstruction), "cpu", Report(), dropout
     )
 
 

@@ -56,12 +56,12 @@ def test_colours_that_do_not_turn_with_the_splats_are_seen_to_be_wrong() -> None
 
 
 def test_a_half_turn_about_x_is_the_one_that_files_with_y_up_get() -> None:
-    from stages.scene.turn import turned
+    from stages.scene.flip import flipped
 
     splats = exact(20, 3)
     where = Similarity(rotation=about(np.array([1.0, 0, 0]), 180))
-    np.testing.assert_allclose(where.of_splats(splats).sh, turned(splats).sh, atol=1e-12)
-    np.testing.assert_allclose(where.of_splats(splats).means, turned(splats).means, atol=1e-12)
+    np.testing.assert_allclose(where.of_splats(splats).sh, flipped(splats).sh, atol=1e-12)
+    np.testing.assert_allclose(where.of_splats(splats).means, flipped(splats).means, atol=1e-12)
 
 
 def test_the_origin_goes_along() -> None:

@@ -20,7 +20,7 @@ QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]
 def test_reading_and_writing_are_told(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     told: list[tuple[int, int]] = []
-    with blocks.watched(lambda done, total: told.append((done, total))):
+    with blocks.progress_reported_to(lambda done, total: told.append((done, total))):
         formats.write(path, many_splats(40))
         if suffix not in ("glb", "gltf", "quantised.glb"):
             assert (40, 40) in told

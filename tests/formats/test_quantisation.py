@@ -28,7 +28,7 @@ def test_a_file_holds_what_was_rounded_and_is_smaller(tmp_path) -> None:
         sizes.append(path.stat().st_size)
     assert sizes[1] < 0.8 * sizes[0]
     read = formats.read(tmp_path / "b.sog")
-    wanted = rounded.take(morton.order(rounded))
+    wanted = rounded.take(morton.morton_order(rounded))
     np.testing.assert_allclose(read.means, wanted.means, atol=2e-4)
     np.testing.assert_allclose(read.log_scales, wanted.log_scales, atol=1e-5)
     np.testing.assert_allclose(read.sh, wanted.sh, atol=1e-5)
@@ -53,7 +53,7 @@ def test_a_palette_of_few_rows_is_written_as_it_was_chosen(tmp_path) -> None:
     formats.write(tmp_path / "a.sog", rounded)
     read = formats.read(tmp_path / "a.sog").sh[:, 1:].reshape(len(rounded), -1)
     assert len(np.unique(read, axis=0)) <= 64
-    wanted = kinds[morton.order(rounded)]
+    wanted = kinds[morton.morton_order(rounded)]
     assert np.abs(read - wanted).max() < 0.02 * np.ptp(wanted)
 
 

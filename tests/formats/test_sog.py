@@ -81,7 +81,7 @@ def test_every_pixel_is_that_of_the_specification(tmp_path: Path) -> None:
 def test_values_come_back_as_near_as_the_format_allows(tmp_path: Path, degree: int) -> None:
     splats = many_splats(600).with_sh_degree(degree)
     formats.write(tmp_path / "a.sog", splats)
-    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.order(splats))
+    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.morton_order(splats))
     np.testing.assert_array_equal(back.origin, splats.origin)
     bent, back_bent = (np.sign(m) * np.log1p(np.abs(m)) for m in (wanted.means, back.means))
     assert np.abs(back_bent - bent).max() <= 0.5 * np.ptp(bent, axis=0).max() / 65535 + 1e-6
@@ -137,7 +137,7 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
     splats = extreme_splats(1)
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.sog", splats) == 0
-    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.order(splats))
+    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.morton_order(splats))
     np.testing.assert_allclose(back.log_scales, np.clip(wanted.log_scales, -20, 20), atol=1e-5)
     np.testing.assert_allclose(back.opacities, wanted.opacities, atol=1e-6)
 

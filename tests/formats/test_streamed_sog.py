@@ -21,7 +21,7 @@ from stages.formats import sog, streamed_sog
 from stages.formats.rows import drawable
 from stages.measure.evaluation import capped_psnr_db
 from stages.proof.checks import read_back
-from stages.raster.draw import renderer, settings_of
+from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at
 from tests.editing.walls import wall
 from tests.formats.truth import many_splats
@@ -214,7 +214,7 @@ def test_a_level_looks_like_the_scene_where_its_splats_are_a_pixel() -> None:
     full = wall(8000)
     every = [full, *levels.coarser_levels(full)]
     assert [len(level) for level in every] == [8000, 2000, 500, 125]
-    settings = replace(settings_of(full), antialias=True)
+    settings = replace(raster_settings_of(full), antialias=True)
     for level in every[1:]:
         camera = camera_at(at_one_pixel(level))
         picture = renderer(full, settings)(camera).image

@@ -228,7 +228,7 @@ def test_looking_on_does_not_change_what_is_trained(tmp_path):
         drawn.append(draw(where))
         assert drawn[-1].shape == (height, width, 3)
 
-    report.onlooker = keep
+    report.preview = keep
     watched, start = small_problem(tmp_path, "watched", report, steps=150)
     found = watched.run(start)
     assert len(drawn) == 150
@@ -243,7 +243,7 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     t, start = small_problem(tmp_path, "seen", report, steps=40)
     where = camera(48, 36)
     seen = []
-    report.onlooker = lambda draw: seen.append(draw(where))
+    report.preview = lambda draw: seen.append(draw(where))
     trained = finished(t.run(start), 1, start, t.draw_settings)
     settings = t.settings(t.schedule.sh_degree)
     image = render(trained, where, settings, backend="reference").image

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene import Camera, Splats, View, split_held_out
-from stages.scene.framing import depth_of_interest, in_front_of
+from stages.scene.framing import front_camera, median_depth
 from stages.scene.rotations import quaternions_of
 
 _VIEWER_FROM_WORLD = np.diag([-1.0, -1.0, 1.0])
@@ -35,7 +35,7 @@ class Shot:
 def shots_of(views: Sequence[View], splats: Splats) -> tuple[Shot, ...]:
     """The capture's cameras by name, without photographs; or one in front of the splats."""
     if not views:
-        return (Shot("in front", in_front_of(splats)),)
+        return (Shot("in front", front_camera(splats)),)
     held = {view.name for view in split_held_out(tuple(views))[1]}
     ordered = sorted(views, key=lambda view: view.name)
     return tuple(Shot(view.name, view.camera, held_out=view.name in held) for view in ordered)
@@ -48,7 +48,7 @@ def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
     world. Lengths in pixels as in `Camera`.
     """
     camera = shot.camera
-    depth = depth_of_interest(camera, means)
+    depth = median_depth(camera, means)
     rotation = _VIEWER_FROM_WORLD @ camera.world_to_camera[:3, :3].T @ _CAMERA_FROM_VIEWERS
     return {
         "name": shot.name,

@@ -18,7 +18,7 @@ from stages.measure.evaluation import EvaluationView, Score, evaluate, image_ren
 from stages.measure.speed import seconds_per_frame
 from stages.measure.tradeoff.points import Moment, Point, Trade, change_db, mean_db
 from stages.measure.tradeoff.thin import Thin, measure_thin
-from stages.scene import DrawSettings, QuantisedSplats, Splats, View, split_held_out, spread_over
+from stages.scene import DrawSettings, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 
 # Shares of the splats that are left, each taken from the one before: what single splats are worth
 # no longer adds up where many go at once.
@@ -156,4 +156,4 @@ def deciding(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
         return []
     camera = draw_settings.camera(views[0].camera)
     most = round(DECIDING_PIXELS / (camera.width * camera.height))
-    return spread_over(views, max(_LEAST_DECIDING, most))
+    return evenly_spaced(views, max(_LEAST_DECIDING, most))

@@ -20,8 +20,8 @@ from stages.measure.coverage import (
 )
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.shimmer import Framing, framings, shimmer, small_psnr_db
-from stages.scene import Camera, Splats, View, look_at, spread_over
-from stages.scene.framing import depth_of_interest
+from stages.scene import Camera, Splats, View, evenly_spaced, look_at
+from stages.scene.framing import median_depth
 
 MOST_PHOTOGRAPHS = 200  # that coverage is found by
 FRAMED = 3  # photographs from which extremes are drawn
@@ -54,14 +54,14 @@ def measure_thin(
     backend: str,
 ) -> Thin:
     """hanging [N]: which splats are floaters; the others as in `Material`."""
-    chosen = spread_over(training, MOST_PHOTOGRAPHS)
+    chosen = evenly_spaced(training, MOST_PHOTOGRAPHS)
     cameras = tuple(splats.draw_settings.camera(view.camera) for view in chosen)
     patches = patches_of(splats, cameras, backend)
     ring = around(cameras, patches, levelled) if len(patches.centres) else None
     empty = gaps(ring, patches) if ring else ()
     draw = image_renderer(splats, backend)
-    seen = [photograph.camera for photograph in spread_over(held_out, FRAMED)]
-    framed = framings(draw, [(c, depth_of_interest(c, splats.means)) for c in seen])
+    seen = [photograph.camera for photograph in evenly_spaced(held_out, FRAMED)]
+    framed = framings(draw, [(c, median_depth(c, splats.means)) for c in seen])
     if ring and ring.inward and empty:
         eye = ring.middle + ring.reach * empty[0].direction
         unseen = replace(seen[0], world_to_camera=look_at(eye, ring.middle, up=ring.up))

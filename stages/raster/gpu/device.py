@@ -123,7 +123,7 @@ def built() -> str:
 
 
 @contextmanager
-def failures_told(splats: int) -> Iterator[None]:
+def gpu_errors_explained(splats: int) -> Iterator[None]:
     """What a device refuses while it works on so many splats, as SplatError."""
     import torch
 

@@ -18,7 +18,7 @@ from stages.measure.tradeoff.measuring import SHARES, Material, deciding, measur
 from stages.measure.tradeoff.pair import Side, pair, verdict
 from stages.measure.tradeoff.pair_report import write_pair
 from stages.measure.tradeoff.report import write_report
-from stages.scene import Camera, DrawSettings, QuantisedSplats, View, split_held_out, spread_over
+from stages.scene import Camera, DrawSettings, QuantisedSplats, View, evenly_spaced, split_held_out
 from tests.small_scene import small_scene
 
 COURSE = [
@@ -216,8 +216,8 @@ def test_the_comparison_shows_every_judge_three_times(scene, tmp_path) -> None:
 
 
 def test_few_are_taken_from_all_over() -> None:
-    assert spread_over(range(10), 5) == [0, 2, 4, 6, 8]
-    assert spread_over(range(3), 24) == [0, 1, 2]
+    assert evenly_spaced(range(10), 5) == [0, 2, 4, 6, 8]
+    assert evenly_spaced(range(3), 24) == [0, 1, 2]
 
 
 def test_all_photographs_decide_where_time_allows() -> None:

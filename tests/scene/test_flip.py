@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
 from tests.formats.truth import colour, covariance, many_splats, red_splat
 
 F = np.diag([1.0, -1.0, -1.0])
@@ -12,7 +12,7 @@ F = np.diag([1.0, -1.0, -1.0])
 
 def test_turning_twice_changes_nothing() -> None:
     splats = many_splats()
-    back = turned(turned(splats))
+    back = flipped(flipped(splats))
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
         np.testing.assert_array_equal(getattr(back, name), getattr(splats, name))
 
@@ -21,13 +21,13 @@ def test_up_becomes_plus_y_and_handedness_stays() -> None:
     up_in_our_world = np.array([0.0, -1.0, 0.0])
     splats = red_splat()
     splats.means[0] = up_in_our_world
-    np.testing.assert_array_equal(turned(splats).means[0], [0, 1, 0])
+    np.testing.assert_array_equal(flipped(splats).means[0], [0, 1, 0])
     assert np.linalg.det(F) == 1
 
 
 def test_ellipsoids_turn_with_the_world() -> None:
     splats = many_splats(40)
-    after = turned(splats)
+    after = flipped(splats)
     for i in range(len(splats)):
         before = covariance(splats.quaternions[i], np.exp(splats.log_scales[i]))
         now = covariance(after.quaternions[i], np.exp(after.log_scales[i]))
@@ -36,7 +36,7 @@ def test_ellipsoids_turn_with_the_world() -> None:
 
 def test_colours_seen_from_the_turned_direction_are_the_same() -> None:
     splats = many_splats(8)
-    after = turned(splats)
+    after = flipped(splats)
     rng = np.random.default_rng(0)
     for i in range(len(splats)):
         direction = rng.normal(size=3)

@@ -26,7 +26,7 @@ SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np
 _QUATERNION_SIGNS = np.array([1, 1, -1, -1], np.float32)
 
 
-def turned(splats: Splats, *, reuse: bool = False) -> Splats:
+def flipped(splats: Splats, *, reuse: bool = False) -> Splats:
     """The splats in the other frame (y down to y up, and back).
 
     reuse: into the arrays that they come in, for a caller who needs those no more.
