@@ -27,7 +27,6 @@ app = typer.Typer(
     cls=Commands,
     help="Turn a folder of photographs into a 3D Gaussian splat that opens everywhere.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -44,7 +43,13 @@ Photos = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option("--out", "-o", help="Run folder to make or continue.", show_default="run"),
+    typer.Option(
+        "--out",
+        "-o",
+        help="Run folder to make or continue.",
+        show_default="run",
+        rich_help_panel="Output",
+    ),
 ]
 Run = Annotated[
     Path | None, typer.Argument(help="Run folder; by default the one in the current folder.")
@@ -70,6 +75,7 @@ Cluster = Annotated[
         "(HOST:PORT, ray://HOST:PORT, auto), or local:N for N workers of this machine: "
         f"{install_command('cluster').replace('[', chr(92) + '[')}.",
         show_default="this process",
+        rich_help_panel="Advanced",
     ),
 ]
 Device = Annotated[
@@ -85,8 +91,18 @@ Device = Annotated[
         shown=False,
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only warnings and results.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Events and results as lines of JSON.")]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", help="Print only warnings and results.", rich_help_panel="Output"
+    ),
+]
+AsJson = Annotated[
+    bool,
+    typer.Option(
+        "--json", help="Print events and results as lines of JSON.", rich_help_panel="Output"
+    ),
+]
 
 _ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
 _STAGE_HELP = {
@@ -94,8 +110,8 @@ _STAGE_HELP = {
     "sfm": "Find where each photograph was taken from.",
     "seed": "Turn the sparse points into first splats.",
     "train": "Fit the splats to the photographs.",
-    "prune": "Remove floaters.",
-    "quantise": "Decide what to keep at which precision.",
+    "prune": "Remove floaters and splats that do not improve the pictures.",
+    "quantise": "Choose the precision at which each value is kept.",
     "export": "Write the files that other programs open.",
 }
 _STAGE_EXAMPLES = {

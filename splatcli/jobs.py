@@ -25,38 +25,6 @@ from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
 
 DEFAULT_PRESET = "standard"
-PROCESS_OPTIONS = (
-    "backend",
-    "device",
-    "max_side",
-    "masks",
-    "invert_masks",
-    "mask_means",
-    "frames",
-    "train_side",
-    "steps",
-    "seconds",
-    "patience",
-    "max_splats",
-    "blocks",
-    "price",
-    "max_mb",
-    "mb_of",
-    "min_psnr",
-    "tune_steps",
-    "light",
-    "background",
-    "formats",
-    "cameras",
-    "split",
-    "refine_cameras",
-    "metres",
-    "scale",
-    "marker",
-    "allow_partial",
-    "seed",
-)
-
 # What speaks of one capture and no other: a batch gives the same options to all of its runs.
 _OF_ONE_CAPTURE = ("masks", "cameras", "split", "refine_cameras", "scale", "blocks", "view")
 
@@ -69,13 +37,18 @@ def preset_parameter(shown: str) -> Parameter:
         str,
         choices=tuple(presets()),
         help="How much training: preview (minutes), standard, or best (the full recipe).",
+        panel="Quality and time",
     )
     return options.keyword("preset", str | None, options.option(setting, shown))
 
 
 def view_parameter() -> Parameter:
     """`--view`, of the commands that train."""
-    option = typer.Option("--view", help="Show the scene in the browser while it is trained.")
+    option = typer.Option(
+        "--view",
+        help="Show the scene in the browser while it is trained.",
+        rich_help_panel="Output",
+    )
     return options.keyword("view", bool, option, default=False)
 
 
@@ -92,11 +65,10 @@ def process_parameters() -> list[Parameter]:
     found: dict[str, Parameter] = {}
     for name in STAGE_NAMES:
         kind = load_stage(name).settings_type
-        for parameter in options.parameters(kind, PROCESS_OPTIONS, _shown):
+        for parameter in options.parameters(kind, _shown, only_in_process=True):
             found.setdefault(parameter.name, parameter)
-    chosen = (found[name] for name in PROCESS_OPTIONS if name in found)
     shown = f"{DEFAULT_PRESET}; as before where a run goes on"
-    return [preset_parameter(shown), *chosen, view_parameter()]
+    return [preset_parameter(shown), *found.values(), view_parameter()]
 
 
 def batch_parameters() -> list[Parameter]:

@@ -1,8 +1,8 @@
 """Command-line options, made from the stages' settings.
 
-A setting's type, help and bounds are stated once, in its stage, which also says what is wrong with
-a value. An option that is not given is None here, so that a stage's command changes only what was
-typed.
+A setting's type, help, bounds and panel are stated once, in its stage, which also says what is
+wrong with a value. An option that is not given is None here, so that a stage's command changes only
+what was typed.
 """
 
 from __future__ import annotations
@@ -11,53 +11,64 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
-from stages.base.settings import Setting, check_settings, settings_of
+from stages.base.settings import PANELS, Setting, check_settings, settings_of
 
 _METAVARS = {int: "N", float: "X", bool: None, Path: "PATH"}
 
 
 def parameters(
     settings_type: type,
-    names: Iterable[str] | None = None,
     shown: Callable[[Setting], str | bool] | None = None,
+    *,
+    only_in_process: bool = False,
 ) -> list[inspect.Parameter]:
-    """One keyword parameter a settings field (those in `names`), as typer reads them.
+    """One keyword parameter for each field of a stage's settings, as typer reads them.
 
-    shown: the default to show in the help; by default the field's own.
+    Args:
+        shown: gives the default that the help shows; by default the field's own.
+        only_in_process: leave out the settings that have no panel.
     """
-    every = {setting.name: setting for setting in settings_of(settings_type)}
-    chosen = every.values() if names is None else [every[name] for name in names if name in every]
-    return [_parameter(setting, (shown or shown_default)(setting)) for setting in chosen]
+    found = [s for s in settings_of(settings_type) if s.panel or not only_in_process]
+    return [_parameter(setting, (shown or shown_default)(setting)) for setting in found]
 
 
 def _parameter(setting: Setting, shown: str | bool) -> inspect.Parameter:
     if setting.kind is bool:
-        flags, accepted = f"{setting.flag}/--no-{setting.flag[2:]}", bool | None
-        return keyword(
-            setting.name, accepted, typer.Option(flags, help=setting.help, show_default=shown)
-        )
+        flags = f"{setting.flag}/--no-{setting.flag[2:]}"
+        return keyword(setting.name, bool | None, option(setting, shown, flags=flags))
     if setting.together:
-        words: Any = tuple[(setting.kind,) * len(setting.together.split())]  # type: ignore[misc]
-        typed = typer.Option(
-            setting.flag, help=setting.help, show_default=shown, metavar=setting.together
-        )
-        return keyword(setting.name, words | None, typed)
+        values: Any = tuple[(setting.kind,) * len(setting.together.split())]  # type: ignore[misc]
+        made = option(setting, shown, metavar=setting.together)
+        return keyword(setting.name, values | None, made)
     one = list[setting.kind] if setting.many else setting.kind  # type: ignore[name-defined]
     return keyword(setting.name, one | None, option(setting, shown))
 
 
-def option(setting: Setting, shown: str | bool = True) -> Any:
-    """A typer option that takes what the setting allows, and says so itself when it does not."""
+def option(
+    setting: Setting, shown: str | bool = True, *, flags: str = "", metavar: str | None = None
+) -> Any:
+    """A typer option that accepts what the setting allows; the setting explains a refusal.
+
+    Args:
+        shown: the default for the help; True for the parameter's own, False for none.
+        flags: "--fill/--no-fill"; by default the setting's flag.
+        metavar: of an option with several values; by default the name of the type.
+    """
+    parsed = not (flags or metavar)
     return typer.Option(
-        setting.flag,
-        parser=setting.parse,
+        flags or setting.flag,
+        parser=setting.parse if parsed else None,
         help=_help(setting),
         show_default=shown,
-        metavar=_METAVARS.get(setting.kind, "NAME" if setting.choices else "TEXT"),
+        metavar=metavar or _METAVARS.get(setting.kind, "NAME" if setting.choices else "TEXT"),
+        rich_help_panel=setting.panel or "Advanced",
+        autocompletion=lambda incomplete: [
+            choice for choice in setting.choices if choice.startswith(incomplete)
+        ],
     )
 
 
@@ -65,7 +76,8 @@ def number(
     flag: str, kind: type, low: float, high: float, help: str, shown: str | bool = True
 ) -> Any:
     """A typer option for a number that is no stage's setting."""
-    return option(Setting(flag[2:], flag, kind, low=low, high=high, help=help), shown)
+    setting = Setting(flag[2:], flag, kind, low=low, high=high, help=help, panel="Options")
+    return option(setting, shown)
 
 
 def _help(setting: Setting) -> str:
@@ -88,7 +100,7 @@ def keyword(name: str, accepted: Any, option: Any, default: Any = None) -> inspe
 def shown_default(setting: Setting) -> str | bool:
     """A setting's default for the help; False for none."""
     value = setting.default
-    if value is None or value == "":
+    if value is None or value in ("", ()):
         return False
     if isinstance(value, (tuple, list)):
         return " ".join(map(str, value))
@@ -96,7 +108,7 @@ def shown_default(setting: Setting) -> str | bool:
 
 
 def given_only(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What was typed: None and empty lists left out, lists as tuples."""
+    """What was typed: None and empty lists left out, lists as tuples, paths absolute."""
     typed = {name: value for name, value in given.items() if value is not None and value != []}
     typed |= {n: value.absolute() for n, value in typed.items() if isinstance(value, Path)}
     return {n: tuple(value) if isinstance(value, list) else value for n, value in typed.items()}
@@ -113,19 +125,25 @@ def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
 def with_parameters(
     command: Callable[..., Any], added: Iterable[inspect.Parameter]
 ) -> Callable[..., Any]:
-    """`command`, which takes **given, with the added parameters in the signature typer sees."""
+    """`command`, which takes **given, with the added parameters in the signature that typer sees;
+    options in the order of their panels."""
     signature = inspect.signature(command, eval_str=True)
     own = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
-    every = [*own, *added]
-    annotations = {p.name: p.annotation for p in every}
+    # Typer shows panels in the order of their first options.
+    every = sorted([*added, *own], key=lambda p: (p.kind, _panel_number(p)))
 
     def call(**values: Any) -> Any:
         return command(**values)
 
     call.__name__ = command.__name__
     call.__doc__ = command.__doc__
-    call.__annotations__ = annotations
+    call.__annotations__ = {p.name: p.annotation for p in every}
     call.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=sorted(every, key=lambda p: p.kind), return_annotation=None
+        parameters=every, return_annotation=None
     )
     return call
+
+
+def _panel_number(parameter: inspect.Parameter) -> int:
+    panels = [getattr(part, "rich_help_panel", None) for part in get_args(parameter.annotation)]
+    return next((PANELS.index(panel) for panel in panels if panel in PANELS), -1)

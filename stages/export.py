@@ -51,6 +51,7 @@ class ExportSettings:
     formats: tuple[str, ...] = field(
         default=("ply", "splat", "glb", "usdz"),
         metadata={
+            "panel": "Output",
             "help": "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
             "choices": _CHOICES,
         },

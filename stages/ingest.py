@@ -34,6 +34,7 @@ class IngestSettings:
     max_side: int = field(
         default=1600,
         metadata={
+            "panel": "Quality and time",
             "help": "Longer side of the photographs used for structure from motion and, at most, "
             "for training (px).",
             "min": 64,
@@ -43,6 +44,7 @@ class IngestSettings:
     masks: Path | None = field(
         default=None,
         metadata={
+            "panel": "Light and masks",
             "help": "Folder of masks, white where a photograph counts, named as the photographs "
             "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside the "
             "photographs' is found without.",
@@ -51,11 +53,15 @@ class IngestSettings:
     )
     invert_masks: bool = field(
         default=False,
-        metadata={"help": "Masks are black where a photograph counts, not white."},
+        metadata={
+            "panel": "Light and masks",
+            "help": "Masks are black where a photograph counts, not white.",
+        },
     )
     mask_means: str = field(
         default="auto",
         metadata={
+            "panel": "Light and masks",
             "help": "What is outside a mask: ignore (something that does not count), transparent "
             "(nothing, as around an object cut out) or auto (nothing where pictures themselves are "
             "transparent, ignored where masks are files).",
@@ -65,6 +71,7 @@ class IngestSettings:
     frames: int = field(
         default=0,
         metadata={
+            "panel": "Input",
             "help": "Frames to take from each video, at most; 0 takes as many as its motion asks "
             "for.",
             "min": 0,

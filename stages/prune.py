@@ -37,6 +37,7 @@ class PruneSettings:
     price: float = field(
         default=1.0,
         metadata={
+            "panel": "Size",
             "help": "How much a splat must be worth to stay, 1 for what the photographs ask; the "
             "loss allowed grows with it.",
             "min": 0.001,
@@ -59,6 +60,7 @@ class PruneSettings:
     max_mb: float = field(
         default=0.0,
         metadata={
+            "panel": "Size",
             "help": "Size at most, whatever it costs, of the file that --mb-of names; 0 for any "
             "(megabytes).",
             "min": 0,
@@ -67,11 +69,16 @@ class PruneSettings:
     )
     mb_of: str = field(
         default="ply",
-        metadata={"help": "Format that --max-mb speaks of", "choices": tuple(FORMATS)},
+        metadata={
+            "panel": "Size",
+            "help": "Format that --max-mb speaks of",
+            "choices": tuple(FORMATS),
+        },
     )
     min_psnr: float = field(
         default=0.0,
         metadata={
+            "panel": "Size",
             "help": "As small as the training photographs allow at this PSNR, instead of by price; "
             "0 for none (dB).",
             "min": 0,
@@ -81,6 +88,7 @@ class PruneSettings:
     finetune_steps: int = field(
         default=90,
         metadata={
+            "panel": "Advanced",
             "help": "Steps of fine-tuning after each round; 0 for none.",
             "min": 0,
             "max": 100_000,

@@ -41,6 +41,7 @@ class SfmSettings:
     seed: int = field(
         default=0,
         metadata={
+            "panel": "Advanced",
             "help": "Seed of every random choice; same seed, same result.",
             "min": 0,
             "max": 2**31 - 1,
@@ -64,11 +65,15 @@ class SfmSettings:
     )
     allow_partial: bool = field(
         default=False,
-        metadata={"help": "Go on with the best reconstruction found even if it fails its gates."},
+        metadata={
+            "panel": "Advanced",
+            "help": "Go on with the best reconstruction found even if it fails its gates.",
+        },
     )
     cameras: Path | None = field(
         default=None,
         metadata={
+            "panel": "Known cameras",
             "help": "File or folder of cameras that are known already, of COLMAP, nerfstudio, a "
             "synthetic NeRF scene, LLFF, OpenSfM, Bundler, Metashape or RealityScan: nothing "
             "is searched.",
@@ -78,6 +83,7 @@ class SfmSettings:
     split: bool = field(
         default=False,
         metadata={
+            "panel": "Known cameras",
             "help": "Keep the training and test photographs that --cameras tells apart.",
             "needs": "cameras",
         },
@@ -85,6 +91,7 @@ class SfmSettings:
     refine_cameras: bool = field(
         default=False,
         metadata={
+            "panel": "Known cameras",
             "help": "Move the cameras of --cameras to where the photographs' matches want them; "
             "their lenses stay as they are.",
             "needs": "cameras",
@@ -93,6 +100,7 @@ class SfmSettings:
     metres: bool = field(
         default=False,
         metadata={
+            "panel": "Known cameras",
             "help": "The cameras of --cameras are in metres, as those of phones' AR sessions are.",
             "needs": "cameras",
         },
@@ -100,6 +108,7 @@ class SfmSettings:
     scale: tuple[str, ...] = field(
         default=(),
         metadata={
+            "panel": "Known cameras",
             "help": "Two photographs and how far apart their cameras were (metres).",
             "together": "A B METRES",
         },
@@ -107,6 +116,7 @@ class SfmSettings:
     marker: float = field(
         default=0.0,
         metadata={
+            "panel": "Known cameras",
             "help": "Side of the ArUco markers that lie in the scene, alone or on a ChArUco board "
             "(metres); 0: there are none.",
             "min": 0.0,

@@ -36,11 +36,17 @@ if TYPE_CHECKING:
 class TrainSettings:
     steps: int = field(
         default=7000,
-        metadata={"help": "Steps of training, one photograph each.", "min": 1, "max": 1_000_000},
+        metadata={
+            "panel": "Quality and time",
+            "help": "Steps of training, one photograph each.",
+            "min": 1,
+            "max": 1_000_000,
+        },
     )
     train_side: int = field(
         default=800,
         metadata={
+            "panel": "Quality and time",
             "help": "Longer side of the photographs in training (pixels).",
             "min": 16,
             "max": 8192,
@@ -53,6 +59,7 @@ class TrainSettings:
     max_splats: int = field(
         default=0,
         metadata={
+            "panel": "Size",
             "help": "Splats at most; 0: what free memory allows, and no more numbers than the "
             "photographs have.",
             "min": 0,
@@ -62,6 +69,7 @@ class TrainSettings:
     seconds: float = field(
         default=0.0,
         metadata={
+            "panel": "Quality and time",
             "help": "Seconds that training may take: as many steps as fit, whatever --steps says. "
             "0: as long as the steps take.",
             "min": 0,
@@ -71,6 +79,7 @@ class TrainSettings:
     patience: float = field(
         default=0.0,
         metadata={
+            "panel": "Advanced",
             "help": "What growing on for as long again must give one at least of the photographs "
             "that are lent for it (dB): where it gives less, training goes back, and ends its "
             "growth there. 0: never.",
@@ -91,6 +100,7 @@ class TrainSettings:
     background: str = field(
         default="black",
         metadata={
+            "panel": "Light and masks",
             "help": "What is behind photographs in training: black, which viewers have too, or any "
             "colour, for scenes that will be laid over others. Objects cut out always take any.",
             "choices": ("black", "any"),
@@ -99,6 +109,7 @@ class TrainSettings:
     light: str = field(
         default="auto",
         metadata={
+            "panel": "Light and masks",
             "help": "Bring photographs to the exposure and white balance of the median one first: "
             "auto (where they differ by more than a camera's noise), on or off.",
             "choices": ("auto", "on", "off"),
@@ -115,6 +126,7 @@ class TrainSettings:
     blocks: str = field(
         default="1",
         metadata={
+            "panel": "Advanced",
             "help": "Cut the scene into as many blocks, train each on the photographs that show "
             "it, and make them one again; auto: one for about every 250 photographs.",
             "pattern": r"auto|[1-9]\d{0,3}",

@@ -6,7 +6,9 @@ for all of it, with "wanted", the sentence that says what it asks for. "option":
 where it is not the field's. "together": of a list, the words that one use of the option takes, as
 its help shows them. "needs": another field, without which a value but the default means nothing.
 "affects_output": False where another value gives the same bytes. "midway": True where half-done
-work goes on under another value, which the stage then says.
+work goes on under another value, which the stage then says. "panel": the heading (one of `PANELS`)
+under which `splat process --help` lists the option; a setting without one is an option of its
+stage's own command only.
 """
 
 from __future__ import annotations
@@ -18,6 +20,11 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from stages.base.errors import Family, SplatError
+
+PANELS = (
+    *("Input", "Quality and time", "Size", "Output"),
+    *("Known cameras", "Light and masks", "Advanced"),
+)
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,7 @@ class Setting:
     help: str = ""
     together: str = ""
     needs: str = ""
+    panel: str = ""
 
     def check(self, value: Any) -> None:
         """Raises SplatError "option-value" for a value that the setting cannot have."""
@@ -124,6 +132,7 @@ def settings_of(settings_type: type) -> list[Setting]:
                 help=field.metadata.get("help", ""),
                 together=field.metadata.get("together", ""),
                 needs=field.metadata.get("needs", ""),
+                panel=field.metadata.get("panel", ""),
             )
         )
     return found

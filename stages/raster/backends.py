@@ -164,10 +164,16 @@ def backend_setting() -> Any:
     """The field `backend` of a stage's settings."""
     choices = ", ".join(f"{backend.name} ({backend.summary})" for backend in BACKENDS)
     help = f"Rendering backend: {AUTO} (the fastest available), {choices}."
-    return field(default=AUTO, metadata={"help": help, "choices": CHOICES, "midway": True})
+    return field(
+        default=AUTO,
+        metadata={"help": help, "choices": CHOICES, "midway": True, "panel": "Advanced"},
+    )
 
 
 def device_setting() -> Any:
     """The field `device` of a stage's settings."""
     help = f"Torch device for --backend reference: {', '.join(DEVICES)}."
-    return field(default=CPU, metadata={"help": help, "choices": DEVICES, "midway": True})
+    return field(
+        default=CPU,
+        metadata={"help": help, "choices": DEVICES, "midway": True, "panel": "Advanced"},
+    )

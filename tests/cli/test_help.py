@@ -10,9 +10,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from splatcli.app import app
 from stages import STAGE_NAMES
 from stages.base.distribution import NAME, VERSION
+from stages.base.settings import PANELS
 from tests import processes
 from tests.cli.help_text import help_of
 
@@ -109,6 +112,29 @@ def test_process_has_the_promised_options() -> None:
         "--json",
     ):
         assert flag in text, flag
+
+
+def test_process_groups_its_options_and_lists_the_common_ones_first() -> None:
+    text = help_of("process")
+    found = re.findall(r"─ (.+?) ─+╮", text)
+    assert found == ["Arguments", "Options", *PANELS]
+    between = text[text.index("Quality and time") : text.index("─ Size ─")]
+    assert all(flag in between for flag in ("--preset", "--steps", "--train-side"))
+    assert text.index("--preset") < text.index("--cameras") < text.index("--backend")
+
+
+@pytest.mark.parametrize(
+    ("line", "completed"),
+    [("splat pro", ["process"]), ("splat process --preset s", ["standard"])],
+)
+def test_shell_completion_knows_commands_and_choices(
+    line: str, completed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("_SPLAT_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
+    result = CliRunner().invoke(app, [], prog_name="splat")
+    assert result.stdout.split() == completed
 
 
 def readme_commands() -> list[list[str]]:
