@@ -1,4 +1,5 @@
-"""No pixel of a photograph that judges reaches the asset; and a photograph with a duplicate_of judges not.
+"""No pixel of a photograph that judges reaches the asset; and a photograph with a duplicate_of
+judges not.
 
 Structure from motion is before all this: it has to place the judges too, and sees all photographs.
 """

@@ -49,6 +49,7 @@ __all__ = [
     "View",
     "dc_to_rgb",
     "draw_settings_of",
+    "evenly_spaced",
     "fitted_size",
     "load_splats",
     "logit",
@@ -58,7 +59,6 @@ __all__ = [
     "rgb_to_dc",
     "save_splats",
     "scene_extent",
-    "training_extent",
     "split_held_out",
-    "evenly_spaced",
+    "training_extent",
 ]

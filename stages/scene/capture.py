@@ -29,7 +29,8 @@ class Photo:
     focal_px: focal length from EXIF in pixels of the normalised picture, or None.
     camera: a key that is equal for photographs of the same camera, lens setting and size.
     sharpness: the higher the sharper; comparable within one capture.
-    duplicate_of: the first photograph of those that show nearly the same as this one; "" if none does.
+    duplicate_of: the first photograph of those that show nearly the same as this one; "" if none
+    does.
     log2_luminance: log2 of the median linear luminance. exposure_ev: EV at ISO 100 from EXIF.
     mask: a grey picture of the same size, relative to the capture's folder; "" for none. 0 is
         outside. outside: what that means: IGNORE (nobody knows what is there) or TRANSPARENT
@@ -68,8 +69,9 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """A registered photograph, undistorted. image: relative to the reconstruction's folder. duplicate_of:
-    as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody does. mask,
+    """A registered photograph, undistorted. image: relative to the reconstruction's folder.
+    duplicate_of: as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody
+    does. mask,
     outside: as in `Photo`, the mask relative to the reconstruction's folder. light: see
     `scene.light`; None where it could not be measured."""
 
@@ -109,9 +111,9 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
     """(training, held out): of every eight by name the first is held out, to judge and for nothing
     else. Where views have roles, those for "test" are.
 
-    A photograph that has a duplicate_of would be judged by how well its duplicate_of was learnt: the first of the
-    eight that has none takes its place. Fewer than 4 views are too few to spare one: then nothing
-    is held out.
+    A photograph that has a duplicate_of would be judged by how well its duplicate_of was learnt:
+    the first of the eight that has none takes its place. Fewer than 4 views are too few to spare
+    one: then nothing is held out.
     """
     ordered = tuple(sorted(views, key=lambda view: view.name))
     if any(view.role for view in ordered):
