@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console, sources
+from splatcli import console
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
+from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
@@ -73,7 +74,7 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 def _side(run: Pipeline, name: str) -> Side:
     from stages.measure.tradeoff.pair import Side
 
-    splats = sources.finished_splats(run)
+    splats = results.finished_splats(run)
     told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
     trained = run.manifest("train")
     if trained is not None:
@@ -81,6 +82,6 @@ def _side(run: Pipeline, name: str) -> Side:
         steps = trained.metrics.get("steps", trained.settings["steps"])
         told["steps"] = f"{steps:,}"
         told["seed"] = str(trained.settings["seed"])
-    for ending, figures in sources.exported_formats(run).items():
+    for ending, figures in results.exported_formats(run).items():
         told[f".{ending}"] = console.size(figures["size_bytes"])
-    return Side(name, splats, run.load("sfm"), sources.backend_of(run), told)
+    return Side(name, splats, run.load("sfm"), results.backend_of(run), told)

@@ -68,9 +68,9 @@ def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
 
 def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     """What the proof found. Raises SplatError "convert-verify-failed"."""
-    from splatcli.sources import views_around
     from stages.formats import format_of
     from stages.proof.prover import Prover, cameras_for
+    from stages.run.results import views_around
 
     cameras = cameras_for(splats, views_around(source))
     proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)

@@ -70,11 +70,11 @@ def edit(
 
 def _opened(source: Path) -> Edited:
     """With the photographs of the run that it is of, or lies in. Raises SplatError."""
-    from splatcli.sources import backend_of, pipeline_around, splats_of
     from stages.editing.operations import without_undrawable
     from stages.editing.scene import Edited
     from stages.formats import units_of
     from stages.measure.evaluation import load_evaluation_views
+    from stages.run.results import backend_of, pipeline_around, splats_of
     from stages.scene import split_held_out
 
     splats, pipeline = splats_of(source)

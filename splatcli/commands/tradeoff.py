@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console, sources
+from splatcli import console
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
+from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def material_of(pipeline: Pipeline) -> Material:
     from stages.measure.tradeoff.measuring import Material, deciding
     from stages.scene import split_held_out
 
-    splats = sources.finished_splats(pipeline)
+    splats = results.finished_splats(pipeline)
     reconstruction = pipeline.load("sfm")
     training, held = split_held_out(reconstruction.views)
     if not held:
@@ -70,7 +71,7 @@ def material_of(pipeline: Pipeline) -> Material:
             family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
-    exported = tuple(sources.exported_formats(pipeline))
+    exported = tuple(results.exported_formats(pipeline))
     fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
     return Material(
         splats=splats,
@@ -80,7 +81,7 @@ def material_of(pipeline: Pipeline) -> Material:
         held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
         views=reconstruction.views,
         units=reconstruction.units,
-        backend=sources.backend_of(pipeline),
+        backend=results.backend_of(pipeline),
         levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,

@@ -21,7 +21,7 @@ WATCHED = "train"
 _FAREWELL_S = 5.0  # for an open page to hear how it ended; it asks twice a second, a busy one less
 
 
-class Watching(Listener):
+class LiveTraining(Listener):
     """Serves the page from the start of training to the end of the run."""
 
     def __init__(self, pipeline: Pipeline, as_json: bool) -> None:
