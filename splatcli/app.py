@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from splatcli import summary
-from splatcli.commands import process
+from splatcli.commands import process as jobs
 from splatcli.console import guarded
 from splatcli.folders import find_run_folder
 from splatcli.operation_options import Chain, chain_parameters, typed_in
@@ -157,7 +157,7 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
-    process.run_all(photos, out, cluster, given, quiet, as_json)
+    jobs.run_all(photos, out, cluster, given, quiet, as_json)
 
 
 def batch(
@@ -197,13 +197,13 @@ def _stage_command(name: str) -> Callable[..., None]:
         as_json: AsJson = False,
         **given: Any,
     ) -> None:
-        pipeline = Pipeline(*process.target_of(photos, out))
-        process.run_stage("ingest", pipeline, given, quiet, as_json)
+        pipeline = Pipeline(*jobs.target_of(photos, out))
+        jobs.run_stage("ingest", pipeline, given, quiet, as_json)
 
     def later(
         run: Run = None, *, quiet: Quiet = False, as_json: AsJson = False, **given: Any
     ) -> None:
-        process.run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
+        jobs.run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
 
     return ingest if name == "ingest" else later
 
