@@ -436,13 +436,13 @@ def doctor(as_json: AsJson = False) -> None:
 
 def _register() -> None:
     example = _example("splat process photos/ --preset preview --out run/")
-    command = with_parameters(process, process.process_parameters())
+    command = with_parameters(process, jobs.process_parameters())
     app.command("process", epilog=example)(guarded(command))
-    many = with_parameters(batch, process.batch_parameters())
+    many = with_parameters(batch, jobs.batch_parameters())
     app.command("batch", epilog=_example("splat batch captures/* --out runs/"))(guarded(many))
     for name in STAGE_NAMES:
         line = _STAGE_EXAMPLES.get(name, f"splat {name}")
-        command = with_parameters(_stage_command(name), process.stage_parameters(name))
+        command = with_parameters(_stage_command(name), jobs.stage_parameters(name))
         app.command(name, help=_STAGE_HELP[name], epilog=_example(line))(guarded(command))
     line = "splat edit scene.ply chair.sog --crop box:-1,-1,-1,1,1,1 --decimate 50%"
     command = with_parameters(edit, chain_parameters())
