@@ -99,7 +99,7 @@ def run(
     file from being written.
     """
     from stages import formats
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
@@ -109,7 +109,7 @@ def run(
     if not quantised.splats.origin.any():
         moved = replace(quantised.splats, origin=reconstruction.origin)
         quantised = replace(quantised, splats=moved)
-    splats, dropped = kept_rows(quantised.splats)
+    splats, dropped = drop_undrawable(quantised.splats)
     _say_what_is_missing(len(splats), dropped, report)
     wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)

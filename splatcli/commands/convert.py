@@ -26,7 +26,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     make_folder(target.parent)
@@ -37,7 +37,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
         say(f"writing {target}")
         dropped = formats.write(target, splats)
         say(f"comparing {target}")
-        found = _proven(source, target, kept_rows(splats)[0])
+        found = _proven(source, target, drop_undrawable(splats)[0])
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),

@@ -96,10 +96,10 @@ def _proven(source: Path, target: Path, scene: Edited) -> dict[str, Any]:
     """What another parser reads in `target`, drawn from cameras that training never saw. Raises
     SplatError "edit-verify-failed"."""
     from stages.formats import format_of
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.proof.prover import Prover, cameras_for
 
-    splats = kept_rows(scene.splats)[0]
+    splats = drop_undrawable(scene.splats)[0]
     came_as = format_of(source).ending if source.is_file() else ""
     cameras = cameras_for(splats, scene.views_there())
     proof = Prover.of(splats, cameras, scene.backend, came_as).prove(target)

@@ -112,21 +112,21 @@ def _files(target: Path | None) -> list[Path]:
 def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     """read: what our own reader finds in `file`."""
     from stages import formats
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
 
     if against is not None and not against.is_dir():
         seen = results.views_around(against) or results.views_around(file)
-        splats = kept_rows(formats.read(against))[0]
+        splats = drop_undrawable(formats.read(against))[0]
         return _Original(splats, seen, str(against), formats.format_of(against).ending)
     if against is not None and not runfolder.is_run_folder(against):
         raise runfolder.missing(against)
     run = Pipeline(against) if against is not None else results.pipeline_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
         came_as = formats.format_of(file).ending
-        return _Original(kept_rows(read)[0], (), _ITSELF, came_as, itself=True)
+        return _Original(drop_undrawable(read)[0], (), _ITSELF, came_as, itself=True)
     seen = run.load("sfm").views
     quantised = run.load("quantise")
-    splats = kept_rows(quantised.splats)[0]
+    splats = drop_undrawable(quantised.splats)[0]
     backend = results.backend_of(run)
     name = f"the run {run.run_folder}"
     exported = run.stage_folder("export")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, palette_bits, quantise_attribute, quantise_splats
-from stages.formats.rows import kept_rows
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats
 
 # Of what a .sog tells its values in: (numbers of a splat, the fewest bits).
@@ -29,7 +29,7 @@ def choose_bits(
     """(by attribute, in how many bits a .sog tells it; PSNR of such a file). The next bit goes
     where it saves most bytes for what it costs, as long as all together cost `psnr_db` no more
     than loss_db. A step that follows is foretold to cost four times as much: half the precision."""
-    exact = least_turned(kept_rows(splats)[0])
+    exact = smallest_rotations(drop_undrawable(splats)[0])
     found = asdict(BitDepths(palette=palette_bits(len(exact))))
     if not len(exact):
         return found, 0.0

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.lazy import load_object
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
 from stages.measure.evaluation import EvaluationView, mean_psnr_db
@@ -58,7 +58,7 @@ class Fitting:
             return as_read(row, splats)
 
         if row.quantiser and isinstance(bits, dict):
-            exact, few = least_turned(exact), BitDepths(**bits)
+            exact, few = smallest_rotations(exact), BitDepths(**bits)
             found = tuned_to(
                 lambda s: quantise_splats(s, few), exact, self.tuner, self.steps, self.seen
             )

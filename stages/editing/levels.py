@@ -6,7 +6,7 @@ from pathlib import Path
 
 from stages import formats
 from stages.editing.decimate import FAR, decimated
-from stages.formats.rows import kept_rows
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
 # On a surface a quarter of the splats are twice as large, and look as large twice as far away.
@@ -27,5 +27,5 @@ def write(
 ) -> int:
     """As `formats.write`, with levels of detail where the format holds them."""
     streamed = formats.format_of(path).streamed
-    coarser = coarser_levels(kept_rows(splats)[0]) if streamed else ()
+    coarser = coarser_levels(drop_undrawable(splats)[0]) if streamed else ()
     return formats.write(path, splats, units=units, views=views, coarser=coarser)

@@ -19,7 +19,7 @@ from stages.editing.joining import joined
 from stages.editing.scene import Edited
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
-from stages.formats.rows import chosen, kept_rows
+from stages.formats.values import drop_undrawable, select_rows
 from stages.measure import floaters
 from stages.measure.contribution import floaters as hanging
 from stages.scene import Splats
@@ -66,7 +66,7 @@ def done(scene: Edited, chain: Sequence[tuple[ParsedOperation, Operation]]) -> I
 
 def without_undrawable(splats: Splats) -> Splats:
     """Those that a viewer can draw: what operations may count on."""
-    return kept_rows(splats)[0]
+    return drop_undrawable(splats)[0]
 
 
 def _prepared(typed: ParsedOperation, target: Path) -> Operation:
@@ -102,7 +102,7 @@ def _prepared(typed: ParsedOperation, target: Path) -> Operation:
 
 
 def _selecting(holds: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
-    return lambda scene: scene.but(chosen(scene.splats, holds(scene.splats)))
+    return lambda scene: scene.but(select_rows(scene.splats, holds(scene.splats)))
 
 
 def _of_degree(splats: Splats, degree: int) -> Splats:
@@ -118,7 +118,7 @@ def _without_floaters(scene: Edited) -> Edited:
         gone = hanging(scene.splats, scene.worth(), scene.cameras())
     else:
         gone = floaters.isolated_splats(scene.splats)
-    return scene.but(chosen(scene.splats, ~gone))
+    return scene.but(select_rows(scene.splats, ~gone))
 
 
 def _merging(path: Path) -> Operation:

@@ -78,9 +78,9 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError as
     `format_of`, or "splats-unreadable".
     """
-    from stages.formats.rows import damage_kept
+    from stages.formats.values import nonfinite_allowed
 
     reader = load_object(format_of(path).reader)
-    with nullcontext() if strict else damage_kept():
+    with nullcontext() if strict else nonfinite_allowed():
         splats: Splats = reader(Path(path))
     return splats

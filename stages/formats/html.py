@@ -19,8 +19,8 @@ from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import report_progress
 from stages.formats import ply
 from stages.formats.page import document
-from stages.formats.page.shots import shots_of
-from stages.formats.rows import kept_rows
+from stages.formats.page.cameras import page_cameras
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
 _GZIP = 31  # zlib's name for the gzip container; its header holds no time then
@@ -38,8 +38,8 @@ def write(
 
     views: cameras to look from. Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
-    shots = shots_of(views, splats)
+    splats, dropped = drop_undrawable(splats)
+    shots = page_cameras(views, splats)
     scene = document.scene_data(path.stem, splats, shots, units=units, source=path.name)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(document.head(scene).encode("utf-8"))
@@ -66,7 +66,7 @@ def write_beside(
     """
     scene = document.scene_data(
         content.parent.absolute().name,
-        *(splats, shots_of(views, splats)),
+        *(splats, page_cameras(views, splats)),
         units=units,
         source=content.name,
         content=content.name,

@@ -14,7 +14,7 @@ from typing import Any
 
 from stages.formats import format_of, spz_read
 from stages.formats.html import unzipped
-from stages.formats.inflate import Inflated
+from stages.formats.inflate import GzipReader
 from stages.formats.ply_header import Header, read_header
 from stages.formats.splat32 import RECORD
 
@@ -116,7 +116,7 @@ def spz(path: Path) -> ByteBreakdown:
     if sizes:
         return ByteBreakdown(dict(zip(_SPZ, sizes, strict=False)))
     with path.open("rb") as file:
-        head = Inflated(file, path.stat().st_size).read(spz_read.HEADER.size)
+        head = GzipReader(file, path.stat().st_size).read(spz_read.HEADER.size)
     _, version, count, degree, bits, _, _ = spz_read.HEADER.unpack(head)
     widths = spz_read.widths(version, degree, bits)
     parts = {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}

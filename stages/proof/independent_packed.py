@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.rows import joined
+from stages.formats.values import concatenate
 from stages.proof.content import logits, splats_by_rows
 from stages.scene import Splats
 
@@ -129,7 +129,7 @@ def streamed_sog(path: Path) -> Splats:
                     package.write(part, part.name)
             chunks[file] = sog(packed)
         parts.append(chunks[file].take(slice(offset, offset + count)))
-    return joined(parts)
+    return concatenate(parts)
 
 
 def sog(path: Path | BinaryIO) -> Splats:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.formats import BY_ENDING, format_of
-from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
+from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
 from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
@@ -175,7 +175,7 @@ def _drawable(content: FileContent) -> FileContent:
                 splats.opacity_logits,
             ),
         )
-    return replace(content, splats=kept_rows(splats)[0])
+    return replace(content, splats=drop_undrawable(splats)[0])
 
 
 def _words(error: Exception) -> str:

@@ -13,7 +13,7 @@ from stages.base.stage import Report
 from stages.capacity.rounding import ORDER, as_read, tuned_to
 from stages.export import ExportSettings
 from stages.formats import FORMATS
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_splats
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats, TrainedSplats, split_held_out, training_extent
@@ -62,7 +62,7 @@ def test_what_stands_still_does_not_change_by_a_bit(scene: SmallScene, dropout: 
 
 
 def test_the_others_make_up_for_what_is_rounded(scene: SmallScene) -> None:
-    exact = least_turned(scene.splats)
+    exact = smallest_rotations(scene.splats)
     found = tuned_to(
         lambda s: quantise_splats(s, FEW), exact, tuner(scene), 30, nothing_seen(scene.splats)
     )

@@ -18,7 +18,7 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import sog, streamed_sog
-from stages.formats.rows import drawable
+from stages.formats.values import drawable_rows
 from stages.measure.evaluation import capped_psnr_db
 from stages.proof.checks import read_back
 from stages.raster.draw import raster_settings_of, renderer
@@ -108,7 +108,7 @@ def test_units_and_origin_are_told(tmp_path: Path) -> None:
 def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path) -> None:
     splats = many_splats(50)
     splats.means[3] = np.nan
-    assert drawable(splats).sum() == 49
+    assert drawable_rows(splats).sum() == 49
     assert levels.write(tmp_path / "lod-meta.json", splats) == 1
     assert len(formats.read(tmp_path / "lod-meta.json")) == 49
 

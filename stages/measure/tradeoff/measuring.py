@@ -12,7 +12,7 @@ import numpy as np
 
 from stages import formats
 from stages.formats.quantisation import splats_to_write
-from stages.formats.rows import kept_rows
+from stages.formats.values import drop_undrawable
 from stages.measure.contribution import Contributions, floaters, measure_contributions
 from stages.measure.evaluation import EvaluationView, Score, evaluate, image_renderer
 from stages.measure.speed import seconds_per_frame
@@ -53,7 +53,7 @@ class Material:
 
 def measure_trade(material: Material, tell: Tell) -> Trade:
     """All of it; photographs that judge decide nothing. Raises SplatError, as writers do."""
-    splats = kept_rows(material.splats)[0]
+    splats = drop_undrawable(material.splats)[0]
     material = replace(material, splats=splats)
     tell("judging the run's splats")
     own_scores = _scores(material, splats)
