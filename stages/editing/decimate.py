@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.blocks import blocks, reported_blocks
-from stages.editing.moments import Moments, costs, merged
+from stages.editing.moments import Moments, merge, merge_costs
 from stages.scene import Splats, logit, morton
 
 # Of the splats that one round may take away. Small rounds spend themselves on what is smallest,
 # which nobody sees from afar; larger ones spare more of what is seen from near.
-NEAR, FAR = 0.2, 0.1
+NEAR_ROUND_SHARE, FAR_ROUND_SHARE = 0.2, 0.1
 _NEXT = 16  # splats along the curve that each is compared with
 # Pairs that cost the same would all choose the one beside them, and hardly two each other.
 _UNLIKE = 1 + 1e-3 * np.random.default_rng(5).random(1 << 12)
@@ -32,7 +32,7 @@ _BLOCK = 1 << 15
 
 
 @dataclass(frozen=True)
-class Appraisal:
+class RemovalCosts:
     """Of N splats, in one unit: weights [N]: what is seen of each. alone [N]: squared error that
     leaving out it alone brings; infinite where it must not be left out."""
 
@@ -40,27 +40,30 @@ class Appraisal:
     alone: NDArray[np.float64]
 
 
-Appraise = Callable[[Splats], Appraisal]
+RemovalCostsOf = Callable[[Splats], RemovalCosts]
 
 
-def decimated(
-    splats: Splats, count: int, share: float = NEAR, appraise: Appraise | None = None
+def decimate(
+    splats: Splats,
+    count: int,
+    share: float = NEAR_ROUND_SHARE,
+    removal_costs: RemovalCostsOf | None = None,
 ) -> Splats:
     """At most `count` splats (at least 1), by merging, and by leaving out where somebody appraises
     that and it is cheaper. Every splat must be drawable. share: see `NEAR`."""
     number, count = 0, max(1, count)
     while len(splats) > count:
         most = max(1, min(len(splats) - count, int(share * len(splats))))
-        splats = _round(splats, most, number, appraise)
+        splats = _round(splats, most, number, removal_costs)
         number += 1
     return splats
 
 
-def _round(splats: Splats, most: int, number: int, appraise: Appraise | None) -> Splats:
+def _round(splats: Splats, most: int, number: int, removal_costs: RemovalCostsOf | None) -> Splats:
     # nothing but the order depends on these axes: they may be rounded
     axes = np.linalg.qr(np.random.default_rng([11, number]).normal(size=(3, 3)))[0]
     order = morton.morton_order_of(splats.means @ axes.astype(splats.means.dtype))
-    worth = appraise(splats) if appraise else None
+    worth = removal_costs(splats) if removal_costs else None
     partners, cost = _partners(splats, order, worth)
     places = np.arange(len(order))
     first = places[(partners[partners] == places) & (places < partners)]
@@ -79,7 +82,7 @@ def _round(splats: Splats, most: int, number: int, appraise: Appraise | None) ->
 
 
 def _partners(
-    splats: Splats, order: NDArray[np.intp], worth: Appraisal | None
+    splats: Splats, order: NDArray[np.intp], worth: RemovalCosts | None
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """By place along the curve: (the place [N] of the cheapest partner, what that costs [N])."""
     count = len(order)
@@ -98,7 +101,7 @@ def _partners(
         for step in range(1, min(_NEXT, len(rows) - 1) + 1):
             end = min(block.stop, count - step) - block.start
             here, there = slice(0, end), slice(step, end + step)
-            cost = costs(part.take(here), part.take(there), weights[here], weights[there])
+            cost = merge_costs(part.take(here), part.take(there), weights[here], weights[there])
             cost *= np.resize(np.roll(_UNLIKE, 131 * step), len(cost))
             cost = np.fmin(cost, _COST_MOST)
             offer(slice(block.start, block.start + end), cost, step)
@@ -106,7 +109,7 @@ def _partners(
     return partners, cheapest
 
 
-def _alone(order: NDArray[np.intp], worth: Appraisal | None) -> NDArray[np.float64]:
+def _alone(order: NDArray[np.intp], worth: RemovalCosts | None) -> NDArray[np.float64]:
     """By place along the curve: what leaving it out costs; only the least of neighbours may go."""
     if worth is None:
         return np.zeros(0)
@@ -138,7 +141,7 @@ def _with_merged(
 
 def _take_up(part: Splats, pairs: NDArray[np.intp], splats: Splats, rows: NDArray[np.intp]) -> None:
     """Splats `pairs` of `part` become one with those in `rows` of `splats`."""
-    found, share = merged(Moments.of(part, pairs), Moments.of(splats, rows))
+    found, share = merge(Moments.of(part, pairs), Moments.of(splats, rows))
     part.means[pairs] = found.means
     part.quaternions[pairs], part.log_scales[pairs] = found.shapes()
     part.opacity_logits[pairs] = logit(found.opacities)

@@ -21,7 +21,7 @@ from stages.base.errors import Family, SplatError
 from stages.scene import Splats, dc_to_rgb
 
 Column = Callable[[Splats], NDArray[np.floating]]
-NAMES: Mapping[str, Column] = {
+VARIABLES: Mapping[str, Column] = {
     "x": lambda splats: splats.means[:, 0],
     "y": lambda splats: splats.means[:, 1],
     "z": lambda splats: splats.means[:, 2],
@@ -72,7 +72,7 @@ class Expression:
         return found
 
 
-def parsed(text: str) -> Expression:
+def parse_expression(text: str) -> Expression:
     """Raises SplatError "edit-keep" for what is no condition in the names and signs above."""
     try:
         if len(text) > _LONGEST:
@@ -124,7 +124,7 @@ def _checked(node: ast.expr, depth: int = 0) -> type:
                 raise _RefusedError("it holds a number that is too large")
             return float
         case ast.Name(id=name):
-            if name in NAMES:
+            if name in VARIABLES:
                 return float
             raise _RefusedError(f"nothing is called {name!r}")
     raise _RefusedError(f"{ast.unparse(node)[:60]!r} is not understood")
@@ -138,7 +138,7 @@ def _value(node: Any, splats: Splats) -> Any:
         case ast.Constant(value=int() | float() as number):
             return float(number)
         case ast.Name(id=name):
-            return NAMES[name](splats).astype(np.float64)
+            return VARIABLES[name](splats).astype(np.float64)
         case ast.BoolOp(op=sign, values=values):
             together = np.logical_and if isinstance(sign, ast.And) else np.logical_or
             return functools.reduce(together, [_value(part, splats) for part in values])
@@ -163,7 +163,7 @@ def _wrong(text: str, why: str) -> SplatError:
     return SplatError(
         "edit-keep",
         given=f"--keep {text[:100]!r}: {why}.",
-        wanted=f"A condition on {', '.join(NAMES)}, with numbers, + - * /, < <= > >= == !=, "
+        wanted=f"A condition on {', '.join(VARIABLES)}, with numbers, + - * /, < <= > >= == !=, "
         "and, or, not.",
         hint="For example: --keep 'opacity > 0.1 and scale < 0.5'",
         family=Family.USAGE,

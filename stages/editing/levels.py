@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages import formats
-from stages.editing.decimate import FAR, decimated
+from stages.editing.decimate import FAR_ROUND_SHARE, decimate
 from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
@@ -18,7 +18,7 @@ def coarser_levels(splats: Splats) -> list[Splats]:
     """The levels of detail below `splats`, finest first. Every splat must be drawable."""
     levels = [splats]
     while len(levels[-1]) > _FEWEST:
-        levels.append(decimated(levels[-1], len(levels[-1]) // LEVEL_RATIO, FAR))
+        levels.append(decimate(levels[-1], len(levels[-1]) // LEVEL_RATIO, FAR_ROUND_SHARE))
     return levels[1:]
 
 

@@ -80,7 +80,7 @@ def areas_of(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.maximum(squares, 1e-120)))
 
 
-def merged(a: Moments, b: Moments) -> tuple[Moments, NDArray[np.float64]]:
+def merge(a: Moments, b: Moments) -> tuple[Moments, NDArray[np.float64]]:
     """(the pairs as one each, a's share of the mass [N]).
 
     What the two hide of each other is taken off the mass. A mass that would need an opacity above
@@ -101,7 +101,7 @@ def merged(a: Moments, b: Moments) -> tuple[Moments, NDArray[np.float64]]:
     return Moments(means, covariances, opacities, colours, areas_of(covariances)), share
 
 
-def costs(
+def merge_costs(
     a: Moments, b: Moments, weight_a: NDArray[np.float64], weight_b: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """[N] squared error that each pair as one brings, weights being what is seen of each (its mass,

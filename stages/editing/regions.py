@@ -40,20 +40,20 @@ class Region:
         return found
 
 
-def parsed(text: str) -> Region:
+def parse_region(text: str) -> Region:
     """Of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or `lasso:...`, as the page of
     `splat view` writes it. Raises SplatError "edit-region", "edit-hull-unreadable"."""
     kind, _, rest = text.partition(":")
-    if kind == "box" and (ends := numbers(rest, 6)) is not None:
+    if kind == "box" and (ends := parse_numbers(rest, 6)) is not None:
         low, high = ends[:3], ends[3:]
         if (low <= high).all():
             return Region(lambda at: np.asarray(((at >= low) & (at <= high)).all(axis=1)))
-    if kind == "sphere" and (ball := numbers(rest, 4)) is not None and ball[3] > 0:
+    if kind == "sphere" and (ball := parse_numbers(rest, 4)) is not None and ball[3] > 0:
         middle, radius = ball[:3], ball[3]
         return Region(lambda at: np.asarray(np.linalg.norm(at - middle, axis=1) <= radius))
     if kind == "hull" and rest:
         return Region(_inside_hull(Path(rest)))
-    if kind == "lasso" and (drawn := numbers(rest, rest.count(",") + 1)) is not None:
+    if kind == "lasso" and (drawn := parse_numbers(rest, rest.count(",") + 1)) is not None:
         view, corners = drawn[:_VIEW], drawn[_VIEW:]
         if len(corners) >= 6 and len(corners) % 2 == 0:
             return Region(_inside_lasso(view, corners.reshape(-1, 2)))
@@ -67,7 +67,7 @@ def parsed(text: str) -> Region:
     )
 
 
-def numbers(text: str, count: int) -> NDArray[np.float64] | None:
+def parse_numbers(text: str, count: int) -> NDArray[np.float64] | None:
     """[count] finite numbers between commas; None for anything else."""
     try:
         values = np.array([float(word) for word in text.split(",")])

@@ -87,9 +87,9 @@ def _of_line(line: str, where: str) -> ParsedOperation:
     return ParsedOperation(word, value)
 
 
-def as_text(operations: Iterable[ParsedOperation]) -> str:
+def format_operations(operations: Iterable[ParsedOperation]) -> str:
     """What `from_file` reads."""
-    return "".join(f"{typed.word} {typed.value}".rstrip() + "\n" for typed in operations)
+    return "".join(f"{parsed.word} {parsed.value}".rstrip() + "\n" for parsed in operations)
 
 
 def _wrong(given: str) -> SplatError:

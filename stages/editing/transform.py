@@ -35,7 +35,7 @@ class Similarity:
         turned = self.scale * self.rotation @ first.offset + self.offset
         return Similarity(self.scale * first.scale, self.rotation @ first.rotation, turned)
 
-    def of_camera(self, camera: Camera) -> Camera:
+    def apply_to_camera(self, camera: Camera) -> Camera:
         """A camera that sees of the scene there what `camera` sees here; z is scaled too."""
         rotation = camera.world_to_camera[:3, :3] @ self.rotation.T
         pose = np.eye(4)
@@ -46,7 +46,7 @@ class Similarity:
     def draw_settings(self, draw_settings: DrawSettings) -> DrawSettings:
         return replace(draw_settings, near=draw_settings.near * self.scale)
 
-    def of_splats(self, splats: Splats) -> Splats:
+    def apply_to_splats(self, splats: Splats) -> Splats:
         """The splats there. What is nowhere near the origin of their file is told from an origin
         beside it, so that positions keep their digits."""
         linear, kind = self.scale * self.rotation, splats.means.dtype
@@ -84,7 +84,7 @@ class Similarity:
         return recentred(there, np.zeros(3))[1]
 
 
-def about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+def rotation_about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
     """[3, 3] a turn about `axis`, by the right hand's rule."""
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -93,13 +93,13 @@ def about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
     return np.asarray(turned)
 
 
-def upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_to_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """[3, 3] the shortest turn that takes the direction `up` to where ours is, -y."""
     unit = up / np.linalg.norm(up)
     axis = np.cross(unit, _UP)
     if np.linalg.norm(axis) < 1e-12:
-        return np.eye(3) if unit @ _UP > 0 else about(np.array([1.0, 0, 0]), 180)
-    return about(axis, np.rad2deg(np.arctan2(np.linalg.norm(axis), unit @ _UP)))
+        return np.eye(3) if unit @ _UP > 0 else rotation_about(np.array([1.0, 0, 0]), 180)
+    return rotation_about(axis, np.rad2deg(np.arctan2(np.linalg.norm(axis), unit @ _UP)))
 
 
 def _product(q: NDArray[np.float64]) -> NDArray[np.float64]:
