@@ -70,16 +70,16 @@ def edit(
 
 def _opened(source: Path) -> EditedScene:
     """With the photographs of the run that it is of, or lies in. Raises SplatError."""
-    from stages.editing.operations import without_undrawable
     from stages.editing.scene import EditedScene
     from stages.formats import units_of
+    from stages.formats.values import drop_undrawable
     from stages.measure.evaluation import load_evaluation_views
     from stages.run.results import backend_of, pipeline_around, splats_of
     from stages.scene import split_held_out
 
     splats, pipeline = splats_of(source)
     pipeline = pipeline or pipeline_around(source)
-    splats = without_undrawable(splats)
+    splats = drop_undrawable(splats)[0]
     if pipeline is None or pipeline.manifest("sfm") is None:
         return EditedScene(splats, units_of(source))
     found = pipeline.load("sfm")
