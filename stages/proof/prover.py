@@ -126,7 +126,7 @@ class Prover:
             "worst_attribute": found.worst,
             "worst_splat": found.worst_row,
         }
-        fault = diagnosis.explained(self.splats, content, found)
+        fault = diagnosis.explain(self.splats, content, found)
         if not lossy and worst < _LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn

@@ -118,7 +118,7 @@ def test_the_order_of_the_rows_does_not_matter(
         (moved, "positions are wrong: all lie 7"),
         (shrunk, "the scene is 0.1 times as large"),
         (rolled, "rotations are wrong: they look like x, y, z, w taken for w, x, y, z"),
-        (interleaved, "colours are wrong: the coefficients look like red, green, blue in turn"),
+        (interleaved, "colours are wrong: the coefficients look like coefficient-major"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
@@ -145,7 +145,7 @@ def test_bytes_of_f_rest_in_the_wrong_order_are_seen(
         data["vertex"][name] = column
     data.write(tmp_path / "a.ply")
     proof = prover.prove(tmp_path / "a.ply")
-    assert "red, green, blue in turn, taken for all reds first" in proof.fault
+    assert "coefficient-major (RGB together), read as channel-major" in proof.fault
     assert proof.figures["verify_db"] < 45
 
 
