@@ -14,29 +14,34 @@ from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
 if TYPE_CHECKING:
-    from stages.measure.tradeoff.pair import Side
+    from stages.measure.tradeoff.comparison import Candidate
 
 
-def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
+def compare_runs(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
     """Judge both, write the report into `out`, print the verdict.
 
     Raises SplatError: stage-not-finished, run-half-anew, compare-other-photographs,
     compare-nothing-in-common, and what keeps files from being written."""
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.pair import default_name, pair, verdict
-    from stages.measure.tradeoff.pair_report import facts, write_pair
+    from stages.measure.tradeoff.comparison import (
+        compare_runs,
+        distinct_name,
+        fact_rows,
+        verdict_lines,
+        write_comparison,
+    )
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [
-        _side(run, default_name(run.run_folder, other.run_folder))
+        _side(run, distinct_name(run.run_folder, other.run_folder))
         for run, other in zip(runs, reversed(runs), strict=True)
     ]
     _check_photographs(*runs)
     if not quiet and not as_json and not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    pairing = pair(sides[0], sides[1])
+    pairing = compare_runs(sides[0], sides[1])
     make_folder(out)
-    files = write_pair(out, pairing)
+    files = write_comparison(out, pairing)
     if as_json:
         change = pairing.psnr
         console.emit(
@@ -49,8 +54,8 @@ def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) ->
         )
         return
     if not quiet:
-        console.table(("", sides[0].name, sides[1].name), facts(pairing))
-    for line in verdict(pairing):
+        console.table(("", sides[0].name, sides[1].name), fact_rows(pairing))
+    for line in verdict_lines(pairing):
         console.out.print(line, markup=False)
     console.out.print(str(files[0]), markup=False)
 
@@ -71,8 +76,8 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
         )
 
 
-def _side(run: Pipeline, name: str) -> Side:
-    from stages.measure.tradeoff.pair import Side
+def _side(run: Pipeline, name: str) -> Candidate:
+    from stages.measure.tradeoff.comparison import Candidate
 
     splats = results.finished_splats(run)
     told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
@@ -84,4 +89,4 @@ def _side(run: Pipeline, name: str) -> Side:
         told["seed"] = str(trained.settings["seed"])
     for ending, figures in results.exported_formats(run).items():
         told[f".{ending}"] = console.size(figures["size_bytes"])
-    return Side(name, splats, run.load("sfm"), results.backend_of(run), told)
+    return Candidate(name, splats, run.load("sfm"), results.backend_of(run), told)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from stages.base.atomic import replacing
 from stages.measure.evaluation import Score, image_renderer
-from stages.measure.tradeoff import pages
-from stages.measure.tradeoff.pair import Pairing, verdict
+from stages.measure.tradeoff import html
+from stages.measure.tradeoff.comparison import Pairing, verdict_lines
 
 
 def write_pair(folder: Path, pairing: Pairing) -> list[Path]:
@@ -20,21 +20,21 @@ def write_pair(folder: Path, pairing: Pairing) -> list[Path]:
         temporary.write_text(_table(pairing), encoding="utf-8")
     report = folder / "report.html"
     parts = [
-        pages.paragraphs(verdict(pairing)),
-        pages.heading("The runs"),
-        pages.table(("", a, b), facts(pairing)),
-        pages.heading("Photograph by photograph"),
-        pages.table(
+        html.paragraphs(verdict_lines(pairing)),
+        html.heading("The runs"),
+        html.table(("", a, b), facts(pairing)),
+        html.heading("Photograph by photograph"),
+        html.table(
             ("photograph", f"{a}, PSNR", f"{b}, PSNR", "change"),
             [
                 (one.name, f"{one.psnr_db:.2f} dB", f"{two.psnr_db:.2f} dB", _change(one, two))
                 for one, two in zip(*pairing.scores, strict=True)
             ],
         ),
-        pages.heading("Side by side"),
+        html.heading("Side by side"),
         *_pictures(pairing),
     ]
-    pages.write_page(report, f"{a} and {b}", parts)
+    html.write_page(report, f"{a} and {b}", parts)
     return [report, table]
 
 
@@ -69,5 +69,5 @@ def _pictures(pairing: Pairing) -> list[str]:
             pairing.sides, draw, (seen_a, seen_b), pairing.scores, strict=True
         ):
             shown.append((f"{side.name}, {found[i].psnr_db:.2f} dB", drawn(seen.camera)))
-        rows.append(pages.pictures(shown))
+        rows.append(html.pictures(shown))
     return rows

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.measure.plots import BLUE, GREY, ORANGE, new_plot, write_plot
+from stages.measure.tradeoff.curves import Point, Trade, knee
 from stages.measure.tradeoff.plan_view import plan_view
-from stages.measure.tradeoff.points import Point, Trade, knee
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

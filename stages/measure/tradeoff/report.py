@@ -11,39 +11,39 @@ import numpy as np
 
 from stages.base.atomic import replacing
 from stages.measure.evaluation import image_renderer
-from stages.measure.tradeoff import pages, thin_words, words
-from stages.measure.tradeoff.measuring import Material
+from stages.measure.tradeoff import html, summary, thin_words
+from stages.measure.tradeoff.curves import Point, Trade
+from stages.measure.tradeoff.measurement import TradeoffInputs
 from stages.measure.tradeoff.plots import write_plots
-from stages.measure.tradeoff.points import Point, Trade
 
 _COLUMNS = (
     *("curve", "label", "splats", "bytes", "wall_seconds", "cpu_seconds", "frame_seconds"),
     *("psnr_db", "change_db", "change_low_db", "change_high_db"),
 )
 _SECTIONS = {
-    "time": ("Time", words.about_time),
-    "formats": ("Bytes", words.about_formats),
-    "splats": ("Splats", words.about_splats),
-    "drawing": ("Drawing", words.about_drawing),
+    "time": ("Time", summary.about_time),
+    "formats": ("Bytes", summary.about_formats),
+    "splats": ("Splats", summary.about_splats),
+    "drawing": ("Drawing", summary.about_drawing),
     "coverage": ("Coverage", thin_words.about_coverage),
     "framing": ("Framing", thin_words.about_framing),
-    "photographs": ("Photographs", words.about_photographs),
+    "photographs": ("Photographs", summary.about_photographs),
 }
 
 
-def sentences(trade: Trade) -> dict[str, list[str]]:
+def summarise(trade: Trade) -> dict[str, list[str]]:
     """What the report says, by section."""
     return {title: say(trade) for title, say in _SECTIONS.values()}
 
 
-def write_report(folder: Path, name: str, trade: Trade, material: Material) -> list[Path]:
+def write_report(folder: Path, name: str, trade: Trade, material: TradeoffInputs) -> list[Path]:
     """Everything into `folder`, which is there; name: the run's. The files. Raises SplatError."""
     plots = {path.stem: path for path in write_plots(folder, trade)}
     table = folder / "tradeoff.csv"
     with replacing(table) as temporary:
         temporary.write_text(_table(trade), encoding="utf-8")
     parts = [
-        pages.paragraphs(
+        html.paragraphs(
             [
                 f"Quality is PSNR of {len(trade.scores)} photographs that training never saw, "
                 f"drawn {trade.side_px} pixels large. Intervals (95 %) are of the difference to "
@@ -53,16 +53,16 @@ def write_report(folder: Path, name: str, trade: Trade, material: Material) -> l
         )
     ]
     for stem, (title, say) in _SECTIONS.items():
-        parts += [pages.heading(title), pages.paragraphs(say(trade))]
+        parts += [html.heading(title), html.paragraphs(say(trade))]
         if stem in plots:
-            parts.append(pages.png(plots[stem], f"Plot: {title}"))
+            parts.append(html.png(plots[stem], f"Plot: {title}"))
         if stem == "formats":
             parts.append(_formats_table(trade))
         if stem == "framing":
             parts.append(_framings(trade))
     parts += [_photographs_table(trade), _worst(trade, material)]
     report = folder / "report.html"
-    pages.write_page(report, f"The trade of {name}", parts)
+    html.write_page(report, f"The trade of {name}", parts)
     return [report, table, *plots.values()]
 
 
@@ -99,7 +99,7 @@ def _formats_table(trade: Trade) -> str:
         )
         for point in trade.formats
     ]
-    return pages.table(("format", "size", "held-out PSNR", "change"), rows)
+    return html.table(("format", "size", "held-out PSNR", "change"), rows)
 
 
 def _photographs_table(trade: Trade) -> str:
@@ -107,7 +107,7 @@ def _photographs_table(trade: Trade) -> str:
         (f"{number}  {score.name}", f"{score.psnr_db:.2f} dB", f"{score.ssim:.3f}")
         for number, score in enumerate(trade.scores, 1)
     ]
-    return pages.table(("photograph", "PSNR", "SSIM"), rows)
+    return html.table(("photograph", "PSNR", "SSIM"), rows)
 
 
 def _framings(trade: Trade) -> str:
@@ -116,18 +116,18 @@ def _framings(trade: Trade) -> str:
         (f"{framing.label}: shimmer {framing.shimmer:.1f} of 255", framing.image)
         for framing in trade.thin.framings
     ]
-    return "".join(pages.pictures(shown[i : i + 3]) for i in range(0, len(shown), 3))
+    return "".join(html.pictures(shown[i : i + 3]) for i in range(0, len(shown), 3))
 
 
-def _worst(trade: Trade, material: Material) -> str:
+def _worst(trade: Trade, material: TradeoffInputs) -> str:
     """The worst photograph, what is drawn of it, and what lies between."""
     photograph = next(p for p in material.held_out if p.name == trade.worst.name)
     drawn = image_renderer(material.splats, material.backend)(photograph.camera)
     drawn, truth = np.clip(drawn, 0.0, 1.0), photograph.image
-    return pages.pictures(
+    return html.pictures(
         (
             (f"{photograph.name}: the photograph", truth),
             (f"drawn, {trade.worst.psnr_db:.2f} dB", drawn),
-            (f"error x {pages.ERROR_GAIN:g}", pages.error_of(drawn, truth)),
+            (f"error x {html.ERROR_GAIN:g}", html.error_of(drawn, truth)),
         )
     )

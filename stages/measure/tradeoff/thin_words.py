@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stages.base.text import counted
 from stages.measure.coverage import FEW_PHOTOGRAPHS, SMALL_ANGLE_DEG, Around, Gap, Place
-from stages.measure.tradeoff.points import Trade
+from stages.measure.tradeoff.curves import Trade
 from stages.measure.tradeoff.thin import Thin
 
 _OVERHEAD_DEG, _DOWN_DEG = 65.0, 25.0

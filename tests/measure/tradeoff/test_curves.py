@@ -5,8 +5,8 @@ import pytest
 
 from stages.measure.bootstrap import paired_difference
 from stages.measure.coverage import Patches
-from stages.measure.tradeoff import words
-from stages.measure.tradeoff.points import Moment, Point, Trade, knee, time_to
+from stages.measure.tradeoff import summary
+from stages.measure.tradeoff.curves import Moment, Point, Trade, knee, time_to
 from stages.measure.tradeoff.thin import Thin
 
 
@@ -46,15 +46,15 @@ def test_a_curve_that_pays_more_and_more_has_no_knee():
 
 def test_a_loss_is_told_as_a_cost_and_its_interval_the_same_way_round():
     change = paired_difference(np.array([-0.2, -0.22, -0.18, -0.2, -0.21, -0.19]))
-    told = words.costs(change)
+    told = summary.costs(change)
     assert told.startswith("costs 0.20 dB (95 %: 0.1")
     low, high = (float(x) for x in told.split("%: ")[1].rstrip(")").split(" to "))
     assert low < 0.2 < high
 
 
 def test_one_photograph_makes_no_interval():
-    assert words.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (one judge)"
-    assert words.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one judge)"
+    assert summary.costs(paired_difference(np.array([-0.2]))) == "costs 0.20 dB (one judge)"
+    assert summary.costs(paired_difference(np.array([0.2]))) == "gains 0.20 dB (one judge)"
 
 
 def nowhere() -> Thin:
@@ -68,4 +68,4 @@ def nowhere() -> Thin:
 def test_a_run_without_a_log_says_so(logged):
     own = Point("as it is", 100, 20.0, paired_difference(np.zeros(3)))
     trade = Trade(own, tuple(moments(20.0)[:logged]), (), (own,), (), 480, nowhere())
-    assert words.about_time(trade) == [words.NO_TIMES]
+    assert summary.about_time(trade) == [summary.NO_TIMES]

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from stages.measure.evaluation import EvaluationView
-from stages.measure.tradeoff.points import Trade
+from stages.measure.tradeoff.curves import Trade
 from stages.measure.tradeoff.thin import Thin, measure_thin
 from stages.measure.tradeoff.thin_words import about_coverage, about_framing
 from stages.scene import DrawSettings, View

@@ -16,7 +16,7 @@ from stages.formats.values import drop_undrawable
 from stages.measure.contribution import Contributions, floaters, measure_contributions
 from stages.measure.evaluation import EvaluationView, Score, evaluate, image_renderer
 from stages.measure.speed import seconds_per_frame
-from stages.measure.tradeoff.points import Moment, Point, Trade, change_db, mean_db
+from stages.measure.tradeoff.curves import Moment, Point, Trade, change_db, mean_db
 from stages.measure.tradeoff.thin import Thin, measure_thin
 from stages.scene import DrawSettings, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 
@@ -32,7 +32,7 @@ Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Material:
+class TradeoffInputs:
     """What is measured. splats: the run's last, in the frame of its cameras. training, held_out:
     photographs that decide, and that judge. levelled: whether up is -Y. history: as training logged
     it. exported: formats. quantised: what was decided on for files; None where nothing was. fitted:
@@ -51,7 +51,7 @@ class Material:
     fitted: Mapping[str, Splats] = field(default_factory=dict)
 
 
-def measure_trade(material: Material, tell: Tell) -> Trade:
+def measure_tradeoff(material: TradeoffInputs, tell: Tell) -> Trade:
     """All of it; photographs that judge decide nothing. Raises SplatError, as writers do."""
     splats = drop_undrawable(material.splats)[0]
     material = replace(material, splats=splats)
@@ -72,12 +72,12 @@ def measure_trade(material: Material, tell: Tell) -> Trade:
     )
 
 
-def _scores(material: Material, splats: Splats) -> list[Score]:
+def _scores(material: TradeoffInputs, splats: Splats) -> list[Score]:
     return evaluate(image_renderer(splats, material.backend), material.held_out)
 
 
 def _point(
-    material: Material, label: str, splats: Splats, found: list[Score], own: list[Score]
+    material: TradeoffInputs, label: str, splats: Splats, found: list[Score], own: list[Score]
 ) -> Point:
     cameras = [photograph.camera for photograph in material.held_out[:TIMED_FRAMES]]
     seconds = float(np.median(seconds_per_frame(splats, cameras, material.backend)))
@@ -93,7 +93,7 @@ def _moments(history: Sequence[dict[str, Any]]) -> tuple[Moment, ...]:
     )
 
 
-def _formats(material: Material, own: list[Score], tell: Tell) -> tuple[Point, ...]:
+def _formats(material: TradeoffInputs, own: list[Score], tell: Tell) -> tuple[Point, ...]:
     """The splats written as export does, read back and judged, in every format, smallest first."""
     splats, points = material.splats, []
     with tempfile.TemporaryDirectory() as folder:
@@ -121,7 +121,7 @@ def _same(a: Splats, b: Splats) -> bool:
     )
 
 
-def _thin(material: Material, worth: Contributions, tell: Tell) -> Thin:
+def _thin(material: TradeoffInputs, worth: Contributions, tell: Tell) -> Thin:
     tell("looking where the capture is thin")
     cameras = [photograph.camera for photograph in material.training]
     return measure_thin(
@@ -134,7 +134,9 @@ def _thin(material: Material, worth: Contributions, tell: Tell) -> Thin:
     )
 
 
-def _fewer(material: Material, own: list[Score], worth: Contributions, tell: Tell) -> list[Point]:
+def _fewer(
+    material: TradeoffInputs, own: list[Score], worth: Contributions, tell: Tell
+) -> list[Point]:
     """Fewer and fewer splats: first goes what changes the training pictures least. worth: of
     all."""
     splats, points = material.splats, []
@@ -150,7 +152,7 @@ def _fewer(material: Material, own: list[Score], worth: Contributions, tell: Tel
     return points
 
 
-def deciding(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
+def deciding_views(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
     """Those photographs of training that decide, at the size that they are judged at."""
     if not views:
         return []

@@ -18,19 +18,19 @@ from stages.measure.evaluation import (
     image_renderer,
     load_evaluation_views,
 )
-from stages.measure.tradeoff.points import change_db
+from stages.measure.tradeoff.curves import change_db
 from stages.scene import Reconstruction, Splats, View, split_held_out
 
 
 @dataclass(frozen=True)
-class Side:
+class Candidate:
     """One of the two runs. facts: what else is worth a line, by name, in words."""
 
     name: str
     splats: Splats
     reconstruction: Reconstruction
     backend: str
-    facts: dict[str, str]
+    fact_rows: dict[str, str]
 
     @property
     def held_out(self) -> dict[str, View]:
@@ -49,7 +49,7 @@ class Pairing:
     """scores of both, photograph by photograph. psnr, ssim: of the second less the first.
     side_px: longer side of every picture."""
 
-    sides: tuple[Side, Side]
+    sides: tuple[Candidate, Candidate]
     photographs: tuple[tuple[EvaluationView, ...], tuple[EvaluationView, ...]]
     scores: tuple[tuple[Score, ...], tuple[Score, ...]]
     psnr: Difference
@@ -57,7 +57,7 @@ class Pairing:
     side_px: int
 
 
-def pair(first: Side, second: Side) -> Pairing:
+def compare_runs(first: Candidate, second: Candidate) -> Pairing:
     """Judge both on the photographs that neither learnt from, at the smaller size of the two.
 
     Each photograph is seen as its own run undistorted and placed it. Raises SplatError
@@ -89,12 +89,12 @@ def pair(first: Side, second: Side) -> Pairing:
     )
 
 
-def _side(one: Side, name: str) -> int:
+def _side(one: Candidate, name: str) -> int:
     camera = one.splats.draw_settings.camera(one.held_out[name].camera)
     return max(camera.width, camera.height)
 
 
-def verdict(pairing: Pairing) -> list[str]:
+def verdict_lines(pairing: Pairing) -> list[str]:
     """What may be said of the two."""
     change, (a, b) = pairing.psnr, pairing.sides
     interval, ssim = (
@@ -110,7 +110,7 @@ def verdict(pairing: Pairing) -> list[str]:
     ]
 
 
-def default_name(folder: Path, other: Path) -> str:
+def distinct_name(folder: Path, other: Path) -> str:
     """A run folder's own name, with its parent's where the other is called the same."""
     here, there = folder.absolute(), other.absolute()
     return here.name if here.name != there.name else f"{here.parent.name}/{here.name}"

@@ -13,10 +13,19 @@ from stages.base.errors import SplatError
 from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.measure.evaluation import load_evaluation_views
-from stages.measure.tradeoff import words
-from stages.measure.tradeoff.measuring import SHARES, Material, deciding, measure_trade
-from stages.measure.tradeoff.pair import Side, pair, verdict
-from stages.measure.tradeoff.pair_report import write_pair
+from stages.measure.tradeoff import summary
+from stages.measure.tradeoff.comparison import (
+    Candidate,
+    compare_runs,
+    verdict_lines,
+    write_comparison,
+)
+from stages.measure.tradeoff.measurement import (
+    SHARES,
+    TradeoffInputs,
+    deciding_views,
+    measure_tradeoff,
+)
 from stages.measure.tradeoff.report import write_report
 from stages.scene import Camera, DrawSettings, QuantisedSplats, View, evenly_spaced, split_held_out
 from tests.small_scene import small_scene
@@ -41,14 +50,14 @@ def material(scene):
         for views in split_held_out(reconstruction.views)
     )
     splats = replace(scene.splats, draw_settings=draw_settings)
-    return Material(
+    return TradeoffInputs(
         splats, training, held, reconstruction.views, "metres", "cpu", True, COURSE, ("ply", "spz")
     )
 
 
 @pytest.fixture(scope="module")
 def trade(material):
-    return measure_trade(material, lambda label: None)
+    return measure_tradeoff(material, lambda label: None)
 
 
 def test_every_format_is_really_written_and_judged(trade) -> None:
@@ -65,7 +74,7 @@ def test_formats_are_told_in_as_many_bits_as_the_run_decided_on(material, tmp_pa
     bits = {"position": 11, "rotation": 4, "scale": 4, "colour": 4, "opacity": 4, "palette": 5}
     decided = QuantisedSplats(material.splats, 2, {"bits": bits})
     found = [
-        next(p for p in measure_trade(m, lambda label: None).formats if p.label == ".sog")
+        next(p for p in measure_tradeoff(m, lambda label: None).formats if p.label == ".sog")
         for m in (material, replace(material, quantised=decided))
     ]
     assert (found[1].size_bytes or 0) < 0.9 * (found[0].size_bytes or 0)
@@ -81,7 +90,7 @@ def test_splats_go_by_their_worth_to_photographs_that_do_not_judge(trade, materi
         replace(p, pixels=noise.integers(0, 256, p.pixels.shape, np.uint8))
         for p in material.held_out
     ]
-    other = measure_trade(replace(material, held_out=judges), lambda label: None)
+    other = measure_tradeoff(replace(material, held_out=judges), lambda label: None)
     assert [p.splats for p in other.counts] == [p.splats for p in trade.counts]
     assert other.own.psnr_db < 12
 
@@ -104,7 +113,7 @@ def test_the_report_is_one_file_that_needs_no_other(trade, material, tmp_path) -
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
     assert "<script" not in text
     assert "The trade of &lt;scene&gt;" in text
-    assert words.NOT_FINE_TUNED in text
+    assert summary.NOT_FINE_TUNED in text
     assert trade.worst.name in text
     assert text.count("shimmer") > len(trade.thin.framings)
     assert "<h2>Coverage</h2>" in text
@@ -146,28 +155,28 @@ def test_plots_have_axes_with_units_and_legends(trade, material, tmp_path, monke
 
 
 def test_a_run_without_a_log_gets_the_other_curves(material, tmp_path) -> None:
-    trade = measure_trade(replace(material, history=()), lambda label: None)
+    trade = measure_tradeoff(replace(material, history=()), lambda label: None)
     files = write_report(tmp_path, "scene", trade, material)
     assert "time.png" not in {file.name for file in files}
-    assert words.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert summary.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_single_judge_makes_no_interval_and_no_fuss(scene, material, tmp_path) -> None:
-    trade = measure_trade(replace(material, held_out=material.held_out[:1]), lambda label: None)
+    trade = measure_tradeoff(replace(material, held_out=material.held_out[:1]), lambda label: None)
     write_report(tmp_path, "scene", trade, material)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "one judge" in text
     assert "inf" not in re.sub(r"<[^>]*>", " ", text)
     few = replace(scene.reconstruction, views=scene.reconstruction.views[:5])
     both = [replace(side(scene, name), reconstruction=few) for name in "ab"]
-    told = verdict(pair(*both))
+    told = verdict_lines(compare_runs(*both))
     assert told[0] == "b against a: +0.00 dB (one judge): not told apart."
     assert "1 held-out photograph," in told[-1]
 
 
-def side(scene, name: str, splats=None) -> Side:
+def side(scene, name: str, splats=None) -> Candidate:
     draw_settings = DrawSettings(near=0.01, side=72)
-    return Side(
+    return Candidate(
         name,
         replace(splats or scene.splats, draw_settings=draw_settings),
         scene.reconstruction,
@@ -177,15 +186,15 @@ def side(scene, name: str, splats=None) -> Side:
 
 
 def test_a_run_is_not_told_apart_from_itself(scene) -> None:
-    found = pair(side(scene, "a"), side(scene, "b"))
+    found = compare_runs(side(scene, "a"), side(scene, "b"))
     assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
-    assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): not told apart." in verdict(found)
+    assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): not told apart." in verdict_lines(found)
 
 
 def test_a_worse_run_is_told_as_worse_and_the_other_way_round_as_better(scene) -> None:
     fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
-    assert pair(side(scene, "all"), fewer).psnr.verdict == WORSE
-    assert pair(fewer, side(scene, "all")).psnr.verdict == BETTER
+    assert compare_runs(side(scene, "all"), fewer).psnr.verdict == WORSE
+    assert compare_runs(fewer, side(scene, "all")).psnr.verdict == BETTER
 
 
 def test_both_are_judged_at_the_smaller_size(scene) -> None:
@@ -193,7 +202,7 @@ def test_both_are_judged_at_the_smaller_size(scene) -> None:
     small = replace(
         small, splats=replace(small.splats, draw_settings=DrawSettings(near=0.01, side=40))
     )
-    found = pair(side(scene, "large"), small)
+    found = compare_runs(side(scene, "large"), small)
     assert found.side_px == 40
     assert {max(p.pixels.shape[:2]) for seen in found.photographs for p in seen} == {40}
 
@@ -202,13 +211,13 @@ def test_a_photograph_that_one_has_learnt_from_judges_neither(scene) -> None:
     views = scene.reconstruction.views[1:]
     shifted = replace(scene.reconstruction, views=views)
     with pytest.raises(SplatError) as error:
-        pair(side(scene, "a"), replace(side(scene, "b"), reconstruction=shifted))
+        compare_runs(side(scene, "a"), replace(side(scene, "b"), reconstruction=shifted))
     assert error.value.code == "compare-nothing-in-common"
 
 
 def test_the_comparison_shows_every_judge_three_times(scene, tmp_path) -> None:
-    found = pair(side(scene, "a"), side(scene, "b"))
-    report, table = write_pair(tmp_path, found)
+    found = compare_runs(side(scene, "a"), side(scene, "b"))
+    report, table = write_comparison(tmp_path, found)
     text = report.read_text(encoding="utf-8")
     assert text.count("<img") == 3 * found.psnr.photographs
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
@@ -222,10 +231,11 @@ def test_few_are_taken_from_all_over() -> None:
 
 def test_all_photographs_decide_where_time_allows() -> None:
     views = [View(str(i), "", camera(800, 600)) for i in range(60)]
-    assert len(deciding(views, DrawSettings(side=480))) == 60
-    assert len(deciding(views, DrawSettings(side=800))) == 50
+    assert len(deciding_views(views, DrawSettings(side=480))) == 60
+    assert len(deciding_views(views, DrawSettings(side=800))) == 50
     assert (
-        len(deciding([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings())) == 24
+        len(deciding_views([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings()))
+        == 24
     )
 
 

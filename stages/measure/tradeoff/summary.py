@@ -6,7 +6,7 @@ import math
 
 from stages.base.text import counted
 from stages.measure.bootstrap import Difference
-from stages.measure.tradeoff.points import Moment, Point, Trade, knee, time_to
+from stages.measure.tradeoff.curves import Moment, Point, Trade, knee, time_to
 
 CHEAP_DB = 0.1  # a loss that few would see
 NO_TIMES = "Training kept no times (an older splat trained this run): `splat train` again has them."
