@@ -15,8 +15,8 @@ from stages.run.pipeline import Pipeline, Step
 _HEADLINES = {
     "ingest": ("photographs", "left_out"),
     "sfm": (
-        *("registered", "photographs", "points", "mean_reprojection_error_px"),
-        *("pairs_looked_at", "pairs_matched", "pairs_verified"),
+        *("registered_images", "photographs", "points", "mean_reprojection_error_px"),
+        *("pairs_compared", "pairs_matched", "pairs_verified"),
         *("features_seconds", "matching_seconds", "mapping_seconds"),
     ),
     "seed": ("splats",),

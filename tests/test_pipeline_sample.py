@@ -34,7 +34,7 @@ def metrics(result: dict[str, Any], stage: str) -> dict[str, Any]:
 
 
 def test_every_photograph_is_registered(result: dict[str, Any]) -> None:
-    assert metrics(result, "sfm")["registered"] == PHOTO_COUNT
+    assert metrics(result, "sfm")["registered_images"] == PHOTO_COUNT
     assert metrics(result, "sfm")["mean_reprojection_error_px"] < 1.0
 
 

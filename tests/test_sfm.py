@@ -239,7 +239,7 @@ def test_a_plausible_model_that_is_wrong_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        fallbacks, "LADDER", (fallbacks.CONFIGURATIONS[0], fallbacks.CONFIGURATIONS[-1])
+        fallbacks, "CONFIGURATIONS", (fallbacks.CONFIGURATIONS[0], fallbacks.CONFIGURATIONS[-1])
     )
     error = failure(make(tmp_path / "in")[0], tmp_path, max_features=1500)
     assert error.code == code
@@ -275,7 +275,7 @@ def test_two_scenes_are_told_apart_and_one_may_be_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        fallbacks, "LADDER", fallbacks.CONFIGURATIONS[:1]
+        fallbacks, "CONFIGURATIONS", fallbacks.CONFIGURATIONS[:1]
     )  # the others take minutes
     capture = bad_captures.two_scenes(tmp_path / "in", each=6)
     assert failure(capture, tmp_path, max_features=1500).code == "sfm-separate-groups"

@@ -4,16 +4,17 @@
 them so. The axes and encodings of a format stay inside its module.
 
 To add a format, in six steps:
-1. Write `write(path, splats, *, units)` in a module here. It writes what `rows.kept_rows` leaves
-   through `base.atomic.replacing`, one block of `base.blocks.passing` at a time, and returns how
+1. Write `write(path, splats, *, units)` in a module here. It writes what `values.drop_undrawable`
+   leaves
+   through `base.atomic.replacing`, one block of `base.blocks.reported_blocks` at a time, and returns how
    many splats it left out.
 2. Write `read(path)` in the same module, or in one beside it. It works inside
-   `base.bad_files.reading` and returns its result through `rows.checked`.
+   `base.bad_files.reading` and returns its result through `values.check_finite`.
 3. Add a row to `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the
    fuzzer and the tests of all formats are driven by this table.
 4. Write an independent reader (of a library, or of raw bytes) and a byte breakdown in
    `stages.proof`, and add their row to `stages.proof.checks.CHECKS`.
-5. Add the line to README's table that `pytest tests/formats/test_table.py` prints.
+5. Run `python -m tests.docs_tables`, which writes the tables of the documentation.
 6. Run `pytest tests/formats tests/proof tests/fuzz`.
 """
 

@@ -1,9 +1,8 @@
-"""The table of formats says what is true of the files, and README's table is made of it."""
+"""The table of formats says what is true of the files, and nothing else."""
 
 from __future__ import annotations
 
 import inspect
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -18,27 +17,8 @@ from stages.surface.table import MESHES, MeshFormat
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
-README = Path(__file__).parents[2] / "README.md"
 PLACES = ("writer", "reader", "independent_reader", "order", "quantiser")
 ROWS: list[Format | MeshFormat] = [*BY_ENDING.values(), *MESHES.values()]
-
-
-def readme_lines() -> list[str]:
-    """The lines of README's table, formats that say the same of themselves on one."""
-    lines = []
-    for (opens_in, keeps, y_up), rows in itertools.groupby(
-        ROWS, lambda row: (row.opens_in, row.keeps, row.y_up)
-    ):
-        names = ", ".join(f"`{row.ending}`" for row in rows)
-        lines.append(f"| {names} | {opens_in} | {keeps}{'; y up' if y_up else ''} |")
-    return lines
-
-
-def test_readmes_table_is_made_of_the_rows() -> None:
-    lines = README.read_text(encoding="utf-8").splitlines()
-    start = lines.index("| `--format` | opens in | keeps |") + 2
-    found = list(itertools.takewhile(str.strip, lines[start:]))
-    assert found == readme_lines(), "README's table should be:\n" + "\n".join(readme_lines())
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.ending)

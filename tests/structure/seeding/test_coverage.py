@@ -179,7 +179,7 @@ def test_held_out_photographs_lend_nothing(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         report = Report()
         made.append(seed.run({"sfm": reconstruction}, seed.SeedSettings(), tmp_path / name, report))
-        assert len(made[-1]) == len(points) + report.metrics["filled"]
+        assert len(made[-1]) == len(points) + report.metrics["filled_cells"]
         (tmp_path / reconstruction.views[0].image).unlink(missing_ok=True)
     assert made[0].means.tobytes() == made[1].means.tobytes()
     bare = seed.run(
