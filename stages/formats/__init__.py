@@ -5,9 +5,8 @@ them so. The axes and encodings of a format stay inside its module.
 
 To add a format, in six steps:
 1. Write `write(path, splats, *, units)` in a module here. It writes what `values.drop_undrawable`
-   leaves
-   through `base.atomic.replacing`, one block of `base.blocks.reported_blocks` at a time, and returns how
-   many splats it left out.
+   leaves through `base.atomic.replacing`, one block of `base.blocks.reported_blocks` at a time, and
+   returns how many splats it left out.
 2. Write `read(path)` in the same module, or in one beside it. It works inside
    `base.bad_files.reading` and returns its result through `values.check_finite`.
 3. Add a row to `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the

@@ -115,7 +115,7 @@ def test_the_order_of_the_rows_does_not_matter(
     [
         (mirrored, "positions are wrong: its x, y, z look like -x, y, z"),
         (turned_about_x, "positions are wrong: its x, y, z look like x, -y, -z"),
-        (moved, "positions are wrong: all lie 7"),
+        (moved, "positions are wrong: all are moved by 7"),
         (shrunk, "the scene is 0.1 times as large"),
         (rolled, "rotations are wrong: they look like x, y, z, w taken for w, x, y, z"),
         (interleaved, "colours are wrong: the coefficients look like coefficient-major"),
