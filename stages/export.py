@@ -192,7 +192,7 @@ def _fitting(
     tuner = FineTuner(photographs, training_extent(reconstruction), backend, report, dropout)
     seen = np.zeros(len(splats), np.int32)
     if dropout:  # only then it matters
-        seen = measure_contributions(splats, photographs, backend).photographs
+        seen = measure_contributions(splats, photographs, backend).view_counts
     deciding = load_evaluation_views(
         folder, evenly_spaced(training, DECIDING), splats.draw_settings
     )

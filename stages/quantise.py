@@ -77,7 +77,7 @@ def run(
     from stages.capacity.bits import choose_bits
     from stages.formats import FORMATS, splat32
     from stages.formats.quantisation import splats_to_write
-    from stages.measure.flat import flat_dc
+    from stages.measure.sh import view_averaged_dc
     from stages.scene import QuantisedSplats, save_splats, split_held_out
 
     splats: Splats = inputs["prune"]
@@ -95,7 +95,7 @@ def run(
     flat = None
     if kept.sh_degree:
         views = split_held_out(inputs["sfm"].views)[0]
-        flat = flat_dc(
+        flat = view_averaged_dc(
             kept,
             (kept.draw_settings.camera(v.camera) for v in views),
             backend_of_settings(settings),
@@ -145,15 +145,15 @@ def _cut_each(
     """(splats with each one's negligible bands cut, the threshold that passed)."""
     import numpy as np
 
-    from stages.measure.sh import cut, degrees_at
+    from stages.measure.sh import sufficient_degrees, truncate_sh
 
     if kept.sh_degree == 0:
         return kept, 0.0
     for steps in _THRESHOLDS_OF_255:
-        degrees = degrees_at(kept, steps / 255)
+        degrees = sufficient_degrees(kept, steps / 255)
         if np.array_equal(degrees, kept.sh_degrees):
             continue
-        candidate = cut(kept, degrees)
+        candidate = truncate_sh(kept, degrees)
         if raw_db - decider.psnr(candidate) < settings.max_loss_db:
             return candidate, steps
     return kept, 0.0

@@ -1,4 +1,4 @@
-"""No pixel of a held-out view reaches the asset; a near-duplicate photograph is never held out.
+"""No pixel of a held-out view reaches the asset, and a photograph with a duplicate is not held out.
 
 Structure from motion is before all this: it has to place the judges too, and sees all photographs.
 """

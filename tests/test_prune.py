@@ -11,8 +11,9 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.capacity import pruning
 from stages.capacity.targets import FELT
-from stages.measure.contribution import Contributions, floaters, near_view_frusta
+from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
+from stages.measure.floaters import near_camera_floaters
 from stages.scene import Splats, TrainedSplats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
@@ -241,12 +242,18 @@ def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
     """One camera at the origin that sees its scene 4 away: close is nearer than 1."""
     scene = splats([[0, 0, 0.9], [0, 0, 1.1], [0, 0, 0.9], [0, 0.9, 0.0], [0, 0, 0.5]])
     worth = worth_of([1, 1, 3, 2, 0], [1.0] * 5)
-    assert floaters(scene, worth, [camera()]).tolist() == [True, False, False, True, True]
+    assert near_camera_floaters(scene, worth, [camera()]).tolist() == [
+        True,
+        False,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:
     worth = worth_of([1], [1.0], scene_depth=[np.inf])
-    assert not floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
+    assert not near_camera_floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
 
 
 def test_beside_a_picture_is_a_quarter_of_its_longer_side_beyond_the_rim() -> None:

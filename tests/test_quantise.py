@@ -13,7 +13,7 @@ import pytest
 from stages import quantise
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.measure.sh import cut, degrees_at, tail_rms
+from stages.measure.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.quantise import QuantiseSettings
 from stages.scene import QuantisedSplats, dc_to_rgb
 from tests.formats.truth import colour, many_splats
@@ -134,7 +134,7 @@ def test_a_damaged_decision_is_an_error_of_the_run_folder(
     assert caught.value.family == Family.RUN_FOLDER
 
 
-def test_tail_rms_is_what_colours_lose_over_all_directions() -> None:
+def test_truncation_rms_is_what_colours_lose_over_all_directions() -> None:
     splats = many_splats(4)
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(20000, 3))
@@ -145,16 +145,16 @@ def test_tail_rms_is_what_colours_lose_over_all_directions() -> None:
         channel = np.square(tail).max(axis=1)  # the bound takes the worst channel of each term
         seen = np.array([colour(tail, d) - 0.5 for d in directions[:4000]])
         measured = np.sqrt(np.mean(seen**2, axis=0)).max()
-        told = tail_rms(splats)[3, degree - 1]
+        told = truncation_rms(splats)[3, degree - 1]
         assert told == pytest.approx(np.sqrt(channel.sum() / (4 * np.pi)), rel=1e-6)
         assert 0.97 * measured <= told <= 2.0 * measured
 
 
-def test_cutting_takes_whole_bands_and_no_others() -> None:
+def test_truncation_drops_whole_degrees_and_no_others() -> None:
     splats = many_splats()
-    degrees = degrees_at(splats, 0.1)
+    degrees = sufficient_degrees(splats, 0.1)
     assert (degrees <= splats.sh_degrees).all()
-    after = cut(splats, degrees)
+    after = truncate_sh(splats, degrees)
     for i in range(0, len(splats), 7):
         kept = (int(degrees[i]) + 1) ** 2
         np.testing.assert_array_equal(after.sh[i, :kept], splats.sh[i, :kept])

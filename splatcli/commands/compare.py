@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console
+from splatcli import console, sources
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
-from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
@@ -17,19 +16,15 @@ if TYPE_CHECKING:
     from stages.measure.tradeoff.comparison import Candidate
 
 
-def compare_runs(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
+def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
     """Judge both, write the report into `out`, print the verdict.
 
     Raises SplatError: stage-not-finished, run-half-anew, compare-other-photographs,
     compare-nothing-in-common, and what keeps files from being written."""
+    from stages.measure.tradeoff.pair_report import fact_rows, write_comparison
+
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.comparison import (
-        compare_runs,
-        distinct_name,
-        fact_rows,
-        verdict_lines,
-        write_comparison,
-    )
+    from stages.measure.tradeoff.comparison import compare_runs, distinct_name, verdict_lines
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [
@@ -48,8 +43,8 @@ def compare_runs(first: Path, second: Path, out: Path, quiet: bool, as_json: boo
             "compared",
             verdict=change.verdict,
             psnr_change_db=change.mean,
-            interval_db=[change.low, change.high] if change.photographs > 1 else None,
-            photographs=change.photographs,
+            interval_db=[change.low, change.high] if change.views > 1 else None,
+            photographs=change.views,
             files=[str(file) for file in files],
         )
         return
@@ -79,7 +74,7 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 def _side(run: Pipeline, name: str) -> Candidate:
     from stages.measure.tradeoff.comparison import Candidate
 
-    splats = results.finished_splats(run)
+    splats = sources.finished_splats(run)
     told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
     trained = run.manifest("train")
     if trained is not None:
@@ -87,6 +82,6 @@ def _side(run: Pipeline, name: str) -> Candidate:
         steps = trained.metrics.get("steps", trained.settings["steps"])
         told["steps"] = f"{steps:,}"
         told["seed"] = str(trained.settings["seed"])
-    for ending, figures in results.exported_formats(run).items():
+    for ending, figures in sources.exported_formats(run).items():
         told[f".{ending}"] = console.size(figures["size_bytes"])
-    return Candidate(name, splats, run.load("sfm"), results.backend_of(run), told)
+    return Candidate(name, splats, run.load("sfm"), sources.backend_of(run), told)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatcli import console
+from splatcli.sources import backend_of, newest_with_splats, pipeline_around, splats_of
+from splatcli.viewpoints import views_of
 from stages.raster.backends import backend_of as chosen_backend
 from stages.raster.kernels import cache
 from stages.run.pipeline import Pipeline
-from stages.run.results import backend_of, newest_with_splats, pipeline_around, splats_of
-from stages.viewer.render_cameras import views_of
 
 if TYPE_CHECKING:
     from stages.proof.statistics import Statistics
@@ -104,6 +104,7 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
     around the splats where there are none."""
     from stages.measure.speed import seconds_per_frame
+
     from stages.scene.framing import orbit_cameras
 
     if not cache.are_compiled():

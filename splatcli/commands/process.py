@@ -11,6 +11,7 @@ from typing import Any
 import typer
 
 from splatcli import console, options, progress, summary
+from splatcli import live_view as watching
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
@@ -22,7 +23,6 @@ from stages.run import runfolder
 from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.precompile import PrecompileListener
-from stages.viewer import live_training as watching
 
 DEFAULT_PRESET = "standard"
 # What speaks of one capture and no other: a batch gives the same options to all of its runs.

@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatcli import console
+from splatcli import console, sources, viewpoints
 from splatcli.progress import counting
 from stages.base import memory
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
-from stages.run import results
-from stages.viewer import render_cameras
 
 if TYPE_CHECKING:
     from stages.raster.definition import Rendering
@@ -52,17 +50,17 @@ def render(target: Path | None, wanted: Wanted) -> None:
     from stages.viewer import sinks
 
     kind = _kind_of(wanted)
-    splats, pipeline = results.splats_of(target)
-    seen = render_cameras.views_of(pipeline or results.pipeline_around(target))
+    splats, pipeline = sources.splats_of(target)
+    seen = viewpoints.views_of(pipeline or sources.pipeline_around(target))
     begun = time.monotonic()
     if kind == "picture":
-        cameras = [_widened(render_cameras.one_camera(splats, seen, wanted.camera), wanted.width)]
+        cameras = [_widened(viewpoints.one_camera(splats, seen, wanted.camera), wanted.width)]
     else:
         cameras = _film_cameras(splats, seen, wanted, kind == "film")
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
     if not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    backend = results.backend_of(pipeline or results.pipeline_around(target))
+    backend = sources.backend_of(pipeline or sources.pipeline_around(target))
     if wanted.backend or wanted.device:
         backend = qualified_name(wanted.backend or AUTO, wanted.device or CPU)
     draw = renderer(splats, backend=backend)
@@ -161,7 +159,7 @@ def _kind_of(wanted: Wanted) -> str:
 
 def _film_cameras(splats: Any, seen: Any, wanted: Wanted, is_film: bool) -> list[Camera]:
     """A camera a frame; for a film, all of one even size."""
-    cameras, as_given = render_cameras.along(
+    cameras, as_given = viewpoints.along(
         wanted.path or "orbit", splats, seen, (wanted.frames, wanted.seconds, wanted.fps)
     )
     if wanted.width is not None:

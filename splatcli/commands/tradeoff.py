@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console
+from splatcli import console, sources
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
-from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
     from stages.measure.tradeoff.measurement import TradeoffInputs, deciding_views
     from stages.scene import split_held_out
 
-    splats = results.finished_splats(pipeline)
+    splats = sources.finished_splats(pipeline)
     reconstruction = pipeline.load("sfm")
     training, held = split_held_out(reconstruction.views)
     if not held:
@@ -71,7 +70,7 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
             family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
-    exported = tuple(results.exported_formats(pipeline))
+    exported = tuple(sources.exported_formats(pipeline))
     fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
     return TradeoffInputs(
         splats=splats,
@@ -83,10 +82,10 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
         held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
         views=reconstruction.views,
         units=reconstruction.units,
-        backend=results.backend_of(pipeline),
+        backend=sources.backend_of(pipeline),
         levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,
         quantised=pipeline.load("quantise"),
-        fitted={name: splats for name, splats in fitted.items() if splats is not None},
+        finetuned={name: splats for name, splats in fitted.items() if splats is not None},
     )

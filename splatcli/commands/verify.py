@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatcli import console
+from splatcli import console, sources
 from stages.base.errors import Family, SplatError
 from stages.raster.kernels import cache
-from stages.run import results, runfolder
+from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -115,19 +115,19 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     from stages.formats.values import drop_undrawable
 
     if against is not None and not against.is_dir():
-        seen = results.views_around(against) or results.views_around(file)
+        seen = sources.views_around(against) or sources.views_around(file)
         splats = drop_undrawable(formats.read(against))[0]
         return _Original(splats, seen, str(against), formats.format_of(against).ending)
     if against is not None and not runfolder.is_run_folder(against):
         raise runfolder.missing(against)
-    run = Pipeline(against) if against is not None else results.pipeline_around(file)
+    run = Pipeline(against) if against is not None else sources.pipeline_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
         came_as = formats.format_of(file).ending
         return _Original(drop_undrawable(read)[0], (), _ITSELF, came_as, itself=True)
     seen = run.load("sfm").views
     quantised = run.load("quantise")
     splats = drop_undrawable(quantised.splats)[0]
-    backend = results.backend_of(run)
+    backend = sources.backend_of(run)
     name = f"the run {run.run_folder}"
     exported = run.stage_folder("export")
     return _Original(splats, seen, name, backend=backend, quantised=quantised, exported=exported)

@@ -11,9 +11,8 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatcli import console
+from splatcli import console, sources
 from stages.base.errors import Family, SplatError
-from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ def show(target: Path | None, port: int, open_browser: bool) -> None:
 
     with tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
-            splats, pipeline = results.splats_of(target)
+            splats, pipeline = sources.splats_of(target)
             splats, _ = drop_undrawable(splats)
             count = len(splats)
             if not count:
@@ -57,7 +56,7 @@ def _items(
     from stages.formats import format_of, ply
     from stages.viewer.site import site
 
-    run = pipeline or results.pipeline_around(target)
+    run = pipeline or sources.pipeline_around(target)
     sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
     units = sfm.units if sfm else "arbitrary"
     if pipeline is None and target is not None and format_of(target).streamed:

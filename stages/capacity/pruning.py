@@ -101,7 +101,7 @@ class Pruner:
             if cut is None:
                 found.stopped_by = PRICE
                 break
-            fewer, seen = cut.of(found.splats), worth.photographs[~cut.gone]
+            fewer, seen = cut.of(found.splats), worth.view_counts[~cut.gone]
             measured = squared_error(fewer, self._pictures(self.decide), self.backend)
             measured = (measured - _fresh_sse(worth)) * _told_by(worth)
             fewer = self.tuner.finetune(fewer, self.finetune_steps * self.rounds // planned, seen)
@@ -157,7 +157,7 @@ class Pruner:
         return measure_contributions(splats, self._pictures(self.decide), self.backend, others)
 
     def _worth(self, splats: Splats, before: Contributions, cut: Removal) -> Contributions:
-        others = before.others.take(~cut.gone) if before.others else None
+        others = before.previous.take(~cut.gone) if before.previous else None
         return measure_contributions(splats, self._pictures(self.decide), self.backend, others)
 
     def _planned(self, splats: Splats) -> int:
@@ -182,12 +182,12 @@ class Pruner:
 
 def _fresh_sse(worth: Contributions) -> float:
     """Of the photographs that decide."""
-    return worth.sse - (worth.others.sse if worth.others else 0.0)
+    return worth.sse - (worth.previous.sse if worth.previous else 0.0)
 
 
 def _told_by(worth: Contributions) -> float:
     """How much larger a change is of all photographs than of those that decide."""
-    return 1 + (worth.others.sse if worth.others else 0.0) / max(_fresh_sse(worth), TINY)
+    return 1 + (worth.previous.sse if worth.previous else 0.0) / max(_fresh_sse(worth), TINY)
 
 
 def _round(

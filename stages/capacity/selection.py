@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.contribution import Contributions, floaters, near_view_frusta
+from stages.measure.contribution import Contributions, near_view_frusta
+from stages.measure.floaters import near_camera_floaters
 from stages.scene import SH_C0, Camera, Splats, morton, parameters_per_splat
 
 SPLATS_A_ROUND = 0.10  # predictions for single splats add up only while few go at once,
@@ -57,8 +58,8 @@ def choose(
     Floaters and what lies where no photograph looks go whatever the price. What continues a picture
     beyond its rim, where none speaks against it, goes last, and only at an infinite price.
     """
-    seen, beside = worth.photographs > 0, near_view_frusta(splats, list(cameras))
-    floating = floaters(splats, worth, list(cameras))
+    seen, beside = worth.view_counts > 0, near_view_frusta(splats, list(cameras))
+    floating = near_camera_floaters(splats, worth, list(cameras))
     free = floating | (~seen & ~beside)
     alone = worth.sse_change if harm else worth.picture_change
     ratio = alone / parameters_per_splat(splats.sh_degrees)

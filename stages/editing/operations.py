@@ -19,8 +19,7 @@ from stages.editing.scene import EditedScene
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
 from stages.formats.values import concatenate, drop_undrawable, select_rows
-from stages.measure.contribution import floaters
-from stages.measure.floaters import isolated_splats
+from stages.measure.floaters import isolated_splats, near_camera_floaters
 from stages.scene import Splats
 
 Operation = Callable[[EditedScene], EditedScene]
@@ -111,7 +110,7 @@ def _transforming(similarity: Similarity) -> Operation:
 def _without_floaters(scene: EditedScene) -> EditedScene:
     """Floaters by their contributions where training views are known, else isolated splats."""
     if len(scene.training_views):
-        found = floaters(scene.splats, scene.contributions(), scene.training_cameras())
+        found = near_camera_floaters(scene.splats, scene.contributions(), scene.training_cameras())
     else:
         found = isolated_splats(scene.splats)
     return scene.with_splats(select_rows(scene.splats, ~found))

@@ -85,7 +85,7 @@ class EditedScene:
         if chosen by error, and 21.6 dB if chosen by change.
         """
         found = self.with_splats(splats).contributions()
-        unseen = (found.photographs == 0) & near_view_frusta(splats, self.training_cameras())
+        unseen = (found.view_counts == 0) & near_view_frusta(splats, self.training_cameras())
         costs: NDArray[np.float64] = np.where(unseen, np.inf, found.sse_change)
         return RemovalCosts(found.weight + _UNSEEN_WEIGHT, costs)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from stages.base.blocks import blocks
 from stages.formats import BY_ENDING, format_of
 from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
-from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
+from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
 from stages.proof.content import FileContent

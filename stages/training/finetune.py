@@ -133,7 +133,7 @@ def _with(finetune: Splats, before: Splats, still: Collection[str]) -> Splats:
 def _level(photograph: EvaluationView) -> Level:
     """In the light and over the background that it is judged in, without what is not judged."""
     planar: NDArray[np.uint8] = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
-    kept = photograph.kept
+    kept = photograph.valid
     mask = None if kept is None else kept.astype(np.uint8)
     outside = "" if mask is None else IGNORE
     return Level(photograph.camera, planar, channel_means(planar), mask, outside)

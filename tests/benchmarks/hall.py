@@ -104,8 +104,8 @@ def _pillar(number: int, x: float, z: float) -> tuple[Shape, ...]:
 
 def through_run(run: Path, photographs: int, width: int) -> Walk:
     """From one photograph's place to the next, on a smooth way, all along a finished run's."""
+    from splatcli.sources import splats_of
     from stages.raster.draw import renderer
-    from stages.run.results import splats_of
     from stages.viewer import camera_paths
 
     splats, pipeline = splats_of(run)

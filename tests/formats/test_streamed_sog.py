@@ -19,7 +19,7 @@ from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import sog, streamed_sog
 from stages.formats.values import drawable_rows
-from stages.measure.evaluation import capped_psnr_db
+from stages.measure.image_metrics import capped_psnr_db
 from stages.proof.checks import read_back
 from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at

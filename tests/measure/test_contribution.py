@@ -73,7 +73,7 @@ def test_worth_goes_on_from_what_other_photographs_told(tmp_path) -> None:
         "truncated_picture_change",
     ):
         np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-9)
-    assert (found.photographs == whole.photographs).all()
+    assert (found.view_counts == whole.view_counts).all()
     assert found.sse == pytest.approx(whole.sse)
     assert (found.scene_depth == whole.scene_depth).all()
     assert (found.psnr_db == whole.psnr_db[4:]).all()

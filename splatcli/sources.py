@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatcli.folders import find_run_folder
+from splatcli.viewpoints import views_of
 from stages.base.errors import Family, SplatError
 from stages.run import runfolder
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
-from stages.viewer.render_cameras import views_of
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View
