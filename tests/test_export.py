@@ -17,7 +17,7 @@ from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.proof import checks
 from stages.proof.content import FileContent
-from stages.scene import ExportedAssets, QuantisedSplats, Splats, TrainedSplats
+from stages.scene import ExportedAssets, QuantisedSplats, Splats
 from stages.surface import fuse, ply
 from tests.small_scene import SmallScene, small_scene
 
@@ -32,9 +32,9 @@ def exported(
 ) -> tuple[ExportedAssets, Report]:
     report = Report()
     splats = scene.splats if splats is None else splats
+    splats = replace(splats, origin=scene.reconstruction.origin)
     inputs = {
         "sfm": scene.reconstruction,
-        "train": TrainedSplats(splats),
         "quantise": QuantisedSplats(splats, splats.sh_degree, {}),
     }
     return export.run(inputs, ExportSettings(**settings), folder, report), report
@@ -243,6 +243,12 @@ def test_no_splats_give_an_empty_mesh(scene: SmallScene, tmp_path: Path) -> None
     nothing = scene.splats.take(np.zeros(len(scene.splats), bool))
     _, report = exported(scene, tmp_path, nothing, formats=("mesh",))
     assert [code for code, _ in report.warnings] == ["export-empty", "export-mesh-empty"]
+
+
+def test_export_reads_no_photograph(scene: SmallScene, tmp_path: Path) -> None:
+    gone = replace(scene, reconstruction=replace(scene.reconstruction, folder=tmp_path / "gone"))
+    assets, _ = exported(gone, tmp_path, formats=tuple(FORMATS))
+    assert len(assets.files) == len(FORMATS)
 
 
 def test_formats_named_twice_are_written_once(scene: SmallScene, tmp_path: Path) -> None:

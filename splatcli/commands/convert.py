@@ -25,11 +25,9 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     """
     from stages import formats
     from stages.base import scratch
-    from stages.base.atomic import make_folder
     from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
-    make_folder(target.parent)
     begun = time.monotonic()
     with _progress(quiet, as_json) as say, scratch.scratch_in(target.parent, spare=True):
         say(f"reading {source}")
@@ -68,9 +66,9 @@ def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
 
 def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     """What the proof found. Raises SplatError "convert-verify-failed"."""
+    from splatcli.sources import views_around
     from stages.formats import format_of
     from stages.proof.prover import Prover, cameras_for
-    from stages.run.results import views_around
 
     cameras = cameras_for(splats, views_around(source))
     proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)
