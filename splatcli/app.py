@@ -8,10 +8,11 @@ from typing import Annotated, Any
 
 import typer
 
-from splatcli import jobs, summary
-from splatcli.chain import Chain, chain_parameters, typed_in
+from splatcli import summary
+from splatcli.commands import process as commands_process
 from splatcli.console import guarded
 from splatcli.folders import find_run_folder
+from splatcli.operation_options import Chain, chain_parameters, typed_in
 from splatcli.options import number, option, with_parameters
 from splatcli.usage import Commands
 from stages import STAGE_NAMES
@@ -156,7 +157,7 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
-    jobs.run_all(photos, out, cluster, given, quiet, as_json)
+    commands_process.run_all(photos, out, cluster, given, quiet, as_json)
 
 
 def batch(
@@ -196,13 +197,13 @@ def _stage_command(name: str) -> Callable[..., None]:
         as_json: AsJson = False,
         **given: Any,
     ) -> None:
-        pipeline = Pipeline(*jobs.target_of(photos, out))
-        jobs.run_stage("ingest", pipeline, given, quiet, as_json)
+        pipeline = Pipeline(*commands_process.target_of(photos, out))
+        commands_process.run_stage("ingest", pipeline, given, quiet, as_json)
 
     def later(
         run: Run = None, *, quiet: Quiet = False, as_json: AsJson = False, **given: Any
     ) -> None:
-        jobs.run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
+        commands_process.run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
 
     return ingest if name == "ingest" else later
 
@@ -435,13 +436,13 @@ def doctor(as_json: AsJson = False) -> None:
 
 def _register() -> None:
     example = _example("splat process photos/ --preset preview --out run/")
-    command = with_parameters(process, jobs.process_parameters())
+    command = with_parameters(process, commands_process.process_parameters())
     app.command("process", epilog=example)(guarded(command))
-    many = with_parameters(batch, jobs.batch_parameters())
+    many = with_parameters(batch, commands_process.batch_parameters())
     app.command("batch", epilog=_example("splat batch captures/* --out runs/"))(guarded(many))
     for name in STAGE_NAMES:
         line = _STAGE_EXAMPLES.get(name, f"splat {name}")
-        command = with_parameters(_stage_command(name), jobs.stage_parameters(name))
+        command = with_parameters(_stage_command(name), commands_process.stage_parameters(name))
         app.command(name, help=_STAGE_HELP[name], epilog=_example(line))(guarded(command))
     line = "splat edit scene.ply chair.sog --crop box:-1,-1,-1,1,1,1 --decimate 50%"
     command = with_parameters(edit, chain_parameters())

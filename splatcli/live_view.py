@@ -21,7 +21,7 @@ WATCHED = "train"
 _FAREWELL_S = 5.0  # for an open page to hear how it ended; it asks twice a second, a busy one less
 
 
-class Watching(Listener):
+class LiveTraining(Listener):
     """Serves the page from the start of training to the end of the run."""
 
     def __init__(self, pipeline: Pipeline, as_json: bool) -> None:
@@ -35,13 +35,15 @@ class Watching(Listener):
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         if stage.name != WATCHED:
             return
-        from stages.formats.page.shots import shots_of
+        from stages.formats.page.cameras import page_cameras
         from stages.viewer.live_page import LivePage
         from stages.viewer.server import LocalServer
 
         sfm, seeds = self._pipeline.load("sfm"), self._pipeline.load("seed")
         title = self._pipeline.run_folder.absolute().name
-        self._page = LivePage(title, sfm.views, shots_of(sfm.views, seeds), seeds.means, sfm.folder)
+        self._page = LivePage(
+            title, sfm.views, page_cameras(sfm.views, seeds), seeds.means, sfm.folder
+        )
         try:
             self._server = LocalServer(self._page.items)
         except OSError as error:  # looking on is no reason not to train

@@ -83,7 +83,7 @@ def along(
                 family=Family.USAGE,
             )
         cameras = [cameras[i] for i in camera_paths.tour(cameras, splats)]
-        steady = camera_paths.steadied(_travel(cameras, splats, length), _STEADY_S * length[2])
+        steady = camera_paths.smoothed(_travel(cameras, splats, length), _STEADY_S * length[2])
         return [camera_paths.levelled(camera) for camera in steady], False
     cameras = _from_file(path)
     if length[0] is None and length[1] is None:
@@ -96,7 +96,7 @@ def _travel(cameras: list[Camera], splats: Splats, length: Length) -> list[Camer
 
     usual = _TURN_S * camera_paths.length_in_turns(cameras, splats)
     frames = _frames(length, min(max(usual, _SHORTEST_S), _LONGEST_S))
-    return list(camera_paths.through(cameras, splats, frames))
+    return list(camera_paths.interpolated(cameras, splats, frames))
 
 
 def _frames(length: Length, usual_s: float) -> int:

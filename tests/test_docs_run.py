@@ -79,5 +79,3 @@ def test_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert len(scene.splats) > 100  # type: ignore[attr-defined]
     assert [file.format for file in scene.assets.files] == ["ply"]  # type: ignore[attr-defined]
     assert scene.metrics["train"]["psnr_db"] > 15  # type: ignore[attr-defined]
-    with pytest.raises(TypeError, match="no stage has the option colour"):
-        exec('process(Path("photos"), Path("other"), colour="red")', made)

@@ -16,7 +16,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from splatcli import console, jobs, options
+from splatcli import console, options
+from splatcli.commands import process
 from stages import STAGE_NAMES
 from stages.base.atomic import replacing
 from stages.base.errors import Family, SplatError
@@ -54,7 +55,7 @@ def batch(
 ) -> None:
     """Bring each capture's run to its end; exit with the worst status of all. Raises SplatError
     for what concerns all of them, and Interrupted."""
-    settings = jobs.fresh_settings(options.given_only(given))
+    settings = process.fresh_settings(options.given_only(given))
     runs = remote.parse_location(out)
     photos = named(remote.expand_locations(captures))
     tasks = [

@@ -13,7 +13,7 @@ from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
 if TYPE_CHECKING:
-    from stages.measure.tradeoff.pair import Side
+    from stages.measure.tradeoff.comparison import Candidate
 
 
 def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
@@ -21,35 +21,36 @@ def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) ->
 
     Raises SplatError: stage-not-finished, run-half-anew, compare-other-photographs,
     compare-nothing-in-common, and what keeps files from being written."""
+    from stages.measure.tradeoff.pair_report import fact_rows, write_comparison
+
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.pair import default_name, pair, verdict
-    from stages.measure.tradeoff.pair_report import facts, write_pair
+    from stages.measure.tradeoff.comparison import compare_runs, distinct_name, verdict_lines
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [
-        _side(run, default_name(run.run_folder, other.run_folder))
+        _side(run, distinct_name(run.run_folder, other.run_folder))
         for run, other in zip(runs, reversed(runs), strict=True)
     ]
     _check_photographs(*runs)
     if not quiet and not as_json and not cache.are_compiled():
         console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    pairing = pair(sides[0], sides[1])
+    pairing = compare_runs(sides[0], sides[1])
     make_folder(out)
-    files = write_pair(out, pairing)
+    files = write_comparison(out, pairing)
     if as_json:
         change = pairing.psnr
         console.emit(
             "compared",
             verdict=change.verdict,
             psnr_change_db=change.mean,
-            interval_db=[change.low, change.high] if change.photographs > 1 else None,
-            photographs=change.photographs,
+            interval_db=[change.low, change.high] if change.views > 1 else None,
+            photographs=change.views,
             files=[str(file) for file in files],
         )
         return
     if not quiet:
-        console.table(("", sides[0].name, sides[1].name), facts(pairing))
-    for line in verdict(pairing):
+        console.table(("", sides[0].name, sides[1].name), fact_rows(pairing))
+    for line in verdict_lines(pairing):
         console.out.print(line, markup=False)
     console.out.print(str(files[0]), markup=False)
 
@@ -70,8 +71,8 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
         )
 
 
-def _side(run: Pipeline, name: str) -> Side:
-    from stages.measure.tradeoff.pair import Side
+def _side(run: Pipeline, name: str) -> Candidate:
+    from stages.measure.tradeoff.comparison import Candidate
 
     splats = sources.finished_splats(run)
     told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
@@ -83,4 +84,4 @@ def _side(run: Pipeline, name: str) -> Side:
         told["seed"] = str(trained.settings["seed"])
     for ending, figures in sources.exported_formats(run).items():
         told[f".{ending}"] = console.size(figures["size_bytes"])
-    return Side(name, splats, run.load("sfm"), sources.backend_of(run), told)
+    return Candidate(name, splats, run.load("sfm"), sources.backend_of(run), told)

@@ -25,7 +25,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     """
     from stages import formats
     from stages.base import scratch
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
@@ -35,7 +35,7 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
         say(f"writing {target}")
         dropped = formats.write(target, splats)
         say(f"comparing {target}")
-        found = _proven(source, target, kept_rows(splats)[0])
+        found = _proven(source, target, drop_undrawable(splats)[0])
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
@@ -71,7 +71,7 @@ def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     from stages.proof.prover import Prover, cameras_for
 
     cameras = cameras_for(splats, views_around(source))
-    proof = Prover.of(splats, cameras, source_format=format_of(source).ending).prove(target)
+    proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)
     if proof.fault:
         raise _failed(target, proof.fault)
     return proof.figures

@@ -11,15 +11,15 @@ from splatcli import console
 from stages.base.errors import Family, SplatError
 
 if TYPE_CHECKING:
-    from stages.editing.operations import Done
-    from stages.editing.scene import Edited
+    from stages.editing.operations import AppliedOperation
+    from stages.editing.scene import EditedScene
     from stages.editing.syntax import ParsedOperation
 
 
 def edit(
     source: Path,
     target: Path | None,
-    typed: Sequence[ParsedOperation],
+    parsed: Sequence[ParsedOperation],
     dry_run: bool,
     quiet: bool,
     as_json: bool,
@@ -29,7 +29,7 @@ def edit(
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
-    from stages.editing import operations
+    from stages.editing import levels, operations
 
     if target is None and not dry_run:
         raise SplatError(
@@ -40,25 +40,25 @@ def edit(
             family=Family.USAGE,
         )
     target = target or Path("scene.ply")
-    row, chain = formats.format_of(target), operations.prepared(typed, target)
-    if row.streamed and not dry_run:
+    row, chain = formats.format_of(target), operations.prepare_operations(parsed, target)
+    if not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
-        if target.parent.is_dir():  # `write` says so where it is not
+        if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
         scene = _opened(source)
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps = []
-        for step in operations.done(scene, chain):
+        for step in operations.apply_operations(scene, chain):
             scene = step.scene
             steps.append(_told(step, as_json, quiet))
         facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
         if start_db is not None:
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
         if not dry_run:
-            views = scene.views_there()
-            formats.write(target, scene.splats, units=scene.units, views=views)
+            views = scene.placed_views()
+            levels.write(target, scene.splats, units=scene.units, views=views)
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
             if views:
                 facts |= _proven(source, target, scene)
@@ -68,41 +68,41 @@ def edit(
         _show(facts)
 
 
-def _opened(source: Path) -> Edited:
+def _opened(source: Path) -> EditedScene:
     """With the photographs of the run that it is of, or lies in. Raises SplatError."""
     from splatcli.sources import backend_of, pipeline_around, splats_of
-    from stages.editing.operations import without_undrawable
-    from stages.editing.scene import Edited
+    from stages.editing.scene import EditedScene
     from stages.formats import units_of
+    from stages.formats.values import drop_undrawable
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
     splats, pipeline = splats_of(source)
     pipeline = pipeline or pipeline_around(source)
-    splats = without_undrawable(splats)
+    splats = drop_undrawable(splats)[0]
     if pipeline is None or pipeline.manifest("sfm") is None:
-        return Edited(splats, units_of(source))
+        return EditedScene(splats, units_of(source))
     found = pipeline.load("sfm")
     training, held = split_held_out(found.views)
     photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
-    judges = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
-    return Edited(
-        *(splats, found.units, photographs, judges, found.views),
+    held_out_views = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
+    return EditedScene(
+        *(splats, found.units, photographs, held_out_views, found.views),
         backend=backend_of(pipeline),
     )
 
 
-def _proven(source: Path, target: Path, scene: Edited) -> dict[str, Any]:
+def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
     """What another parser reads in `target`, drawn from cameras that training never saw. Raises
     SplatError "edit-verify-failed"."""
     from stages.formats import format_of
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.proof.prover import Prover, cameras_for
 
-    splats = kept_rows(scene.splats)[0]
-    source_format = format_of(source).ending if source.is_file() else ""
-    cameras = cameras_for(splats, scene.views_there())
-    proof = Prover.of(splats, cameras, scene.backend, source_format).prove(target)
+    splats = drop_undrawable(scene.splats)[0]
+    came_as = format_of(source).ending if source.is_file() else ""
+    cameras = cameras_for(splats, scene.placed_views())
+    proof = Prover.of(splats, cameras, scene.backend, came_as).prove(target)
     if proof.fault:
         raise SplatError(
             "edit-verify-failed",
@@ -114,14 +114,14 @@ def _proven(source: Path, target: Path, scene: Edited) -> dict[str, Any]:
     return proof.figures
 
 
-def _db(scene: Edited) -> float | None:
+def _db(scene: EditedScene) -> float | None:
     found = scene.psnr_db()
     return None if found is None else round(found, 3)
 
 
-def _told(step: Done, as_json: bool, quiet: bool) -> dict[str, Any]:
+def _told(step: AppliedOperation, as_json: bool, quiet: bool) -> dict[str, Any]:
     facts: dict[str, Any] = {
-        "operation": str(step.typed),
+        "operation": str(step.parsed),
         "splats_before": step.before,
         "splats": step.after,
     }
@@ -132,7 +132,7 @@ def _told(step: Done, as_json: bool, quiet: bool) -> dict[str, Any]:
         console.emit("operation", **facts)
     elif not quiet:
         cost = f", {console.figure('psnr_db', psnr)}" if psnr is not None else ""
-        console.note(f"{step.typed}: {step.before:,} -> {step.after:,} splats{cost}")
+        console.note(f"{step.parsed}: {step.before:,} -> {step.after:,} splats{cost}")
     return facts
 
 

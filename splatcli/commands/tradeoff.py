@@ -12,7 +12,7 @@ from stages.raster.kernels import cache
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.measure.tradeoff.measuring import Material
+    from stages.measure.tradeoff.measurement import TradeoffInputs
 
 
 def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> None:
@@ -21,8 +21,8 @@ def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> 
     Raises SplatError: stage-not-finished, run-half-anew, nothing-held-out, and what keeps files
     from being written."""
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.measuring import measure_trade
-    from stages.measure.tradeoff.report import sentences, write_report
+    from stages.measure.tradeoff.measurement import measure_tradeoff
+    from stages.measure.tradeoff.report import summarise, write_report
 
     pipeline = Pipeline(find_run_folder(run))
     material = material_of(pipeline)
@@ -37,25 +37,24 @@ def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> 
         elif not quiet:
             console.note(label)
 
-    trade = measure_trade(material, tell)
+    trade = measure_tradeoff(material, tell)
     files = write_report(folder, pipeline.run_folder.absolute().name, trade, material)
     if as_json:
-        said = sentences(trade)
+        said = summarise(trade)
         console.emit("tradeoff", folder=str(folder), files=[str(f) for f in files], said=said)
         return
     if not quiet:
-        for title, lines in sentences(trade).items():
+        for title, lines in summarise(trade).items():
             for number, line in enumerate(lines):
                 console.out.print(f"{title if not number else '':<12} {line}", markup=False)
     console.out.print(str(files[0]), markup=False)
 
 
-def material_of(pipeline: Pipeline) -> Material:
+def material_of(pipeline: Pipeline) -> TradeoffInputs:
     """What is measured of a finished run. Raises SplatError (stage-not-finished, run-half-anew,
     nothing-held-out)."""
-    from stages.export import fitted_in
     from stages.measure.evaluation import load_evaluation_views
-    from stages.measure.tradeoff.measuring import Material, deciding
+    from stages.measure.tradeoff.measurement import TradeoffInputs, deciding_views
     from stages.scene import split_held_out
 
     splats = sources.finished_splats(pipeline)
@@ -71,11 +70,12 @@ def material_of(pipeline: Pipeline) -> Material:
         )
     trained = pipeline.manifest("train")
     exported = tuple(sources.exported_formats(pipeline))
-    fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
-    return Material(
+    return TradeoffInputs(
         splats=splats,
         training=load_evaluation_views(
-            reconstruction.folder, deciding(training, splats.draw_settings), splats.draw_settings
+            reconstruction.folder,
+            deciding_views(training, splats.draw_settings),
+            splats.draw_settings,
         ),
         held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
         views=reconstruction.views,
@@ -85,5 +85,4 @@ def material_of(pipeline: Pipeline) -> Material:
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,
         quantised=pipeline.load("quantise"),
-        fitted={name: splats for name, splats in fitted.items() if splats is not None},
     )

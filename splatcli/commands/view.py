@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 def show(target: Path | None, port: int, open_browser: bool) -> None:
     """Serve the page until Ctrl-C. Raises SplatError."""
     from stages.base import scratch
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.viewer.server import LocalServer
 
     with tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
             splats, pipeline = sources.splats_of(target)
-            splats, _ = kept_rows(splats)
+            splats, _ = drop_undrawable(splats)
             count = len(splats)
             if not count:
                 raise SplatError(

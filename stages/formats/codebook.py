@@ -16,7 +16,7 @@ _ROWS_AT_ONCE = 1 << 14
 _LOOK = 2  # times as many vectors as a palette has rows: if they all differ, it is too small
 
 
-def of_numbers(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.float64]:
+def scalar_codebook(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.float64]:
     """[size] rising: near the values [M] in the least squares sense; all of them if few."""
     ordered = np.sort(values, axis=None)
     new = np.ones(len(ordered), bool)
@@ -67,7 +67,7 @@ def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDAr
     return indices
 
 
-def of_vectors(
+def vector_palette(
     vectors: NDArray[np.float32], size: int, seed: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """(palette [at most `size`, D], which of its rows stands for each of `vectors` [N, D]).

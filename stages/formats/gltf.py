@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
-from stages.formats.rows import (
-    kept_rows,
+from stages.formats.values import (
+    drop_undrawable,
     linear_opacities,
     linear_scales,
     unit_quaternions,
@@ -33,7 +33,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 
     Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     splats = splats.with_sh_degree(int(splats.sh_degrees.max(initial=0)))
     primitives = [_attributes(splats)] if len(splats) else []
     write_file(Path(path), primitives, flipped(splats.take(slice(0))).origin, units)

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from stages.base.blocks import blocks
 from stages.formats.gltf import fallback_colours, sh_attributes
 from stages.formats.gltf_file import EXTENSION, Attribute, write_file
-from stages.formats.rows import (
-    kept_rows,
+from stages.formats.values import (
+    drop_undrawable,
     linear_opacities,
     linear_scales,
     unit_quaternions,
@@ -42,7 +42,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Normalised scales end at 1, so the node enlarges them by a power of two, and positions are
     divided by it, which costs no bits. Raises SplatError as `gltf.write`.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     unit = _unit(linear_scales(splats))
     primitives = [_attributes(group, unit) for group in _groups(splats)]
     origin = flipped(splats.take(slice(0))).origin

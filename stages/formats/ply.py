@@ -21,7 +21,7 @@ from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import release_mapped_pages, reported_blocks
 from stages.formats import compressed_ply
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
-from stages.formats.rows import allocated, checked, kept_rows
+from stages.formats.values import allocate, check_finite, drop_undrawable
 from stages.scene import Splats
 from stages.scene.recentring import recentred
 
@@ -50,7 +50,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Positions stay relative to `splats.origin`, which float32 could not hold; a comment says it.
     Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
         for block in blocks(splats, units):
             file.write(block)
@@ -111,7 +111,7 @@ def parse(path: Path) -> Splats:
             tables = _ascii_tables(file, header)
         else:
             tables = _binary_tables(binary_rows(path, header, "vertex"))
-        splats = allocated(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
+        splats = allocate(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
         wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
         exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
         for rows, table in tables:
@@ -122,9 +122,9 @@ def parse(path: Path) -> Splats:
             else:
                 splats.means[rows] = columns.floats(["x", "y", "z"])
     if exact is None:
-        return checked(replace(splats, origin=header.origin))
+        return check_finite(replace(splats, origin=header.origin))
     means, origin = recentred(exact, header.origin)
-    return checked(replace(splats, means=means, origin=origin))
+    return check_finite(replace(splats, means=means, origin=origin))
 
 
 def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
+from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import FLIP, flipped
 
@@ -41,7 +41,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     2048 units from the centre is drawn nearer along its ray and smaller, which looks the same from
     the middle. Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
     bits = _fractional_bits(splats.means)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import partial_prefix, replacing
 from stages.base.blocks import reported_blocks
-from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
+from stages.formats.values import drop_undrawable, linear_opacities, linear_scales, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import flipped
 
@@ -35,7 +35,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     written.
     """
     path = Path(path)
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     with replacing(path) as temporary:
         if path.suffix.lower() == ".usdz":
             _write_package(temporary, splats, units, f"{path.stem}.usdc")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from stages.base.stage import Numbers
 from stages.formats.page import document
-from stages.formats.page.shots import Shot
+from stages.formats.page.cameras import PageCamera
 from stages.scene import Camera, View
 from stages.scene.framing import median_depth
 from stages.viewer.live_frames import Picture, Pictures
@@ -44,7 +44,7 @@ class LivePage:
         self,
         title: str,
         views: Sequence[View],
-        shots: Sequence[Shot],
+        shots: Sequence[PageCamera],
         points: NDArray[np.floating],
         photos: Path | None = None,
     ) -> None:
@@ -115,7 +115,7 @@ def _rigid(text: str) -> NDArray[np.float64]:
     return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
 
-def _plain(shot: Shot, points: NDArray[np.floating]) -> dict[str, Any]:
+def _plain(shot: PageCamera, points: NDArray[np.floating]) -> dict[str, Any]:
     """A shot as the page takes it. depth: how far ahead the point to turn around lies."""
     camera: Camera = shot.camera
     return {

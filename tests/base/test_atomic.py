@@ -1,17 +1,12 @@
-"""What was killed half-way does not stay for ever."""
+"""Incomplete files of processes that ended are removed."""
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from stages.base.atomic import partial_prefix, remove_abandoned_files
-
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="only there is it known what runs")
 
 
 def ended() -> str:

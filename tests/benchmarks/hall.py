@@ -112,7 +112,7 @@ def through_run(run: Path, photographs: int, width: int) -> Walk:
     assert pipeline is not None, "a run folder is wanted"
     cameras = [view.camera for view in pipeline.load("sfm").views]
     order = camera_paths.tour(cameras, splats)
-    way = camera_paths.through([cameras[i] for i in order], splats, photographs)
+    way = camera_paths.interpolated([cameras[i] for i in order], splats, photographs)
     height = round(way[0].height * width / way[0].width)
     cameras = [camera.resized(width, height) for camera in way]
     draw = renderer(splats)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatcli import jobs
+from splatcli.commands import process
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Interrupted, SplatError
 from stages.distributed import block_views, blocks
@@ -63,7 +63,7 @@ def pipeline_at(run_folder: Path, photos: Path) -> Pipeline:
 
 
 def trained(run_folder: Path, photos: Path, listener: Listener | None = None, **asked) -> Pipeline:
-    pipeline = jobs.in_blocks(pipeline_at(run_folder, photos), None)
+    pipeline = process.in_blocks(pipeline_at(run_folder, photos), None)
     settings = replace(pipeline.recorded_settings()["train"], **SMALL | asked)
     pipeline.run({"train": settings}, listener=listener)
     return pipeline

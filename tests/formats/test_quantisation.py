@@ -9,7 +9,7 @@ import pytest
 
 from stages import formats
 from stages.formats import FORMATS
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_for_sog, splats_to_write
 from stages.scene import QuantisedSplats, Splats, morton
 from stages.scene.rotations import matrices_of
@@ -59,12 +59,12 @@ def test_a_palette_of_few_rows_is_written_as_it_was_chosen(tmp_path) -> None:
 
 def test_axes_named_anew_are_the_same_ellipsoids_turned_less() -> None:
     splats = many_splats(3000)
-    found = least_turned(splats)
+    found = smallest_rotations(splats)
     for one, other in zip(covariances(splats), covariances(found), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(one).max())
     assert found.quaternions[:, 0].min() > 0.85  # 63 degrees: no cube is farther from itself
     assert splats.quaternions[:, 0].min() < 0.1
-    again = least_turned(found)
+    again = smallest_rotations(found)
     np.testing.assert_allclose(again.quaternions, found.quaternions, atol=1e-6)
 
 

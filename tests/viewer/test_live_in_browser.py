@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.formats.page.shots import shots_of
+from stages.formats.page.cameras import page_cameras
 from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
@@ -64,7 +64,7 @@ def worker(tmp_path: Path) -> Iterator[Worker]:
         picture = ours(coloured_scene(), view.camera)
         Image.fromarray(np.uint8(picture * 255)).save(tmp_path / view.image)
     splats = coloured_scene()
-    page = LivePage("test", views(), shots_of(views(), splats), splats.means, tmp_path)
+    page = LivePage("test", views(), page_cameras(views(), splats), splats.means, tmp_path)
     working = Worker(page)
     server = LocalServer(page.items)
     serving = threading.Thread(target=server.serve_forever)

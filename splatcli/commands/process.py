@@ -12,7 +12,6 @@ import typer
 
 from splatcli import console, options, progress, summary
 from splatcli import live_view as watching
-from splatcli.compiling import Compiling
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Family, SplatError
@@ -23,6 +22,7 @@ from stages.raster.backends import backend_of, backend_of_settings
 from stages.run import runfolder
 from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
+from stages.run.precompile import PrecompileListener
 
 DEFAULT_PRESET = "standard"
 # What speaks of one capture and no other: a batch gives the same options to all of its runs.
@@ -176,9 +176,9 @@ def run(
     """Run the pipeline and show what came of it. view: on a page too, while it trains."""
     listener = progress.listener_for(quiet, as_json)
     if until is None:
-        listener = Listeners(Compiling(settings["train"].backend), listener)
+        listener = Listeners(PrecompileListener(settings["train"].backend), listener)
     if view:
-        listener = Listeners(watching.Watching(pipeline, as_json), listener)
+        listener = Listeners(watching.LiveTraining(pipeline, as_json), listener)
     pipeline.run(settings, until=until, may_run=may_run, listener=listener)
     summary.show(pipeline, until, quiet=quiet, as_json=as_json)
 
@@ -232,6 +232,9 @@ def run_stage(
     if "formats" in typed:
         typed["formats"] = _with_exported(pipeline, typed["formats"])
     settings = settings_for({name: base[name]}, typed, preset)
+    if name == "export" and "formats" in typed:  # which quantise may have to fine-tune to first
+        formats = (*base["quantise"].formats, *typed["formats"])
+        settings["quantise"] = options.changed(base["quantise"], {"formats": formats})
     if not known:
         settings = {**base, **settings}
     if name == "train" and not (quiet or as_json):

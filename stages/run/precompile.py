@@ -17,7 +17,7 @@ _PATIENCE_S = 300.0
 _LAST = "gather_contributions"  # of the kernels, see `training.warm`
 
 
-class Compiling(Listener):
+class PrecompileListener(Listener):
     """Starts the process with the first stage, and waits for it before anything is drawn: two
     processes must not compile the same. Whatever becomes of it, the run goes on and compiles what
     is missing. backend: that the run will train with.

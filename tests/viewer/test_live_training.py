@@ -31,11 +31,11 @@ def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.fixture
-def watcher(tmp_path: Path, said: list[str]) -> live_view.Watching:
+def watcher(tmp_path: Path, said: list[str]) -> live_view.LiveTraining:
     scene = small_scene(tmp_path, views=3)
     outputs = {"sfm": scene.reconstruction, "seed": scene.splats}
     pipeline: Any = SimpleNamespace(load=outputs.__getitem__, run_folder=tmp_path / "run")
-    return live_view.Watching(pipeline, as_json=False)
+    return live_view.LiveTraining(pipeline, as_json=False)
 
 
 def get(address: str) -> Any:

@@ -22,7 +22,7 @@ _CAMERA_FROM_VIEWERS = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class Shot:
+class PageCamera:
     """A place to look from. photo: the address of its photograph; "" without one. held_out:
     whether training never saw it."""
 
@@ -32,16 +32,16 @@ class Shot:
     held_out: bool = False
 
 
-def shots_of(views: Sequence[View], splats: Splats) -> tuple[Shot, ...]:
+def page_cameras(views: Sequence[View], splats: Splats) -> tuple[PageCamera, ...]:
     """The capture's cameras by name, without photographs; or one in front of the splats."""
     if not views:
-        return (Shot("in front", front_camera(splats)),)
+        return (PageCamera("in front", front_camera(splats)),)
     held = {view.name for view in split_held_out(tuple(views))[1]}
     ordered = sorted(views, key=lambda view: view.name)
-    return tuple(Shot(view.name, view.camera, held_out=view.name in held) for view in ordered)
+    return tuple(PageCamera(view.name, view.camera, held_out=view.name in held) for view in ordered)
 
 
-def as_plain(shot: Shot, means: NDArray[np.floating]) -> dict[str, Any]:
+def as_plain(shot: PageCamera, means: NDArray[np.floating]) -> dict[str, Any]:
     """A shot as plain data. means [N, 3]: what it looks at, for the distance to turn around.
 
     position, target: the viewer's world. rotation: x, y, z, w, from the viewer's camera to its

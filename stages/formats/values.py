@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
@@ -27,7 +27,7 @@ _keeps_damage: ContextVar[bool] = ContextVar("keeps_damage", default=False)
 
 
 @contextmanager
-def damage_kept() -> Iterator[None]:
+def nonfinite_allowed() -> Iterator[None]:
     """Inside, readers hand out values that are not finite instead of refusing the file: for who
     wants to know what is in it."""
     token = _keeps_damage.set(True)
@@ -37,11 +37,11 @@ def damage_kept() -> Iterator[None]:
         _keeps_damage.reset(token)
 
 
-def keeps_damage() -> bool:
+def allows_nonfinite() -> bool:
     return _keeps_damage.get()
 
 
-def drawable(splats: Splats) -> NDArray[np.bool_]:
+def drawable_rows(splats: Splats) -> NDArray[np.bool_]:
     """[N] true where every value is finite, the scales can be squared in float32 and the
     quaternion has a direction: the rule of our rasteriser. The others no viewer can draw."""
     good = np.empty(len(splats), bool)
@@ -64,13 +64,13 @@ def _drawable(splats: Splats) -> NDArray[np.bool_]:
     return np.asarray(good, bool)
 
 
-def kept_rows(splats: Splats) -> tuple[Splats, int]:
+def drop_undrawable(splats: Splats) -> tuple[Splats, int]:
     """(the drawable splats, how many were dropped)."""
-    kept = chosen(splats, drawable(splats))
+    kept = select_rows(splats, drawable_rows(splats))
     return kept, len(splats) - len(kept)
 
 
-def chosen(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
+def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
     """The rows where `keep` [N] is true, in their order."""
     if keep.all():
         return splats
@@ -120,27 +120,27 @@ def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
     logits = np.empty(len(opacities), np.float32)
     for rows in blocks(len(opacities)):
         p = opacities[rows].astype(np.float64)
-        if not ((p >= 0) & (p <= 1)).all() and not keeps_damage():
+        if not ((p >= 0) & (p <= 1)).all() and not allows_nonfinite():
             raise BadFileError("opacities lie outside 0..1")
         with np.errstate(divide="ignore", invalid="ignore"):
             logits[rows] = np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX)
     return logits
 
 
-def logs_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
+def log_scales_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
     """[N, 3] the inverse of `linear_scales`, of scales enlarged by `factor`; 0 (a flat splat)
     becomes the least scale that a float32 keeps. Raises BadFileError for negative scales."""
     logs = np.empty(scales.shape, np.float32)
     for rows in blocks(len(scales)):
         exact = scales[rows].astype(np.float64) * factor
-        if not (exact >= 0).all() and not keeps_damage():
+        if not (exact >= 0).all() and not allows_nonfinite():
             raise BadFileError("scales are negative or not numbers")
         with np.errstate(divide="ignore", invalid="ignore"):
             logs[rows] = np.maximum(np.log(exact), LOG_SCALE_MIN)
     return logs
 
 
-def allocated(count: int, degree: int) -> Splats:
+def allocate(count: int, degree: int) -> Splats:
     """`count` splats for a reader to fill, float32; what they hold is not defined."""
     return Splats(
         means=scratch.empty((count, 3)),
@@ -152,7 +152,7 @@ def allocated(count: int, degree: int) -> Splats:
     )
 
 
-def degrees_in_use(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
+def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[N] the highest degree with a coefficient that is not 0, of `sh` [N, (L + 1)^2, 3]."""
     degrees = np.zeros(len(sh), np.uint8)
     for rows in blocks(len(sh)):
@@ -162,7 +162,7 @@ def degrees_in_use(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
     return degrees
 
 
-def checked(splats: Splats) -> Splats:
+def check_finite(splats: Splats) -> Splats:
     """What a reader hands out: infinite opacity and scale logarithms made finite in their place
     (files hold them for opaque and for flat splats), and the degree of each splat found.
 
@@ -175,31 +175,42 @@ def checked(splats: Splats) -> Splats:
         logs[flat] = LOG_SCALE_MIN
         logits[opaque] = np.clip(logits[opaque], LOGIT_MIN, LOGIT_MAX)
         np.clip(logits, -1e30, 1e30, out=logits)
-    clean = replace(splats, sh_degrees=degrees_in_use(splats.sh))
+    clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
-        bad = not_finite(getattr(clean, name))
-        if bad and not keeps_damage():
+        bad = count_nonfinite(getattr(clean, name))
+        if bad and not allows_nonfinite():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")
     return clean
 
 
-def not_finite(values: NDArray[np.floating]) -> int:
+def count_nonfinite(values: NDArray[np.floating]) -> int:
     """How many of `values` are NaN or infinite."""
     return sum(
         int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)) if values.size
     )
 
 
-def joined(parts: list[Splats]) -> Splats:
-    """All rows of all parts, at the highest degree among them; the origin is left at 0."""
+def concatenate(parts: Sequence[Splats]) -> Splats:
+    """All rows of `parts`, at the highest SH degree among them, with the origin 0."""
     if len(parts) == 1:
         return replace(parts[0], origin=np.zeros(3))
-    degree = max((part.sh_degree for part in parts), default=0)
-    wide = [part.with_sh_degree(degree) for part in parts]
-    empty = {"opacity_logits": (0,), "sh_degrees": (0,), "sh": (0, 1, 3), "quaternions": (0, 4)}
+    if not parts:
+        return allocate(0, 0)
+    count, width = sum(map(len, parts)), max(part.sh.shape[1] for part in parts)
     arrays: dict[str, Any] = {}
     for name in _FIELDS:
-        dtype = np.uint8 if name == "sh_degrees" else np.float32
-        rows = [getattr(part, name) for part in wide]
-        arrays[name] = np.concatenate(rows) if rows else np.zeros(empty.get(name, (0, 3)), dtype)
+        values = getattr(parts[0], name)
+        shape = (width, 3) if name == "sh" else values.shape[1:]
+        arrays[name] = scratch.empty((count, *shape), values.dtype)
+    start = 0
+    for part in parts:
+        for rows in reported_blocks(len(part)):
+            for name in _FIELDS:
+                values = getattr(part, name)[rows]
+                out = arrays[name][start + rows.start : start + rows.stop]
+                if name == "sh":
+                    out[:, values.shape[1] :] = 0
+                    out = out[:, : values.shape[1]]
+                out[...] = values
+        start += len(part)
     return Splats(**arrays)
