@@ -286,7 +286,7 @@ def test_what_the_usd_librarys_validators_find_is_a_fault(
 def test_of_very_many_splats_the_middle_is_drawn_and_all_are_compared(
     scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    monkeypatch.setattr(proving, "_MOST_DRAWN", len(scene.splats) // 2)
+    monkeypatch.setattr(proving, "_MAX_DRAWN", len(scene.splats) // 2)
     cameras = cameras_for(scene.splats, scene.reconstruction.views)
     some = Prover.of(scene.splats, cameras)
     right = written(some, tmp_path, name, scene.splats)
