@@ -75,7 +75,7 @@ def run(
     Metrics: files (how many), splats, dropped; formats: by format size_bytes, bytes_per_splat and
     the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
     the file, the worst camera) and the largest errors of the values; mesh: the figures of
-    `surface.make`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
+    `CollisionMesh`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
     file from being written.
     """
     from stages import formats
@@ -126,7 +126,7 @@ def _write_meshes(
     folder: Path,
     report: Report,
 ) -> list[ExportedFile]:
-    """Each mesh asked for, read back and compared; metric: mesh, see `surface.make`. Raises
+    """Each mesh asked for, read back and compared; metric: mesh, see `CollisionMesh`. Raises
     SplatError "export-verify-failed"."""
     asked = (e for name in settings.formats for e in (MESHES if name == ALL_MESHES else (name,)))
     wanted = [MESHES[ending] for ending in dict.fromkeys(asked) if ending in MESHES]
@@ -134,10 +134,10 @@ def _write_meshes(
         return []
     from stages.base.lazy import load_object
     from stages.scene import ExportedFile
-    from stages.surface.files import fault_of
-    from stages.surface.make import make
+    from stages.surface.checks import fault_of
+    from stages.surface.collision_mesh import make_collision_mesh
 
-    made = make(
+    made = make_collision_mesh(
         splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
     )
     report.metric("mesh", made.figures)
