@@ -10,7 +10,7 @@ from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
 from stages.scene import Capture
 from stages.structure.fallbacks import Attempt, best_attempt
-from stages.structure.gates import Thresholds, borderline_failures
+from stages.structure.gates import THRESHOLDS, borderline_failures
 from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PARTIAL_POINTS = 50
@@ -22,7 +22,7 @@ def accepted_model(attempts: list[Attempt], capture: Capture, allow_partial: boo
     and the model has enough photographs and points."""
     best = best_attempt(attempts)
     model = best.result.model if best.result is not None else None
-    if model is not None and len(model.names) >= Thresholds().fewest_views:
+    if model is not None and len(model.names) >= THRESHOLDS.fewest_views:
         enough = len(model.points) >= _FEWEST_PARTIAL_POINTS
         if best.passed or (enough and allow_partial):
             return model

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure.gates import ModelStatistics, Thresholds
+from stages.structure.gates import THRESHOLDS, ModelStatistics
 from stages.structure.view_graph import weakest_cut
 
 _SAMPLED_POINTS = 4000  # every pair of rays of a point is compared, so a sample must do
@@ -126,19 +126,16 @@ def load_result(folder: Path) -> MappingResult:
     return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
 
 
-def without_implausible_views(
-    model: SparseModel, thresholds: Thresholds | None = None
-) -> SparseModel:
+def without_implausible_views(model: SparseModel) -> SparseModel:
     """The model without photographs whose poses are unreliable: those that observe fewer than 15
     points, and those with implausible intrinsics. The latter stay if they are more than a tenth:
     then the whole model is implausible, and the gates must refuse it."""
-    thresholds = thresholds or Thresholds()
     seen = np.bincount(model.observing_views, minlength=len(model.names))
     keep = seen >= FEWEST_OBSERVATIONS
     with np.errstate(invalid="ignore"):
         zoom = np.abs(np.log(model.camera_params[:, 0] / model.focal_priors_px))
-        implausible = (np.abs(model.camera_params[:, 3]) > thresholds.distortion) | (
-            zoom > np.log(thresholds.focal_ratio)
+        implausible = (np.abs(model.camera_params[:, 3]) > THRESHOLDS.distortion) | (
+            zoom > np.log(THRESHOLDS.focal_ratio)
         )
     views = implausible[model.view_cameras]
     if views.mean() <= IMPLAUSIBLE_SHARE:
