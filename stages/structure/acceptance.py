@@ -14,6 +14,10 @@ from stages.structure.gates import THRESHOLDS, borderline_failures
 from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PARTIAL_POINTS = 50
+_REPORTED = (
+    *("configuration", "keypoints_median", "mean_track_length"),
+    *("median_triangulation_angle_deg", "baseline_over_depth"),
+)
 _MOST_NAMES = 12  # photographs that a message names
 
 
@@ -80,16 +84,11 @@ def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -
 
 def report_metrics(best: Attempt, model: SparseModel, report: Report) -> None:
     """The metrics of the attempt that is used, and of its `model`."""
-    statistics = best.statistics
-    report.metric("mean_track_length", round(statistics.mean_track_length, 3))
-    report.metric(
-        "median_triangulation_angle_deg", round(statistics.median_triangulation_angle_deg, 2)
-    )
-    report.metric("baseline_over_depth", round(statistics.baseline_over_depth, 4))
-    report.metric("keypoints_median", best.keypoints_median)
+    metrics = attempt_metrics(best)
+    for name in _REPORTED:
+        report.metric(name, metrics[name])
     report.metric("focal_px", [round(float(f), 2) for f in model.camera_params[:, 0]])
     report.metric("distortion", [round(float(k), 5) for k in model.camera_params[:, 3]])
-    report.metric("configuration", best.configuration.name)
     report.metric("pairs_matched", best.pairs_matched)
     report.metric("pairs_verified", best.pairs_verified)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -97,31 +97,20 @@ def save_model(
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    if model is not None:
-        for field in fields(model):
-            if field.name != "names":
-                np.save(partial / f"{field.name}.npy", getattr(model, field.name))
-    result = {
-        "names": None if model is None else list(model.names),
-        "groups": groups,
-        "timed_out": timed_out,
-    }
+    arrays = {} if model is None else vars(model) | {"names": np.array(model.names)}
+    np.savez(partial / "model.npz", **arrays)
+    result = {"groups": groups, "timed_out": timed_out}
     (partial / "result.json").write_text(json.dumps(result), encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(partial, folder)
 
 
 def load_result(folder: Path) -> MappingResult:
-    """What `save_model` wrote. Raises OSError or ValueError if it is missing or damaged."""
+    """What `save_model` wrote. Raises OSError, ValueError or BadZipFile if it is missing
+    or damaged."""
     result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    model = None
-    if result["names"] is not None:
-        arrays = {
-            field.name: np.load(folder / f"{field.name}.npy", allow_pickle=False)
-            for field in fields(SparseModel)
-            if field.name != "names"
-        }
-        model = SparseModel(names=tuple(result["names"]), **arrays)
+    arrays = dict(np.load(folder / "model.npz"))
+    model = SparseModel(**arrays | {"names": tuple(arrays["names"].tolist())}) if arrays else None
     groups = tuple(tuple(group) for group in result["groups"])
     return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
 
