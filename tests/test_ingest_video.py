@@ -185,8 +185,8 @@ def test_a_broken_video_among_photographs_is_left_out_and_named(tmp_path: Path) 
 
 def test_memory_hardly_grows_with_length() -> None:
     """What is kept of a frame is a few hundred bytes, however large it is."""
-    from stages.photos.frames import Watcher
+    from stages.photos.frame_selection import FrameMeter
 
-    watcher = Watcher()
-    seen = [watcher.see(at(i)[..., 0], i / 30) for i in range(20)]
-    assert all(one.moved.nbytes + 16 < 400 for one in seen)
+    meter = FrameMeter()
+    seen = [meter.measure(at(i)[..., 0], i / 30) for i in range(20)]
+    assert all(one.motion.nbytes + 16 < 400 for one in seen)
