@@ -322,7 +322,7 @@ def _too_few(root: Path, usable: int, unusable: list[tuple[str, str, str]]) -> S
             "ingest-video-unusable",
             given=f"{root} cannot be used: {unusable[0][1]}.",
             wanted="A video with pictures that decode.",
-            hint=f"{unusable[0][2]}, or export it again as H.264 or HEVC.",
+            hint=f"{unusable[0][2]}.",
         )
     given = f"{root} holds {counted(usable, 'usable photograph')}."
     if unusable:

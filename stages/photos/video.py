@@ -19,6 +19,7 @@ from stages.scene import fitted_size
 _CONTAINERS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,gif,flv,ogg,h264,hevc"
 )
+_COPY_OR_EXPORT = "Copy it from the camera again, or export it as H.264 or HEVC"
 _SMALLEST_SIDE_PX = 16
 _LARGEST_SIDE_PX = 16_384
 _LOST_SECONDS = 1.0  # at the end: less may be rounding of the container
@@ -107,7 +108,8 @@ class Video:
             raise Unusable(
                 "none of its frames decodes: it is encrypted, or damaged"
                 if self.damaged
-                else "it holds no frames"
+                else "it holds no frames",
+                _COPY_OR_EXPORT,
             )
         self.missing_s = whole - last if whole - last > _LOST_SECONDS else 0.0
 
@@ -140,14 +142,15 @@ def _opened(path: Path) -> Any:
     """The PyAV container. Raises Unusable."""
     try:
         if path.stat().st_size == 0:
-            raise Unusable("the file is empty")
+            raise Unusable("the file is empty", _COPY_OR_EXPORT)
         limits = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
         return av.open(str(path), options=limits, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise Unusable(
             f"it does not open as a video ({reason}); a recording that was cut off may lack "
-            "its index"
+            "its index",
+            _COPY_OR_EXPORT,
         ) from error
 
 
@@ -156,7 +159,7 @@ def _video_stream(container: Any) -> Any:
     cover = av.stream.Disposition.attached_pic
     streams = [s for s in container.streams.video if not s.disposition & cover]
     if not streams:
-        raise Unusable("it holds no video, only sound or data", "Remove it")
+        raise Unusable("it holds no video, only sound or data", "Use a file with video")
     if streams[0].codec_context is None:
         raise Unusable("its codec is not known here", "Export it as H.264 or HEVC")
     return streams[0]

@@ -93,4 +93,4 @@ def test_wide_colours_come_out_as_the_srgb_colour_that_they_stand_for() -> None:
 def test_the_mapping_is_named() -> None:
     assert "HLG" in HLG.conversion
     assert "BT.2390" in PQ.conversion
-    assert Colours(1, 1, 1, 1).conversion == "taken as sRGB"
+    assert Colours(1, 1, 1, 1).conversion == "read as sRGB"
