@@ -41,7 +41,7 @@ def made(reconstruction: Reconstruction, folder: Path) -> dict[str, bytes]:
         (seed.STAGE, seed.SeedSettings()),
         (train.STAGE, train.TrainSettings(steps=120, train_side=72, sh_degree=1, max_splats=400)),
         (prune.STAGE, prune.PruneSettings()),
-        (quantise.STAGE, quantise.QuantiseSettings()),
+        (quantise.STAGE, quantise.QuantiseSettings(formats=("spz",))),
         (export.STAGE, export.ExportSettings(formats=("ply", "spz"))),
     )
     found = {}

@@ -12,10 +12,11 @@ import pytest
 
 from stages import quantise
 from stages.base.errors import Family, SplatError
+from stages.base.settings import check_settings
 from stages.base.stage import Report
 from stages.measure.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.quantise import QuantiseSettings
-from stages.scene import QuantisedSplats, dc_to_rgb
+from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -29,8 +30,13 @@ def decide(
     scene: SmallScene, folder: Path, **settings: Any
 ) -> tuple[QuantisedSplats, dict[str, Any]]:
     report = Report()
-    inputs = {"sfm": scene.reconstruction, "prune": scene.splats}
-    result = quantise.run(inputs, QuantiseSettings(**settings), folder, report)
+    inputs = {
+        "sfm": scene.reconstruction,
+        "train": TrainedSplats(scene.splats),
+        "prune": scene.splats,
+    }
+    chosen = QuantiseSettings(**{"rounding_steps": 0, **settings})
+    result = quantise.run(inputs, chosen, folder, report)
     return result, report.metrics
 
 
@@ -84,12 +90,32 @@ def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(
     contents = []
     for folder in folders:
         folder.mkdir()
-        result, _ = decide(scene, folder)
-        contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+        result, _ = decide(scene, folder, formats=("sog", "splat"), rounding_steps=2)
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        contents.append({path.relative_to(folder): path.read_bytes() for path in files})
     assert contents[0] == contents[1]
     loaded = quantise.load(folders[0])
     np.testing.assert_array_equal(loaded.splats.sh, result.splats.sh)
     assert (loaded.degree, loaded.decisions) == (result.degree, result.decisions)
+    assert set(loaded.finetuned) == {"splat", "sog"}
+    for name, splats in loaded.finetuned.items():
+        np.testing.assert_array_equal(splats.means, result.finetuned[name].means)
+
+
+def test_a_format_that_does_not_round_changes_no_setting() -> None:
+    assert QuantiseSettings(formats=("ply", "sog", "mesh", "splat")).formats == ("splat", "sog")
+    assert QuantiseSettings(formats=("sog", "splat")) == QuantiseSettings(formats=("splat", "sog"))
+    check_settings(QuantiseSettings(formats=("ply",)))
+    with pytest.raises(SplatError, match="--format ksplat"):
+        check_settings(QuantiseSettings(formats=("ply", "ksplat")))
+
+
+def test_the_report_says_what_finetuning_to_a_format_gained(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    result, metrics = decide(scene, tmp_path, rounding_steps=5)
+    assert set(result.finetuned) == set(metrics["formats"]) == {"splat"}
+    assert set(metrics["formats"]["splat"]) == {"rounded_db", "finetuned_db"}
 
 
 def test_too_few_photographs_to_hold_out_are_measured_on_themselves(

@@ -19,7 +19,7 @@ def without(splats: Splats, row: int, degree: int, added: np.ndarray) -> Splats:
     """One splat cut to a degree, its colour moved."""
     degrees, shift = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     degrees[row], shift[row] = degree, added
-    return Removal(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).of(splats)
+    return Removal(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).apply(splats)
 
 
 def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,6 @@ class TradeoffInputs:
         history: as training logged it.
         exported: formats that the run wrote.
         quantised: the precision that was chosen for files; None where none was.
-        finetuned: by format, the splats that export wrote after fine-tuning.
     """
 
     splats: Splats
@@ -88,7 +87,6 @@ class TradeoffInputs:
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
     quantised: QuantisedSplats | None = None
-    finetuned: Mapping[str, Splats] = field(default_factory=dict)
 
     @property
     def on_cpu(self) -> bool:
@@ -160,7 +158,6 @@ def _formats(
             progress(f"writing and evaluating .{name}")
             path = Path(folder) / f"scene.{name}"
             held = splats_to_write(row, inputs.quantised) if inputs.quantised else splats
-            held = inputs.finetuned.get(name, held)
             formats.write(path, held, units=inputs.units, views=inputs.views)
             size = row.size_bytes(path)
             read = replace(formats.read(path), draw_settings=splats.draw_settings)
