@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
-from stages.formats.settings import ALL_MESHES, DEFAULT_FORMATS, formats_setting
+from stages.capacity.output_formats import ALL_MESHES, DEFAULT_FORMATS, formats_setting
 from stages.formats.table import FORMATS, MESHES
 from stages.raster.backends import (
     backend_of_settings,

@@ -17,7 +17,12 @@ from typing import TYPE_CHECKING, Any
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.capacity import DECIDING_VIEWS, SOG_LOSS_DB
-from stages.formats.settings import CHOICES, DEFAULT_FORMATS, formats_setting, rounding_formats
+from stages.capacity.output_formats import (
+    CHOICES,
+    DEFAULT_FORMATS,
+    formats_setting,
+    rounding_formats,
+)
 from stages.raster.backends import (
     backend_of_settings,
     backend_setting,

@@ -10,12 +10,12 @@ import pytest
 
 from stages import export, formats
 from stages.base.stage import Report
+from stages.capacity.output_formats import rounding_formats
 from stages.capacity.rounding import RoundingFinetuner, finetune_to_rounding, write_and_read
 from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_splats
-from stages.formats.settings import rounding_formats
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.scene import QuantisedSplats, split_held_out, training_extent
 from stages.training.finetune import FineTuner
