@@ -17,13 +17,14 @@ from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
 from stages.capacity.output_formats import ALL_MESHES, DEFAULT_FORMATS, formats_setting
-from stages.formats.table import FORMATS, MESHES
+from stages.formats.table import FORMATS
 from stages.raster.backends import (
     backend_of_settings,
     backend_setting,
     device_setting,
     report_backend,
 )
+from stages.surface.table import MESHES
 
 if TYPE_CHECKING:
     from stages.proof.prover import Prover
@@ -146,7 +147,7 @@ def _write_meshes(
         load_object(row.writer)(path, made.mesh, reconstruction.units)
         if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
-        files.append(ExportedFile(row.ending, path.name, row.size_bytes(path)))
+        files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
     return files
 
 

@@ -15,7 +15,7 @@ from stages.base.settings import check_settings
 from stages.base.stage import Report
 from stages.export import ExportSettings
 from stages.formats import FORMATS
-from stages.proof import independent_readers
+from stages.proof import checks
 from stages.proof.content import FileContent
 from stages.scene import ExportedAssets, QuantisedSplats, Splats
 from stages.surface import fuse, ply
@@ -98,7 +98,7 @@ def test_a_wrong_file_does_not_pass(
 ) -> None:
     """As if the writer had made a common mistake: the check must see each of them."""
 
-    right = independent_readers.read_back
+    right = checks.read_back
 
     def wrong(path: Path) -> FileContent:
         content = right(path)
@@ -115,7 +115,7 @@ def test_a_wrong_file_does_not_pass(
             splats = splats.take(np.arange(1, len(splats)))
         return replace(content, splats=splats)
 
-    monkeypatch.setattr(independent_readers, "read_back", wrong)
+    monkeypatch.setattr(checks, "read_back", wrong)
     with pytest.raises(SplatError) as caught:
         exported(scene, tmp_path, formats=(name,))
     assert caught.value.code == "export-verify-failed"

@@ -157,7 +157,7 @@ def _share(count: int, statistics: Statistics) -> str:
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:
     from stages.formats import format_of
-    from stages.proof.byte_breakdown import byte_breakdown_of
+    from stages.proof.checks import byte_breakdown_of
 
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size": console.size(size)}

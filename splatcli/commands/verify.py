@@ -89,7 +89,7 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
 
 def _files(target: Path | None) -> list[Path]:
     """The file itself; of a run folder, what it exported but for meshes, which hold no splats."""
-    from stages.formats import MESHES
+    from stages.surface.table import MESHES
 
     if target is not None and not target.is_dir():
         return [target]

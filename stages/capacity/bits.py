@@ -90,6 +90,6 @@ def file_size_bytes(
     empty for formats without a quantiser."""
     held = load_object(row.quantiser)(splats, BitDepths(**depths)) if depths else splats
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / row.name("scene")
+        path = Path(folder) / row.file_name("scene")
         formats.write(path, held, units=units, views=views)
         return row.size_bytes(path)

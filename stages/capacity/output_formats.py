@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from dataclasses import field
 from typing import Any
 
-from stages.formats.table import FORMATS, MESHES
+from stages.formats.table import FORMATS
+from stages.surface.table import MESHES
 
 DEFAULT_FORMATS = ("ply", "splat", "glb", "usdz")
 ALL_MESHES = "mesh"  # a value of `--format`: every format of meshes

@@ -103,7 +103,7 @@ def finetune_to_rounding(
 def write_and_read(row: Format, splats: Splats) -> Splats:
     """`splats` as a file of the format returns them, in their own order. All must be drawable."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / row.name("scene")
+        path = Path(folder) / row.file_name("scene")
         formats.write(path, splats)
         found = formats.read(path).with_sh_degree(splats.sh_degree)
     if row.order:

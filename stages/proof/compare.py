@@ -12,7 +12,7 @@ from stages.base import scratch
 from stages.base.blocks import blocks
 from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, Format
-from stages.proof.independent_readers import FileContent
+from stages.proof.content import FileContent
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.scene import SH_C0, Splats
 from stages.scene.flip import FLIP, flipped

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, format_of
 from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
-from stages.proof import diagnosis, independent_readers
+from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows
@@ -102,13 +101,13 @@ class Prover:
         """
         row = format_of(path)
         try:
-            content = _drawable(independent_readers.read_back(path))
-            said = load_object(row.validator)(path) if row.validator else []
+            content = _drawable(checks.read_back(path))
+            errors = checks.CHECKS[row.ending].validate(path)
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)
-        if said:
-            return Proof(count, {}, f"its validator says: {said[0]}")
+        if errors:
+            return Proof(count, {}, f"its validator says: {errors[0]}")
         if count != len(self.splats):
             return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
         names = tuple(filter(None, (row.ending, self.came_as)))
@@ -127,7 +126,7 @@ class Prover:
             "worst_attribute": found.worst,
             "worst_splat": found.worst_row,
         }
-        fault = diagnosis.explained(self.splats, content, found)
+        fault = diagnosis.explain(self.splats, content, found)
         if not lossy and worst < _LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn

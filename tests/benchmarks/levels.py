@@ -55,7 +55,7 @@ def main(path: Path, fewest: int = 2000) -> None:
     smooth = replace(plain, antialias=True)
     print("| splats | full | as sharp: full, level | without antialiasing: full, level |")
     print("|--:|--:|--:|--:|")
-    for level in levels.levels_of(full)[1:]:
+    for level in levels.coarser_levels(full):
         rows = []
         for camera in cameras(full, level):
             truth = truth_of(full, camera, smooth)
