@@ -68,7 +68,7 @@ def run(
     Metrics: files (how many), splats, dropped; formats: by format size_bytes, bytes_per_splat and
     the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
     the file, the worst camera) and the largest errors of the values; mesh: the figures of
-    `surface.make`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
+    `CollisionMesh`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
     file from being written.
     """
     from stages import formats
@@ -119,7 +119,7 @@ def _write_meshes(
     folder: Path,
     report: Report,
 ) -> list[ExportedFile]:
-    """Write the meshes that were asked for, and prove each; metric: mesh, see `surface.make`.
+    """Write the meshes that were asked for, and prove each; metric: mesh, see `CollisionMesh`.
     Raises SplatError "export-verify-failed"."""
     rows = mesh_formats(settings.formats)
     if not rows:
