@@ -120,7 +120,7 @@ def rotation_gradient(out, mask, q0, q1, q2, q3, norm, r00, r10, r20, r01, r11, 
 def colour_gradient(
     cam, rows, at, mask, record, sums, out, BANDS: tl.constexpr, REAL: tl.constexpr
 ):
-    """SH gradients into `out`; (x, y, z): what the viewing directions add to the mean's gradient."""
+    """SH gradients into `out`; returns what the viewing directions add to the mean's gradient."""
     x, y, z, distance = direction(cam, rows, at, mask, REAL)
     g_r = shown_colour(record, sums, 0, mask)
     g_g = shown_colour(record, sums, 1, mask)
