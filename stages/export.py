@@ -221,10 +221,10 @@ def _write_meshes(
         return []
     from stages.base.lazy import load_object
     from stages.scene import ExportedFile
-    from stages.surface.files import fault_of
-    from stages.surface.make import make
+    from stages.surface.checks import fault_of
+    from stages.surface.collision_mesh import make_collision_mesh
 
-    made = make(
+    made = make_collision_mesh(
         splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
     )
     report.metric("mesh", made.figures)

@@ -120,7 +120,7 @@ def _filled(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.structure.seeding.coverage import fill_cells
+    from stages.structure.seeding.empty_cells import fill_cells
 
     training, _ = split_held_out(reconstruction.views)
     cameras = tuple(view.camera for view in reconstruction.views)

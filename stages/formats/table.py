@@ -117,7 +117,7 @@ _MESH = Format(
     opens_in="game engines, mesh tools",
     keeps="no splats: triangles to collide with, see below",
     writer="stages.surface.ply:write",
-    second_reader="stages.surface.files:read_ply",
+    second_reader="stages.surface.checks:read_ply",
 )
 TABLE = (
     Format(
@@ -221,7 +221,7 @@ TABLE = (
         _MESH,
         ending="mesh.glb",
         writer="stages.surface.gltf:write",
-        second_reader="stages.surface.files:read_glb",
+        second_reader="stages.surface.checks:read_glb",
         y_up=True,
     ),
     _MESH,

@@ -100,7 +100,7 @@ def _block(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
         "position": _apart(a.means, b.means),
         "log_scale": _apart(a.log_scales, b.log_scales),
         "opacity": _apart(a.opacities[:, None], b.opacities[:, None]),
-        "rotation": rotations_apart(a.quaternions, b.quaternions),
+        "rotation": rotation_angles(a.quaternions, b.quaternions),
         "sh": _apart(a.sh.reshape(len(a), -1), b.sh.reshape(len(b), -1)),
         "colour": np.abs(seen[0] - seen[1]).max(axis=1, initial=0.0),
         "length": a.log_scales.max(axis=1) - a.log_scales.min(axis=1),
@@ -115,7 +115,7 @@ def _apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float
     return found
 
 
-def rotations_apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+def rotation_angles(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """[N] degrees between rotations [N, 4] of ellipsoids, which half turns about their own axes
     leave as they are: of the four turns from a to b, the least."""
     a, b = (q.astype(np.float64) for q in (a, b))

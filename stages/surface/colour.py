@@ -10,7 +10,7 @@ from stages.surface.depth_maps import DepthMap
 from stages.surface.mesh import Mesh
 
 
-def coloured(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
+def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
     """Each vertex in the mean of what the pixels show that see it, by their votes.
 
     tolerance: how far a pixel's depth may lie from the vertex, world units. What no pixel sees
@@ -29,7 +29,7 @@ def coloured(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
         agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
         seen = np.flatnonzero(inside)[agrees]
         rows, columns = rows[agrees], columns[agrees]
-        weight = found.vote[rows, columns].astype(np.float64)
+        weight = found.weight[rows, columns].astype(np.float64)
         sums[seen] += weight[:, None] * found.colour[rows, columns]
         votes[seen] += weight
     known = votes > 0

@@ -26,12 +26,12 @@ class DepthMap:
 
     camera: Camera
     depth: NDArray[np.float32]
-    vote: NDArray[np.float32]
+    weight: NDArray[np.float32]
     colour: NDArray[np.uint8]
 
     def points(self, step: int = 1) -> NDArray[np.float64]:
         """[M, 3] every `step`-th trusted pixel's place in the world."""
-        trusted = np.flatnonzero(self.vote > 0)[::step]
+        trusted = np.flatnonzero(self.weight > 0)[::step]
         places = unproject(self.camera, self.depth).reshape(-1, 3)[trusted]
         rotation, translation = (
             self.camera.world_to_camera[:3, :3],
@@ -48,12 +48,12 @@ def unproject(camera: Camera, depth: NDArray[np.floating]) -> NDArray[np.float64
     return found
 
 
-def chosen(cameras: list[Camera]) -> list[Camera]:
+def select_cameras(cameras: list[Camera]) -> list[Camera]:
     """At most CAMERAS_AT_MOST of them, evenly, at the size at which depth is drawn."""
     return [camera.fitted(SIDE_PX) for camera in evenly_spaced(cameras, CAMERAS_AT_MOST)]
 
 
-def draw(
+def draw_depth_maps(
     splats: Splats,
     cameras: list[Camera],
     settings: RasterSettings,
@@ -72,14 +72,14 @@ def draw(
         depth = drawn.median_depth
         solid = (drawn.alpha >= _SOLID) & (depth > 0) & np.isfinite(depth)
         depth = np.where(solid, depth, 0).astype(np.float32)
-        cosine = facing(camera, depth)
-        vote = np.where(solid & (cosine >= _GRAZING), cosine, 0).astype(np.float32)
+        cosine = surface_cosine(camera, depth)
+        weight = np.where(solid & (cosine >= _GRAZING), cosine, 0).astype(np.float32)
         colour = np.rint(255 * np.clip(np.nan_to_num(drawn.image), 0, 1)).astype(np.uint8)
-        maps.append(DepthMap(camera, depth, vote, colour))
+        maps.append(DepthMap(camera, depth, weight, colour))
     return maps
 
 
-def facing(camera: Camera, depth: NDArray[np.floating]) -> NDArray[np.float64]:
+def surface_cosine(camera: Camera, depth: NDArray[np.floating]) -> NDArray[np.float64]:
     """[H, W] cosine between each pixel's ray and the normal of the surface through its
     neighbours; 1 for a surface that faces the camera."""
     places = unproject(camera, depth)

@@ -11,7 +11,9 @@ _CANDIDATES = 8  # triangles measured exactly for each point
 _POINTS_AT_ONCE = 1 << 16
 
 
-def distances(points: NDArray[np.floating], mesh: Mesh, spacing: float) -> NDArray[np.float64]:
+def distances_to_mesh(
+    points: NDArray[np.floating], mesh: Mesh, spacing: float
+) -> NDArray[np.float64]:
     """[P] from each point to the nearest triangle, world units; infinite if there is none.
 
     Exact distances to the triangles of the eight nearest samples of the surface, `spacing` apart at

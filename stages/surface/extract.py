@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from stages.surface.fuse import Volume
 from stages.surface.mesh import Mesh
 
-CRUMB = 0.01  # of the whole area; smaller pieces that hang on nothing are left out
+SMALL_COMPONENT = 0.01  # of the whole area; smaller pieces that hang on nothing are left out
 
 
-def surface_of(volume: Volume) -> Mesh:
+def extract_surface(volume: Volume) -> Mesh:
     """Marching cubes (Lewiner et al. 2003) between observed voxels only: where the unseen begins
     the surface ends, open, instead of closing around it."""
     from skimage.measure import marching_cubes
@@ -42,7 +42,7 @@ def _observed_cubes(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return cubes
 
 
-def without_crumbs(mesh: Mesh) -> tuple[Mesh, int]:
+def remove_small_components(mesh: Mesh) -> tuple[Mesh, int]:
     """(the mesh, number of pieces left out): those of less than CRUMB of the area."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -55,7 +55,7 @@ def without_crumbs(mesh: Mesh) -> tuple[Mesh, int]:
     links = coo_array((np.ones(len(ends[0]), bool), ends), shape=(count, count))
     pieces, piece_of = connected_components(links, directed=False)
     areas = np.bincount(piece_of[a], face_areas(mesh), pieces)
-    kept = areas >= CRUMB * areas.sum()
+    kept = areas >= SMALL_COMPONENT * areas.sum()
     return Mesh.of(mesh.vertices, mesh.faces[kept[piece_of[a]]]), int((~kept).sum())
 
 
@@ -65,7 +65,7 @@ def face_areas(mesh: Mesh) -> NDArray[np.float64]:
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
-def simplified(mesh: Mesh, triangles: int) -> Mesh:
+def simplify(mesh: Mesh, triangles: int) -> Mesh:
     """At most about `triangles` of them, by quadric error (Garland & Heckbert, SIGGRAPH 1997)."""
     from fast_simplification import simplify
 

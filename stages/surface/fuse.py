@@ -39,7 +39,7 @@ class Volume:
         return self.corner + self.voxel * (np.array(self.distance.shape) - 1)
 
 
-def voxels_that_fit() -> int:
+def voxel_budget() -> int:
     """VOXELS, or what a quarter of free memory holds."""
     free_mib = available_mib()
     if free_mib is None:
@@ -47,14 +47,14 @@ def voxels_that_fit() -> int:
     return min(VOXELS, max(1000, int(_SHARE_OF_MEMORY * free_mib * MIB / _BYTES_A_VOXEL)))
 
 
-def seen_region(
+def observed_box(
     maps: list[DepthMap],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Corners [3], [3] of the box that most of the trusted pixels lie in; None if there are none.
 
     Robust at both ends: one far splat must not take the voxels away from everything else.
     """
-    sampled = [found.depth[found.vote > 0][::_SAMPLE_STEP] for found in maps]
+    sampled = [found.depth[found.weight > 0][::_SAMPLE_STEP] for found in maps]
     if not any(map(len, sampled)):
         return None
     depths = np.concatenate(sampled)
@@ -72,7 +72,7 @@ def empty_volume(low: NDArray[np.float64], high: NDArray[np.float64], voxels: in
     return Volume(np.zeros(shape, np.float32), np.zeros(shape, np.float32), low, voxel)
 
 
-def fuse(maps: list[DepthMap], volume: Volume, near: float) -> Volume:
+def fuse_depth_maps(maps: list[DepthMap], volume: Volume, near: float) -> Volume:
     """The volume with all maps in it. near: depth from which a camera sees, world units.
 
     In every voxel the maps are added in their order, so the result does not depend on threads.
@@ -94,7 +94,7 @@ def fuse(maps: list[DepthMap], volume: Volume, near: float) -> Volume:
         near,
         rows,
         np.concatenate([found.depth.ravel() for found in maps]),
-        np.concatenate([found.vote.ravel() for found in maps]),
+        np.concatenate([found.weight.ravel() for found in maps]),
     )
     np.multiply(volume.distance, np.float32(TRUNCATION), out=volume.distance)
     return volume

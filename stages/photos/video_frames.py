@@ -11,7 +11,7 @@ from stages.base.text import counted
 from stages.photos.decode import Decoded
 from stages.photos.exif import Exif
 from stages.photos.find import Source
-from stages.photos.frames import (
+from stages.photos.frame_selection import (
     BLURRED_BELOW,
     MEASURED_SIDE_PX,
     MOST,

@@ -12,7 +12,7 @@ from stages.base.stage import Report
 from stages.raster.kernels.pool import Pool
 from stages.scene import Reconstruction, Splats
 from stages.surface import fuse
-from stages.surface.make import MadeMesh, make
+from stages.surface.collision_mesh import CollisionMesh, make_collision_mesh
 from tests.surface.shapes import (
     CENTRE,
     all_around,
@@ -34,9 +34,9 @@ def _few_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(
     splats: Splats, reconstruction: Reconstruction, triangles: int = 100_000
-) -> tuple[MadeMesh, Report]:
+) -> tuple[CollisionMesh, Report]:
     report = Report()
-    return make(splats, reconstruction, triangles, "auto", report), report
+    return make_collision_mesh(splats, reconstruction, triangles, "auto", report), report
 
 
 def test_a_sphere_seen_from_all_sides_is_that_sphere() -> None:
@@ -121,7 +121,7 @@ def test_little_memory_means_larger_voxels_and_a_warning(monkeypatch: pytest.Mon
     monkeypatch.setattr(fuse, "available_mib", lambda: 1.0)
     found, report = made(sphere(), all_around())
     assert [code for code, _ in report.warnings] == ["export-mesh-coarse"]
-    assert fuse.voxels_that_fit() * 16 <= 2**20 / 4
+    assert fuse.voxel_budget() * 16 <= 2**20 / 4
     radii = np.linalg.norm(found.mesh.vertices - CENTRE, axis=1)
     assert np.abs(radii - 1).max() < 2 * MESH_VOXELS * found.figures["voxel"]
 
@@ -140,4 +140,4 @@ def test_ctrl_c_stops_between_cameras() -> None:
     report = Report()
     report.stop_requested.set()
     with pytest.raises(Interrupted):
-        make(sphere(), all_around(3), 1000, "auto", report)
+        make_collision_mesh(sphere(), all_around(3), 1000, "auto", report)

@@ -14,7 +14,7 @@ from stages.raster.draw import raster_settings_of
 from stages.scene import Reconstruction, Splats, split_held_out
 from stages.surface import colour, depth_maps, extract, fuse
 from stages.surface.depth_maps import DepthMap
-from stages.surface.distance import distances
+from stages.surface.distance import distances_to_mesh
 from stages.surface.mesh import Mesh
 
 _WITHIN_VOXELS = 2.0  # how far a surface may lie from the mesh and count as covered
@@ -23,7 +23,7 @@ _POOR_SHARE = 0.7
 
 
 @dataclass(frozen=True)
-class MadeMesh:
+class CollisionMesh:
     """A mesh and its figures, JSON values. Lengths in world units.
 
     triangles, vertices, watertight, voxel, pieces_left_out.
@@ -39,16 +39,16 @@ class MadeMesh:
     figures: dict[str, Any]
 
 
-def make(
+def make_collision_mesh(
     splats: Splats, reconstruction: Reconstruction, triangles: int, backend: str, report: Report
-) -> MadeMesh:
+) -> CollisionMesh:
     """The mesh of what the training cameras see, of at most about `triangles` triangles.
 
     Equal inputs give an equal mesh, unless memory is so short that voxels have to be larger.
     Warnings: export-mesh-empty, export-mesh-coarse, export-mesh-gaps. Raises Interrupted.
     """
     training, _ = split_held_out(reconstruction.views)
-    cameras = depth_maps.chosen([view.camera for view in training])
+    cameras = depth_maps.select_cameras([view.camera for view in training])
     settings = raster_settings_of(splats)
 
     def tick(number: int) -> None:
@@ -56,24 +56,24 @@ def make(
             raise Interrupted(f"stopped after {number} of {len(cameras)} cameras")
         report.progress(number, len(cameras), "drawing depth")
 
-    maps = depth_maps.draw(splats, cameras, settings, backend, tick)
+    maps = depth_maps.draw_depth_maps(splats, cameras, settings, backend, tick)
     report.progress(len(cameras), len(cameras), "fusing depth")
-    region = fuse.seen_region(maps)
+    region = fuse.observed_box(maps)
     if region is None:
         return _nothing(report)
-    voxels = fuse.voxels_that_fit()
+    voxels = fuse.voxel_budget()
     if voxels < fuse.VOXELS:
         report.warn(
             "export-mesh-coarse",
             f"Memory is short: the mesh was made of {voxels:,} voxels instead of "
             f"{fuse.VOXELS:,}. Close other programs and export again for a finer one.",
         )
-    volume = fuse.fuse(maps, fuse.empty_volume(*region, voxels), settings.near)
-    fine, crumbs = extract.without_crumbs(extract.surface_of(volume))
-    mesh = extract.simplified(fine, triangles)
+    volume = fuse.fuse_depth_maps(maps, fuse.empty_volume(*region, voxels), settings.near)
+    fine, crumbs = extract.remove_small_components(extract.extract_surface(volume))
+    mesh = extract.simplify(fine, triangles)
     if not len(mesh.faces):
         return _nothing(report)
-    mesh = colour.coloured(mesh, maps, fuse.TRUNCATION * volume.voxel)
+    mesh = colour.colour_vertices(mesh, maps, fuse.TRUNCATION * volume.voxel)
     mesh = replace(mesh, origin=splats.origin)
     covered = _covered(mesh, maps, volume.voxel)
     figures = {
@@ -86,16 +86,16 @@ def make(
         **_from_sparse_points(mesh, reconstruction.points, volume),
     }
     _warn_of_gaps(covered, report)
-    return MadeMesh(mesh, figures)
+    return CollisionMesh(mesh, figures)
 
 
-def _nothing(report: Report) -> MadeMesh:
+def _nothing(report: Report) -> CollisionMesh:
     report.warn(
         "export-mesh-empty",
         "The mesh is empty: no training camera sees a solid surface. Look at the splats with "
         "`splat view`.",
     )
-    return MadeMesh(Mesh.empty(), {"triangles": 0, "vertices": 0, "covered_share": 0.0})
+    return CollisionMesh(Mesh.empty(), {"triangles": 0, "vertices": 0, "covered_share": 0.0})
 
 
 def _warn_of_gaps(covered: float, report: Report) -> None:
@@ -111,9 +111,9 @@ def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
     """See MadeMesh."""
     pixels = sum(int((found.depth > 0).sum()) for found in maps)
     step = max(1, pixels // _SAMPLES)
-    solid = [replace(found, vote=(found.depth > 0).astype(np.float32)) for found in maps]
+    solid = [replace(found, weight=(found.depth > 0).astype(np.float32)) for found in maps]
     places = np.concatenate([found.points(step) for found in solid])
-    near = distances(places, mesh, voxel) <= _WITHIN_VOXELS * voxel
+    near = distances_to_mesh(places, mesh, voxel) <= _WITHIN_VOXELS * voxel
     return round(float(near.mean()), 4)
 
 
@@ -123,7 +123,7 @@ def _from_sparse_points(
     inside = np.all((points >= volume.corner) & (points <= volume.far_corner), axis=1)
     share = float(inside.mean()) if len(points) else 0.0
     figures: dict[str, float | None] = {"sparse_points_inside_share": round(share, 4)}
-    found = distances(points[inside], mesh, volume.voxel)
+    found = distances_to_mesh(points[inside], mesh, volume.voxel)
     diagonal = float(np.linalg.norm(volume.far_corner - volume.corner))
     for name, percent in (("median", 50), ("p90", 90)):
         value = float(np.percentile(found, percent)) if len(found) else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.photos.frames import (
+from stages.photos.frame_selection import (
     BLURRED_BELOW,
     STEP,
     WIDEST_GAP,

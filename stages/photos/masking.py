@@ -24,7 +24,7 @@ _NAMED = 5
 
 
 @dataclass(frozen=True)
-class Masked:
+class MaskedPhoto:
     """A photograph and what of it counts. decoded: over black where nothing is. mask [H, W], 0 is
     outside, and outside: as in `scene.Photo`; None where everything counts. scaled: whether a mask
     file had another size. share: of the photograph that is inside."""
@@ -36,7 +36,9 @@ class Masked:
     share: float = 1.0
 
     @classmethod
-    def of(cls, decoded: Decoded, name: str, file: Path | None, invert: bool, means: str) -> Masked:
+    def of(
+        cls, decoded: Decoded, name: str, file: Path | None, invert: bool, means: str
+    ) -> MaskedPhoto:
         """From the photograph's alpha and the mask in `file`, white inside (or black: invert).
 
         means: IGNORE, TRANSPARENT, or AUTO: what the file masks is ignored, what alpha does is

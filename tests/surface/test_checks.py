@@ -16,7 +16,7 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.base.lazy import load_object
 from stages.formats import MESHES
-from stages.surface.files import fault_of
+from stages.surface.checks import fault_of
 from stages.surface.mesh import Mesh
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 from stages import seed
 from stages.base.stage import Report
 from stages.scene import Camera, Reconstruction, View, look_at
-from stages.structure.seeding.coverage import CELLS, MARGIN, fill_cells
+from stages.structure.seeding.empty_cells import CELLS, MARGIN, fill_cells
 
 WIDTH, HEIGHT = 80, 60
 FLOOR = 1.0  # y of the floor; up is -y
