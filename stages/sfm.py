@@ -35,6 +35,7 @@ class SfmSettings:
     seed: int = field(
         default=0,
         metadata={
+            "panel": "Advanced",
             "help": "Seed of every random choice; same seed, same result.",
             "min": 0,
             "max": 2**31 - 1,
@@ -58,11 +59,15 @@ class SfmSettings:
     )
     allow_partial: bool = field(
         default=False,
-        metadata={"help": "Use the best reconstruction found even if it fails the quality gates."},
+        metadata={
+            "panel": "Advanced",
+            "help": "Use the best reconstruction found even if it fails the quality gates.",
+        },
     )
     cameras: Path | None = field(
         default=None,
         metadata={
+            "panel": "Known cameras",
             "help": "File or folder of known camera poses, of COLMAP, nerfstudio, a synthetic NeRF "
             "scene, LLFF, OpenSfM, Bundler, Metashape or RealityScan; they are not estimated.",
             "affects_output": False,  # its content does, and that is an input
@@ -71,6 +76,7 @@ class SfmSettings:
     split: bool = field(
         default=False,
         metadata={
+            "panel": "Known cameras",
             "help": "Use the split into training and test photographs of --cameras.",
             "needs": "cameras",
         },
@@ -78,6 +84,7 @@ class SfmSettings:
     refine_cameras: bool = field(
         default=False,
         metadata={
+            "panel": "Known cameras",
             "help": "Refine the poses of --cameras by bundle adjustment; intrinsics stay fixed.",
             "needs": "cameras",
         },
@@ -85,6 +92,7 @@ class SfmSettings:
     metres: bool = field(
         default=False,
         metadata={
+            "panel": "Known cameras",
             "help": "The poses of --cameras are in metres, as those of phones' AR sessions are.",
             "needs": "cameras",
         },
@@ -92,6 +100,7 @@ class SfmSettings:
     scale: tuple[str, ...] = field(
         default=(),
         metadata={
+            "panel": "Known cameras",
             "help": "Two photographs and the distance between their cameras (metres).",
             "together": "A B METRES",
         },
@@ -99,6 +108,7 @@ class SfmSettings:
     marker: float = field(
         default=0.0,
         metadata={
+            "panel": "Known cameras",
             "help": "Side of the ArUco markers in the scene, alone or on a ChArUco board "
             "(metres); 0: there are none.",
             "min": 0.0,

@@ -12,10 +12,15 @@ import itertools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stages import STAGE_NAMES, load_stage
 from stages.base.settings import settings_of
 from tests.layers import LAYERS, STAGE_FILES
+
+if TYPE_CHECKING:
+    from stages.formats.table import Format
+    from stages.surface.table import MeshFormat
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
@@ -77,11 +82,16 @@ def stages() -> str:
     return _table(("folder", "module", "reads", "version", "options"), rows)
 
 
-def formats() -> str:
+def _formats() -> list[Format | MeshFormat]:
     from stages.formats.table import TABLE
+    from stages.surface.table import MESHES
 
+    return [*TABLE, *MESHES.values()]
+
+
+def formats() -> str:
     rows: list[tuple[str, ...]] = []
-    same = itertools.groupby(TABLE, lambda row: (row.opens_in, row.keeps, row.y_up))
+    same = itertools.groupby(_formats(), lambda row: (row.opens_in, row.keeps, row.y_up))
     for (opens_in, keeps, y_up), group in same:
         names = ", ".join(f"`{row.ending}`" for row in group)
         rows.append((names, opens_in, f"{keeps}{'; y up' if y_up else ''}"))
@@ -89,11 +99,9 @@ def formats() -> str:
 
 
 def format_modules() -> str:
-    from stages.formats.table import TABLE
-
     rows: list[tuple[str, ...]] = []
-    for row in TABLE:
-        places = (row.writer, row.reader)
+    for row in _formats():
+        places = (row.writer, getattr(row, "reader", ""))
         cells = (f"`{place.replace(':', '` `')}`" if place else "none" for place in places)
         rows.append((f"`{row.ending}`", *cells))
     return _table(("format", "writer", "reader"), rows)

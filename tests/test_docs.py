@@ -20,6 +20,8 @@ from tests.docs_tables import PAGES, ROOT, renewed
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
 GUIDE = (ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md")))
 README_LINES = 200
+# Files of users and of run folders, which the code does not hold.
+WRITTEN = {"manifest.json", "transforms.json", "reconstruction.json"}
 _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
 # Strings of the source that look like codes and are something else.
 _NO_CODES = {
@@ -102,9 +104,25 @@ def test_paths_and_names_of_the_code_exist(page: Path) -> None:
         assert (ROOT / path).exists(), path
         if name:
             assert re.search(rf"\b{name}\b", source_of(ROOT / path)), f"{path} has no {name}"
+    names = {
+        path.name for top in ("stages", "splatcli", "tests") for path in (ROOT / top).rglob("*")
+    }
+    for name in re.findall(r"`(\w+\.(?:py|cpp|json))`", text):
+        assert name in names | WRITTEN, name
     for module in re.findall(r"python -m ((?:stages|tests)[\w.]*)", text):
         found = ROOT.joinpath(*module.split("."))
         assert found.with_suffix(".py").exists() or (found / "__main__.py").exists(), module
+
+
+@pytest.mark.parametrize("page", GUIDE, ids=page_id)
+def test_keys_and_metrics_that_the_guide_names_exist(page: Path) -> None:
+    """`psnr_as_taken_db` and the like: words in code style with an underscore."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    code = source_of(ROOT / "stages") + source_of(ROOT / "splatcli")
+    for inline in re.findall(r"`([^`]+)`", text):
+        for name in re.findall(r"(?<![\w./-])[a-z]+_\w+(?!\.)\b", inline):
+            known = name in ("a_mask", "poses_bounds", "transforms_train", "sample_captures")
+            assert known or re.search(rf"\b{name}\b", code), name
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""No pixel of a held-out view reaches the asset; a near-duplicate photograph is never held out.
+"""No pixel of a held-out view reaches the asset, and a photograph with a duplicate is not held out.
 
 Structure from motion is before all this: it has to place the judges too, and sees all photographs.
 """
@@ -41,7 +41,7 @@ def made(reconstruction: Reconstruction, folder: Path) -> dict[str, bytes]:
         (seed.STAGE, seed.SeedSettings()),
         (train.STAGE, train.TrainSettings(steps=120, train_side=72, sh_degree=1, max_splats=400)),
         (prune.STAGE, prune.PruneSettings()),
-        (quantise.STAGE, quantise.QuantiseSettings()),
+        (quantise.STAGE, quantise.QuantiseSettings(formats=("spz",))),
         (export.STAGE, export.ExportSettings(formats=("ply", "spz"))),
     )
     found = {}

@@ -25,9 +25,11 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     """
     from stages import formats
     from stages.base import scratch
+    from stages.base.atomic import make_folder
     from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
+    make_folder(target.parent)
     begun = time.monotonic()
     with _progress(quiet, as_json) as say, scratch.scratch_in(target.parent, spare=True):
         say(f"reading {source}")

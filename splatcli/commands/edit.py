@@ -29,7 +29,7 @@ def edit(
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
-    from stages.editing import operations
+    from stages.editing import levels, operations
 
     if target is None and not dry_run:
         raise SplatError(
@@ -41,10 +41,10 @@ def edit(
         )
     target = target or Path("scene.ply")
     row, chain = formats.format_of(target), operations.prepare_operations(parsed, target)
-    if row.streamed and not dry_run:
+    if not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
-        if target.parent.is_dir():  # `write` says so where it is not
+        if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
         scene = _opened(source)
         before, start_db = len(scene.splats), scene.psnr_db()
@@ -58,7 +58,7 @@ def edit(
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
         if not dry_run:
             views = scene.placed_views()
-            formats.write(target, scene.splats, units=scene.units, views=views)
+            levels.write(target, scene.splats, units=scene.units, views=views)
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
             if views:
                 facts |= _proven(source, target, scene)
@@ -71,15 +71,15 @@ def edit(
 def _opened(source: Path) -> EditedScene:
     """With the photographs of the run that it is of, or lies in. Raises SplatError."""
     from splatcli.sources import backend_of, pipeline_around, splats_of
-    from stages.editing.operations import without_undrawable
     from stages.editing.scene import EditedScene
     from stages.formats import units_of
+    from stages.formats.values import drop_undrawable
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
     splats, pipeline = splats_of(source)
     pipeline = pipeline or pipeline_around(source)
-    splats = without_undrawable(splats)
+    splats = drop_undrawable(splats)[0]
     if pipeline is None or pipeline.manifest("sfm") is None:
         return EditedScene(splats, units_of(source))
     found = pipeline.load("sfm")

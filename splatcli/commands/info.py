@@ -104,6 +104,7 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
     around the splats where there are none."""
     from stages.measure.speed import seconds_per_frame
+
     from stages.scene.framing import orbit_cameras
 
     if not cache.are_compiled():
@@ -156,7 +157,7 @@ def _share(count: int, statistics: Statistics) -> str:
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:
     from stages.formats import format_of
-    from stages.proof.byte_breakdown import byte_breakdown_of
+    from stages.proof.checks import byte_breakdown_of
 
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size": console.size(size)}

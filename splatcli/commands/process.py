@@ -232,6 +232,9 @@ def run_stage(
     if "formats" in typed:
         typed["formats"] = _with_exported(pipeline, typed["formats"])
     settings = settings_for({name: base[name]}, typed, preset)
+    if name == "export" and "formats" in typed:  # which quantise may have to fine-tune to first
+        formats = (*base["quantise"].formats, *typed["formats"])
+        settings["quantise"] = options.changed(base["quantise"], {"formats": formats})
     if not known:
         settings = {**base, **settings}
     if name == "train" and not (quiet or as_json):

@@ -53,7 +53,6 @@ def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> 
 def material_of(pipeline: Pipeline) -> TradeoffInputs:
     """What is measured of a finished run. Raises SplatError (stage-not-finished, run-half-anew,
     nothing-held-out)."""
-    from stages.export import fitted_in
     from stages.measure.evaluation import load_evaluation_views
     from stages.measure.tradeoff.measurement import TradeoffInputs, deciding_views
     from stages.scene import split_held_out
@@ -71,7 +70,6 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
         )
     trained = pipeline.manifest("train")
     exported = tuple(sources.exported_formats(pipeline))
-    fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
     return TradeoffInputs(
         splats=splats,
         training=load_evaluation_views(
@@ -87,5 +85,4 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,
         quantised=pipeline.load("quantise"),
-        fitted={name: splats for name, splats in fitted.items() if splats is not None},
     )

@@ -27,8 +27,7 @@ _ONLY_ITSELF = (
 @dataclass(frozen=True)
 class _Original:
     """What files are compared with. name: in words. came_as: the format that it was read from.
-    itself: whether that was the file in question. backend: what draws. quantised: of a run;
-    exported: its export's folder."""
+    itself: whether that was the file in question. backend: what draws. quantised: of a run."""
 
     splats: Splats
     views: tuple[View, ...]
@@ -37,20 +36,20 @@ class _Original:
     itself: bool = False
     backend: str = "auto"
     quantised: QuantisedSplats | None = None
-    exported: Path | None = None
 
     def held_in(self, file: Path) -> Iterator[Splats]:
-        """What `file` may hold, likeliest first: where a run is known, what its export fitted to
-        the format, and what a conversion of the run's splats would."""
-        from stages import export
+        """What `file` may hold, likeliest first: what the run's export writes, which may be
+        fine-tuned to the format, and what a conversion of the run's splats writes."""
         from stages.formats import format_of
         from stages.formats.quantisation import splats_to_write
 
         row = format_of(file)
-        if self.exported is not None:
-            fitted = export.fitted_in(self.exported, row.ending)
-            yield from () if fitted is None else (fitted,)
-        yield splats_to_write(row, self.quantised) if self.quantised else self.splats
+        if self.quantised is None:
+            yield self.splats
+            return
+        yield splats_to_write(row, self.quantised)
+        if row.ending in self.quantised.finetuned:
+            yield splats_to_write(row, replace(self.quantised, finetuned={}))
 
 
 def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool) -> None:
@@ -90,7 +89,7 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
 
 def _files(target: Path | None) -> list[Path]:
     """The file itself; of a run folder, what it exported but for meshes, which hold no splats."""
-    from stages.formats import MESHES
+    from stages.surface.table import MESHES
 
     if target is not None and not target.is_dir():
         return [target]
@@ -129,8 +128,7 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     splats = drop_undrawable(quantised.splats)[0]
     backend = sources.backend_of(run)
     name = f"the run {run.run_folder}"
-    exported = run.stage_folder("export")
-    return _Original(splats, seen, name, backend=backend, quantised=quantised, exported=exported)
+    return _Original(splats, seen, name, backend=backend, quantised=quantised)
 
 
 def _tell(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:

@@ -28,7 +28,7 @@ from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Listener
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
-from stages.training.checkpoint import FILE_NAME, checkpoint_files
+from stages.training.checkpoint import FILE_NAME
 
 
 def parse_location(text: str) -> Location:
@@ -262,7 +262,7 @@ class UploadListener(Listener):
             saved_ns = (folder / FILE_NAME).stat().st_mtime_ns
             if saved_ns != self._saved_ns:
                 self._saved_ns = saved_ns
-                for name in (REQUEST, *checkpoint_files(folder)):
+                for name in (REQUEST, FILE_NAME):
                     self._put(folder, name)
 
     def _put(self, folder: Path, name: str) -> None:

@@ -1,7 +1,7 @@
-"""What `--keep` says of each splat: `opacity > 0.1 and scale < 0.5`.
+"""The conditions of `--keep`: `opacity > 0.1 and scale < 0.5`.
 
-Numbers, the names in `NAMES`, + - * /, comparisons, and, or, not and parentheses: Python's words,
-parsed by its parser and walked here. Nothing is ever evaluated by Python itself.
+A condition consists of numbers, the names in `VARIABLES`, + - * /, comparisons, and, or, not and
+parentheses. Python's parser builds the tree; it is checked and evaluated here, never by Python.
 """
 
 from __future__ import annotations
@@ -53,18 +53,17 @@ _COMPARISONS: dict[type[ast.AST], Any] = {
 
 
 class _RefusedError(ValueError):
-    """What of the text is not allowed."""
+    """Why a text is no condition."""
 
 
 @dataclass(frozen=True)
 class Expression:
-    """A condition that was checked. text: as it was given."""
+    """A checked condition."""
 
-    text: str
     tree: ast.expr
 
-    def holds(self, splats: Splats) -> NDArray[np.bool_]:
-        """[N] for which splats it is true; never for values that are not numbers."""
+    def evaluate(self, splats: Splats) -> NDArray[np.bool_]:
+        """[N] whether the condition is true; false where a comparison meets NaN."""
         found = np.empty(len(splats), bool)
         for rows in reported_blocks(len(splats)):
             with np.errstate(all="ignore"):
@@ -73,7 +72,7 @@ class Expression:
 
 
 def parse_expression(text: str) -> Expression:
-    """Raises SplatError "edit-keep" for what is no condition in the names and signs above."""
+    """Check `text`. Raises SplatError "edit-keep" for what is no condition."""
     try:
         if len(text) > _LONGEST:
             raise _RefusedError(f"it is longer than {_LONGEST} characters")
@@ -86,11 +85,11 @@ def parse_expression(text: str) -> Expression:
         raise _wrong(text, f"it cannot be read ({error.msg})") from error
     except (ValueError, MemoryError, RecursionError) as error:
         raise _wrong(text, "it cannot be read") from error
-    return Expression(text, tree)
+    return Expression(tree)
 
 
 def _checked(node: ast.expr, depth: int = 0) -> type:
-    """bool or float: what `node` says. Raises _RefusedError."""
+    """The type of `node`, bool or float. Raises _RefusedError."""
     if depth > _DEEPEST:
         raise _RefusedError(f"it is nested deeper than {_DEEPEST}")
 
@@ -98,7 +97,7 @@ def _checked(node: ast.expr, depth: int = 0) -> type:
         for part in parts:
             if _checked(part, depth + 1) is not wanted:
                 kind = "true or false" if wanted is bool else "a number"
-                raise _RefusedError(f"{ast.unparse(part)!r} stands where {kind} should")
+                raise _RefusedError(f"{ast.unparse(part)!r} stands where {kind} is wanted")
 
     match node:
         case ast.BoolOp(values=values):
@@ -126,12 +125,12 @@ def _checked(node: ast.expr, depth: int = 0) -> type:
         case ast.Name(id=name):
             if name in VARIABLES:
                 return float
-            raise _RefusedError(f"nothing is called {name!r}")
+            raise _RefusedError(f"there is no variable {name!r}")
     raise _RefusedError(f"{ast.unparse(node)[:60]!r} is not understood")
 
 
 def _value(node: Any, splats: Splats) -> Any:
-    """Of a tree that `_checked` let pass: [N], or one value for all."""
+    """The value of a checked tree: [N], or one value for all splats."""
     match node:
         case ast.Constant(value=bool() as truth):
             return truth
@@ -147,7 +146,7 @@ def _value(node: Any, splats: Splats) -> Any:
         case ast.UnaryOp(op=sign, operand=operand):
             return _ARITHMETIC[type(sign)](_value(operand, splats))
         case ast.BinOp(left=left, op=sign, right=right):
-            # one value for all divides by 0 as the others do
+            # as NumPy values, so that scalars divide by 0 like arrays
             both = np.float64(1) * _value(left, splats), np.float64(1) * _value(right, splats)
             return _ARITHMETIC[type(sign)](*both)
         case ast.Compare(left=left, ops=signs, comparators=others):

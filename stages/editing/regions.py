@@ -1,4 +1,4 @@
-"""Parts of space: a box, a ball, what lies between given points, or within a lasso."""
+"""Regions of space: a box, a sphere, the convex hull of points, or a lasso."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ _HULL = FileKind(
     "Write the corners down, or save them as points from another program.",
 )
 _CELLS = 1 << 22  # point x face, of one block
-_VIEW = 12  # numbers of a lasso that say from where it was drawn
+_VIEW = 12  # numbers of a lasso that hold its camera
 
 
 @dataclass(frozen=True)
 class Region:
-    """inside: which points lie in it, its rim included."""
+    """inside: which points [M, 3] lie in the region, its boundary included."""
 
     inside: Inside
 
-    def holds(self, splats: Splats) -> NDArray[np.bool_]:
-        """[N] whose centres lie inside."""
+    def contains(self, splats: Splats) -> NDArray[np.bool_]:
+        """[N] whether the centre of each splat lies inside."""
         found = np.empty(len(splats), bool)
         for rows in reported_blocks(len(splats)):
             found[rows] = self.inside(splats.means[rows].astype(np.float64))
@@ -41,8 +41,8 @@ class Region:
 
 
 def parse_region(text: str) -> Region:
-    """Of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or `lasso:...`, as the page of
-    `splat view` writes it. Raises SplatError "edit-region", "edit-hull-unreadable"."""
+    """The region of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or `lasso:...`, which
+    the page of `splat view` writes. Raises SplatError "edit-region", "edit-hull-unreadable"."""
     kind, _, rest = text.partition(":")
     if kind == "box" and (ends := parse_numbers(rest, 6)) is not None:
         low, high = ends[:3], ends[3:]
@@ -59,16 +59,16 @@ def parse_region(text: str) -> Region:
             return Region(_inside_lasso(view, corners.reshape(-1, 2)))
     raise SplatError(
         "edit-region",
-        given=f"{text[:100]!r} names no part of space.",
-        wanted="box:x0,y0,z0,x1,y1,z1 with its least corner first, sphere:x,y,z,r, hull:FILE, or "
+        given=f"{text[:100]!r} is no region of space.",
+        wanted="box:x0,y0,z0,x1,y1,z1 with its lowest corner first, sphere:x,y,z,r, hull:FILE, or "
         "lasso: and its numbers.",
-        hint="`splat info` tells the bounds of the scene; the page of `splat view` writes a lasso.",
+        hint="`splat info` prints the bounds; the page of `splat view` writes a lasso.",
         family=Family.USAGE,
     )
 
 
 def parse_numbers(text: str, count: int) -> NDArray[np.float64] | None:
-    """[count] finite numbers between commas; None for anything else."""
+    """[count] finite numbers separated by commas; None for any other text."""
     try:
         values = np.array([float(word) for word in text.split(",")])
     except ValueError:
@@ -103,10 +103,13 @@ def _inside_hull(path: Path) -> Inside:
 
 
 def _inside_lasso(view: NDArray[np.float64], corners: NDArray[np.float64]) -> Inside:
-    """view [12]: three rows that take (x, y, z, 1) to pixels times depth, and depth. corners
-    [K, 2]: pixels; inside is what an odd number of sides lies to the right of.
+    """Points whose projection lies inside a polygon (even-odd rule) and in front of the camera.
 
-    Added and multiplied in the order in which the page does it: to the last bit the same.
+    The operations keep the order of the page's script, so that both give the same bits.
+
+    Args:
+        view: [12] three rows that take (x, y, z, 1) to u * depth, v * depth and depth.
+        corners: [K, 2] the polygon in pixels.
     """
 
     def inside(at: NDArray[np.float64]) -> NDArray[np.bool_]:

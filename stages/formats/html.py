@@ -17,7 +17,7 @@ from pathlib import Path
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import report_progress
-from stages.formats import ply, streamed_sog
+from stages.formats import ply
 from stages.formats.page import document
 from stages.formats.page.cameras import page_cameras
 from stages.formats.values import drop_undrawable
@@ -51,15 +51,26 @@ def write(
     return dropped
 
 
-def write_beside(content: Path, splats: Splats, units: str, views: tuple[View, ...]) -> None:
-    """The page of an asset that streams, which holds none of its splats. Raises SplatError."""
+def write_beside(
+    content: Path, splats: Splats, units: str, views: tuple[View, ...], widths: list[float]
+) -> None:
+    """Write the page of a streamed asset, which itself holds no splats.
+
+    Args:
+        content: the asset's lod-meta.json; the page lies beside it.
+        splats: the finest level, to place the cameras.
+        units, views: as for `write`.
+        widths: width of the splats of each level, see `streamed_sog.widths`.
+
+    Raises SplatError when the file cannot be written.
+    """
     scene = document.scene_data(
         content.parent.absolute().name,
         *(splats, page_cameras(views, splats)),
         units=units,
         source=content.name,
         content=content.name,
-        levels=streamed_sog.splat_widths(content, splats),
+        levels=widths,
     )
     with replacing(content.with_suffix(".html")) as temporary:
         temporary.write_text(document.head(scene) + document.tail(), encoding="utf-8")

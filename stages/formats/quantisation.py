@@ -80,6 +80,8 @@ def palette_bits(count: int) -> int:
 def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
     """What a file of this format should hold: drawable splats, their mean colours where colours do
     not change with the view, in as many bits as were decided on."""
+    if row.ending in quantised.finetuned:
+        return quantised.finetuned[row.ending]
     splats = quantised.splats
     if not row.sh_degree and quantised.flat_dc is not None:
         sh = quantised.flat_dc[:, None].astype(splats.sh.dtype)

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
-from stages.formats import sog
+from stages.formats import html, sog
 from stages.formats.sog_read import Source, in_folder, in_zip
 from stages.formats.table import CHUNK
-from stages.formats.values import allocate, check_finite
-from stages.scene import Splats, morton
+from stages.formats.values import allocate, check_finite, drop_undrawable
+from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
 
 LEAF, CHUNK_SPLATS = 1 << 15, 1 << 17  # splats of the finest level; of a chunk, about
@@ -48,6 +48,32 @@ def order(splats: Splats) -> NDArray[np.intp]:
     """[N] rows of the finest level as `read` finds them."""
     leaves = [leaf.rows[0] for leaf in _leaves(_cut([splats]))]
     return np.concatenate(leaves) if leaves else np.zeros(0, np.intp)
+
+
+def write(
+    path: Path,
+    splats: Splats,
+    *,
+    units: str = "arbitrary",
+    views: tuple[View, ...] = (),
+    coarser: Sequence[Splats] = (),
+) -> int:
+    """Write a streamed SOG and, beside it, a page that shows it on any web server.
+
+    Args:
+        path: the asset's lod-meta.json.
+        splats: the finest level.
+        units: "metres" or "arbitrary".
+        views: cameras of the page.
+        coarser: coarser levels of detail of the same scene, finest first, all drawable.
+
+    Returns how many of `splats` could not be drawn and were left out. Raises SplatError when the
+    asset cannot be written.
+    """
+    kept, dropped = drop_undrawable(splats)
+    write_levels(path, [kept, *coarser], units)
+    html.write_beside(path, kept, units, views, splat_widths(path, kept))
+    return dropped
 
 
 def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:

@@ -136,8 +136,8 @@ def _splats(prim: Any) -> Splats:
 
 
 def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
-    """[N, width] float32, not to be changed: the attribute, or its twin in half precision where
-    only that is set."""
+    """[N, width] float32, read-only: the attribute, or its half-precision form ("...h") where only
+    that is set."""
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
         value = attribute.Get() if attribute else None
         if value is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
@@ -190,16 +190,27 @@ def count_nonfinite(values: NDArray[np.floating]) -> int:
     )
 
 
-def concatenate(parts: list[Splats]) -> Splats:
-    """All rows of all parts, at the highest degree among them; the origin is left at 0."""
+def concatenate(parts: Sequence[Splats]) -> Splats:
+    """All rows of `parts`, at the highest SH degree among them, with the origin 0."""
     if len(parts) == 1:
         return replace(parts[0], origin=np.zeros(3))
-    degree = max((part.sh_degree for part in parts), default=0)
-    wide = [part.with_sh_degree(degree) for part in parts]
-    empty = {"opacity_logits": (0,), "sh_degrees": (0,), "sh": (0, 1, 3), "quaternions": (0, 4)}
+    if not parts:
+        return allocate(0, 0)
+    count, width = sum(map(len, parts)), max(part.sh.shape[1] for part in parts)
     arrays: dict[str, Any] = {}
     for name in _FIELDS:
-        dtype = np.uint8 if name == "sh_degrees" else np.float32
-        rows = [getattr(part, name) for part in wide]
-        arrays[name] = np.concatenate(rows) if rows else np.zeros(empty.get(name, (0, 3)), dtype)
+        values = getattr(parts[0], name)
+        shape = (width, 3) if name == "sh" else values.shape[1:]
+        arrays[name] = scratch.empty((count, *shape), values.dtype)
+    start = 0
+    for part in parts:
+        for rows in reported_blocks(len(part)):
+            for name in _FIELDS:
+                values = getattr(part, name)[rows]
+                out = arrays[name][start + rows.start : start + rows.stop]
+                if name == "sh":
+                    out[:, values.shape[1] :] = 0
+                    out = out[:, : values.shape[1]]
+                out[...] = values
+        start += len(part)
     return Splats(**arrays)

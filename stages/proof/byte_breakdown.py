@@ -1,4 +1,4 @@
-"""How many bytes of a file are spent on what."""
+"""How many bytes of a splat file each attribute takes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ import struct
 import zipfile
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stages.base.bad_files import reading
-from stages.base.lazy import load_object
-from stages.formats import ByteBreakdown, format_of, spz_read
+from stages.formats import format_of, spz_read
 from stages.formats.html import unzipped
 from stages.formats.inflate import GzipReader
 from stages.formats.ply_header import Header, read_header
@@ -43,28 +42,30 @@ _SPZ = ("positions", "opacities", "colours", "scales", "rotations", "SH")
 _SOG = {"means": "positions", "quats": "rotations", "sh0": "colours, opacities", "shN": "SH"}
 
 
-def byte_breakdown_of(path: Path) -> ByteBreakdown:
-    """Where the bytes of a file of splats are, "other" for what belongs to no attribute. Raises
-    SplatError as `format_of`, or "splats-unreadable"."""
-    path = Path(path)
-    row = format_of(path)
-    with reading(path):
-        found: ByteBreakdown = load_object(row.anatomy)(path)
-    other = row.size_bytes(path) - sum(found.parts.values())
-    if found.unknown or found.unpacked or other <= 0:
-        return found
-    return ByteBreakdown({**found.parts, "other": other})
+@dataclass(frozen=True)
+class ByteBreakdown:
+    """Where the bytes of a file are.
+
+    Attributes:
+        parts: bytes by attribute.
+        unpacked: whether they are counted before the compression that packs all of them together.
+        unknown: why there are no parts; "" if there are.
+    """
+
+    parts: dict[str, int]
+    unpacked: bool = False
+    unknown: str = ""
 
 
 def ply(path: Path) -> ByteBreakdown:
     with path.open("rb") as file:
-        return ByteBreakdown(_columns(read_header(file)))
+        return ByteBreakdown(_ply_columns(read_header(file)))
 
 
 def html(path: Path) -> ByteBreakdown:
-    """Of the .ply that is packed inside."""
+    """Of the .ply inside."""
     start = next(unzipped(path))  # some megabytes: longer than any header
-    return ByteBreakdown(_columns(read_header(io.BytesIO(start))), unpacked=True)
+    return ByteBreakdown(_ply_columns(read_header(io.BytesIO(start))), unpacked=True)
 
 
 def usd(path: Path) -> ByteBreakdown:
@@ -72,7 +73,7 @@ def usd(path: Path) -> ByteBreakdown:
     return ByteBreakdown({}, unknown=unknown)
 
 
-def _columns(header: Header) -> dict[str, int]:
+def _ply_columns(header: Header) -> dict[str, int]:
     parts: Counter[str] = Counter()
     for element in header.elements if header.encoding != "ascii" else ():
         for name, kind in element.properties:
@@ -124,16 +125,16 @@ def spz(path: Path) -> ByteBreakdown:
 
 def sog(path: Path) -> ByteBreakdown:
     with zipfile.ZipFile(path) as package:
-        return _of_pictures((m.filename, m.compress_size) for m in package.infolist())
+        return _sog_breakdown((m.filename, m.compress_size) for m in package.infolist())
 
 
 def streamed_sog(path: Path) -> ByteBreakdown:
     chunks = format_of(path).files(path)[1:]
-    return _of_pictures((file.name, file.stat().st_size) for file in chunks)
+    return _sog_breakdown((file.name, file.stat().st_size) for file in chunks)
 
 
-def _of_pictures(members: Iterable[tuple[str, int]]) -> ByteBreakdown:
-    """Of (name, bytes) of the files of a SOG."""
+def _sog_breakdown(members: Iterable[tuple[str, int]]) -> ByteBreakdown:
+    """By attribute, from (name, bytes) of the files of a SOG."""
     parts: Counter[str] = Counter()
     for name, size in members:
         stem = name.rpartition("/")[2].partition(".")[0].partition("_")[0]

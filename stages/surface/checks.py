@@ -1,4 +1,4 @@
-"""Mesh files, compared with the mesh that they were made of by parsers that did not write them."""
+"""Check of mesh files with independent readers."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.lazy import load_object
-from stages.formats import Format
 from stages.surface.mesh import Mesh
+from stages.surface.table import MeshFormat
 
-_Y_UP = np.array([1.0, -1.0, -1.0])  # spelled out here: a wrong turn must not check itself
+# Not taken from the writer: its error must not check itself.
+_Y_UP = np.array([1.0, -1.0, -1.0])
 
 
-def fault_of(path: Path, row: Format, mesh: Mesh) -> str:
-    """What is wrong with a file that should hold `mesh`, as `row`'s second reader finds it; "" if
+def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
+    """What is wrong with a file that should hold `mesh`, as the independent reader finds it; "" if
     nothing is."""
     try:
-        vertices, faces = load_object(row.second_reader)(path)
-    except Exception as error:  # whatever another parser raises: the file is wrong
+        vertices, faces = load_object(row.independent_reader)(path)
+    except Exception as error:  # whatever the reader raises: the file is wrong
         return f"another reader refused it ({error})"
     if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):
         return f"it holds {len(vertices)} vertices and {len(faces)} triangles"
@@ -40,7 +41,7 @@ def read_ply(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def read_glb(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """(vertices [V, 3], faces [F, 3]) by pygltflib, turned from y up to the world's axes."""
+    """(vertices [V, 3], faces [F, 3]) by pygltflib, rotated from y up to the world's axes."""
     from pygltflib import GLTF2
 
     document = GLTF2().load(str(path))

@@ -1,4 +1,4 @@
-"""Splats and their cameras -> a collision proxy, and how good it is."""
+"""Splats and their cameras -> the collision mesh and its quality figures."""
 
 from __future__ import annotations
 
@@ -17,22 +17,21 @@ from stages.surface.depth_maps import DepthMap
 from stages.surface.distance import distances_to_mesh
 from stages.surface.mesh import Mesh
 
-_WITHIN_VOXELS = 2.0  # how far a surface may lie from the mesh and count as covered
+_COVERED_VOXELS = 2.0  # largest distance of a covered surface from the mesh
 _SAMPLES = 200_000  # pixels that the covered share is measured on
-_POOR_SHARE = 0.7
+_LOW_COVERAGE = 0.7
 
 
 @dataclass(frozen=True)
 class CollisionMesh:
-    """A mesh and its figures, JSON values. Lengths in world units.
+    """A mesh and its figures, JSON values. Lengths are in world units.
 
-    triangles, vertices, watertight, voxel, pieces_left_out.
-    covered_share: of the pixels in which a training camera sees something solid, those whose
-    surface (median depth) lies within two voxels of the mesh; what lies outside the box counts as
-    not covered.
-    sparse_points_inside_share: of the sparse points, those inside the box that was fused. Of these:
-    sparse_median_distance, sparse_p90_distance to the nearest triangle, and the same as shares of
-    the box's diagonal. None where there are no such points.
+    triangles, vertices, watertight, voxel, removed_components.
+    covered_share: of the pixels with depth in the training cameras, the share whose surface (median
+    depth) lies within two voxels of the mesh. Surfaces outside the fused box are not covered.
+    sparse_points_inside_share: the share of sparse points inside the fused box. For these:
+    sparse_median_distance, sparse_p90_distance to the nearest triangle, and both relative to the
+    diagonal of the box; None where there are no such points.
     """
 
     mesh: Mesh
@@ -42,9 +41,9 @@ class CollisionMesh:
 def make_collision_mesh(
     splats: Splats, reconstruction: Reconstruction, triangles: int, backend: str, report: Report
 ) -> CollisionMesh:
-    """The mesh of what the training cameras see, of at most about `triangles` triangles.
+    """The mesh of what the training cameras see, with at most about `triangles` triangles.
 
-    Equal inputs give an equal mesh, unless memory is so short that voxels have to be larger.
+    Equal inputs give an equal mesh, unless a lack of memory enlarges the voxels.
     Warnings: export-mesh-empty, export-mesh-coarse, export-mesh-gaps. Raises Interrupted.
     """
     training, _ = split_held_out(reconstruction.views)
@@ -60,7 +59,7 @@ def make_collision_mesh(
     report.progress(len(cameras), len(cameras), "fusing depth")
     region = fuse.observed_box(maps)
     if region is None:
-        return _nothing(report)
+        return _empty_mesh(report)
     voxels = fuse.voxel_budget()
     if voxels < fuse.VOXELS:
         report.warn(
@@ -69,10 +68,10 @@ def make_collision_mesh(
             f"{fuse.VOXELS:,}. Close other programs and export again for a finer one.",
         )
     volume = fuse.fuse_depth_maps(maps, fuse.empty_volume(*region, voxels), settings.near)
-    fine, crumbs = extract.remove_small_components(extract.extract_surface(volume))
+    fine, removed = extract.remove_small_components(extract.extract_surface(volume))
     mesh = extract.simplify(fine, triangles)
     if not len(mesh.faces):
-        return _nothing(report)
+        return _empty_mesh(report)
     mesh = colour.colour_vertices(mesh, maps, fuse.TRUNCATION * volume.voxel)
     mesh = replace(mesh, origin=splats.origin)
     covered = _covered(mesh, maps, volume.voxel)
@@ -81,15 +80,15 @@ def make_collision_mesh(
         "vertices": len(mesh.vertices),
         "watertight": mesh.is_watertight,
         "voxel": _rounded(volume.voxel),
-        "pieces_left_out": crumbs,
+        "removed_components": removed,
         "covered_share": covered,
-        **_from_sparse_points(mesh, reconstruction.points, volume),
+        **_sparse_point_figures(mesh, reconstruction.points, volume),
     }
     _warn_of_gaps(covered, report)
     return CollisionMesh(mesh, figures)
 
 
-def _nothing(report: Report) -> CollisionMesh:
+def _empty_mesh(report: Report) -> CollisionMesh:
     report.warn(
         "export-mesh-empty",
         "The mesh is empty: no training camera sees a solid surface. Look at the splats with "
@@ -99,25 +98,25 @@ def _nothing(report: Report) -> CollisionMesh:
 
 
 def _warn_of_gaps(covered: float, report: Report) -> None:
-    if covered < _POOR_SHARE:
+    if covered < _LOW_COVERAGE:
         report.warn(
             "export-mesh-gaps",
             f"The mesh covers only {covered:.0%} of what the training photographs show; the rest "
-            "lies far away, or the splats disagree about where it is.",
+            "is far away, or its depth differs between cameras.",
         )
 
 
 def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
-    """See MadeMesh."""
+    """`covered_share` of CollisionMesh."""
     pixels = sum(int((found.depth > 0).sum()) for found in maps)
     step = max(1, pixels // _SAMPLES)
     solid = [replace(found, weight=(found.depth > 0).astype(np.float32)) for found in maps]
     places = np.concatenate([found.points(step) for found in solid])
-    near = distances_to_mesh(places, mesh, voxel) <= _WITHIN_VOXELS * voxel
+    near = distances_to_mesh(places, mesh, voxel) <= _COVERED_VOXELS * voxel
     return round(float(near.mean()), 4)
 
 
-def _from_sparse_points(
+def _sparse_point_figures(
     mesh: Mesh, points: NDArray[np.float64], volume: fuse.Volume
 ) -> dict[str, float | None]:
     inside = np.all((points >= volume.corner) & (points <= volume.far_corner), axis=1)

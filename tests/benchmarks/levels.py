@@ -17,7 +17,7 @@ import numpy as np
 
 from stages import formats
 from stages.editing import levels
-from stages.measure.evaluation import capped_psnr_db
+from stages.measure.image_metrics import capped_psnr_db
 from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at
 from stages.scene.framing import orbit_cameras
@@ -55,7 +55,7 @@ def main(path: Path, fewest: int = 2000) -> None:
     smooth = replace(plain, antialias=True)
     print("| splats | full | as sharp: full, level | without antialiasing: full, level |")
     print("|--:|--:|--:|--:|")
-    for level in levels.levels_of(full)[1:]:
+    for level in levels.coarser_levels(full):
         rows = []
         for camera in cameras(full, level):
             truth = truth_of(full, camera, smooth)

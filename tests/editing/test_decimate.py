@@ -9,7 +9,7 @@ import pytest
 
 from stages.editing.decimate import RemovalCosts, decimate
 from stages.editing.moments import Moments, merge
-from stages.measure.evaluation import capped_psnr_db
+from stages.measure.image_metrics import capped_psnr_db
 from stages.raster.definition import ALPHA_MAX
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, look_at

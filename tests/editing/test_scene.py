@@ -76,7 +76,7 @@ def test_photographs_say_what_may_go() -> None:
     start = scene(replace(solid, opacity_logits=solid.opacity_logits + 3))
     half = f"decimate {len(start.splats) // 2}"
     guided = after(start, half)
-    blind = after(replace(start, photographs=(), held_out_views=()), half)
+    blind = after(replace(start, training_views=(), held_out_views=()), half)
     assert len(guided.splats) == len(blind.splats) == 750
     assert blind.psnr_db() is None
     judged = replace(blind, held_out_views=start.held_out_views)

@@ -9,8 +9,8 @@ import pytest
 
 from stages import formats
 from stages.base import blocks
+from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.proof.independent_readers import read_back
 from tests.formats.truth import many_splats
 
 QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]

@@ -11,16 +11,14 @@ from PIL import Image
 
 from stages.measure import evaluation
 from stages.measure.evaluation import (
-    IDENTICAL_DB,
     LARGEST_SUBSET,
     EvaluationView,
-    capped_psnr_db,
     evaluate,
     evaluation_subset,
     image_renderer,
     load_evaluation_views,
 )
-from stages.measure.image_metrics import flip
+from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db, flip
 from stages.raster.draw import raster_settings_of
 from stages.scene import (
     IGNORE,

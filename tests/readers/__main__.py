@@ -19,8 +19,8 @@ from PIL import Image
 from stages import formats, quantise, sfm
 from stages.formats.values import drop_undrawable
 from stages.measure.image_metrics import psnr
+from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.proof.independent_readers import read_back
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, View, look_at, split_held_out
 from tests.packages import UnavailableError, installed

@@ -67,7 +67,7 @@ def test_playcanvas_draws_levels_of_detail_from_three_distances(
     splats = scene()
     monkeypatch.setattr(levels, "_FEWEST", len(splats) // 3)
     path = tmp_path / "lod-meta.json"
-    formats.write(path, splats)
+    levels.write(path, splats)
     assert (tmp_path / "1_0").is_dir()
     with served(packages, tmp_path) as address:
         engine = Engine(browser, address, "playcanvas")

@@ -1,4 +1,4 @@
-"""A report as one file that opens from disk: text, tables, pictures inside."""
+"""A report as one HTML file that needs no other: text, tables, embedded pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 
-ERROR_GAIN = 4.0
 _LARGEST_SIDE = 640  # pixels of a picture in a report
 _STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -24,8 +23,8 @@ th:first-child,td:first-child{text-align:left} tr:nth-child(even){background:#f4
 """
 
 
-def paragraphs(sentences: Iterable[str]) -> str:
-    return "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
+def paragraphs(lines: Iterable[str]) -> str:
+    return "".join(f"<p>{escape(line)}</p>" for line in lines)
 
 
 def heading(text: str) -> str:
@@ -40,28 +39,23 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def png(path: Path, words: str) -> str:
-    """A plot as it lies on the disk; words: for who cannot see it."""
-    return _image("png", path.read_bytes(), words)
+def png(path: Path, description: str) -> str:
+    """The PNG file at `path`; description: alternative text."""
+    return _image("png", path.read_bytes(), description)
 
 
 def pictures(captioned: Iterable[tuple[str, NDArray[np.floating]]]) -> str:
-    """Pictures [H, W, 3] in [0, 1] side by side."""
+    """(caption, picture [H, W, 3] in [0, 1]) side by side."""
     figures = (
-        f"<figure>{_image('jpeg', _jpeg(image), words)}<figcaption>{escape(words)}</figcaption>"
+        f"<figure>{_image('jpeg', _jpeg(image), caption)}<figcaption>{escape(caption)}</figcaption>"
         "</figure>"
-        for words, image in captioned
+        for caption, image in captioned
     )
     return f'<div class="row">{"".join(figures)}</div>'
 
 
-def error_of(image: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray[np.floating]:
-    """What lies between them, made stronger to be seen."""
-    return np.clip(np.abs(image - truth) * ERROR_GAIN, 0.0, 1.0)
-
-
 def write_page(path: Path, title: str, parts: Iterable[str]) -> None:
-    """The whole file. Raises SplatError."""
+    """Write a page of HTML `parts`. Raises SplatError."""
     text = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f"<style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>{''.join(parts)}</body></html>"
@@ -70,9 +64,9 @@ def write_page(path: Path, title: str, parts: Iterable[str]) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def _image(kind: str, data: bytes, words: str) -> str:
+def _image(kind: str, data: bytes, description: str) -> str:
     inside = base64.b64encode(data).decode("ascii")
-    return f'<img alt="{escape(words)}" src="data:image/{kind};base64,{inside}">'
+    return f'<img alt="{escape(description)}" src="data:image/{kind};base64,{inside}">'
 
 
 def _jpeg(image: NDArray[np.floating]) -> bytes:
@@ -80,6 +74,6 @@ def _jpeg(image: NDArray[np.floating]) -> bytes:
 
     picture = Image.fromarray(np.uint8(np.clip(image, 0, 1) * 255 + 0.5))
     picture.thumbnail((_LARGEST_SIDE, _LARGEST_SIDE))
-    held = io.BytesIO()
-    picture.save(held, format="JPEG", quality=88)
-    return held.getvalue()
+    file = io.BytesIO()
+    picture.save(file, format="JPEG", quality=88)
+    return file.getvalue()

@@ -1,4 +1,4 @@
-"""The report of a little scene, and two runs side by side."""
+"""The report of a small scene, and two runs side by side."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.measure.evaluation import load_evaluation_views
 from stages.measure.tradeoff import summary
-from stages.measure.tradeoff.comparison import Candidate, compare_runs, verdict_lines
+from stages.measure.tradeoff.comparison import (
+    Candidate,
+    compare_runs,
+    verdict_lines,
+    write_comparison,
+)
 from stages.measure.tradeoff.measurement import (
     SHARES,
     TradeoffInputs,
     deciding_views,
     measure_tradeoff,
 )
-from stages.measure.tradeoff.pair_report import write_comparison
 from stages.measure.tradeoff.report import write_report
 from stages.scene import Camera, DrawSettings, QuantisedSplats, View, evenly_spaced, split_held_out
 from tests.small_scene import small_scene
@@ -38,7 +42,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def material(scene):
+def inputs(scene):
     draw_settings = DrawSettings(near=0.01, side=72)
     reconstruction = scene.reconstruction
     training, held = (
@@ -52,55 +56,54 @@ def material(scene):
 
 
 @pytest.fixture(scope="module")
-def trade(material):
-    return measure_tradeoff(material, lambda label: None)
+def tradeoff(inputs):
+    return measure_tradeoff(inputs, lambda label: None)
 
 
-def test_every_format_is_really_written_and_judged(trade) -> None:
-    points = {point.label.removeprefix("."): point for point in trade.formats}
+def test_every_format_is_written_and_evaluated(tradeoff) -> None:
+    points = {point.label.removeprefix("."): point for point in tradeoff.formats}
     assert points.keys() == FORMATS.keys()
     assert points["ply"].change.mean == 0
     assert points["splat"].change.mean < -0.05  # no colour that depends on the view
     assert points["spz"].size_bytes < points["ply"].size_bytes / 3
-    sizes = [point.size_bytes for point in trade.formats]
+    sizes = [point.size_bytes for point in tradeoff.formats]
     assert sizes == sorted(sizes)
 
 
-def test_formats_are_told_in_as_many_bits_as_the_run_decided_on(material, tmp_path) -> None:
+def test_formats_are_written_with_the_precision_that_the_run_chose(inputs, tmp_path) -> None:
     bits = {"position": 11, "rotation": 4, "scale": 4, "colour": 4, "opacity": 4, "palette": 5}
-    decided = QuantisedSplats(material.splats, 2, {"bits": bits})
+    decided = QuantisedSplats(inputs.splats, 2, {"bits": bits})
     found = [
         next(p for p in measure_tradeoff(m, lambda label: None).formats if p.label == ".sog")
-        for m in (material, replace(material, quantised=decided))
+        for m in (inputs, replace(inputs, quantised=decided))
     ]
     assert (found[1].size_bytes or 0) < 0.9 * (found[0].size_bytes or 0)
     assert found[1].change.mean < found[0].change.mean
 
 
-def test_splats_go_by_their_worth_to_photographs_that_do_not_judge(trade, material) -> None:
-    assert [point.splats for point in trade.counts] == [250, *(round(250 * s) for s in SHARES)]
-    losses = [point.psnr_db for point in trade.counts]
+def test_held_out_views_do_not_decide_which_splats_are_removed(tradeoff, inputs) -> None:
+    assert [point.splats for point in tradeoff.pruned] == [250, *(round(250 * s) for s in SHARES)]
+    losses = [point.psnr_db for point in tradeoff.pruned]
     assert losses[0] - losses[1] < 1.0 < losses[0] - losses[-1]
     noise = np.random.default_rng(0)
-    judges = [
-        replace(p, pixels=noise.integers(0, 256, p.pixels.shape, np.uint8))
-        for p in material.held_out
+    noisy = [
+        replace(p, pixels=noise.integers(0, 256, p.pixels.shape, np.uint8)) for p in inputs.held_out
     ]
-    other = measure_tradeoff(replace(material, held_out=judges), lambda label: None)
-    assert [p.splats for p in other.counts] == [p.splats for p in trade.counts]
+    other = measure_tradeoff(replace(inputs, held_out=noisy), lambda label: None)
+    assert [p.splats for p in other.pruned] == [p.splats for p in tradeoff.pruned]
     assert other.own.psnr_db < 12
 
 
-def test_worth_leaves_a_better_picture_than_chance(trade, material) -> None:
+def test_pruning_by_contribution_is_better_than_by_chance(tradeoff, inputs) -> None:
     from stages.measure.evaluation import mean_psnr_db
 
-    half = next(point for point in trade.counts if point.splats == 125)
-    chance = material.splats.take(np.random.default_rng(1).permutation(250)[:125])
-    assert half.psnr_db > mean_psnr_db(chance, material.held_out, "cpu") + 1
+    half = next(point for point in tradeoff.pruned if point.splats == 125)
+    chance = inputs.splats.take(np.random.default_rng(1).permutation(250)[:125])
+    assert half.psnr_db > mean_psnr_db(chance, inputs.held_out, "cpu") + 1
 
 
-def test_the_report_is_one_file_that_needs_no_other(trade, material, tmp_path) -> None:
-    files = write_report(tmp_path, "<scene>", trade, material)
+def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) -> None:
+    files = write_report(tmp_path, "<scene>", tradeoff, inputs)
     assert {file.name for file in files} == {
         *("report.html", "tradeoff.csv"),
         *(f"{n}.png" for n in ("time", "formats", "splats", "drawing", "coverage", "photographs")),
@@ -108,16 +111,16 @@ def test_the_report_is_one_file_that_needs_no_other(trade, material, tmp_path) -
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
     assert "<script" not in text
-    assert "The trade of &lt;scene&gt;" in text
+    assert "Trade-off report: &lt;scene&gt;" in text
     assert summary.NOT_FINE_TUNED in text
-    assert trade.worst.name in text
-    assert text.count("shimmer") > len(trade.thin.framings)
+    assert tradeoff.worst.name in text
+    assert text.count("shimmer") > len(tradeoff.framings)
     assert "<h2>Coverage</h2>" in text
     assert "Gap 1, straight above" in text  # ten cameras in a ring
 
 
-def test_the_table_holds_every_point(trade, material, tmp_path) -> None:
-    write_report(tmp_path, "scene", trade, material)
+def test_the_table_holds_every_point(tradeoff, inputs, tmp_path) -> None:
+    write_report(tmp_path, "scene", tradeoff, inputs)
     with (tmp_path / "tradeoff.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     counts = {curve: sum(row["curve"] == curve for row in rows) for curve in ("time", "format")}
@@ -127,22 +130,22 @@ def test_the_table_holds_every_point(trade, material, tmp_path) -> None:
     assert (last["splats"], last["wall_seconds"], last["psnr_db"]) == ("400", "40.00", "24.6000")
 
 
-def test_plots_have_axes_with_units_and_legends(trade, material, tmp_path, monkeypatch) -> None:
+def test_plots_have_axes_with_units_and_legends(tradeoff, inputs, tmp_path, monkeypatch) -> None:
     from stages.measure.tradeoff import plots
 
     shown = {}
     monkeypatch.setattr(plots, "write_plot", lambda path, figure: shown.update({path.stem: figure}))
-    plots.write_plots(tmp_path, trade)
+    plots.write_plots(tmp_path, tradeoff)
     maps = shown.pop("coverage")
     bars = [axes.get_xlabel() for axes in maps.axes if axes.get_xlabel()]
-    assert bars == ["photographs that see it", "over how many degrees"]
+    assert bars == ["views that see it", "angle between views (°)"]
     assert maps.legends
     labels = {name: figure.axes[0].get_xlabel() for name, figure in shown.items()}
     assert labels == {
-        "time": "seconds",
+        "time": "CPU time of all threads (s)",
         "formats": "file size (MB)",
         "splats": "splats",
-        "drawing": "milliseconds a picture",
+        "drawing": "CPU time of a picture (ms)",
         "photographs": "number of the photograph",
     }
     for figure in shown.values():
@@ -150,24 +153,24 @@ def test_plots_have_axes_with_units_and_legends(trade, material, tmp_path, monke
         assert figure.axes[0].get_legend() is not None
 
 
-def test_a_run_without_a_log_gets_the_other_curves(material, tmp_path) -> None:
-    trade = measure_tradeoff(replace(material, history=()), lambda label: None)
-    files = write_report(tmp_path, "scene", trade, material)
+def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
+    tradeoff = measure_tradeoff(replace(inputs, history=()), lambda label: None)
+    files = write_report(tmp_path, "scene", tradeoff, inputs)
     assert "time.png" not in {file.name for file in files}
     assert summary.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_single_judge_makes_no_interval_and_no_fuss(scene, material, tmp_path) -> None:
-    trade = measure_tradeoff(replace(material, held_out=material.held_out[:1]), lambda label: None)
-    write_report(tmp_path, "scene", trade, material)
+def test_a_single_held_out_view_has_no_interval(scene, inputs, tmp_path) -> None:
+    tradeoff = measure_tradeoff(replace(inputs, held_out=inputs.held_out[:1]), lambda label: None)
+    write_report(tmp_path, "scene", tradeoff, inputs)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "one judge" in text
+    assert "one view" in text
     assert "inf" not in re.sub(r"<[^>]*>", " ", text)
     few = replace(scene.reconstruction, views=scene.reconstruction.views[:5])
     both = [replace(side(scene, name), reconstruction=few) for name in "ab"]
-    told = verdict_lines(compare_runs(*both))
-    assert told[0] == "b against a: +0.00 dB (one judge): not told apart."
-    assert "1 held-out photograph," in told[-1]
+    lines = verdict_lines(compare_runs(*both))
+    assert lines[0] == "b against a: +0.00 dB (one view): no significant difference."
+    assert "1 held-out view," in lines[-1]
 
 
 def side(scene, name: str, splats=None) -> Candidate:
@@ -181,29 +184,32 @@ def side(scene, name: str, splats=None) -> Candidate:
     )
 
 
-def test_a_run_is_not_told_apart_from_itself(scene) -> None:
+def test_a_run_does_not_differ_from_itself(scene) -> None:
     found = compare_runs(side(scene, "a"), side(scene, "b"))
     assert (found.psnr.mean, found.psnr.verdict) == (0, INCONCLUSIVE)
-    assert "b against a: +0.00 dB (95 %: +0.00 to +0.00): not told apart." in verdict_lines(found)
+    assert (
+        "b against a: +0.00 dB (95 %: +0.00 to +0.00): no significant difference."
+        in verdict_lines(found)
+    )
 
 
-def test_a_worse_run_is_told_as_worse_and_the_other_way_round_as_better(scene) -> None:
+def test_a_worse_run_is_worse_and_the_other_way_round_better(scene) -> None:
     fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
     assert compare_runs(side(scene, "all"), fewer).psnr.verdict == WORSE
     assert compare_runs(fewer, side(scene, "all")).psnr.verdict == BETTER
 
 
-def test_both_are_judged_at_the_smaller_size(scene) -> None:
+def test_both_are_compared_at_the_smaller_size(scene) -> None:
     small = side(scene, "small")
     small = replace(
         small, splats=replace(small.splats, draw_settings=DrawSettings(near=0.01, side=40))
     )
     found = compare_runs(side(scene, "large"), small)
     assert found.side_px == 40
-    assert {max(p.pixels.shape[:2]) for seen in found.photographs for p in seen} == {40}
+    assert {max(p.pixels.shape[:2]) for seen in found.views for p in seen} == {40}
 
 
-def test_a_photograph_that_one_has_learnt_from_judges_neither(scene) -> None:
+def test_a_training_view_of_one_run_is_not_compared(scene) -> None:
     views = scene.reconstruction.views[1:]
     shifted = replace(scene.reconstruction, views=views)
     with pytest.raises(SplatError) as error:
@@ -211,21 +217,21 @@ def test_a_photograph_that_one_has_learnt_from_judges_neither(scene) -> None:
     assert error.value.code == "compare-nothing-in-common"
 
 
-def test_the_comparison_shows_every_judge_three_times(scene, tmp_path) -> None:
+def test_the_comparison_shows_every_held_out_view_three_times(scene, tmp_path) -> None:
     found = compare_runs(side(scene, "a"), side(scene, "b"))
     report, table = write_comparison(tmp_path, found)
     text = report.read_text(encoding="utf-8")
-    assert text.count("<img") == 3 * found.psnr.photographs
+    assert text.count("<img") == 3 * found.psnr.views
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
-    assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + found.psnr.photographs
+    assert len(table.read_text(encoding="utf-8").splitlines()) == 1 + found.psnr.views
 
 
-def test_few_are_taken_from_all_over() -> None:
+def test_a_few_views_are_evenly_spaced() -> None:
     assert evenly_spaced(range(10), 5) == [0, 2, 4, 6, 8]
     assert evenly_spaced(range(3), 24) == [0, 1, 2]
 
 
-def test_all_photographs_decide_where_time_allows() -> None:
+def test_all_training_views_decide_where_time_allows() -> None:
     views = [View(str(i), "", camera(800, 600)) for i in range(60)]
     assert len(deciding_views(views, DrawSettings(side=480))) == 60
     assert len(deciding_views(views, DrawSettings(side=800))) == 50
