@@ -33,7 +33,7 @@ def tour(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.int64]:
     return given if _way(given, apart) <= _DETOUR * _way(found, apart) else found
 
 
-def through(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
+def interpolated(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
     """On from the first camera to the last at constant speed, through every one between.
 
     Positions and quaternions follow one centripetal Catmull-Rom spline (Yuksel, Schaefer & Keyser,
@@ -56,7 +56,7 @@ def through(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Cam
     return tuple(_posed(lens, row) for row in np.stack(rows, axis=1))
 
 
-def steadied(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
+def smoothed(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
     """A path without the jerks of a hand: positions and quaternions averaged over neighbours with
     Gaussian weights of standard deviation `frames`. Ends stay near their places."""
     keys = _keys(cameras)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatcli import jobs
+from splatcli.commands import process
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Interrupted, SplatError
 from stages.distributed import block_views, blocks
@@ -63,7 +63,7 @@ def pipeline_at(run_folder: Path, photos: Path) -> Pipeline:
 
 
 def trained(run_folder: Path, photos: Path, listener: Listener | None = None, **asked) -> Pipeline:
-    pipeline = jobs.in_blocks(pipeline_at(run_folder, photos), None)
+    pipeline = process.distribute(pipeline_at(run_folder, photos), None)
     settings = replace(pipeline.recorded_settings()["train"], **SMALL | asked)
     pipeline.run({"train": settings}, listener=listener)
     return pipeline
@@ -157,7 +157,7 @@ def test_a_block_that_no_photograph_shows_is_the_coarse_model_s(
     tmp_path, photos, monkeypatch
 ) -> None:
     monkeypatch.setattr(
-        block_views, "members", lambda share: np.array([[True], [False]]) & (share >= 0)
+        block_views, "assign_views", lambda share: np.array([[True], [False]]) & (share >= 0)
     )
     manifest = trained(tmp_path / "run", photos, blocks="2", steps=20).manifest("train")
     assert manifest is not None

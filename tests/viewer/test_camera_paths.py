@@ -9,10 +9,10 @@ import pytest
 
 from stages.scene import Camera, look_at
 from stages.viewer.camera_paths import (
+    interpolated,
     length_in_turns,
     levelled,
-    steadied,
-    through,
+    smoothed,
     tour,
 )
 from tests import scenes
@@ -48,7 +48,7 @@ def apart(a: Camera, b: Camera, reach: float = 4.0) -> float:
 
 def test_the_path_begins_and_ends_at_the_ends_and_passes_all_between() -> None:
     given = wandering()
-    frames = through(given, SPLATS, 400)
+    frames = interpolated(given, SPLATS, 400)
     assert len(frames) == 400
     for end, frame in ((given[0], frames[0]), (given[-1], frames[-1])):
         np.testing.assert_allclose(frame.world_to_camera, end.world_to_camera, atol=1e-9)
@@ -58,7 +58,7 @@ def test_the_path_begins_and_ends_at_the_ends_and_passes_all_between() -> None:
 
 
 def test_speed_is_constant_and_nothing_flips() -> None:
-    frames = through(wandering(), SPLATS, 300)
+    frames = interpolated(wandering(), SPLATS, 300)
     steps = np.array([apart(a, b) for a, b in itertools.pairwise(frames)])
     assert steps.max() < 1.1 * np.median(steps)
     assert max(turn_deg(a, b) for a, b in itertools.pairwise(frames)) < 5
@@ -70,7 +70,7 @@ def test_speed_is_constant_and_nothing_flips() -> None:
 
 def test_cameras_on_a_line_give_a_line() -> None:
     given = [camera((x, 0, -5), (x, 0, 0)) for x in (0.0, 0.1, 2.0, 2.5)]
-    frames = through(given, SPLATS, 26)
+    frames = interpolated(given, SPLATS, 26)
     np.testing.assert_allclose(
         [f.centre for f in frames], [(0.1 * i, 0, -5) for i in range(26)], atol=5e-3
     )
@@ -80,13 +80,13 @@ def test_cameras_on_a_line_give_a_line() -> None:
 def test_the_shorter_way_round_is_taken() -> None:
     """Quaternions of 170 and 190 degrees about y may have opposite signs: 20 degrees apart."""
     ends = [camera((np.sin(a), 0, np.cos(a)), (0, 0, 0)) for a in np.radians((170, 190))]
-    frames = through(ends, SPLATS, 11)
+    frames = interpolated(ends, SPLATS, 11)
     assert max(turn_deg(a, b) for a, b in itertools.pairwise(frames)) < 2.5
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_cameras_in_one_place_are_a_standstill(count: int) -> None:
-    frames = through([camera((0, 0, -5))] * count, SPLATS, 4)
+    frames = interpolated([camera((0, 0, -5))] * count, SPLATS, 4)
     assert len(frames) == 4
     for frame in frames:
         np.testing.assert_allclose(frame.centre, (0, 0, -5), atol=1e-12)
@@ -141,7 +141,7 @@ def test_a_steady_path_ends_where_it_did_and_turns_corners_gently() -> None:
     corner = [(x, 0, -5) for x in np.linspace(-2, 0, 60)]
     corner += [(0, y, -5) for y in np.linspace(0, -2, 60)]
     hand = [camera((x, y, -5), (x, y, -4)) for x, y, _ in corner]
-    steady = steadied(hand, 6.0)
+    steady = smoothed(hand, 6.0)
 
     def kink(path) -> float:
         bends = np.diff([c.centre for c in path], 2, axis=0)
@@ -152,7 +152,7 @@ def test_a_steady_path_ends_where_it_did_and_turns_corners_gently() -> None:
         np.testing.assert_allclose(steady[i].centre, hand[i].centre, atol=1e-9)
     far = max(np.linalg.norm(a.centre - b.centre) for a, b in zip(steady, hand, strict=True))
     assert far < 0.3
-    assert len(steadied(hand[:1], 6.0)) == 1
+    assert len(smoothed(hand[:1], 6.0)) == 1
 
 
 def test_a_full_turn_is_one_turn_long() -> None:
@@ -165,4 +165,6 @@ def test_a_random_rotation_survives_the_path() -> None:
     matrix = np.eye(4)
     matrix[:3, :3] = random_rotation(5)
     one = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, matrix)
-    np.testing.assert_allclose(through([one], SPLATS, 1)[0].world_to_camera, matrix, atol=1e-12)
+    np.testing.assert_allclose(
+        interpolated([one], SPLATS, 1)[0].world_to_camera, matrix, atol=1e-12
+    )

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from splatcli.compiling import Compiling
 from stages import load_stage
 from stages.raster.kernels import cache
+from stages.run.precompile import PrecompileListener
 from tests import processes
 
 # What training, pruning and judging still compile.
@@ -48,7 +48,7 @@ print(sorted(names))
 
 
 @pytest.fixture
-def busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Compiling:
+def busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PrecompileListener:
     """With a helper that has begun, and does not come to an end by itself."""
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\nexec sleep 600\n")
@@ -56,22 +56,22 @@ def busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Compiling:
     monkeypatch.setattr(sys, "executable", str(program))
     monkeypatch.setattr(cache, "are_compiled", lambda kernel: False)
     monkeypatch.setenv("SPLAT_THREADS", "2")
-    compiling = Compiling("cpu")
+    compiling = PrecompileListener("cpu")
     begin(compiling, "ingest")
     return compiling
 
 
-def begin(compiling: Compiling, stage: str) -> None:
+def begin(compiling: PrecompileListener, stage: str) -> None:
     compiling.started(load_stage(stage), 1, "", False)
 
 
-def helper(compiling: Compiling) -> subprocess.Popen[bytes]:
+def helper(compiling: PrecompileListener) -> subprocess.Popen[bytes]:
     process = compiling._process
     assert process is not None
     return process
 
 
-def test_stages_that_draw_nothing_do_not_wait(busy: Compiling) -> None:
+def test_stages_that_draw_nothing_do_not_wait(busy: PrecompileListener) -> None:
     process = helper(busy)
     for stage in ("sfm", "seed"):
         begin(busy, stage)
@@ -81,16 +81,16 @@ def test_stages_that_draw_nothing_do_not_wait(busy: Compiling) -> None:
 
 
 def test_a_helper_that_does_not_end_is_ended(
-    busy: Compiling, monkeypatch: pytest.MonkeyPatch
+    busy: PrecompileListener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("splatcli.compiling._PATIENCE_S", 0.2)
+    monkeypatch.setattr("stages.run.precompile._TIMEOUT_S", 0.2)
     process = helper(busy)
     begin(busy, "train")
     assert process.poll() is not None
 
 
-@pytest.mark.parametrize("how", [Compiling.stopping, Compiling.ended])
-def test_it_ends_with_the_run(how: object, busy: Compiling) -> None:
+@pytest.mark.parametrize("how", [PrecompileListener.stopping, PrecompileListener.ended])
+def test_it_ends_with_the_run(how: object, busy: PrecompileListener) -> None:
     process = helper(busy)
     assert callable(how)
     how(busy)
@@ -100,7 +100,7 @@ def test_it_ends_with_the_run(how: object, busy: Compiling) -> None:
 def test_what_is_compiled_already_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "are_compiled", lambda kernel: True)
     monkeypatch.setenv("SPLAT_THREADS", "2")
-    compiling = Compiling("cpu")
+    compiling = PrecompileListener("cpu")
     begin(compiling, "ingest")
     assert compiling._process is None
 
@@ -111,7 +111,7 @@ def test_a_python_that_cannot_be_started_stops_nothing(
     monkeypatch.setattr(sys, "executable", str(tmp_path / "none"))
     monkeypatch.setattr(cache, "are_compiled", lambda kernel: False)
     monkeypatch.setenv("SPLAT_THREADS", "2")
-    compiling = Compiling("cpu")
+    compiling = PrecompileListener("cpu")
     begin(compiling, "ingest")
     begin(compiling, "train")
     compiling.ended()

@@ -1,0 +1,186 @@
+"""`splat process` and the commands of single stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from splatcli import console, log, options, progress, run_settings, summary
+from splatcli.arguments import AsJson, Cluster, Out, Photos, Quiet, Run, Verbose
+from splatcli.folders import DEFAULT, find_run_folder
+from stages import STAGE_NAMES
+from stages.base.errors import Family, SplatError
+from stages.distributed import blocks, cluster, sfm_chunks
+from stages.distributed.tasks import Executor
+from stages.run import runfolder
+from stages.run.listeners import Listeners
+from stages.run.pipeline import Listener, Pipeline
+from stages.run.precompile import PrecompileListener
+
+
+def process(
+    photos: Photos = None,
+    *,
+    out: Out = None,
+    cluster: Cluster = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
+    **given: Any,
+) -> None:
+    """Photographs in, assets out: all seven stages.
+
+    Finished work is kept: after an interruption the same command goes on where it stopped.
+    """
+    run_folder, photos = _run_folder_and_photos(photos, out)
+    pipeline = distribute(Pipeline(run_folder, photos), cluster)
+    given = options.given_only(given)
+    view, preset = given.pop("view", False), given.pop("preset", None)
+    base = run_settings.defaults() if photos is not None else pipeline.recorded_settings()
+    settings = run_settings.combined(base, given, preset)
+    if "cameras" in given:
+        _check_cameras(given["cameras"])
+    if photos is None and not (quiet or as_json):
+        console.note(run_settings.training_summary(settings["train"], given, preset))
+    _run(pipeline, settings, quiet=quiet, as_json=as_json, view=view)
+
+
+def stage_command(name: str) -> Callable[..., None]:
+    """The command that runs the stage `name`."""
+
+    def ingest(
+        photos: Photos = None,
+        *,
+        out: Out = None,
+        quiet: Quiet = False,
+        as_json: AsJson = False,
+        verbose: Verbose = False,
+        **given: Any,
+    ) -> None:
+        pipeline = Pipeline(*_run_folder_and_photos(photos, out))
+        _run_stage("ingest", pipeline, given, quiet, as_json)
+
+    def later(
+        run: Run = None,
+        *,
+        quiet: Quiet = False,
+        as_json: AsJson = False,
+        verbose: Verbose = False,
+        **given: Any,
+    ) -> None:
+        _run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
+
+    return ingest if name == "ingest" else later
+
+
+def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]:
+    """(run folder, photographs or None) of a command's arguments.
+
+    Photographs start or continue the run folder `out`, or `run/`; a run folder in their place, or
+    nothing, continues with the recorded settings. Raises SplatError.
+    """
+    if photos is None:
+        return find_run_folder(out), None
+    if runfolder.is_run_folder(photos):
+        if out is not None and out.absolute() != photos.absolute():
+            raise SplatError(
+                "option-out",
+                given=f"{photos} is itself a run folder, and --out names {out}.",
+                wanted="Photographs to start from, or one run folder to continue.",
+                hint=f"Leave --out away to continue {photos}.",
+                family=Family.USAGE,
+            )
+        return photos, None
+    return out or DEFAULT, photos
+
+
+def _check_cameras(path: Path) -> None:
+    """Raises SplatError for a camera file that cannot be read, before the photographs are."""
+    from stages.cameras.table import read_cameras
+
+    read_cameras(path)
+
+
+def _run_stage(
+    name: str, pipeline: Pipeline, given: Mapping[str, Any], quiet: bool, as_json: bool
+) -> None:
+    """One stage, with the recorded settings and the given options. The stages after training take
+    little time: those that are missing in between run too."""
+    is_known = runfolder.is_run_folder(pipeline.run_folder)
+    base = pipeline.recorded_settings() if is_known else run_settings.defaults()
+    given = options.given_only(given)
+    preset, view = given.pop("preset", None), given.pop("view", False)
+    if "formats" in given:
+        given["formats"] = _with_exported(pipeline, given["formats"])
+    settings = run_settings.combined({name: base[name]}, given, preset)
+    if not is_known:
+        settings = {**base, **settings}
+    if name == "train" and not (quiet or as_json):
+        console.note(run_settings.training_summary(settings["train"], given, preset))
+    after_training = STAGE_NAMES[STAGE_NAMES.index("train") + 1 :]
+    _run(
+        distribute(pipeline, None),
+        settings,
+        until=name,
+        may_run=after_training if name in after_training else (name,),
+        quiet=quiet,
+        as_json=as_json,
+        view=view,
+    )
+
+
+def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:
+    """The given formats after those that were exported before, which stay."""
+    manifest = pipeline.manifest("export")
+    earlier = manifest.settings.get("formats", ()) if manifest is not None else ()
+    return tuple(dict.fromkeys((*earlier, *formats)))
+
+
+def distribute(pipeline: Pipeline, address: str | None) -> Pipeline:
+    """The pipeline, which trains blocks on the cluster at `address`, or in this process without
+    one. A cluster computes chunks of features and matches, too."""
+
+    def open_executor(folder: Path, listener: Listener) -> AbstractContextManager[Executor]:
+        paths = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
+        return cluster.open_executor(address, folder, paths, listener)
+
+    if address is not None:
+        pipeline = sfm_chunks.with_chunks(pipeline, open_executor)
+    return blocks.in_blocks(pipeline, open_executor)
+
+
+def _run(
+    pipeline: Pipeline,
+    settings: Mapping[str, Any],
+    *,
+    until: str | None = None,
+    may_run: Collection[str] | None = None,
+    quiet: bool = False,
+    as_json: bool = False,
+    view: bool = False,
+) -> None:
+    """Run the pipeline and print the result. view: show the training on a page, too."""
+    log.write_settings(settings)
+    listeners: list[Listener] = [log.LogListener(), progress.listener_for(quiet, as_json)]
+    if until is None:
+        listeners.insert(0, PrecompileListener(settings["train"].backend))
+    if view:
+        listeners.insert(0, _live_training(pipeline, as_json))
+    pipeline.run(settings, until=until, may_run=may_run, listener=Listeners(*listeners))
+    summary.show(pipeline, until, quiet=quiet, as_json=as_json)
+
+
+def _live_training(pipeline: Pipeline, as_json: bool) -> Listener:
+    from stages.viewer.live_training import LiveTraining
+    from stages.viewer.server import open_in_browser
+
+    def announce(address: str) -> None:
+        if as_json:
+            console.emit("view", address=address)
+        else:
+            console.note(f"Watch the training at {address}", "bold")
+        open_in_browser(address)
+
+    return LiveTraining(pipeline, announce, console.warn)
