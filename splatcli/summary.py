@@ -13,7 +13,7 @@ from stages.run.pipeline import Pipeline
 # The metrics in the tables of `process` and `status`, by stage.
 _HEADLINES = {
     "ingest": ("photographs", "left_out"),
-    "sfm": ("registered", "points", "mean_reprojection_error_px"),
+    "sfm": ("registered_images", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
     "train": ("splats", "psnr_db", "ssim", "made_by"),
     # Later stages measure at sizes of their own: their PSNR is no sequel of training's.

@@ -1,13 +1,14 @@
-"""QuantisedSplats -> files that other programs open, each one checked before it counts.
+"""Stage 7: writes files that other programs open, and proves each one.
 
 Every file is read back by a parser that did not write it, drawn from cameras of the capture, and
-compared with the splats that it was made from. A file that came out wrong stops the export.
+compared with the splats that it was made from. A wrong file stops the export. Nothing is trained
+here: `quantise` has fine-tuned the splats to the rounding of the formats.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,17 +16,17 @@ from typing import TYPE_CHECKING, Any
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
-from stages.capacity.usual import DECIDING
-from stages.formats import FORMATS, MESHES, Format
+from stages.capacity.output_formats import ALL_MESHES, DEFAULT_FORMATS, formats_setting
+from stages.formats.table import FORMATS
 from stages.raster.backends import (
     backend_of_settings,
     backend_setting,
     device_setting,
     report_backend,
 )
+from stages.surface.table import MESHES
 
 if TYPE_CHECKING:
-    from stages.capacity.rounding import Fitting
     from stages.proof.prover import Prover
     from stages.scene import (
         ExportedAssets,
@@ -35,10 +36,7 @@ if TYPE_CHECKING:
         Splats,
     )
 
-_MESH = "mesh"  # to `--format`: every format of meshes
-_CHOICES = (*FORMATS, _MESH, *MESHES)
 _INDEX = "assets.json"
-_FITTED = "fitted"  # a folder for each format whose splats are not those of quantise
 # Every system must take the name, USD's packages too: brackets separate names inside them.
 _NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 
@@ -47,14 +45,7 @@ _NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 class ExportSettings:
     """Settings of the export."""
 
-    formats: tuple[str, ...] = field(
-        default=("ply", "splat", "glb", "usdz"),
-        metadata={
-            "panel": "Output",
-            "help": "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
-            "choices": _CHOICES,
-        },
-    )
+    formats: tuple[str, ...] = formats_setting(DEFAULT_FORMATS, panel="Output")
     name: str = field(
         default="scene",
         metadata={
@@ -62,15 +53,6 @@ class ExportSettings:
             "pattern": _NAME,
             "wanted": "A name that every system takes: letters, digits, spaces, - and _; no "
             "folder, no suffix.",
-        },
-    )
-    rounding_steps: int = field(
-        default=45,
-        metadata={
-            "help": "Steps of fine-tuning after each kind of value that a format rounds (.splat, "
-            ".spz, .sog, .compressed.ply); 0 for none.",
-            "min": 0,
-            "max": 100_000,
         },
     )
     backend: str = backend_setting()
@@ -90,46 +72,41 @@ def run(
 ) -> ExportedAssets:
     """Write inputs["quantise"] in all formats into `folder`, seen by the views of inputs["sfm"].
 
-    Metrics: files (how many), splats, dropped, formats: by format size_bytes, bytes_per_splat and
+    Metrics: files (how many), splats, dropped; formats: by format size_bytes, bytes_per_splat and
     the figures of `proof.Proof`, among them verify_db (PSNR between pictures of the splats and of
-    the file, the worst camera) and the largest errors of the values, and for formats that round
-    plain_db and fitted_db (see `capacity.rounding.Fitting`); mesh: the figures of
+    the file, the worst camera) and the largest errors of the values; mesh: the figures of
     `surface.make`. Raises SplatError "export-verify-failed" (family QUALITY), and what keeps a
     file from being written.
     """
     from stages import formats
-    from stages.formats.rows import kept_rows
+    from stages.formats.quantisation import splats_to_write
+    from stages.formats.values import drop_undrawable
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
     quantised: QuantisedSplats = inputs["quantise"]
     reconstruction: Reconstruction = inputs["sfm"]
     _clear(folder)
-    if not quantised.splats.origin.any():
-        moved = replace(quantised.splats, origin=reconstruction.origin)
-        quantised = replace(quantised, splats=moved)
-    splats, dropped = kept_rows(quantised.splats)
-    _say_what_is_missing(len(splats), dropped, report)
-    wanted = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
+    splats, dropped = drop_undrawable(quantised.splats)
+    _warn_of_missing(len(splats), dropped, report)
+    chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
     prover = Prover.of(splats, cameras, backend_of_settings(settings))
-    fitting = _fitting(inputs, splats, settings, wanted, report) if len(splats) else None
     files, figures = [], {}
-    for number, name in enumerate(wanted):
-        report.progress(number, len(wanted), f"writing .{name}")
+    for number, name in enumerate(chosen):
+        report.progress(number, len(chosen), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
-        held, fit = _held(FORMATS[name], quantised, fitting, folder)
+        held = splats_to_write(FORMATS[name], quantised)
         formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
         size = FORMATS[name].size_bytes(path)
         files.append(ExportedFile(name, path.name, size))
         figures[name] = {
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
-            **fit,
-            # pictures of all the splats' colours, values of those that it should hold
-            **_proven(replace(prover, splats=held), path, report),
+            # pictures are compared with all SH coefficients, values with what the file should hold
+            **_prove(replace(prover, splats=held), path, report),
         }
-        report.progress(number + 1, len(wanted), f".{name}", verify_db=figures[name]["verify_db"])
+        report.progress(number + 1, len(chosen), f".{name}", verify_db=figures[name]["verify_db"])
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
         files.append(file)
         figures[file.format] = {"size_bytes": file.size_bytes}
@@ -142,68 +119,6 @@ def run(
     return ExportedAssets(folder, tuple(files))
 
 
-def _held(
-    row: Format, quantised: QuantisedSplats, fitting: Fitting | None, folder: Path
-) -> tuple[Splats, dict[str, Any]]:
-    """(what the file should hold, figures of the fitting). Fitted splats are kept in `folder`."""
-    from stages.formats.quantisation import splats_to_write
-    from stages.scene import save_splats
-
-    if fitting is None or not row.needs_finetuning:
-        return splats_to_write(row, quantised), {}
-    held, figures = fitting.fitted(row, quantised)
-    kept = folder / _FITTED / row.ending
-    kept.mkdir(parents=True, exist_ok=True)
-    save_splats(kept, held)
-    return held, figures
-
-
-def _fitting(
-    inputs: Mapping[str, Any],
-    splats: Splats,
-    settings: ExportSettings,
-    wanted: Sequence[str],
-    report: Report,
-) -> Fitting | None:
-    """What fits splats to formats that round; None where none is wanted, or no photographs are."""
-    import numpy as np
-
-    from stages.capacity.rounding import Fitting
-    from stages.measure.contribution import measure_contributions
-    from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import seen_extent, split_held_out, spread_over
-    from stages.training.finetune import FineTuner
-
-    reconstruction: Reconstruction = inputs["sfm"]
-    training = split_held_out(reconstruction.views)[0]
-    if not (
-        settings.rounding_steps
-        and training
-        and any(FORMATS[name].needs_finetuning for name in wanted)
-    ):
-        return None
-    dropout, backend, folder = (
-        inputs["train"].dropout,
-        backend_of_settings(settings),
-        reconstruction.folder,
-    )
-    photographs = load_evaluation_views(folder, training, splats.draw_settings)
-    tuner = FineTuner(photographs, seen_extent(reconstruction), backend, report, dropout)
-    seen = np.zeros(len(splats), np.int32)
-    if dropout:  # only then it matters
-        seen = measure_contributions(splats, photographs, backend).photographs
-    deciding = load_evaluation_views(folder, spread_over(training, DECIDING), splats.draw_settings)
-    return Fitting(tuner, deciding, backend, settings.rounding_steps, seen)
-
-
-def fitted_in(folder: Path, ending: str) -> Splats | None:
-    """What the file of a format in a finished folder holds, if its splats were fitted to it."""
-    from stages.scene import load_splats
-
-    fitted = folder / _FITTED / ending
-    return load_splats(fitted) if fitted.is_dir() else None
-
-
 def _write_meshes(
     splats: Splats,
     reconstruction: Reconstruction,
@@ -213,7 +128,7 @@ def _write_meshes(
 ) -> list[ExportedFile]:
     """Each mesh asked for, read back and compared; metric: mesh, see `surface.make`. Raises
     SplatError "export-verify-failed"."""
-    asked = (e for name in settings.formats for e in (MESHES if name == _MESH else (name,)))
+    asked = (e for name in settings.formats for e in (MESHES if name == ALL_MESHES else (name,)))
     wanted = [MESHES[ending] for ending in dict.fromkeys(asked) if ending in MESHES]
     if not wanted:
         return []
@@ -232,16 +147,14 @@ def _write_meshes(
         load_object(row.writer)(path, made.mesh, reconstruction.units)
         if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
-        files.append(ExportedFile(row.ending, path.name, row.size_bytes(path)))
+        files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
     return files
 
 
 def _clear(folder: Path) -> None:
-    """Remove what a writer that was killed left half done, and splats that were fitted to other
-    settings; whole files are written over."""
+    """Remove partial files that a killed writer left; whole files are written over."""
     import shutil
 
-    shutil.rmtree(folder / _FITTED, ignore_errors=True)
     for path in sorted(folder.glob(".partial-*")):
         if path.is_dir():
             shutil.rmtree(path)
@@ -249,7 +162,7 @@ def _clear(folder: Path) -> None:
             path.unlink()
 
 
-def _say_what_is_missing(count: int, dropped: int, report: Report) -> None:
+def _warn_of_missing(count: int, dropped: int, report: Report) -> None:
     if dropped:
         report.warn(
             "export-splats-dropped",
@@ -269,7 +182,7 @@ def _write_index(folder: Path, files: list[ExportedFile]) -> None:
     (folder / _INDEX).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
-def _proven(prover: Prover, path: Path, report: Report) -> dict[str, Any]:
+def _prove(prover: Prover, path: Path, report: Report) -> dict[str, Any]:
     """The file's figures. Raises SplatError "export-verify-failed"."""
     from stages.formats import format_of
 
@@ -317,8 +230,8 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=9,
-    reads=("sfm", "train", "quantise"),
+    version=10,
+    reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,
     load=load,

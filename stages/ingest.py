@@ -104,7 +104,7 @@ def run(
     capture.json (`load` reads it). Raises SplatError for a folder without at least 3 usable
     photographs and for masks that do not fit them, and Interrupted.
     """
-    from stages.photos import advice, capture_file, cut_out, find, masks
+    from stages.photos import advice, capture_file, find, masking, masks
     from stages.photos.quality import near_duplicates
     from stages.scene import Capture
 
@@ -131,7 +131,7 @@ def run(
         report.warn,
     )
     inside = [t.inside for t in taken if t.photo is not None]
-    cut_out.check_shares(photos, inside, bool(found.masks))
+    masking.check_shares(photos, inside, bool(found.masks))
     advice.about_masks(
         photos,
         [n for n, t in zip(names, taken, strict=True) if t.alpha],
@@ -199,11 +199,11 @@ def _frames_of(
     source: Source, settings: IngestSettings, folder: Path, report: Report
 ) -> list[_Taken]:
     """The chosen frames of a video, kept as photographs of one camera."""
-    from stages.photos import from_video
+    from stages.photos import video_frames
     from stages.photos.decode import Unusable
 
     try:
-        chosen = from_video.photographs(source, settings.frames, settings.max_side, report)
+        chosen = video_frames.photographs(source, settings.frames, settings.max_side, report)
         return [
             _kept(
                 f"{source.name}/{number}",
@@ -230,12 +230,12 @@ def _kept(
 ) -> _Taken:
     """Write a normalised picture and its mask, and measure it. film: the video that it comes
     from."""
-    from stages.photos.cut_out import Masked
+    from stages.photos.masking import MaskedPhoto
     from stages.photos.quality import measure
     from stages.photos.write import write_mask, write_picture
     from stages.scene import Photo
 
-    masked = Masked.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
+    masked = MaskedPhoto.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
     decoded = masked.decoded
     target = folder / image
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -279,7 +279,7 @@ def _film_key(film: str, width: int, height: int) -> str:
 def _with_twins(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
     """The photographs, each of a group of near-duplicates knowing the group's first."""
     first = {index: photos[group[0]].name for group in groups for index in group}
-    return tuple(replace(photo, twin=first.get(i, "")) for i, photo in enumerate(photos))
+    return tuple(replace(photo, duplicate_of=first.get(i, "")) for i, photo in enumerate(photos))
 
 
 def _report_capture(

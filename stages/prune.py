@@ -1,5 +1,7 @@
-"""Stage 5: model only what the scene requires: what no photograph needs goes, and what does not pay
-its way; the rest goes on learning a little. Prove that it cost nothing."""
+"""Stage 5: removes floaters and splats that do not improve the pictures, and fine-tunes the rest.
+
+See `capacity.pruning`. The PSNR of the held-out views before and after is in the report.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.stage import Report, Stage
-from stages.capacity.usual import DECIDING, SOG_LOSS_DB
+from stages.capacity import DECIDING_VIEWS, SOG_LOSS_DB
 from stages.formats.table import FORMATS
 from stages.raster.backends import (
     backend_of_settings,
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PruneSettings:
+    """Settings of pruning."""
+
     rounds: int = field(
         default=8,
         metadata={
@@ -34,12 +38,11 @@ class PruneSettings:
             "max": 100,
         },
     )
-    price: float = field(
+    strength: float = field(
         default=1.0,
         metadata={
             "panel": "Size",
-            "help": "How much a splat must be worth to stay, 1 for what the photographs ask; the "
-            "loss allowed grows with it.",
+            "help": "Pruning strength: larger removes more, and allows more loss.",
             "min": 0.001,
             "max": 1000,
         },
@@ -47,21 +50,25 @@ class PruneSettings:
     max_loss_db: float = field(
         default=0.1,
         metadata={
-            "help": "PSNR that pruning may cost views that were not trained on, as far as training "
-            "can tell, at price 1 (dB).",
+            "help": "PSNR that views which were not trained on may lose, as estimated from the "
+            "training views, at strength 1 (dB).",
             "min": 0,
             "max": 100,
         },
     )
     max_splats: int = field(
         default=0,
-        metadata={"help": "Splats at most, whatever it costs.", "min": 0, "max": 100_000_000},
+        metadata={
+            "help": "Splats at most, whatever the loss; 0 for any number.",
+            "min": 0,
+            "max": 100_000_000,
+        },
     )
     max_mb: float = field(
         default=0.0,
         metadata={
             "panel": "Size",
-            "help": "Size at most, whatever it costs, of the file that --mb-of names; 0 for any "
+            "help": "Size at most, whatever the loss, of the file that --mb-of names; 0 for any "
             "(megabytes).",
             "min": 0,
             "max": 1_000_000,
@@ -71,7 +78,7 @@ class PruneSettings:
         default="ply",
         metadata={
             "panel": "Size",
-            "help": "Format that --max-mb speaks of",
+            "help": "Format that --max-mb is about",
             "choices": tuple(FORMATS),
         },
     )
@@ -79,8 +86,8 @@ class PruneSettings:
         default=0.0,
         metadata={
             "panel": "Size",
-            "help": "As small as the training photographs allow at this PSNR, instead of by price; "
-            "0 for none (dB).",
+            "help": "Remove as much as leaves the training views this PSNR, instead of by "
+            "--strength; 0 for none (dB).",
             "min": 0,
             "max": 99,
         },
@@ -99,96 +106,83 @@ class PruneSettings:
 
 
 def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report: Report) -> Splats:
-    """Fewer splats, written to `folder`; each round, counts and PSNR before and after into the
-    report. Raises SplatError for targets that cannot be met."""
+    """Prune inputs["train"] by the training views of inputs["sfm"]; write the rest to `folder`.
+
+    The report gets each round, counts, and the PSNR before and after. Raises SplatError for targets
+    that cannot be met, and Interrupted.
+    """
     import numpy as np
 
-    from stages.capacity import summary
     from stages.capacity.pruning import Pruner
-    from stages.capacity.targets import Targets, felt_share
+    from stages.capacity.summary import advise_more_splats, summarise
+    from stages.capacity.targets import Targets, held_out_loss_ratio
     from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
-    from stages.scene import seen_extent, split_held_out
+    from stages.scene import split_held_out, training_extent
     from stages.scene.storage import save_splats
     from stages.training.finetune import FineTuner
 
     reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
-    splats = trained.splats
-    kept, held = split_held_out(reconstruction.views)
-    photographs = load_evaluation_views(reconstruction.folder, kept, splats.draw_settings)
-    judges = load_evaluation_views(reconstruction.folder, held, splats.draw_settings) or photographs
-    backend = backend_of_settings(settings)
-    before = mean_psnr_db(splats, judges, backend)
-    extent = seen_extent(reconstruction)
-    tuner = FineTuner(photographs, extent, backend, report, trained.dropout)
-    size_bytes = _sizes(settings, splats, photographs, reconstruction)
+    splats, backend = trained.splats, backend_of_settings(settings)
+    training, held_out = (
+        load_evaluation_views(reconstruction.folder, views, splats.draw_settings)
+        for views in split_held_out(reconstruction.views)
+    )
+    evaluated = held_out or training
+    before_db = mean_psnr_db(splats, evaluated, backend)
+    extent = training_extent(reconstruction)
+    finetuner = FineTuner(training, extent, backend, report, trained.dropout)
     targets = Targets(
-        settings.price,
-        settings.max_loss_db,
-        felt_share(trained.overfitted),
-        settings.max_splats,
-        settings.max_mb * 1e6,
-        settings.min_psnr,
-        size_bytes,
+        strength=settings.strength,
+        max_loss_db=settings.max_loss_db,
+        loss_ratio=held_out_loss_ratio(trained.overfitted),
+        max_splats=settings.max_splats,
+        max_bytes=settings.max_mb * 1e6,
+        min_psnr_db=settings.min_psnr,
+        size_bytes=_size_measure(settings, splats, training, reconstruction),
     )
-    shrinking = Pruner(
-        *(photographs, targets, backend, tuner, settings.rounds, settings.finetune_steps, report)
-    )
-    found = shrinking.run(splats)
-    after = mean_psnr_db(found.splats, judges, backend)
+    limits = settings.rounds, settings.finetune_steps
+    found = Pruner(training, targets, backend, finetuner, *limits, report).prune(splats)
+    after_db = mean_psnr_db(found.splats, evaluated, backend)
     report_backend(report, backend)
-    report.metric("judged_side_px", splats.draw_settings.side)
-    report.metric("psnr_before_db", round(before, 3))
-    report.metric("psnr_db", round(after, 3))
-    report.metric("psnr_change_db", round(after - before, 3))
-    report.metric("tune_steps", tuner.steps)
-    _report_cuts(splats, found, report)
-    report.metric("said", summary.summarise(trained, found, settings.price, tuner.steps))
-    if more := summary.more_would_pay(found, settings.price):
-        report.warn("prune-more-would-pay", more)
+    report.metric("evaluated_side_px", splats.draw_settings.side)
+    report.metric("psnr_before_db", round(before_db, 3))
+    report.metric("psnr_db", round(after_db, 3))
+    report.metric("psnr_change_db", round(after_db - before_db, 3))
+    report.metric("finetune_steps", finetuner.steps)
+    _report_result(splats, found, report)
+    report.metric("summary", summarise(trained, found, settings.strength, finetuner.steps))
+    if advice := advise_more_splats(found, settings.strength):
+        report.warn("prune-more-would-pay", advice)
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)
     return found.splats
 
 
-def _sizes(
+def _size_measure(
     settings: PruneSettings,
     splats: Splats,
-    photographs: Sequence[EvaluationView],
+    training: Sequence[EvaluationView],
     reconstruction: Reconstruction,
 ) -> Callable[[Splats], int]:
-    """Measures the file that --max-mb speaks of, as one that is really written: in as few bits as
-    quantise will choose, which hardly depends on how many splats are left."""
-    import tempfile
-
-    from stages import formats
-    from stages.base.lazy import load_object
-    from stages.capacity.bits import choose_bits
-    from stages.formats.quantisation import BitDepths
+    """Gives the size of the file that --max-mb is about. A .sog is written with the bit depths that
+    `quantise` chooses for all splats: they hardly depend on how many are left."""
+    from stages.capacity.bits import choose_bits, file_size_bytes
     from stages.measure.evaluation import mean_psnr_db
-    from stages.scene import spread_over
+    from stages.scene import evenly_spaced
 
     row = FORMATS[settings.mb_of]
-    few: dict[str, int] = {}
+    depths: dict[str, int] = {}
     if settings.max_mb and row.quantiser:
-        deciding, backend = spread_over(photographs, DECIDING), backend_of_settings(settings)
-        few, _ = choose_bits(splats, lambda s: mean_psnr_db(s, deciding, backend), SOG_LOSS_DB)
-
-    def size_bytes(splats: Splats) -> int:
-        held = load_object(row.quantiser)(splats, BitDepths(**few)) if few else splats
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"scene.{settings.mb_of}"
-            formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
-            return row.size_bytes(path)
-
-    return size_bytes
+        views, backend = evenly_spaced(training, DECIDING_VIEWS), backend_of_settings(settings)
+        depths, _ = choose_bits(splats, lambda s: mean_psnr_db(s, views, backend), SOG_LOSS_DB)
+    return lambda s: file_size_bytes(row, s, depths, reconstruction.units, reconstruction.views)
 
 
-def _report_cuts(before: Splats, found: PruningResult, report: Report) -> None:
-    """Counts, the price and the rounds as metrics; a warning where much was in the air."""
-    kept = [one for one in found.rounds if one.kept]
-    floaters, start = sum(one.floaters for one in kept), len(before)
-    after = found.splats
+def _report_result(before: Splats, found: PruningResult, report: Report) -> None:
+    """Counts, the rate-distortion cost and the rounds as metrics; a warning for many floaters."""
+    floaters = sum(one.floaters for one in found.rounds if one.kept)
+    start, after, cost = len(before), found.splats, found.rate_distortion
     degrees = [int((after.sh_degrees == d).sum()) for d in range(after.sh_degree + 1)]
     report.metric("splats_before", start)
     report.metric("splats", len(after))
@@ -196,9 +190,8 @@ def _report_cuts(before: Splats, found: PruningResult, report: Report) -> None:
     report.metric("unneeded_removed", start - len(after) - floaters)
     report.metric("floater_share", round(floaters / max(start, 1), 5))
     report.metric("splats_by_sh_degree", degrees)
-    report.metric(
-        "price", asdict(found.price) | {"bits_per_parameter": found.price.bits_per_parameter}
-    )
+    cost_figures = asdict(cost) | {"bits_per_parameter": cost.bits_per_parameter}
+    report.metric("rate_distortion", cost_figures)
     report.metric("training_psnr_before_db", round(found.start_db, 3))
     report.metric("training_psnr_db", round(found.end_db, 3))
     report.metric("stopped_by", found.stopped_by)
@@ -206,7 +199,7 @@ def _report_cuts(before: Splats, found: PruningResult, report: Report) -> None:
     if floaters > 0.05 * start:
         report.warn(
             "prune-many-floaters",
-            f"{floaters:,} of {start:,} splats hung in empty space near cameras. "
+            f"{floaters:,} of {start:,} splats were floaters in free space near cameras. "
             "Photographs with more overlap, and a locked exposure, leave fewer.",
         )
 
@@ -220,7 +213,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=10,
+    version=11,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

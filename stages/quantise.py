@@ -1,8 +1,9 @@
-"""Splats + photographs -> QuantisedSplats: what to keep at which precision, by measurement.
+"""Stage 6: chooses at which precision splats are stored, and fine-tunes them to the rounding of the
+file formats that are asked for.
 
-View-dependent colour takes up to three quarters of a file. It is cut, for all splats and then for
-each, as far as training photographs do not show it; held-out ones only judge what came of it. And
-what the 8-bit .splat costs is measured, so that nobody has to guess.
+View-dependent colour takes up to three quarters of a file. The SH degree is lowered, for all splats
+and then for each, as far as training views do not show it. Held-out views measure the result and
+decide nothing. What the 8-bit .splat costs is measured, too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
-from stages.capacity.usual import DECIDING, SOG_LOSS_DB
+from stages.capacity import DECIDING_VIEWS, SOG_LOSS_DB
+from stages.capacity.output_formats import (
+    CHOICES,
+    DEFAULT_FORMATS,
+    formats_setting,
+    rounding_formats,
+)
 from stages.raster.backends import (
     backend_of_settings,
     backend_setting,
@@ -24,23 +31,28 @@ from stages.raster.backends import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from stages.measure.evaluation import EvaluationView
     from stages.scene import DrawSettings, QuantisedSplats, Reconstruction, Splats
 
-_DECISIONS, _FLAT = "decisions.json", "flat_dc.npy"
-# Colour that a splat may lose with its higher bands, in steps of 8 bits; the largest that passes.
+_DECISIONS, _FLAT, _FINETUNED = "decisions.json", "flat_dc.npy", "finetuned"
+# Change of colour (of 255) that a splat's higher SH degrees may make and still be dropped, largest
+# first.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
-_BIT_TRIALS = 25  # about as many as are made
+_BIT_DEPTH_MEASUREMENTS = 25  # about, for the progress bar
 
 
 @dataclass(frozen=True)
 class QuantiseSettings:
-    """Settings of the choice of precision."""
+    """Settings of the choice of precision. Of the formats, only those that need fine-tuning are
+    kept: a further lossless format changes nothing here."""
 
     max_loss_db: float = field(
         default=0.02,
         metadata={
-            "help": "PSNR of training photographs that smaller files may cost (dB).",
+            "help": "PSNR of training views that lower SH degrees may cost (dB).",
             "min": 0,
             "max": 100,
         },
@@ -48,18 +60,32 @@ class QuantiseSettings:
     sog_loss_db: float = field(
         default=SOG_LOSS_DB,
         metadata={
-            "help": "PSNR of training photographs that fewer bits in a .sog may cost besides, "
-            "before fine-tuning at export finds some of it back (dB).",
+            "help": "PSNR of training views that fewer bits in a .sog may cost besides, before "
+            "fine-tuning recovers a part of it (dB).",
             "min": 0,
             "max": 100,
         },
     )
     max_views: int = field(
-        default=DECIDING,
-        metadata={"help": "Training photographs to decide by, at most.", "min": 1, "max": 100_000},
+        default=DECIDING_VIEWS,
+        metadata={"help": "Training views to measure on, at most.", "min": 1, "max": 100_000},
+    )
+    formats: tuple[str, ...] = formats_setting(rounding_formats(DEFAULT_FORMATS), may_be_empty=True)
+    rounding_steps: int = field(
+        default=45,
+        metadata={
+            "help": "Steps of fine-tuning after each attribute that a format rounds (.splat, .spz, "
+            ".sog, .compressed.ply); 0 for none.",
+            "min": 0,
+            "max": 100_000,
+        },
     )
     backend: str = backend_setting()
     device: str = device_setting()
+
+    def __post_init__(self) -> None:
+        unknown = tuple(name for name in self.formats if name not in CHOICES)  # refused by checks
+        object.__setattr__(self, "formats", (*rounding_formats(self.formats), *unknown))
 
 
 def run(
@@ -68,100 +94,144 @@ def run(
     """Decide on the splats of inputs["prune"] by training views of inputs["sfm"].
 
     Metrics: psnr_raw_db, psnr_kept_db, psnr_splat32_db (means over the held-out views, or over
-    those that decided where none are held out), sh_degree, splats_by_sh_degree, raw_mib, kept_mib.
-    Raises SplatError if a photograph cannot be read.
+    the deciding views where none are held out), sh_degree, splats_by_sh_degree, bits, raw_mib,
+    kept_mib; formats: by format that was fine-tuned to, rounded_db and finetuned_db (see
+    `capacity.rounding`). Raises SplatError if a photograph cannot be read, and Interrupted.
     """
-    import numpy as np
-
-    from stages.base.atomic import replacing
     from stages.capacity.bits import choose_bits
-    from stages.formats import FORMATS, splat32
-    from stages.formats.quantisation import splats_to_write
-    from stages.measure.flat import flat_dc
-    from stages.scene import QuantisedSplats, save_splats, split_held_out
+    from stages.scene import QuantisedSplats
 
     splats: Splats = inputs["prune"]
-    decider, judge = _measures(inputs["sfm"], splats.draw_settings, settings, report)
+    decider, evaluator = _measures(inputs["sfm"], splats.draw_settings, settings, report)
+    kept, by_degree, threshold = _choose_sh_degrees(splats, settings, decider)
+    flat = _flat_colours(kept, inputs["sfm"], settings)
+    bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
+    figures = {
+        "psnr_raw_db": evaluator.psnr(splats),
+        "psnr_kept_db": evaluator.psnr(kept),
+        "psnr_splat32_db": evaluator.psnr(_as_splat32(kept, flat)),
+        "sh_degree": kept.sh_degree,
+        "splats_by_sh_degree": [
+            int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)
+        ],
+        "bits": bits,
+        "measured_on": evaluator.what,
+    }
+    decisions: dict[str, object] = {
+        **figures,
+        "psnr_sog_training_db": sog_db,
+        "max_loss_db": settings.max_loss_db,
+        "colour_loss_of_255": threshold,
+        "views": len(decider.views),
+        "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
+    }
+    for name, value in figures.items():
+        report.metric(name, value)
+    report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
+    report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
+    report.metric("evaluated_side_px", splats.draw_settings.side)
+    report_backend(report, backend_of_settings(settings))
+    quantised = QuantisedSplats(kept, kept.sh_degree, decisions, flat)
+    finetuned = _finetune_to_formats(quantised, inputs, settings, decider.views, report)
+    quantised = replace(quantised, finetuned=finetuned)
+    _save(folder, quantised)
+    return quantised
+
+
+def _choose_sh_degrees(
+    splats: Splats, settings: QuantiseSettings, decider: _Measure
+) -> tuple[Splats, dict[int, float], float]:
+    """(splats without the SH coefficients that training views do not show; PSNR by the SH degree
+    of all; the threshold at which single splats have lost degrees, of 255)."""
+    import numpy as np
+
+    from stages.measure.sh import sufficient_degrees, truncate_sh
+
     raw_db = decider.psnr(splats)
-    by_degree = {splats.sh_degree: raw_db}
-    kept = splats
+    by_degree, kept = {splats.sh_degree: raw_db}, splats
     for lower in range(splats.sh_degree):
         candidate = splats.with_sh_degree(lower)
         by_degree[lower] = decider.psnr(candidate)
         if raw_db - by_degree[lower] < settings.max_loss_db:
             kept = candidate
             break
-    kept, threshold = _cut_each(kept, raw_db, settings, decider)
-    flat = None
-    if kept.sh_degree:
-        views = split_held_out(inputs["sfm"].views)[0]
-        flat = flat_dc(
-            kept,
-            (kept.draw_settings.camera(v.camera) for v in views),
-            backend_of_settings(settings),
-        )
-    drawn = splats_to_write(FORMATS["splat"], QuantisedSplats(kept, kept.sh_degree, {}, flat))
-    in_32_bytes = splat32.decode(splat32.encode(drawn))
-    judged = {
-        "psnr_raw_db": judge.psnr(splats),
-        "psnr_kept_db": judge.psnr(kept),
-        "psnr_splat32_db": judge.psnr(replace(in_32_bytes, draw_settings=splats.draw_settings)),
-    }
-
-    counts = [int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)]
-    bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
-    decisions: dict[str, object] = {
-        "sh_degree": kept.sh_degree,
-        "bits": bits,
-        "psnr_sog_training_db": sog_db,
-        "splats_by_sh_degree": counts,
-        "max_loss_db": settings.max_loss_db,
-        "colour_loss_of_255": threshold,
-        "measured_on": judge.what,
-        "views": len(decider.photographs),
-        "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
-        **judged,
-    }
-    for name in ("psnr_raw_db", "psnr_kept_db", "psnr_splat32_db", "sh_degree"):
-        report.metric(name, decisions[name])
-    report.metric("splats_by_sh_degree", counts)
-    report.metric("bits", bits)
-    report.metric("raw_mib", round(_bytes(splats) / 2**20, 3))
-    report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
-    report.metric("measured_on", judge.what)
-    report.metric("judged_side_px", splats.draw_settings.side)
-    report_backend(report, backend_of_settings(settings))
-    save_splats(folder, kept)
-    (folder / _DECISIONS).write_text(json.dumps(decisions, indent=1) + "\n", encoding="utf-8")
-    if flat is not None:
-        with replacing(folder / _FLAT) as path, path.open("wb") as file:
-            np.save(file, flat)
-    return QuantisedSplats(kept, kept.sh_degree, decisions, flat)
-
-
-def _cut_each(
-    kept: Splats, raw_db: float, settings: QuantiseSettings, decider: _Measure
-) -> tuple[Splats, float]:
-    """(splats with each one's negligible bands cut, the threshold that passed)."""
-    import numpy as np
-
-    from stages.measure.sh import cut, degrees_at
-
-    if kept.sh_degree == 0:
-        return kept, 0.0
-    for steps in _THRESHOLDS_OF_255:
-        degrees = degrees_at(kept, steps / 255)
+    for threshold in _THRESHOLDS_OF_255 if kept.sh_degree else ():
+        degrees = sufficient_degrees(kept, threshold / 255)
         if np.array_equal(degrees, kept.sh_degrees):
             continue
-        candidate = cut(kept, degrees)
+        candidate = truncate_sh(kept, degrees)
         if raw_db - decider.psnr(candidate) < settings.max_loss_db:
-            return candidate, steps
-    return kept, 0.0
+            return candidate, by_degree, threshold
+    return kept, by_degree, 0.0
+
+
+def _flat_colours(
+    splats: Splats, reconstruction: Reconstruction, settings: QuantiseSettings
+) -> NDArray[np.floating] | None:
+    """[N, 3] DC coefficients for formats without view dependence; None where `splats` have none."""
+    from stages.measure.sh import view_averaged_dc
+    from stages.scene import split_held_out
+
+    if not splats.sh_degree:
+        return None
+    views = split_held_out(reconstruction.views)[0]
+    cameras = (splats.draw_settings.camera(view.camera) for view in views)
+    found: NDArray[np.floating] = view_averaged_dc(splats, cameras, backend_of_settings(settings))
+    return found
+
+
+def _as_splat32(splats: Splats, flat: NDArray[np.floating] | None) -> Splats:
+    """As a .splat file returns them, without fine-tuning."""
+    from stages.formats import FORMATS, splat32
+    from stages.formats.quantisation import splats_to_write
+    from stages.scene import QuantisedSplats
+
+    held = splats_to_write(FORMATS["splat"], QuantisedSplats(splats, splats.sh_degree, {}, flat))
+    return replace(splat32.decode(splat32.encode(held)), draw_settings=splats.draw_settings)
+
+
+def _finetune_to_formats(
+    quantised: QuantisedSplats,
+    inputs: Mapping[str, Any],
+    settings: QuantiseSettings,
+    deciding_views: Sequence[EvaluationView],
+    report: Report,
+) -> dict[str, Splats]:
+    """By format, the splats that its file should hold. Raises Interrupted."""
+    import numpy as np
+
+    from stages.capacity.rounding import RoundingFinetuner
+    from stages.formats import FORMATS
+    from stages.formats.values import drop_undrawable
+    from stages.measure.contribution import measure_contributions
+    from stages.measure.evaluation import load_evaluation_views
+    from stages.scene import split_held_out, training_extent
+    from stages.training.finetune import FineTuner
+
+    splats, reconstruction = drop_undrawable(quantised.splats)[0], inputs["sfm"]
+    if not (settings.rounding_steps and settings.formats and len(splats)):
+        return {}
+    backend, dropout = backend_of_settings(settings), inputs["train"].dropout
+    training = split_held_out(reconstruction.views)[0]
+    views = load_evaluation_views(reconstruction.folder, training, splats.draw_settings)
+    view_counts = np.zeros(len(splats), np.int32)
+    if dropout:  # which alone depends on them
+        view_counts = measure_contributions(splats, views, backend).view_counts
+    finetuner = FineTuner(views, training_extent(reconstruction), backend, report, dropout)
+    rounding = RoundingFinetuner(
+        finetuner, deciding_views, backend, settings.rounding_steps, view_counts
+    )
+    found, figures = {}, {}
+    for number, name in enumerate(settings.formats):
+        report.progress(number, len(settings.formats), f"fine-tuning to .{name}")
+        found[name], figures[name] = rounding.finetune(FORMATS[name], quantised)
+    report.metric("formats", figures)
+    return found
 
 
 def _bytes(splats: Splats) -> int:
-    """As float32 with the same bands for all, which is what most formats hold (and 11 numbers
-    besides); each splat's own degree only helps formats that compress zeros away."""
+    """As float32 with the same SH degree for all and 11 other values, which is what most formats
+    hold; each splat's own degree helps only formats that compress zeros."""
     found: int = 4 * len(splats) * (11 + 3 * splats.sh.shape[1])
     return found
 
@@ -172,11 +242,11 @@ def _measures(
     settings: QuantiseSettings,
     report: Report,
 ) -> tuple[_Measure, _Measure]:
-    """(what decides, what judges): training photographs, and those held out if there are any."""
+    """(what decides: training views; what evaluates: held-out views if there are any)."""
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import split_held_out, spread_over
+    from stages.scene import evenly_spaced, split_held_out
 
-    training, held = split_held_out(reconstruction.views)
+    training, held_out = split_held_out(reconstruction.views)
     if not training:
         raise SplatError(
             "quantise-no-views",
@@ -185,40 +255,55 @@ def _measures(
             hint="Run `splat sfm` again.",
             family=Family.RUN_FOLDER,
         )
-    lent = tuple(spread_over(training, settings.max_views))
-    judges, what = (held, "held out") if held else (lent, "training")
-    decider = _Measure(
-        load_evaluation_views(reconstruction.folder, lent, draw_settings), settings, report
+    deciding = tuple(evenly_spaced(training, settings.max_views))
+    evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
+    folder, backend = reconstruction.folder, backend_of_settings(settings)
+    return (
+        _Measure(load_evaluation_views(folder, deciding, draw_settings), backend, report),
+        _Measure(load_evaluation_views(folder, evaluated, draw_settings), backend, Report(), what),
     )
-    judge = _Measure(
-        load_evaluation_views(reconstruction.folder, judges, draw_settings),
-        settings,
-        Report(),
-        what,
-    )
-    return decider, judge
 
 
 @dataclass
 class _Measure:
-    """Measures splats on photographs that are loaded once."""
+    """Measures splats on views that are loaded once."""
 
-    photographs: Sequence[EvaluationView]
-    settings: QuantiseSettings
+    views: Sequence[EvaluationView]
+    backend: str
     report: Report
     what: str = "training"
     done: int = 0
 
     def psnr(self, splats: Splats) -> float:
-        """Mean PSNR over the photographs (dB)."""
+        """Mean PSNR over the views (dB)."""
         from stages.measure.evaluation import mean_psnr_db
 
-        mean = round(mean_psnr_db(splats, self.photographs, backend_of_settings(self.settings)), 4)
+        mean = round(mean_psnr_db(splats, self.views, self.backend), 4)
         self.done += 1
-        # Raw, three lower degrees, each threshold, and about as many numbers of bits.
-        total = 5 + len(_THRESHOLDS_OF_255) + _BIT_TRIALS
+        # As it is, three lower degrees, each threshold, and about as many bit depths.
+        total = 5 + len(_THRESHOLDS_OF_255) + _BIT_DEPTH_MEASUREMENTS
         self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
         return mean
+
+
+def _save(folder: Path, quantised: QuantisedSplats) -> None:
+    import shutil
+
+    import numpy as np
+
+    from stages.base.atomic import replacing
+    from stages.scene import save_splats
+
+    shutil.rmtree(folder / _FINETUNED, ignore_errors=True)  # of an interrupted run
+    save_splats(folder, quantised.splats)
+    decisions = json.dumps(quantised.decisions, indent=1) + "\n"
+    (folder / _DECISIONS).write_text(decisions, encoding="utf-8")
+    if quantised.flat_dc is not None:
+        with replacing(folder / _FLAT) as path, path.open("wb") as file:
+            np.save(file, quantised.flat_dc)
+    for name, splats in quantised.finetuned.items():
+        (folder / _FINETUNED / name).mkdir(parents=True, exist_ok=True)
+        save_splats(folder / _FINETUNED / name, splats)
 
 
 def load(folder: Path) -> QuantisedSplats:
@@ -228,10 +313,15 @@ def load(folder: Path) -> QuantisedSplats:
     from stages.scene import QuantisedSplats, load_splats
 
     splats = load_splats(folder)
+    finetuned = {
+        path.name: load_splats(path)
+        for path in sorted((folder / _FINETUNED).glob("*"))
+        if path.is_dir()
+    }
     try:
         decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
-        return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions, flat)
+        return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions, flat, finetuned)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "quantise-folder-damaged",
@@ -244,8 +334,8 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=6,
-    reads=("sfm", "prune"),
+    version=7,
+    reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     run=run,
     load=load,

@@ -105,7 +105,7 @@ def _with_agreed(
 
     training, _ = split_held_out(reconstruction.views)
     more, more_colours = plane_sweep_points(reconstruction.folder, training, points)
-    report.metric("agreed", len(more))
+    report.metric("plane_sweep_points", len(more))
     return np.concatenate([points, more]), np.concatenate([colours, more_colours])
 
 
@@ -120,12 +120,12 @@ def _filled(
     import numpy as np
 
     from stages.scene import split_held_out
-    from stages.structure.seeding.coverage import fill_cells
+    from stages.structure.seeding.empty_cells import fill_cells
 
     training, _ = split_held_out(reconstruction.views)
     cameras = tuple(view.camera for view in reconstruction.views)
     more, more_colours, more_scales = fill_cells(reconstruction.folder, training, points, cameras)
-    report.metric("filled", len(more))
+    report.metric("filled_cells", len(more))
     return (
         np.concatenate([points, more]),
         np.concatenate([colours, more_colours]),
@@ -203,8 +203,8 @@ def _report_counts(reasons: dict[str, NDArray[np.bool_]], points: int, report: R
     counts = {reason: int(mask.sum()) for reason, mask in reasons.items()}
     total = int(np.logical_or.reduce(list(reasons.values())).sum()) if reasons else 0
     report.metric("points", points)
-    report.metric("left_out", total)
-    report.metric("left_out_by_reason", counts)
+    report.metric("outliers", total)
+    report.metric("outliers_by_reason", counts)
     if total > 0.2 * points:
         report.warn(
             "seed-many-outliers",

@@ -1,8 +1,8 @@
-"""Capture -> Reconstruction: where each photograph was taken, and a sparse cloud of points.
+"""Capture -> Reconstruction: camera poses and a sparse point cloud.
 
-Structure from motion by COLMAP, in a process of its own. The result is used only if it passes the
-gates of `stages.structure.gates`; if it does not, other ways are tried, and if none helps, the
-user is told what to photograph differently.
+Structure from motion by COLMAP, in a worker process. A model is used only if it passes the quality
+gates (`structure.gates`). If it does not, other configurations are tried (`structure.fallbacks`),
+and if none passes, the error says what to photograph differently.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base import threads
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
@@ -23,15 +22,10 @@ from stages.base.text import counted
 if TYPE_CHECKING:
     from stages.scene import Capture, Reconstruction
     from stages.structure.chunks import ChunkExecutor
-    from stages.structure.fallbacks import Attempt, Attempts
-    from stages.structure.job import Job
-    from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PHOTOGRAPHS = 3
-_FEWEST_PARTIAL_POINTS = 50
 _FINISHED = "sfm.json"
 _WORK = "work"
-_NAMED = 12  # photographs that a message names before it counts the rest
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ class SfmSettings:
     max_features: int = field(
         default=12_288,
         metadata={
-            "help": "Features to look for in each photograph (about).",
+            "help": "Approximate number of SIFT features in each photograph.",
             "min": 100,
             "max": 1_000_000,
         },
@@ -58,8 +52,8 @@ class SfmSettings:
     matching: str = field(
         default="auto",
         metadata={
-            "help": "Which photographs to compare: exhaustive (every pair), sequential (neighbours "
-            "in order of name) or auto (those that look alike at a first look).",
+            "help": "Pairs of photographs to match: exhaustive (every pair), sequential "
+            "(neighbours in order of name) or auto (those with similar features).",
             "choices": ("auto", "exhaustive", "sequential"),
         },
     )
@@ -67,24 +61,23 @@ class SfmSettings:
         default=False,
         metadata={
             "panel": "Advanced",
-            "help": "Go on with the best reconstruction found even if it fails its gates.",
+            "help": "Use the best reconstruction found even if it fails the quality gates.",
         },
     )
     cameras: Path | None = field(
         default=None,
         metadata={
             "panel": "Known cameras",
-            "help": "File or folder of cameras that are known already, of COLMAP, nerfstudio, a "
-            "synthetic NeRF scene, LLFF, OpenSfM, Bundler, Metashape or RealityScan: nothing "
-            "is searched.",
-            "affects_output": False,  # its content does, which is an input
+            "help": "File or folder of known camera poses, of COLMAP, nerfstudio, a synthetic NeRF "
+            "scene, LLFF, OpenSfM, Bundler, Metashape or RealityScan; they are not estimated.",
+            "affects_output": False,  # its content does, and that is an input
         },
     )
     split: bool = field(
         default=False,
         metadata={
             "panel": "Known cameras",
-            "help": "Keep the training and test photographs that --cameras tells apart.",
+            "help": "Use the split into training and test photographs of --cameras.",
             "needs": "cameras",
         },
     )
@@ -92,8 +85,7 @@ class SfmSettings:
         default=False,
         metadata={
             "panel": "Known cameras",
-            "help": "Move the cameras of --cameras to where the photographs' matches want them; "
-            "their lenses stay as they are.",
+            "help": "Refine the poses of --cameras by bundle adjustment; intrinsics stay fixed.",
             "needs": "cameras",
         },
     )
@@ -101,7 +93,7 @@ class SfmSettings:
         default=False,
         metadata={
             "panel": "Known cameras",
-            "help": "The cameras of --cameras are in metres, as those of phones' AR sessions are.",
+            "help": "The poses of --cameras are in metres, as those of phones' AR sessions are.",
             "needs": "cameras",
         },
     )
@@ -109,7 +101,7 @@ class SfmSettings:
         default=(),
         metadata={
             "panel": "Known cameras",
-            "help": "Two photographs and how far apart their cameras were (metres).",
+            "help": "Two photographs and the distance between their cameras (metres).",
             "together": "A B METRES",
         },
     )
@@ -117,7 +109,7 @@ class SfmSettings:
         default=0.0,
         metadata={
             "panel": "Known cameras",
-            "help": "Side of the ArUco markers that lie in the scene, alone or on a ChArUco board "
+            "help": "Side of the ArUco markers in the scene, alone or on a ChArUco board "
             "(metres); 0: there are none.",
             "min": 0.0,
             "max": 1000.0,
@@ -126,7 +118,7 @@ class SfmSettings:
     max_minutes: float = field(
         default=120.0,
         metadata={
-            "help": "Give up after this time (minutes).",
+            "help": "Stop with an error after this time (minutes).",
             "min": 0.1,
             "max": 100_000,
             "affects_output": False,
@@ -141,73 +133,91 @@ def run(
     report: Report,
     executor: ChunkExecutor | None = None,
 ) -> Reconstruction:
-    """Reconstruct the capture in inputs["ingest"]; see the module's docstring. hands: who does
-    shares of features and matching (`structure.shares`), which changes no byte.
+    """Reconstruct the capture in inputs["ingest"]; see the module's docstring.
 
-    Leaves in `folder`: reconstruction.json and arrays (`load` reads them), colmap/ (undistorted
-    pictures and a COLMAP model of them), sfm.json (metrics but for seconds, and warnings). Raises
-    SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
+    Writes to `folder`: reconstruction.json and arrays (`load` reads them), colmap/ (undistorted
+    pictures and a COLMAP model of them), sfm.json (warnings, and metrics without durations).
+
+    Args:
+        inputs: the capture, as "ingest".
+        settings: see `SfmSettings`.
+        folder: may hold what an interrupted run left.
+        report: receives metrics, warnings and progress.
+        executor: runs chunks of features and matching (`structure.chunks`) in parallel; the result
+            has the same bytes.
+
+    Raises SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
-    from stages.structure import (
-        attempt_runner,
-        fallbacks,
-        finish,
-        light,
-        metric_scale,
-        reconstruction_files,
-    )
+    from stages.structure import light, metric_scale, reconstruction_files
 
     capture: Capture = inputs["ingest"]
-    _check(capture)
+    _check_count(capture)
     if settings.scale:
-        metric_scale.check_distance(settings.scale, capture)  # now, not when cameras are found
+        metric_scale.check_distance(settings.scale, capture)  # before hours of work
     if (folder / _FINISHED).exists():
-        return _again(folder, report)
-    work = folder / _WORK
+        return _load_finished(folder, report)
     if settings.cameras is not None:
-        return _with_known_cameras(capture, settings, settings.cameras, folder, report)
-    _check_different(capture)
-    base = _base_job(capture, settings, work)
-    _reuse_or_clear(work, base)
-    bench = attempt_runner.AttemptRunner(
+        found, seconds = _from_known_cameras(capture, settings, settings.cameras, folder, report)
+    else:
+        found, seconds = _from_photographs(capture, settings, folder, report, executor)
+    found = light.with_light(found, report)
+    reconstruction_files.save_reconstruction(folder, found)
+    report.metric("levelled", found.levelled)
+    report.metric("units", found.units)
+    report.metric("origin", [float(value) for value in found.origin])
+    _write_finished(folder, report)
+    for step, duration in seconds.items():  # not in sfm.json: durations differ between runs
+        report.metric(f"{step}_seconds", round(duration, 1))
+    shutil.rmtree(folder / _WORK)
+    return found
+
+
+def _from_photographs(
+    capture: Capture,
+    settings: SfmSettings,
+    folder: Path,
+    report: Report,
+    executor: ChunkExecutor | None,
+) -> tuple[Reconstruction, dict[str, float]]:
+    """(the reconstruction, seconds by step)."""
+    from stages.structure import acceptance, attempt_runner, fallbacks, finish, metric_scale
+    from stages.structure.job import job_of, prepare_work_folder
+
+    _check_duplicates(capture)
+    work = folder / _WORK
+    job = job_of(capture, work, settings.seed, settings.max_features, settings.matching)
+    prepare_work_folder(work, job)
+    runner = attempt_runner.AttemptRunner(
         folder=work,
-        base=base,
+        base=job,
         report=report,
         deadline=time.monotonic() + 60.0 * settings.max_minutes,
         allow_partial=settings.allow_partial,
         executor=executor,
     )
-    climbed = fallbacks.try_configurations(
-        bench.try_rung,
-        already_exhaustive=base.matching == "exhaustive",
-        out_of_time=bench.out_of_time,
+    attempts = fallbacks.try_configurations(
+        runner.run_configuration,
+        already_exhaustive=job.matching == "exhaustive",
+        out_of_time=runner.out_of_time,
     )
-    best = climbed.best
-    report.metric("rungs", [_rung_figures(attempt) for attempt in climbed.attempts])
-    model = _accepted(best, settings, capture)
-    _tell(best, climbed, capture, report)
-    found = finish.finish(
-        model, capture, folder, report, metric_scale.KnownScale(settings.scale, settings.marker)
-    )
-    reconstruction = light.with_light(found, report)
-    reconstruction_files.save_reconstruction(folder, reconstruction)
-    _model_metrics(best, model, reconstruction, capture, report)
-    report.metric("pairs_looked_at", bench.pairs_looked_at())
-    report.metric("pairs_matched", best.pairs_matched)
-    report.metric("pairs_verified", best.pairs_verified)
-    _write_finished(folder, report)
-    for step, seconds in bench.seconds_by_step().items():  # the clock never says the same twice
-        report.metric(f"{step}_seconds", round(seconds, 1))
-    shutil.rmtree(work)
-    return reconstruction
+    report.metric("attempts", [acceptance.attempt_metrics(attempt) for attempt in attempts])
+    model = acceptance.accepted_model(attempts, capture, settings.allow_partial)
+    acceptance.report_warnings(attempts, capture, report)
+    known_scale = metric_scale.KnownScale(settings.scale, settings.marker)
+    found = finish.finish(model, capture, folder, report, known_scale)
+    best = fallbacks.best_attempt(attempts)
+    _report_model(found, best.statistics.mean_reprojection_error_px, capture, report)
+    acceptance.report_metrics(best, model, report)
+    report.metric("pairs_compared", runner.pairs_compared())
+    return found, runner.seconds_by_step()
 
 
-def _with_known_cameras(
+def _from_known_cameras(
     capture: Capture, settings: SfmSettings, cameras: Path, folder: Path, report: Report
-) -> Reconstruction:
-    import numpy as np
-
-    from stages.structure import known_cameras, light, metric_scale, reconstruction_files
+) -> tuple[Reconstruction, dict[str, float]]:
+    """(the reconstruction, no seconds)."""
+    from stages.structure import known_cameras
+    from stages.structure.metric_scale import KnownScale
 
     deadline = time.monotonic() + 60.0 * settings.max_minutes
     found = known_cameras.reconstruct(
@@ -221,25 +231,12 @@ def _with_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        size=metric_scale.KnownScale(
-            settings.scale, settings.marker, float(settings.metres), "--metres"
-        ),
+        known_scale=KnownScale(settings.scale, settings.marker, float(settings.metres), "--metres"),
         seconds_left=lambda: deadline - time.monotonic(),
     )
-    found = light.with_light(found, report)
-    reconstruction_files.save_reconstruction(folder, found)
-    names = {view.name for view in found.views}
-    report.metric("photographs", len(capture.photos))
-    report.metric("registered", len(found.views))
-    report.metric("left_out", [p.name for p in capture.photos if p.name not in names])
-    report.metric("points", len(found.points))
-    report.metric("mean_reprojection_error_px", round(float(np.mean(found.errors_px)), 4))
-    report.metric("rung", "cameras given")
-    report.metric("levelled", found.levelled)
-    report.metric("units", found.units)
-    _write_finished(folder, report)
-    shutil.rmtree(folder / _WORK)
-    return found
+    _report_model(found, float(found.errors_px.mean()), capture, report)
+    report.metric("configuration", "known cameras")
+    return found, {}
 
 
 def load(folder: Path) -> Reconstruction:
@@ -249,7 +246,7 @@ def load(folder: Path) -> Reconstruction:
     return load_reconstruction(folder)
 
 
-def _check(capture: Capture) -> None:
+def _check_count(capture: Capture) -> None:
     if len(capture.photos) < _FEWEST_PHOTOGRAPHS:
         raise SplatError(
             "sfm-too-few-photographs",
@@ -260,180 +257,32 @@ def _check(capture: Capture) -> None:
         )
 
 
-def _check_different(capture: Capture) -> None:
-    """Near-duplicates would be searched for minutes before the same is said."""
+def _check_duplicates(capture: Capture) -> None:
+    """Refuse a capture of near-duplicates at once; matching would take minutes to find the same."""
     from stages.structure.gates import MOVE
 
-    different = len({photo.twin or photo.name for photo in capture.photos})
+    different = len({photo.duplicate_of or photo.name for photo in capture.photos})
     if different < _FEWEST_PHOTOGRAPHS:
         raise SplatError(
             "sfm-no-parallax",
             given=f"The {len(capture.photos)} photographs show only "
             f"{counted(different, 'picture')} that {'are' if different > 1 else 'is'} not nearly "
             "the same as another.",
-            wanted="Depth shows only when the camera moves sideways.",
+            wanted="Depth can be measured only when the camera moves sideways.",
             hint=MOVE,
             family=Family.RECONSTRUCTION,
         )
 
 
-def _base_job(capture: Capture, settings: SfmSettings, work: Path) -> Job:
-    """The standard job: one camera for all photographs of the same key and size."""
-    from stages.structure.job import CameraGuess, Job
-
-    positions: dict[tuple[str, int, int], int] = {}
-    guesses: list[CameraGuess] = []
-    camera_of = []
-    for photo in capture.photos:
-        key = (photo.camera, photo.width, photo.height)
-        if key not in positions:
-            positions[key] = len(guesses)
-            guesses.append(CameraGuess(photo.width, photo.height, photo.focal_px))
-        camera_of.append(positions[key])
-    return Job(
-        step="",
-        images_root=str(capture.folder.resolve()),
-        database=str(work / "base.db"),
-        out="",
-        progress="",
-        names=tuple(photo.image for photo in capture.photos),
-        masks=tuple(photo.mask for photo in capture.photos),
-        camera_of=tuple(camera_of),
-        cameras=tuple(guesses),
-        seed=settings.seed,
-        threads=threads.count(),
-        max_features=settings.max_features,
-        matching="chosen" if settings.matching == "auto" else settings.matching,
-    )
-
-
-def _reuse_or_clear(work: Path, base: Job) -> None:
-    """Keep what an interrupted run left only if it was about the very same job."""
-    described = work / "base.json"
-    # Where things lie and how many threads work on them changes nothing.
-    plain = asdict(base) | {"images_root": "", "database": "", "threads": 0}
-    wanted = json.dumps(plain, ensure_ascii=False, sort_keys=True)
-    try:
-        same = described.read_text(encoding="utf-8") == wanted
-    except (OSError, ValueError):
-        same = False
-    if not same:
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir(parents=True)
-        described.write_text(wanted, encoding="utf-8")
-
-
-def _accepted(best: Attempt, settings: SfmSettings, capture: Capture) -> SparseModel:
-    """The model to go on with, or the error that says why there is none."""
-    model = best.result.model if best.result is not None else None
-    usable = model is not None and len(model.names) >= _FEWEST_PHOTOGRAPHS
-    if model is not None and usable and best.passed:
-        return model
-    enough = model is not None and len(model.points) >= _FEWEST_PARTIAL_POINTS
-    if model is not None and usable and enough and settings.allow_partial:
-        return model
-    worst = best.failures[0]
-    groups = best.result.groups if best.result is not None else ()
-    code, given = worst.code, worst.given
-    if code == "sfm-too-few-registered" and len(groups) > 1:
-        code = "sfm-separate-groups"
-        names = {photo.image: photo.name for photo in capture.photos}
-        described = "; ".join(
-            f"{len(group)} ({_listed(sorted(names[image] for image in group), 3)})"
-            for group in groups[:4]
-        )
-        given += f" The largest groups that hang together: {described}."
-    raise SplatError(
-        code, given=given, wanted=worst.wanted, hint=worst.hint, family=Family.RECONSTRUCTION
-    )
-
-
-def _tell(best: Attempt, climbed: Attempts, capture: Capture, report: Report) -> None:
-    """Warnings about what is not as it should be."""
-    assert best.result is not None
-    assert best.result.model is not None
-    registered = set(best.result.model.names)
-    left_out = [photo.name for photo in capture.photos if photo.image not in registered]
-    if left_out:
-        one = len(left_out) == 1
-        report.warn(
-            "sfm-photographs-left-out",
-            f"{len(left_out)} of {len(capture.photos)} photographs {'was' if one else 'were'} left "
-            f"out, because {'it' if one else 'they'} could not be placed: {_listed(left_out)}. "
-            "More overlap with the others would help.",
-        )
-    if len(best.result.groups) > 1:
-        sizes = ", ".join(str(len(group)) for group in best.result.groups)
-        report.warn(
-            "sfm-several-models",
-            f"The photographs fell into separate models of {sizes}; the largest is used.",
-        )
-    if best.passed and best is not climbed.attempts[0]:
-        report.warn(
-            "sfm-second-try",
-            f"The usual way did not work ({climbed.attempts[0].failures[0].given}) but "
-            f"another did: {best.rung.name}. Look at the result with care.",
-        )
-    _tell_doubts(best, report)
-    for failure in best.failures:
-        report.warn(failure.code, f"Accepted all the same: {failure.given} {failure.wanted}")
-
-
-def _tell_doubts(best: Attempt, report: Report) -> None:
-    """What would be a failure if there were more of it."""
-    from stages.structure.gates import borderline_failures
-
-    failed = {failure.code for failure in best.failures}
-    for doubt in borderline_failures(best.figures):
-        if doubt.code not in failed:
-            report.warn(doubt.code, f"{doubt.given} {doubt.wanted} {doubt.hint}")
-
-
-def _listed(names: list[str], most: int = _NAMED) -> str:
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + rest
-
-
-def _rung_figures(attempt: Attempt) -> dict[str, Any]:
-    figures = {
-        name: round(value, 4) if isinstance(value, float) else value
-        for name, value in asdict(attempt.figures).items()
-    }
-    return {
-        "rung": attempt.rung.name,
-        "passed": attempt.passed,
-        "failures": [failure.code for failure in attempt.failures],
-        "keypoints_median": attempt.keypoints_median,
-        **figures,
-    }
-
-
-def _model_metrics(
-    best: Attempt,
-    model: SparseModel,
-    reconstruction: Reconstruction,
-    capture: Capture,
-    report: Report,
+def _report_model(
+    found: Reconstruction, mean_error_px: float, capture: Capture, report: Report
 ) -> None:
-    registered = set(model.names)
-    figures = best.figures
+    names = {view.name for view in found.views}
     report.metric("photographs", len(capture.photos))
-    report.metric("registered", len(model.names))
-    report.metric("left_out", [p.name for p in capture.photos if p.image not in registered])
-    report.metric("points", len(model.points))
-    report.metric("mean_reprojection_error_px", round(figures.mean_reprojection_error_px, 4))
-    report.metric("mean_track_length", round(figures.mean_track_length, 3))
-    report.metric(
-        "median_triangulation_angle_deg", round(figures.median_triangulation_angle_deg, 2)
-    )
-    report.metric("baseline_over_depth", round(figures.baseline_over_depth, 4))
-    report.metric("keypoints_median", best.keypoints_median)
-    report.metric("focal_px", [round(float(f), 2) for f in model.camera_params[:, 0]])
-    report.metric("distortion", [round(float(k), 5) for k in model.camera_params[:, 3]])
-    report.metric("rung", best.rung.name)
-    report.metric("levelled", reconstruction.levelled)
-    report.metric("units", reconstruction.units)
-    report.metric("origin", [float(value) for value in reconstruction.origin])
+    report.metric("registered_images", len(found.views))
+    report.metric("unregistered_images", [p.name for p in capture.photos if p.name not in names])
+    report.metric("points", len(found.points))
+    report.metric("mean_reprojection_error_px", round(mean_error_px, 4))
 
 
 def _write_finished(folder: Path, report: Report) -> None:
@@ -444,8 +293,8 @@ def _write_finished(folder: Path, report: Report) -> None:
         path.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
-def _again(folder: Path, report: Report) -> Reconstruction:
-    """What a run that was killed just after its end had found and said."""
+def _load_finished(folder: Path, report: Report) -> Reconstruction:
+    """The output, metrics and warnings of a run that was killed after its last step."""
     data = json.loads((folder / _FINISHED).read_text(encoding="utf-8"))
     for name, value in data["metrics"].items():
         report.metric(name, value)
@@ -456,5 +305,5 @@ def _again(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=10, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=11, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -80,9 +80,8 @@ class TrainSettings:
         default=0.0,
         metadata={
             "panel": "Advanced",
-            "help": "What growing on for as long again must give one at least of the photographs "
-            "that are lent for it (dB): where it gives less, training goes back, and ends its "
-            "growth there. 0: never.",
+            "help": "Stop densifying when it no longer improves any validation view by this "
+            "many dB. 0: never.",
             "min": 0,
             "max": 10,
         },
@@ -115,14 +114,6 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
-    growth: str = field(
-        default="adaptive",
-        metadata={
-            "help": "How splats become more: adaptive (cloned and split where photographs pull at "
-            "them), or relocation (those that do not show move to where others do).",
-            "choices": ("adaptive", "relocation"),
-        },
-    )
     blocks: str = field(
         default="1",
         metadata={
@@ -148,11 +139,6 @@ class TrainSettings:
 
 
 _LEARNT = "learnt.json"
-MAX_VALIDATION_VIEWS = (
-    4  # photographs: what more of them would tell is not worth what each is missed
-)
-MIN_VIEWS_FOR_VALIDATION = 8  # photographs: of fewer, each is missed more than its advice is worth
-
 PRESETS: dict[str, TrainSettings] = {
     "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
     "standard": TrainSettings(steps=7000, train_side=800, sh_degree=2, max_splats=250_000),
@@ -194,23 +180,21 @@ def run(
     if len(splats) == 0:
         raise _nothing_left()
     write_quality(trainer, reconstruction, folder, report)
-    trained = TrainedSplats(splats, trainer.dropout, trainer.overfitted)
+    trained = TrainedSplats(splats, trainer.dropout, overfitted=trainer.dropout)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
     report.metric("steps", trainer.schedule.steps)
     _report_makers(trainer, report)
-    report.metric("photographs_lent", len(trainer.lent))
-    report.metric("learnt_by_heart", trainer.overfitted)
-    if trainer.answers and trainer.gain_db is not None:
-        report.metric("sitting_out_gain_db", round(trainer.gain_db, 3))
-        report.metric("photographs_lent_said", [asdict(answer) for answer in trainer.answers])
-    if trainer.ended:
-        report.metric("ended_early", trainer.ended)
+    report.metric("validation_views", len(trainer.validation))
+    report.metric("overfitted", trainer.dropout)
+    if trainer.early_stopping.stopped_at:
+        report.metric("densification_stopped_at", trainer.early_stopping.stopped_at)
         report.warn(
-            "train-holds-no-more",
-            f"Ended after {trainer.schedule.steps:,} steps: {trainer.ended}. --patience 0 goes the "
-            "whole way.",
+            "train-densification-stopped",
+            f"Densification stopped early, after {trainer.early_stopping.stopped_at:,} steps, and "
+            f"training ended after {trainer.schedule.steps:,}: no validation view improved by "
+            f"{settings.patience:g} dB. --patience 0 trains for all steps.",
         )
     report.metric("splats", len(splats))
     if len(splats) >= 0.98 * trainer.cap:
@@ -260,10 +244,11 @@ def make_trainer(
 ) -> Trainer:
     """Load the photographs and compute the cap, before anything grows."""
     from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import draw_settings_of, seen_extent, split_held_out
+    from stages.scene import draw_settings_of, split_held_out, training_extent
     from stages.training.cap import cap_for, splats_determined
     from stages.training.schedule import Schedule
     from stages.training.trainer import Trainer
+    from stages.training.validation import validation_rows
     from stages.training.views import load_views
 
     kept, held = split_held_out(reconstruction.views)
@@ -290,7 +275,7 @@ def make_trainer(
     return Trainer(
         schedule=Schedule(
             steps=settings.steps,
-            extent=seen_extent(reconstruction),
+            extent=training_extent(reconstruction),
             sh_degree=settings.sh_degree,
             n_start=min(n_start, cap.splats),
             seed=settings.seed,
@@ -305,20 +290,8 @@ def make_trainer(
         over_any=settings.background == "any",
         backend=backend_of_settings(settings),
         within=settings.within,
-        growth=settings.growth,
-        lent=validation_rows(len(train)),
+        validation=validation_rows(len(train)) if settings.patience else (),
         patience_db=settings.patience,
-    )
-
-
-def validation_rows(n: int) -> tuple[int, ...]:
-    """Which of `n` training photographs decide while the model grows: the fifth of every eight, so
-    that they lie between the judges, or of more where that would be more than four; none where
-    there are too few to lend one."""
-    return (
-        tuple(range(4, n, max(8, -(-n // MAX_VALIDATION_VIEWS))))
-        if n >= MIN_VIEWS_FOR_VALIDATION
-        else ()
     )
 
 
@@ -497,5 +470,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=16, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=17, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -15,9 +15,9 @@ from stages.base.settings import check_settings
 from stages.base.stage import Report
 from stages.export import ExportSettings
 from stages.formats import FORMATS
-from stages.proof import independent_readers
+from stages.proof import checks
 from stages.proof.content import FileContent
-from stages.scene import ExportedAssets, QuantisedSplats, Splats, TrainedSplats
+from stages.scene import ExportedAssets, QuantisedSplats, Splats
 from stages.surface import fuse, ply
 from tests.small_scene import SmallScene, small_scene
 
@@ -32,9 +32,9 @@ def exported(
 ) -> tuple[ExportedAssets, Report]:
     report = Report()
     splats = scene.splats if splats is None else splats
+    splats = replace(splats, origin=scene.reconstruction.origin)
     inputs = {
         "sfm": scene.reconstruction,
-        "train": TrainedSplats(splats),
         "quantise": QuantisedSplats(splats, splats.sh_degree, {}),
     }
     return export.run(inputs, ExportSettings(**settings), folder, report), report
@@ -98,7 +98,7 @@ def test_a_wrong_file_does_not_pass(
 ) -> None:
     """As if the writer had made a common mistake: the check must see each of them."""
 
-    right = independent_readers.read_back
+    right = checks.read_back
 
     def wrong(path: Path) -> FileContent:
         content = right(path)
@@ -115,7 +115,7 @@ def test_a_wrong_file_does_not_pass(
             splats = splats.take(np.arange(1, len(splats)))
         return replace(content, splats=splats)
 
-    monkeypatch.setattr(independent_readers, "read_back", wrong)
+    monkeypatch.setattr(checks, "read_back", wrong)
     with pytest.raises(SplatError) as caught:
         exported(scene, tmp_path, formats=(name,))
     assert caught.value.code == "export-verify-failed"
@@ -243,6 +243,12 @@ def test_no_splats_give_an_empty_mesh(scene: SmallScene, tmp_path: Path) -> None
     nothing = scene.splats.take(np.zeros(len(scene.splats), bool))
     _, report = exported(scene, tmp_path, nothing, formats=("mesh",))
     assert [code for code, _ in report.warnings] == ["export-empty", "export-mesh-empty"]
+
+
+def test_export_reads_no_photograph(scene: SmallScene, tmp_path: Path) -> None:
+    gone = replace(scene, reconstruction=replace(scene.reconstruction, folder=tmp_path / "gone"))
+    assets, _ = exported(gone, tmp_path, formats=tuple(FORMATS))
+    assert len(assets.files) == len(FORMATS)
 
 
 def test_formats_named_twice_are_written_once(scene: SmallScene, tmp_path: Path) -> None:

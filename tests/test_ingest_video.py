@@ -185,7 +185,7 @@ def test_a_broken_video_among_photographs_is_left_out_and_named(tmp_path: Path) 
 
 def test_memory_hardly_grows_with_length() -> None:
     """What is kept of a frame is a few hundred bytes, however large it is."""
-    from stages.photos.frames import Watcher
+    from stages.photos.frame_selection import Watcher
 
     watcher = Watcher()
     seen = [watcher.see(at(i)[..., 0], i / 30) for i in range(20)]

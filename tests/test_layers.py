@@ -7,21 +7,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-STAGE_FILES = ("ingest", "sfm", "seed", "train", "prune", "quantise", "export")
+from tests.layers import LAYERS, STAGE_FILES
 
-# Lowest first; a module may import from its own layer (but not in a circle) and from those above it
-# in this list. Types that only a type checker reads may come from anywhere.
-LAYERS: tuple[tuple[str, ...], ...] = (
-    ("stages.base",),
-    ("stages.scene",),
-    ("stages.raster", "stages.formats", "stages.cameras", "stages.photos"),
-    ("stages.measure", "stages.structure"),
-    ("stages.training", "stages.editing", "stages.proof", "stages.surface", "stages.capacity"),
-    ("stages", *(f"stages.{name}" for name in STAGE_FILES)),
-    ("stages.run", "stages.viewer", "stages.distributed"),
-    ("splatcli",),
-)
+ROOT = Path(__file__).parent.parent
 
 
 def sources() -> dict[str, Path]:

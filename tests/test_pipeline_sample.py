@@ -34,7 +34,7 @@ def metrics(result: dict[str, Any], stage: str) -> dict[str, Any]:
 
 
 def test_every_photograph_is_registered(result: dict[str, Any]) -> None:
-    assert metrics(result, "sfm")["registered"] == PHOTO_COUNT
+    assert metrics(result, "sfm")["registered_images"] == PHOTO_COUNT
     assert metrics(result, "sfm")["mean_reprojection_error_px"] < 1.0
 
 
@@ -109,10 +109,24 @@ def test_verify_finds_what_the_manifest_says(result: dict[str, Any], copied: Pat
     assert [each["format"] for each in found] == list(FORMATS)
     for each in found:
         assert each["right"], each["fault"]
-        kept = metrics(result, "export")["formats"][each["format"]]
-        # what fitting gave is told once, where it was done
-        again = {name: kept[name] for name in kept if name not in ("plain_db", "fitted_db")}
-        assert {name: each[name] for name in again} == again
+        figures = metrics(result, "export")["formats"][each["format"]]
+        assert {name: each[name] for name in figures} == figures
+
+
+def test_asking_for_one_more_lossless_format_runs_export_alone(copied: Path) -> None:
+    ran = events(splat("export", "--format", "html", "--json", folder=copied))
+    assert [event["stage"] for event in ran if event["event"] == "started"] == ["export"]
+
+
+def test_asking_for_a_format_that_rounds_has_quantise_finetune_to_it(copied: Path) -> None:
+    words = ("--format", "sog", "--format", "usdz", "--json")
+    ran = events(splat("export", *words, folder=copied))
+    assert [event["stage"] for event in ran if event["event"] == "started"] == [
+        "quantise",
+        "export",
+    ]
+    assert (copied / "run" / "6-quantise" / "finetuned" / "sog").is_dir()
+    assert (copied / "run" / "7-export" / "scene.sog").is_file()
 
 
 def test_asking_for_a_format_that_is_there_runs_nothing_and_loses_none(copied: Path) -> None:

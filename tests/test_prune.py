@@ -10,9 +10,10 @@ from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.capacity import pruning
-from stages.capacity.targets import FELT
-from stages.measure.contribution import Contributions, floaters, near_view_frusta
+from stages.capacity.targets import LOSS_RATIO
+from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
+from stages.measure.floaters import near_camera_floaters
 from stages.scene import Splats, TrainedSplats, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
@@ -36,7 +37,7 @@ def run(
     """Without fine-tuning unless it is asked for: splats that stay are then the same."""
     report = Report()
     inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(trained, overfitted=overfitted)}
-    wanted = prune.PruneSettings(**{"tune_steps": 0, **settings})
+    wanted = prune.PruneSettings(**{"finetune_steps": 0, **settings})
     return prune.run(inputs, wanted, folder, report), report
 
 
@@ -89,9 +90,9 @@ def test_no_loss_allowed_is_no_loss_of_the_photographs_that_decide(scene, tmp_pa
 
 def test_the_loss_allowed_is_kept_and_the_price_moves_it(scene, tmp_path) -> None:
     start, sizes = training_db(scene, scene.splats), []
-    for price in (1.0, 20.0):
-        result, report = run(scene, scene.splats, tmp_path, price=price, rounds=10)
-        assert training_db(scene, result) >= start - 0.1 * price / FELT
+    for strength in (1.0, 20.0):
+        result, report = run(scene, scene.splats, tmp_path, strength=strength, rounds=10)
+        assert training_db(scene, result) >= start - 0.1 * strength / LOSS_RATIO
         assert report.metrics["training_psnr_db"] == pytest.approx(
             training_db(scene, result), abs=2e-3
         )
@@ -106,8 +107,8 @@ def test_what_is_learnt_by_heart_may_lose_more_of_it(scene, tmp_path) -> None:
 
 
 def test_at_a_low_price_nothing_goes_that_the_photographs_show(scene, tmp_path) -> None:
-    result, report = run(scene, scene.splats, tmp_path, price=0.001, max_loss_db=100)
-    assert report.metrics["stopped_by"] == "price"
+    result, report = run(scene, scene.splats, tmp_path, strength=0.001, max_loss_db=100)
+    assert report.metrics["stopped_by"] == "rate_distortion"
     assert training_db(scene, result) >= training_db(scene, scene.splats) - 0.02
     assert len(result) > 0.8 * len(scene.splats)
 
@@ -124,11 +125,11 @@ def test_fine_tuning_buys_back_what_cutting_lost(scene, tmp_path) -> None:
     tuned, report = run(scene, scene.splats, tmp_path, max_splats=150, finetune_steps=20)
     assert len(cut) == len(tuned) == 150
     assert training_db(scene, tuned) > training_db(scene, cut) + 0.5
-    assert report.metrics["tune_steps"] <= 8 * 20
+    assert report.metrics["finetune_steps"] <= 8 * 20
 
 
 def test_bands_that_were_cut_stay_cut_while_the_rest_learns(scene, tmp_path) -> None:
-    result, report = run(scene, scene.splats, tmp_path, price=20, finetune_steps=10)
+    result, report = run(scene, scene.splats, tmp_path, strength=20, finetune_steps=10)
     degrees = np.floor(np.sqrt(np.arange(result.sh.shape[1])))
     above = degrees[None] > result.sh_degrees[:, None]
     assert (result.sh_degrees < 2).any()
@@ -171,7 +172,7 @@ def test_what_cannot_be_met_is_refused_with_what_can(scene, tmp_path, settings, 
 
 def test_the_report_says_what_was_cut_and_why(scene, tmp_path) -> None:
     _, report = run(scene, scene.splats, tmp_path, max_loss_db=0.02)
-    price, cut, why = report.metrics["said"]
+    price, cut, why = report.metrics["summary"]
     assert "independent" in price
     assert f"of {len(scene.splats):,}" in cut
     assert "more than is allowed" in why
@@ -189,7 +190,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 ) -> None:
     trained = join(scene.splats, unseen(5), floater_before(scene, 1))
     usual, _ = run(scene, trained, tmp_path)
-    monkeypatch.setattr(pruning, "LOOKED_AT", 4)
+    monkeypatch.setattr(pruning, "MAX_VIEWS", 4)
     result, report = run(scene, trained, tmp_path)
     assert len(result) == pytest.approx(len(usual), rel=0.15)
     assert training_db(scene, result) > training_db(scene, usual) - 0.3
@@ -202,7 +203,7 @@ def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost
 def test_what_only_a_photograph_sees_that_does_not_decide_stays(
     scene, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(pruning, "LOOKED_AT", 1)  # of nine, the first
+    monkeypatch.setattr(pruning, "MAX_VIEWS", 1)  # of nine, the first
     result, _ = run(scene, scene.splats, tmp_path)
     far = scene.reconstruction.views[5].camera
     seen = [Splats.take(s, far.project(s.means)[1] < 3) for s in (scene.splats, result)]
@@ -241,12 +242,18 @@ def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
     """One camera at the origin that sees its scene 4 away: close is nearer than 1."""
     scene = splats([[0, 0, 0.9], [0, 0, 1.1], [0, 0, 0.9], [0, 0.9, 0.0], [0, 0, 0.5]])
     worth = worth_of([1, 1, 3, 2, 0], [1.0] * 5)
-    assert floaters(scene, worth, [camera()]).tolist() == [True, False, False, True, True]
+    assert near_camera_floaters(scene, worth, [camera()]).tolist() == [
+        True,
+        False,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:
     worth = worth_of([1], [1.0], scene_depth=[np.inf])
-    assert not floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
+    assert not near_camera_floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
 
 
 def test_beside_a_picture_is_a_quarter_of_its_longer_side_beyond_the_rim() -> None:

@@ -12,10 +12,11 @@ import pytest
 
 from stages import quantise
 from stages.base.errors import Family, SplatError
+from stages.base.settings import check_settings
 from stages.base.stage import Report
-from stages.measure.sh import cut, degrees_at, tail_rms
+from stages.measure.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.quantise import QuantiseSettings
-from stages.scene import QuantisedSplats, dc_to_rgb
+from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -29,8 +30,13 @@ def decide(
     scene: SmallScene, folder: Path, **settings: Any
 ) -> tuple[QuantisedSplats, dict[str, Any]]:
     report = Report()
-    inputs = {"sfm": scene.reconstruction, "prune": scene.splats}
-    result = quantise.run(inputs, QuantiseSettings(**settings), folder, report)
+    inputs = {
+        "sfm": scene.reconstruction,
+        "train": TrainedSplats(scene.splats),
+        "prune": scene.splats,
+    }
+    chosen = QuantiseSettings(**{"rounding_steps": 0, **settings})
+    result = quantise.run(inputs, chosen, folder, report)
     return result, report.metrics
 
 
@@ -84,12 +90,32 @@ def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(
     contents = []
     for folder in folders:
         folder.mkdir()
-        result, _ = decide(scene, folder)
-        contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+        result, _ = decide(scene, folder, formats=("sog", "splat"), rounding_steps=2)
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        contents.append({path.relative_to(folder): path.read_bytes() for path in files})
     assert contents[0] == contents[1]
     loaded = quantise.load(folders[0])
     np.testing.assert_array_equal(loaded.splats.sh, result.splats.sh)
     assert (loaded.degree, loaded.decisions) == (result.degree, result.decisions)
+    assert set(loaded.finetuned) == {"splat", "sog"}
+    for name, splats in loaded.finetuned.items():
+        np.testing.assert_array_equal(splats.means, result.finetuned[name].means)
+
+
+def test_a_format_that_does_not_round_changes_no_setting() -> None:
+    assert QuantiseSettings(formats=("ply", "sog", "mesh", "splat")).formats == ("splat", "sog")
+    assert QuantiseSettings(formats=("sog", "splat")) == QuantiseSettings(formats=("splat", "sog"))
+    check_settings(QuantiseSettings(formats=("ply",)))
+    with pytest.raises(SplatError, match="--format ksplat"):
+        check_settings(QuantiseSettings(formats=("ply", "ksplat")))
+
+
+def test_the_report_says_what_finetuning_to_a_format_gained(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    result, metrics = decide(scene, tmp_path, rounding_steps=5)
+    assert set(result.finetuned) == set(metrics["formats"]) == {"splat"}
+    assert set(metrics["formats"]["splat"]) == {"rounded_db", "finetuned_db"}
 
 
 def test_too_few_photographs_to_hold_out_are_measured_on_themselves(
@@ -134,7 +160,7 @@ def test_a_damaged_decision_is_an_error_of_the_run_folder(
     assert caught.value.family == Family.RUN_FOLDER
 
 
-def test_tail_rms_is_what_colours_lose_over_all_directions() -> None:
+def test_truncation_rms_is_what_colours_lose_over_all_directions() -> None:
     splats = many_splats(4)
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(20000, 3))
@@ -145,16 +171,16 @@ def test_tail_rms_is_what_colours_lose_over_all_directions() -> None:
         channel = np.square(tail).max(axis=1)  # the bound takes the worst channel of each term
         seen = np.array([colour(tail, d) - 0.5 for d in directions[:4000]])
         measured = np.sqrt(np.mean(seen**2, axis=0)).max()
-        told = tail_rms(splats)[3, degree - 1]
+        told = truncation_rms(splats)[3, degree - 1]
         assert told == pytest.approx(np.sqrt(channel.sum() / (4 * np.pi)), rel=1e-6)
         assert 0.97 * measured <= told <= 2.0 * measured
 
 
-def test_cutting_takes_whole_bands_and_no_others() -> None:
+def test_truncation_drops_whole_degrees_and_no_others() -> None:
     splats = many_splats()
-    degrees = degrees_at(splats, 0.1)
+    degrees = sufficient_degrees(splats, 0.1)
     assert (degrees <= splats.sh_degrees).all()
-    after = cut(splats, degrees)
+    after = truncate_sh(splats, degrees)
     for i in range(0, len(splats), 7):
         kept = (int(degrees[i]) + 1) ** 2
         np.testing.assert_array_equal(after.sh[i, :kept], splats.sh[i, :kept])

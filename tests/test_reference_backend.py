@@ -28,7 +28,7 @@ print(json.dumps({"event": "kernels", "loaded": loaded, "called": called}))
 """
 _TINY = (
     *("--train-side", "48", "--steps", "6", "--max-splats", "400", "--preset", "preview"),
-    *("--tune-steps", "1"),
+    *("--finetune-steps", "1"),
 )
 
 

@@ -77,7 +77,7 @@ def test_a_grid_gives_splats_as_large_as_its_spacing(tmp_path: Path) -> None:
     assert splats.sh_degrees.max() == 0
     assert splats.means.dtype == np.float32
     assert (splats.origin == scene.origin).all()
-    assert report.metrics["left_out"] == 0
+    assert report.metrics["outliers"] == 0
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_outlying_points_are_left_out_and_counted(
     splats, report = run(with_points(grid(), [point], **changes), tmp_path)
     assert len(splats) == 64
     assert np.abs(splats.means).max() < 10
-    assert report.metrics["left_out_by_reason"][reason] == 1
+    assert report.metrics["outliers_by_reason"][reason] == 1
 
 
 def test_a_background_seen_by_several_photographs_stays(tmp_path: Path) -> None:

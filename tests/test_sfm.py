@@ -187,7 +187,8 @@ def test_the_same_photograph_many_times_has_no_parallax(tmp_path: Path) -> None:
 def test_near_duplicates_are_refused_before_anything_is_searched(tmp_path: Path) -> None:
     capture = bad_captures.sample(6)
     photos = [
-        replace(photo, twin=capture.photos[i // 3].name) for i, photo in enumerate(capture.photos)
+        replace(photo, duplicate_of=capture.photos[i // 3].name)
+        for i, photo in enumerate(capture.photos)
     ]
     error = failure(replace(capture, photos=tuple(photos)), tmp_path)
     assert error.code == "sfm-no-parallax"
@@ -238,7 +239,7 @@ def test_a_plausible_model_that_is_wrong_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        fallbacks, "LADDER", (fallbacks.CONFIGURATIONS[0], fallbacks.CONFIGURATIONS[-1])
+        fallbacks, "CONFIGURATIONS", (fallbacks.CONFIGURATIONS[0], fallbacks.CONFIGURATIONS[-1])
     )
     error = failure(make(tmp_path / "in")[0], tmp_path, max_features=1500)
     assert error.code == code
@@ -274,7 +275,7 @@ def test_two_scenes_are_told_apart_and_one_may_be_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        fallbacks, "LADDER", fallbacks.CONFIGURATIONS[:1]
+        fallbacks, "CONFIGURATIONS", fallbacks.CONFIGURATIONS[:1]
     )  # the others take minutes
     capture = bad_captures.two_scenes(tmp_path / "in", each=6)
     assert failure(capture, tmp_path, max_features=1500).code == "sfm-separate-groups"

@@ -58,8 +58,8 @@ def test_given_cameras_are_kept_and_points_are_triangulated(tmp_path: Path) -> N
     np.testing.assert_allclose(have @ np.linalg.inv(back), wanted, atol=1e-6)
     assert found.levelled
     assert len(found.points) > 100
-    assert report.metrics["points_from"] == "matches"
-    assert report.metrics["matches_that_fit"] > 0.9
+    assert report.metrics["points_source"] == "matches"
+    assert report.metrics["epipolar_inlier_ratio"] > 0.9
     assert report.metrics["mean_reprojection_error_px"] < 1.0
     views = sfm.load(tmp_path / "sfm").views
     assert [view.name for view in views] == [view.name for view in found.views]
@@ -72,7 +72,7 @@ def test_cameras_in_metres_stay_as_large_as_they_are(tmp_path: Path) -> None:
     wanted = np.array([POSES[view.name] for view in found.views])
     have = np.array([view.camera.world_to_camera for view in found.views])
     assert similarity(centres(have), centres(wanted))[1] == pytest.approx(1.0, abs=1e-6)
-    assert (found.units, report.metrics["metres_from"]) == ("metres", "--metres")
+    assert (found.units, report.metrics["scale_source"]) == ("metres", "--metres")
 
 
 def test_a_file_that_knows_north_gives_the_world_its_directions(tmp_path: Path) -> None:
@@ -151,8 +151,12 @@ def test_rough_cameras_are_moved_to_where_the_matches_want_them(tmp_path: Path) 
         off = scale * centres(have) @ turn.T + shift - centres(wanted)
         errors[name] = np.linalg.norm(off, axis=1)
     assert errors["refined"].mean() < 0.2 * errors["as given"].mean()
-    assert report.metrics["matches_that_fit"] > 0.9 > report.metrics["matches_that_fitted_before"]
-    assert 0.001 < report.metrics["cameras_moved"]["centre"] < 0.03
+    assert (
+        report.metrics["epipolar_inlier_ratio"]
+        > 0.9
+        > report.metrics["epipolar_inlier_ratio_before"]
+    )
+    assert 0.001 < report.metrics["cameras_moved"]["median"] < 0.03
     back = np.array(report.metrics["file_from_world"])  # the file's world is kept
     file_centres = np.array([-p[:3, :3].T @ p[:3, 3] for p in rough.values()])
     ours = centres(have @ np.linalg.inv(back))

@@ -16,7 +16,7 @@ from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
 if TYPE_CHECKING:
-    from stages.measure.tradeoff.pair import Side
+    from stages.measure.tradeoff.comparison import Candidate
 
 
 def compare(
@@ -33,34 +33,39 @@ def compare(
     Both are evaluated at one size, view by view, on photographs that neither was trained on.
     """
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.pair import default_name, pair, verdict
-    from stages.measure.tradeoff.pair_report import facts, write_pair
+    from stages.measure.tradeoff.comparison import (
+        compare_runs,
+        distinct_name,
+        fact_rows,
+        verdict_lines,
+        write_comparison,
+    )
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [
-        _side(run, default_name(run.run_folder, other.run_folder))
+        _side(run, distinct_name(run.run_folder, other.run_folder))
         for run, other in zip(runs, reversed(runs), strict=True)
     ]
     _check_photographs(*runs)
     if not quiet and not as_json:
         console.note_compiling()
-    pairing = pair(sides[0], sides[1])
+    comparison = compare_runs(sides[0], sides[1])
     make_folder(out)
-    files = write_pair(out, pairing)
+    files = write_comparison(out, comparison)
     if as_json:
-        change = pairing.psnr
+        change = comparison.psnr
         console.emit(
             "compared",
             verdict=change.verdict,
             psnr_change_db=change.mean,
-            interval_db=[change.low, change.high] if change.photographs > 1 else None,
-            photographs=change.photographs,
+            interval_db=[change.low, change.high] if change.views > 1 else None,
+            views=change.views,
             files=[str(file) for file in files],
         )
         return
     if not quiet:
-        console.table(("", sides[0].name, sides[1].name), facts(pairing))
-    for line in verdict(pairing):
+        console.table(("", sides[0].name, sides[1].name), fact_rows(comparison))
+    for line in verdict_lines(comparison):
         console.out.print(line, markup=False)
     console.out.print(str(files[0]), markup=False)
 
@@ -81,8 +86,8 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
         )
 
 
-def _side(run: Pipeline, name: str) -> Side:
-    from stages.measure.tradeoff.pair import Side
+def _side(run: Pipeline, name: str) -> Candidate:
+    from stages.measure.tradeoff.comparison import Candidate
 
     splats = results.final_splats(run)
     facts = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
@@ -94,4 +99,4 @@ def _side(run: Pipeline, name: str) -> Side:
         facts["seed"] = str(trained.settings["seed"])
     for ending, figures in results.exported_formats(run).items():
         facts[f".{ending}"] = console.size(figures["size_bytes"])
-    return Side(name, splats, run.load("sfm"), results.backend_of_run(run), facts)
+    return Candidate(name, splats, run.load("sfm"), results.backend_of_run(run), facts)

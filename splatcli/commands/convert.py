@@ -34,7 +34,7 @@ def convert(
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
@@ -45,7 +45,7 @@ def convert(
         begin(f"writing {target}")
         dropped = formats.write(target, splats)
         begin(f"comparing {target}")
-        found = _proven(source, target, kept_rows(splats)[0])
+        found = _proven(source, target, drop_undrawable(splats)[0])
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
@@ -115,7 +115,7 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Callable[[str], None]]:
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    from stages.base.blocks import watched
+    from stages.base.blocks import progress_reported_to
 
     columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
     with Progress(*columns, console=console.err, transient=True) as bar:
@@ -129,5 +129,5 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Callable[[str], None]]:
         def update(rows: int, total: int) -> None:
             bar.update(task, completed=rows, total=total)
 
-        with watched(update):
+        with progress_reported_to(update):
             yield begin_bar

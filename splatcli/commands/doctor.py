@@ -25,7 +25,7 @@ from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
 
 _LITTLE_MEMORY_MIB = 2048.0
 _LITTLE_DISK_BYTES = 2_000_000_000
-_BACKEND_ADVICE = "docs/gpu.md says what it takes."
+_BACKEND_ADVICE = "docs/guide/gpu.md says what it takes."
 _VIDEO_CODECS = ("h264", "hevc", "av1", "vp9", "vp8", "mpeg4", "prores", "mjpeg", "gif")
 
 

@@ -16,8 +16,8 @@ from stages.base.errors import Family, SplatError
 from stages.run import results
 
 if TYPE_CHECKING:
-    from stages.editing.operations import Done
-    from stages.editing.scene import Edited
+    from stages.editing.operations import AppliedOperation
+    from stages.editing.scene import EditedScene
 
 
 def edit(
@@ -44,7 +44,7 @@ def edit(
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
-    from stages.editing import operations
+    from stages.editing import levels, operations
 
     if target is None and not dry_run:
         raise SplatError(
@@ -55,25 +55,28 @@ def edit(
             family=Family.USAGE,
         )
     target = target or Path("scene.ply")
-    row, chain = formats.format_of(target), operations.prepared(parsed_operations(ctx), target)
-    if row.streamed and not dry_run:
+    row, chain = (
+        formats.format_of(target),
+        operations.prepare_operations(parsed_operations(ctx), target),
+    )
+    if not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
-        if target.parent.is_dir():  # `write` says so where it is not
+        if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
         scene = _load_scene(source)
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps = []
-        for step in operations.done(scene, chain):
+        for step in operations.apply_operations(scene, chain):
             scene = step.scene
             steps.append(_report(step, as_json, quiet))
         facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
         if start_db is not None:
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
         if not dry_run:
-            views = scene.views_there()
-            formats.write(target, scene.splats, units=scene.units, views=views)
+            views = scene.placed_views()
+            levels.write(target, scene.splats, units=scene.units, views=views)
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
             if views:
                 facts |= _proven(source, target, scene)
@@ -83,39 +86,39 @@ def edit(
         _show(facts)
 
 
-def _load_scene(source: Path) -> Edited:
+def _load_scene(source: Path) -> EditedScene:
     """The splats, with the photographs of their run if there is one. Raises SplatError."""
-    from stages.editing.operations import without_undrawable
-    from stages.editing.scene import Edited
+    from stages.editing.scene import EditedScene
     from stages.formats import units_of
+    from stages.formats.values import drop_undrawable
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
     splats, pipeline = load_target(source)
     pipeline = pipeline or results.run_around(source)
-    splats = without_undrawable(splats)
+    splats = drop_undrawable(splats)[0]
     if pipeline is None or pipeline.manifest("sfm") is None:
-        return Edited(splats, units_of(source))
+        return EditedScene(splats, units_of(source))
     found = pipeline.load("sfm")
     training, held = split_held_out(found.views)
     photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
     evaluation = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
-    return Edited(
+    return EditedScene(
         *(splats, found.units, photographs, evaluation, found.views),
         backend=results.backend_of_run(pipeline),
     )
 
 
-def _proven(source: Path, target: Path, scene: Edited) -> dict[str, Any]:
+def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
     """The figures of comparing `target`, read by a second parser, with the splats. Raises
     SplatError "edit-verify-failed"."""
     from stages.formats import format_of
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.proof.prover import Prover, cameras_for
 
-    splats = kept_rows(scene.splats)[0]
+    splats = drop_undrawable(scene.splats)[0]
     came_as = format_of(source).ending if source.is_file() else ""
-    cameras = cameras_for(splats, scene.views_there())
+    cameras = cameras_for(splats, scene.placed_views())
     proof = Prover.of(splats, cameras, scene.backend, came_as).prove(target)
     if proof.fault:
         raise SplatError(
@@ -128,14 +131,14 @@ def _proven(source: Path, target: Path, scene: Edited) -> dict[str, Any]:
     return proof.figures
 
 
-def _db(scene: Edited) -> float | None:
+def _db(scene: EditedScene) -> float | None:
     found = scene.psnr_db()
     return None if found is None else round(found, 3)
 
 
-def _report(step: Done, as_json: bool, quiet: bool) -> dict[str, Any]:
+def _report(step: AppliedOperation, as_json: bool, quiet: bool) -> dict[str, Any]:
     facts: dict[str, Any] = {
-        "operation": str(step.typed),
+        "operation": str(step.parsed),
         "splats_before": step.before,
         "splats": step.after,
     }
@@ -146,7 +149,7 @@ def _report(step: Done, as_json: bool, quiet: bool) -> dict[str, Any]:
         console.emit("operation", **facts)
     elif not quiet:
         cost = f", {console.figure('psnr_db', psnr)}" if psnr is not None else ""
-        console.note(f"{step.typed}: {step.before:,} -> {step.after:,} splats{cost}")
+        console.note(f"{step.parsed}: {step.before:,} -> {step.after:,} splats{cost}")
     return facts
 
 

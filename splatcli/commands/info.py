@@ -108,12 +108,13 @@ def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from some of the photographs' cameras, at the size of the training; from
     cameras around the splats if there are no photographs."""
     from stages.measure.speed import seconds_per_frame
-    from stages.scene.framing import around
+
+    from stages.scene.framing import orbit_cameras
 
     console.note_compiling()
     views = results.views_of(pipeline)
     chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
-    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or around(
+    cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or orbit_cameras(
         splats, _TIMED_FRAMES, 0.9
     )
     backend = results.backend_of_run(pipeline)
@@ -160,7 +161,7 @@ def _share(count: int, statistics: Statistics) -> str:
 
 def _about_file(path: Path, count: int) -> dict[str, Any]:
     from stages.formats import format_of
-    from stages.proof.byte_breakdown import byte_breakdown_of
+    from stages.proof.checks import byte_breakdown_of
 
     size = format_of(path).size_bytes(path)
     facts: dict[str, Any] = {"file": str(path), "size_bytes": size}

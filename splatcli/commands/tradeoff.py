@@ -15,7 +15,7 @@ from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.measure.tradeoff.measuring import Material
+    from stages.measure.tradeoff.measurement import TradeoffInputs
 
 
 def tradeoff(
@@ -34,11 +34,11 @@ def tradeoff(
     contribute.
     """
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.measuring import measure_trade
-    from stages.measure.tradeoff.report import sentences, write_report
+    from stages.measure.tradeoff.measurement import measure_tradeoff
+    from stages.measure.tradeoff.report import summarise, write_report
 
     pipeline = Pipeline(find_run_folder(run))
-    material = _material(pipeline)
+    inputs = _inputs(pipeline)
     folder = out or pipeline.run_folder / "tradeoff"
     make_folder(folder)
     if not quiet:
@@ -50,28 +50,29 @@ def tradeoff(
         elif not quiet:
             console.note(label)
 
-    trade = measure_trade(material, report_step)
-    files = write_report(folder, pipeline.run_folder.absolute().name, trade, material)
+    found = measure_tradeoff(inputs, report_step)
+    files = write_report(folder, pipeline.run_folder.absolute().name, found, inputs)
     if as_json:
-        said = sentences(trade)
-        console.emit("tradeoff", folder=str(folder), files=[str(f) for f in files], said=said)
+        console.emit(
+            "tradeoff", folder=str(folder), files=[str(f) for f in files], summary=summarise(found)
+        )
         return
     if not quiet:
-        for title, lines in sentences(trade).items():
+        for title, lines in summarise(found).items():
             for number, line in enumerate(lines):
                 console.out.print(f"{title if not number else '':<12} {line}", markup=False)
     console.out.print(str(files[0]), markup=False)
 
 
-def _material(pipeline: Pipeline) -> Material:
+def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     """The splats, views and files to measure, of a finished run. Raises SplatError
     (stage-not-finished, run-half-anew, nothing-held-out)."""
-    from stages.export import fitted_in
     from stages.measure.evaluation import load_evaluation_views
-    from stages.measure.tradeoff.measuring import Material, deciding
+    from stages.measure.tradeoff.measurement import TradeoffInputs, deciding_views
     from stages.scene import split_held_out
 
     splats = results.final_splats(pipeline)
+    settings = splats.draw_settings
     reconstruction = pipeline.load("sfm")
     training, held = split_held_out(reconstruction.views)
     if not held:
@@ -84,13 +85,14 @@ def _material(pipeline: Pipeline) -> Material:
         )
     trained = pipeline.manifest("train")
     exported = tuple(results.exported_formats(pipeline))
-    fitted = {name: fitted_in(pipeline.stage_folder("export"), name) for name in exported}
-    return Material(
+    return TradeoffInputs(
         splats=splats,
         training=load_evaluation_views(
-            reconstruction.folder, deciding(training, splats.draw_settings), splats.draw_settings
+            reconstruction.folder,
+            deciding_views(training, splats.draw_settings),
+            splats.draw_settings,
         ),
-        held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
+        held_out=load_evaluation_views(reconstruction.folder, held, settings),
         views=reconstruction.views,
         units=reconstruction.units,
         backend=results.backend_of_run(pipeline),
@@ -98,5 +100,4 @@ def _material(pipeline: Pipeline) -> Material:
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,
         quantised=pipeline.load("quantise"),
-        fitted={name: splats for name, splats in fitted.items() if splats is not None},
     )

@@ -32,7 +32,7 @@ class _Original:
     """What files are compared with.
 
     name: for messages. came_as: the format that it was read from. itself: whether it is the file
-    to verify. backend: of the rendering. quantised: of a run; exported: its export folder.
+    to verify. backend: of the rendering. quantised: of a run.
     """
 
     splats: Splats
@@ -42,20 +42,20 @@ class _Original:
     itself: bool = False
     backend: str = "auto"
     quantised: QuantisedSplats | None = None
-    exported: Path | None = None
 
     def candidates(self, file: Path) -> Iterator[Splats]:
-        """The splats that `file` may hold, likeliest first: of a run, those fine-tuned for the
-        format, then those that a conversion of the run's splats would write."""
-        from stages import export
+        """The splats that `file` may hold, likeliest first: of a run, those that its export writes,
+        which may be fine-tuned for the format, then those that a conversion would write."""
         from stages.formats import format_of
         from stages.formats.quantisation import splats_to_write
 
         row = format_of(file)
-        if self.exported is not None:
-            finetuned = export.fitted_in(self.exported, row.ending)
-            yield from () if finetuned is None else (finetuned,)
-        yield splats_to_write(row, self.quantised) if self.quantised else self.splats
+        if self.quantised is None:
+            yield self.splats
+            return
+        yield splats_to_write(row, self.quantised)
+        if row.ending in self.quantised.finetuned:
+            yield splats_to_write(row, replace(self.quantised, finetuned={}))
 
 
 def verify(
@@ -113,7 +113,7 @@ def verify(
 
 def _files(target: Path | None) -> list[Path]:
     """The file itself, or the exported files of a run except meshes, which hold no splats."""
-    from stages.formats import MESHES
+    from stages.surface.table import MESHES
 
     if target is not None and not target.is_dir():
         return [target]
@@ -133,26 +133,25 @@ def _files(target: Path | None) -> list[Path]:
 def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     """read: what our own reader finds in `file`."""
     from stages import formats
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
 
     if against is not None and not against.is_dir():
         around = (results.run_around(path) for path in (against, file))
         views = next(filter(None, map(results.views_of, around)), ())
-        splats = kept_rows(formats.read(against))[0]
+        splats = drop_undrawable(formats.read(against))[0]
         return _Original(splats, views, str(against), formats.format_of(against).ending)
     if against is not None and not runfolder.is_run_folder(against):
         raise runfolder.missing(against)
     run = Pipeline(against) if against is not None else results.run_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
         came_as = formats.format_of(file).ending
-        return _Original(kept_rows(read)[0], (), _ITSELF, came_as, itself=True)
+        return _Original(drop_undrawable(read)[0], (), _ITSELF, came_as, itself=True)
     views = run.load("sfm").views
     quantised = run.load("quantise")
-    splats = kept_rows(quantised.splats)[0]
+    splats = drop_undrawable(quantised.splats)[0]
     backend = results.backend_of_run(run)
     name = f"the run {run.run_folder}"
-    exported = run.stage_folder("export")
-    return _Original(splats, views, name, backend=backend, quantised=quantised, exported=exported)
+    return _Original(splats, views, name, backend=backend, quantised=quantised)
 
 
 def _report_step(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:

@@ -38,13 +38,13 @@ def view(
     The page is served to this machine only and needs no network. Ctrl-C ends it.
     """
     from stages.base import scratch
-    from stages.formats.rows import kept_rows
+    from stages.formats.values import drop_undrawable
     from stages.viewer.server import LocalServer
 
     with tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
             splats, pipeline = load_target(target)
-            splats, _ = kept_rows(splats)
+            splats, _ = drop_undrawable(splats)
             count = len(splats)
             if not count:
                 raise SplatError(

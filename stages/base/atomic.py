@@ -1,4 +1,4 @@
-"""Files appear under their final names whole, or not at all."""
+"""Files that appear under their final names complete, or not at all."""
 
 from __future__ import annotations
 
@@ -12,56 +12,46 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from stages.base.disk import is_full
+from stages.base.disk import DISK_FULL, is_full
 from stages.base.errors import Family, SplatError
 
-_LEFT = ".partial-"
+_PARTIAL = ".partial-"
 
 
 def partial_prefix() -> str:
-    """What the names of files and folders begin with that are not whole yet. It says which process
-    of which machine makes them, for `clear_left`."""
-    return f"{_LEFT}{_machine()}-{os.getpid()}-"
+    """Start of the name of every file and folder that is not complete yet. It holds the machine and
+    the process that write it, for `remove_abandoned_files`."""
+    return f"{_PARTIAL}{_machine()}-{os.getpid()}-"
 
 
 def _machine() -> str:
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
-def clear_left(folder: Path) -> None:
-    """Delete what processes of this machine that were killed left half-written in `folder`."""
-    if os.name != "posix":  # elsewhere to ask whether a process runs would end it
-        return
-    mark = re.compile(re.escape(f"{_LEFT}{_machine()}-") + r"(\d+)-")
-    with suppress(OSError):  # nobody waits for it
-        for left in list(folder.iterdir()):
-            found = mark.match(left.name)
-            if found and not _runs(int(found[1])):
-                left.unlink() if not left.is_dir() else shutil.rmtree(left, ignore_errors=True)
+def remove_abandoned_files(folder: Path) -> None:
+    """Delete incomplete files in `folder` whose process, on this machine, has ended."""
+    import psutil
 
-
-def _runs(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # somebody else's
-        return True
-    return True
+    partial = re.compile(re.escape(f"{_PARTIAL}{_machine()}-") + r"(\d+)-")
+    with suppress(OSError, OverflowError):  # tidying up must not stop the work
+        for path in list(folder.iterdir()):
+            found = partial.match(path.name)
+            if found and not psutil.pid_exists(int(found[1])):
+                path.unlink() if not path.is_dir() else shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a name beside `path` to write to; it takes the place of `path` when the block ends.
+    """Yield a temporary name beside `path`; its file replaces `path` when the block ends.
 
     The name keeps the suffix, because some writers choose the format by it. If the block raises,
-    the temporary file is deleted and `path` is as it was. Raises SplatError "disk-full" or
-    "file-not-written" for what the operating system refuses.
+    the temporary file is deleted and `path` is unchanged. Raises SplatError "disk-full" or
+    "file-not-written" if the operating system refuses the write.
     """
     path = Path(path)
     temporary = path.with_name(partial_prefix() + path.name)
     try:
-        if not path.parent.is_dir():  # said here, because some writers would make the folder
+        if not path.parent.is_dir():  # checked here, because some writers would make the folder
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
         yield temporary
         with temporary.open("rb+") as file:
@@ -70,13 +60,13 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise _refused(path, error) from error
     finally:
-        # The error that matters is already on its way if even this is refused.
+        # An error here must not hide the one that is being raised.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
 def make_folder(folder: Path) -> None:
-    """Make `folder`, and those that it lies in. Raises SplatError "folder-not-made"."""
+    """Make `folder` and its parents. Raises SplatError "folder-not-made"."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -91,10 +81,8 @@ def make_folder(folder: Path) -> None:
 
 def _refused(path: Path, error: OSError) -> SplatError:
     reason = error.strerror or str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT) or (
-        # NumPy and the USD library do not say why a write failed: look.
-        error.errno is None and is_full(path.parent)
-    ):
+    # NumPy and the USD library do not say why a write failed.
+    if error.errno in DISK_FULL or (error.errno is None and is_full(path.parent)):
         return SplatError(
             "disk-full",
             given=f"{path} could not be written: {reason}.",

@@ -16,7 +16,7 @@ class BadFileError(ValueError):
 
 
 @dataclass(frozen=True)
-class Kind:
+class FileKind:
     """What a file was to be read as."""
 
     code: str
@@ -25,13 +25,13 @@ class Kind:
     hint: str
 
 
-SPLATS = Kind(
+SPLATS = FileKind(
     "splats-unreadable",
     "splats",
     "A whole file of Gaussian splats in the format that its suffix names.",
     "Copy or export the file again; if it comes from another program, try its .ply.",
 )
-CAMERAS = Kind(
+CAMERAS = FileKind(
     "cameras-unreadable",
     "cameras",
     "A whole file of cameras in one of the formats that README.md lists.",
@@ -40,7 +40,7 @@ CAMERAS = Kind(
 
 
 @contextmanager
-def reading(path: Path, kind: Kind = SPLATS) -> Iterator[None]:
+def reading(path: Path, kind: FileKind = SPLATS) -> Iterator[None]:
     """Turn what goes wrong inside the block into the SplatError of `kind` that names `path`.
 
     Besides `BadFileError` these are the exceptions that damaged bytes raise in Python and NumPy;
@@ -70,7 +70,7 @@ def reading(path: Path, kind: Kind = SPLATS) -> Iterator[None]:
         raise _unreadable(path, kind, reason) from error
 
 
-def _unreadable(path: Path, kind: Kind, reason: str) -> SplatError:
+def _unreadable(path: Path, kind: FileKind, reason: str) -> SplatError:
     return SplatError(
         kind.code,
         given=f"{path} cannot be read as {kind.what}: {reason}.",

@@ -15,7 +15,7 @@ from contextvars import ContextVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.scratch import let_go
+from stages.base.scratch import release_scratch_pages
 
 ROWS = 1 << 16  # 16 MB of splats of degree 3
 Watcher = Callable[[int, int], None]  # (done, in all) of a pass: rows, mostly
@@ -23,7 +23,7 @@ _watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
 
 
 @contextmanager
-def watched(watcher: Watcher) -> Iterator[None]:
+def progress_reported_to(watcher: Watcher) -> Iterator[None]:
     """`watcher` hears of every pass inside the block, on the thread that works."""
     token = _watcher.set(watcher)
     try:
@@ -36,24 +36,24 @@ def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
     """0..count in slices of `rows`. Scratch arrays stay on their disk between one and the next."""
     for start in range(0, count, rows):
         yield slice(start, min(start + rows, count))
-        let_go()
+        release_scratch_pages()
 
 
-def passing(count: int, rows: int = ROWS) -> Iterator[slice]:
+def reported_blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
     """`blocks`, told to who watches: for a pass that takes its time."""
     for part in blocks(count, rows):
         yield part
-        tell(part.stop, count)
+        report_progress(part.stop, count)
 
 
-def tell(done: int, total: int) -> None:
+def report_progress(done: int, total: int) -> None:
     """To who watches, of a pass that does not go by rows."""
     watcher = _watcher.get()
     if watcher is not None:
         watcher(done, total)
 
 
-def forget(mapped: NDArray[np.generic]) -> None:
+def release_mapped_pages(mapped: NDArray[np.generic]) -> None:
     """Let go of the pages of a mapped file that were read; the next look reads them again.
 
     Without it a file that is gone through once counts as memory in use. Does nothing where the

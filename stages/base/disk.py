@@ -1,16 +1,20 @@
-"""Room on a disk."""
+"""Whether a disk is full."""
 
 from __future__ import annotations
 
+import errno
 import shutil
 from pathlib import Path
 
+# Windows has no quota of this kind.
+DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 _FULL_BELOW_BYTES = 4 * 1024 * 1024
 
 
 def is_full(place: Path) -> bool:
-    """Whether next to nothing can be written to the disk of `place`, or of the nearest folder
-    above it that there is. False where the system does not say; /proc and its like have no size.
+    """Whether the disk of `place`, or of its nearest parent that exists, has less than 4 MiB left.
+
+    False where the system does not say, and for file systems without a size, such as /proc.
     """
     for folder in (place, *place.absolute().parents):
         try:

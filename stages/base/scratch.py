@@ -68,7 +68,7 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     return found
 
 
-def let_go() -> None:
+def release_scratch_pages() -> None:
     """Of the pages of such files that were touched: they count as memory in use until then. What
     was written stays, and the next look finds it."""
     for mapped in list(_maps):

@@ -1,14 +1,14 @@
 """What settings may be: stated once, in each field's metadata, and checked from there.
 
 "help": with the unit. "min", "max": of numbers, both allowed. "choices": the words allowed; of a
-list's items, of which there must then be one at least. "pattern": of a text, a regular expression
-for all of it, with "wanted", the sentence that says what it asks for. "option": the option's name
-where it is not the field's. "together": of a list, the words that one use of the option takes, as
-its help shows them. "needs": another field, without which a value but the default means nothing.
-"affects_output": False where another value gives the same bytes. "midway": True where half-done
-work goes on under another value, which the stage then says. "panel": the heading (one of `PANELS`)
-under which `splat process --help` lists the option; a setting without one is an option of its
-stage's own command only.
+list's items, of which there must then be one at least unless "may_be_empty". "pattern": of a text,
+a regular expression for all of it, with "wanted", the sentence that says what it asks for.
+"option": the option's name where it is not the field's. "together": of a list, the words that one
+use of the option takes, as its help shows them. "needs": another field, without which a value but
+the default means nothing. "affects_output": False where another value gives the same bytes.
+"midway": True where half-done work goes on under another value, which the stage then says. "panel":
+the heading (one of `PANELS`) under which `splat process --help` lists the option; a setting without
+one is an option of its stage's own command only.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ class Setting:
     together: str = ""
     needs: str = ""
     panel: str = ""
+    may_be_empty: bool = False
 
     def check(self, value: Any) -> None:
         """Raises SplatError "option-value" for a value that the setting cannot have."""
@@ -59,7 +60,7 @@ class Setting:
         for item in items:
             if not self._allows(item):
                 raise self._refused(item)
-        if self.choices and not items:
+        if self.choices and not items and not self.may_be_empty:
             raise self._refused("with nothing")
 
     def parse(self, text: str) -> Any:
@@ -133,6 +134,7 @@ def settings_of(settings_type: type) -> list[Setting]:
                 together=field.metadata.get("together", ""),
                 needs=field.metadata.get("needs", ""),
                 panel=field.metadata.get("panel", ""),
+                may_be_empty=field.metadata.get("may_be_empty", False),
             )
         )
     return found

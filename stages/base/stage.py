@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stages.scene import Camera
 
 Numbers = dict[str, float | int | str]
-Draw: TypeAlias = "Callable[[Camera], NDArray[np.uint8]]"
+DrawView: TypeAlias = "Callable[[Camera], NDArray[np.uint8]]"
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Report:
     warnings: list[tuple[str, str]] = field(default_factory=list)
     listener: Callable[[str, int, int, Numbers], None] | None = None
     stop_requested: threading.Event = field(default_factory=threading.Event)
-    onlooker: Callable[[Draw], None] | None = None
+    preview: Callable[[DrawView], None] | None = None
     device: str = "cpu"
 
     def metric(self, name: str, value: Any) -> None:
@@ -56,11 +56,11 @@ class Report:
         if self.listener is not None:
             self.listener(label, done, total, numbers)
 
-    def offer(self, draw: Draw) -> None:
+    def offer(self, draw: DrawView) -> None:
         """A picture of the work so far can be drawn, by this thread and until this call returns:
         draw(camera) gives sRGB [H, W, 3]. It is drawn only if an onlooker wants it."""
-        if self.onlooker is not None:
-            self.onlooker(draw)
+        if self.preview is not None:
+            self.preview(draw)
 
 
 @dataclass(frozen=True)

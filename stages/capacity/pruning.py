@@ -1,4 +1,9 @@
-"""Round by round: cut what is worth least, fine-tune, measure, and take back what cost too much."""
+"""Prunes a model in rounds: remove what contributes least, fine-tune the rest, measure, and undo a
+round that cost too much.
+
+What is removed minimises a rate-distortion cost, see `measure.rate_distortion`: the Lagrange
+multiplier says how much squared error one parameter must save to be kept.
+"""
 
 from __future__ import annotations
 
@@ -9,34 +14,42 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.base.stage import Report
-from stages.capacity.selection import SPLATS_A_ROUND, Removal, choose
+from stages.capacity.selection import ROUND_SHARE, Removal, select_removal
 from stages.capacity.targets import Targets
 from stages.measure.contribution import Contributions, measure_contributions, squared_error
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
-from stages.scene import Splats, spread_over
+from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 
-BACK_OFFS = 3  # times that a round may ask for half as much
-# Splats that go together cost more than the sum of each alone, since they stood in for each other:
-# this much at first, then what the last round told that cost enough to tell.
-OVERLAP, TELLING = 1.25, 0.01  # TELLING: of the squared error
-LOOKED_AT = 48  # photographs in a round; what the others told at first goes on counting
+HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
+# Splats that are removed together cost more than the sum of each alone, because they could replace
+# each other: this factor at first, then what the last round measured whose predicted change was at
+# least SIGNIFICANT (of the squared error).
+OVERLAP, SIGNIFICANT = 1.25, 0.01
+MAX_VIEWS = 48  # measured in a round; what the others showed at first goes on counting
+HARM_TOLERANCE = 0.5  # of the predicted gain that removing harmful splats may miss
 TINY = float(np.finfo(np.float64).tiny)
-WRONG = 0.5  # of what taking out harm should save: so much less may come of it
-PRICE, LOSS, ROUNDS = "price", "loss", "rounds"  # why it stopped
+RATE_DISTORTION, LOSS, ROUNDS = "rate_distortion", "loss", "rounds"  # why pruning stopped
 
 
 @dataclass(frozen=True)
-class Round:
-    """One round as it was tried. splats: before. predicted_sse, measured_sse: change of the squared
-    error by the cut alone, foretold and drawn. psnr_db: mean over the photographs, fine-tuned;
-    of harm that stays, as it was. kept: or taken back."""
+class PruningRound:
+    """One round, for the report.
+
+    Args:
+        splats: before it.
+        removed, floaters: how many splats it removed, and how many of them are floaters.
+        sh_reduced: splats that stayed with a lower SH degree.
+        predicted_sse, measured_sse: change of the summed squared error by the removal alone.
+        psnr_db: mean over the views, after fine-tuning.
+        kept: False if the round was undone.
+    """
 
     splats: int
     removed: int
     floaters: int
-    bands_cut: int
+    sh_reduced: int
     predicted_sse: float
     measured_sse: float
     psnr_db: float
@@ -45,167 +58,186 @@ class Round:
 
 @dataclass
 class PruningResult:
-    """What came of it. start_db, end_db: mean over the photographs that decide. stopped_by: PRICE
-    (what is left pays), LOSS or ROUNDS. least_tenth_db: what the tenth of the splats that is worth
-    least was worth at the start."""
+    """The pruned model and how it came about.
+
+    Args:
+        splats: what is left.
+        rate_distortion: at the start.
+        start_db, end_db: mean PSNR of the measured views.
+        least_tenth_db: what the tenth of the splats that contributes least contributed at first.
+        stopped_by: RATE_DISTORTION (what is left is worth its bits), LOSS or ROUNDS.
+        rounds: all that were tried.
+    """
 
     splats: Splats
-    price: RateDistortion
+    rate_distortion: RateDistortion
     start_db: float
     end_db: float
     least_tenth_db: float
     stopped_by: str = ROUNDS
-    rounds: list[Round] = field(default_factory=list)
+    rounds: list[PruningRound] = field(default_factory=list)
+
+    def add_round(
+        self, removal: Removal, predicted: float, measured: float, psnr_db: float, kept: bool
+    ) -> None:
+        """Record a round that started from `splats`."""
+        reduced = (removal.degrees < self.splats.sh_degrees) & ~removal.removed
+        self.rounds.append(
+            PruningRound(
+                splats=len(self.splats),
+                removed=int(removal.removed.sum()),
+                floaters=removal.floaters,
+                sh_reduced=int(reduced.sum()),
+                predicted_sse=round(predicted, 3),
+                measured_sse=round(measured, 3),
+                psnr_db=round(psnr_db, 4),
+                kept=kept,
+            )
+        )
 
 
 @dataclass
 class Pruner:
-    """One model on its way down. rounds: at most, unless targets want more. tune_steps: after each
-    of as many; where targets want more rounds, they share the steps. All photographs tell what it
-    learns and what each splat is worth at first, as many as `LOOKED_AT` decide."""
+    """Prunes a model in rounds.
 
-    photographs: Sequence[EvaluationView]
+    Args:
+        views: training views. All are trained on, and all decide what is removed first; of very
+            many, `MAX_VIEWS` are measured in each round.
+        targets: what pruning may cost and must reach.
+        backend: name of the rasteriser.
+        finetuner: on the same views.
+        rounds: the largest number, unless a target needs more.
+        finetune_steps: after each round; where a target needs more rounds, they share
+            `rounds * finetune_steps` steps.
+        report: for progress.
+    """
+
+    views: Sequence[EvaluationView]
     targets: Targets
     backend: str
-    tuner: FineTuner
+    finetuner: FineTuner
     rounds: int
     finetune_steps: int
     report: Report
 
     def __post_init__(self) -> None:
-        every = range(len(self.photographs))
-        self.decide = spread_over(every, LOOKED_AT)
-        self.others = sorted(set(every) - set(self.decide))
-        # in the order in which worth tells of photographs
-        self.cameras = [self.tuner.cameras[i] for i in (*self.others, *self.decide)]
+        every = range(len(self.views))
+        self._measured = evenly_spaced(every, MAX_VIEWS)
+        self._others = sorted(set(every) - set(self._measured))
+        # in the order of `Contributions.scene_depth`
+        self._cameras = [self.finetuner.cameras[i] for i in (*self._others, *self._measured)]
 
-    def run(self, splats: Splats) -> PruningResult:
+    def prune(self, splats: Splats) -> PruningResult:
         """The smaller model. Raises SplatError for targets that cannot be met, and Interrupted."""
-        worth = self._first_worth(splats)
-        best = worth.psnr_db
-        mean_db = float(best.mean())
+        state = self._measure_all(splats)
+        best_db = state.psnr_db
+        mean_db = float(best_db.mean())
         self.targets.check_start(mean_db)
-        price = rate_distortion_of(
-            image_renderer(splats, self.backend), self._pictures(self.decide)
-        )
-        price = price.scaled(len(self.photographs) / max(1, len(self.decide)))
-        found = PruningResult(splats, price, mean_db, mean_db, _least_tenth_db(worth))
-        planned, share, overlap = self._planned(splats), SPLATS_A_ROUND, OVERLAP
+        rate_distortion = self._rate_distortion(splats)
+        found = PruningResult(splats, rate_distortion, mean_db, mean_db, _least_tenth_db(state))
+        planned, share, overlap = self._planned_rounds(splats), ROUND_SHARE, OVERLAP
         if planned:
-            worth = self._without_harm(found, worth)
-            best = max(best, worth.psnr_db, key=np.mean)
+            state = self._remove_harmful(found, state)
+            best_db = max(best_db, state.psnr_db, key=np.mean)
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
             excess = self.targets.excess(found.splats)
-            cut = self._cut(found, worth, excess, share)
-            if cut is None:
-                found.stopped_by = PRICE
+            removal = self._select(found, state, excess, share)
+            if removal is None:
+                found.stopped_by = RATE_DISTORTION
                 break
-            fewer, seen = cut.of(found.splats), worth.photographs[~cut.gone]
-            measured = squared_error(fewer, self._pictures(self.decide), self.backend)
-            measured = (measured - _fresh_sse(worth)) * _told_by(worth)
-            fewer = self.tuner.finetune(fewer, self.finetune_steps * self.rounds // planned, seen)
-            after = self._worth(fewer, worth, cut)
-            kept = excess > 0 or self.targets.holds(after.psnr_db, best)
-            predicted = cut.predicted_sse * (overlap if cut.predicted_sse > 0 else 1)
-            told = (predicted, measured, float(after.psnr_db.mean()), kept)
-            found.rounds.append(_round(found.splats, cut, *told))
-            if cut.predicted_sse > TELLING * worth.sse:
-                overlap = max(1.0, measured / cut.predicted_sse)
+            fewer = removal.apply(found.splats)
+            measured = self._sse_change(fewer, state)
+            steps = self.finetune_steps * self.rounds // planned
+            fewer = self.finetuner.finetune(fewer, steps, state.view_counts[~removal.removed])
+            after = self._measure(fewer, state, removal)
+            kept = excess > 0 or self.targets.allows(after.psnr_db, best_db)
+            predicted = removal.predicted_sse * (overlap if removal.predicted_sse > 0 else 1)
+            found.add_round(removal, predicted, measured, float(after.psnr_db.mean()), kept)
+            if removal.predicted_sse > SIGNIFICANT * state.sse:
+                overlap = max(1.0, measured / removal.predicted_sse)
             if kept:
-                found.splats, worth = fewer, after
-                # what removing harm and learning on win is not there to be spent
-                best = max(best, after.psnr_db, key=np.mean)
+                found.splats, state = fewer, after
+                # what fine-tuning gains is not added to the loss allowed
+                best_db = max(best_db, after.psnr_db, key=np.mean)
                 continue
             share, found.stopped_by = share / 2, LOSS
-            if share < SPLATS_A_ROUND / 2**BACK_OFFS:
+            if share < ROUND_SHARE / 2**HALVINGS:
                 break
-        found.end_db = float(worth.psnr_db.mean())
+        found.end_db = float(state.psnr_db.mean())
         self.targets.check_end(found.splats, found.end_db)
         return found
 
-    def _without_harm(self, found: PruningResult, worth: Contributions) -> Contributions:
-        """Take out what the photographs are better without. Fewer, where they turn out to be missed
-        together: drawing tells."""
-        share = SPLATS_A_ROUND
-        for _ in range(BACK_OFFS + 1):
-            most = max(1, int(share * len(found.splats)))
-            limits = (self.cameras, -TINY, min(most, len(found.splats) - 1))
-            cut = choose(found.splats, worth, *limits, share, harm=True)
-            if cut is None:
-                return worth
-            fewer = cut.of(found.splats)
-            measured = squared_error(fewer, self._pictures(self.decide), self.backend)
-            measured = (measured - _fresh_sse(worth)) * _told_by(worth)
-            kept = measured <= cut.predicted_sse + WRONG * abs(cut.predicted_sse)
-            after = self._worth(fewer, worth, cut) if kept else worth
-            told = (cut.predicted_sse, measured, float(after.psnr_db.mean()), kept)
-            found.rounds.append(_round(found.splats, cut, *told))
+    def _remove_harmful(self, found: PruningResult, state: Contributions) -> Contributions:
+        """Remove splats without which the views are matched better. Of those that seem so one by
+        one, some are missed once all are gone: then fewer are removed."""
+        share = ROUND_SHARE
+        for _ in range(HALVINGS + 1):
+            most = min(max(1, int(share * len(found.splats))), len(found.splats) - 1)
+            removal = select_removal(
+                found.splats, state, self._cameras, -TINY, most, share, by_error=True
+            )
+            if removal is None:
+                return state
+            fewer = removal.apply(found.splats)
+            measured = self._sse_change(fewer, state)
+            predicted = removal.predicted_sse
+            kept = measured <= predicted + HARM_TOLERANCE * abs(predicted)
+            after = self._measure(fewer, state, removal) if kept else state
+            found.add_round(removal, predicted, measured, float(after.psnr_db.mean()), kept)
             if kept:
                 found.splats = fewer
                 return after
             share /= 2
-        return worth
+        return state
 
-    def _pictures(self, numbers: list[int]) -> Iterator[EvaluationView]:
-        return (self.photographs[i] for i in numbers)
+    def _measured_views(self) -> Iterator[EvaluationView]:
+        return (self.views[i] for i in self._measured)
 
-    def _first_worth(self, splats: Splats) -> Contributions:
+    def _rate_distortion(self, splats: Splats) -> RateDistortion:
+        measured = rate_distortion_of(image_renderer(splats, self.backend), self._measured_views())
+        return measured.scaled(len(self.views) / max(1, len(self._measured)))
+
+    def _measure_all(self, splats: Splats) -> Contributions:
         others = None
-        if self.others:
-            others = measure_contributions(splats, self._pictures(self.others), self.backend)
-        return measure_contributions(splats, self._pictures(self.decide), self.backend, others)
+        if self._others:
+            views = (self.views[i] for i in self._others)
+            others = measure_contributions(splats, views, self.backend)
+        return measure_contributions(splats, self._measured_views(), self.backend, others)
 
-    def _worth(self, splats: Splats, before: Contributions, cut: Removal) -> Contributions:
-        others = before.others.take(~cut.gone) if before.others else None
-        return measure_contributions(splats, self._pictures(self.decide), self.backend, others)
+    def _measure(self, splats: Splats, before: Contributions, removal: Removal) -> Contributions:
+        others = before.previous.take(~removal.removed) if before.previous else None
+        return measure_contributions(splats, self._measured_views(), self.backend, others)
 
-    def _planned(self, splats: Splats) -> int:
-        """As many rounds as targets need, and a few for what they leave over."""
+    def _sse_change(self, splats: Splats, before: Contributions) -> float:
+        """Change of the summed squared error of all views since `before`, from measured ones."""
+        others = before.previous.sse if before.previous else 0.0
+        measured = before.sse - others
+        change = squared_error(splats, self._measured_views(), self.backend) - measured
+        return change * (1 + others / max(measured, TINY))
+
+    def _planned_rounds(self, splats: Splats) -> int:
+        """As many as the size targets need, and a few more for what they leave."""
         left = len(splats) - self.targets.excess(splats)
         if left == len(splats):
             return self.rounds
-        needed = math.log(left / len(splats)) / math.log(1 - SPLATS_A_ROUND)
+        needed = math.log(left / len(splats)) / math.log(1 - ROUND_SHARE)
         return max(self.rounds, math.ceil(needed) + 4)
 
-    def _cut(
-        self, found: PruningResult, worth: Contributions, excess: int, share: float
+    def _select(
+        self, found: PruningResult, state: Contributions, excess: int, share: float
     ) -> Removal | None:
         forced = excess > 0 or self.targets.min_psnr_db > 0
-        limit = math.inf if forced else self.targets.price * found.price.sse_per_parameter
-        most = max(1, int((SPLATS_A_ROUND if excess else share) * len(found.splats)))
-        most = min(most, excess, len(found.splats) - 1) if excess else most
-        return choose(
-            found.splats, worth, self.cameras, limit, min(most, len(found.splats) - 1), share
+        limit = found.rate_distortion.sse_per_parameter * self.targets.strength
+        most = max(1, int((ROUND_SHARE if excess else share) * len(found.splats)))
+        most = min(most, excess or most, len(found.splats) - 1)
+        return select_removal(
+            found.splats, state, self._cameras, math.inf if forced else limit, most, share
         )
 
 
-def _fresh_sse(worth: Contributions) -> float:
-    """Of the photographs that decide."""
-    return worth.sse - (worth.others.sse if worth.others else 0.0)
-
-
-def _told_by(worth: Contributions) -> float:
-    """How much larger a change is of all photographs than of those that decide."""
-    return 1 + (worth.others.sse if worth.others else 0.0) / max(_fresh_sse(worth), TINY)
-
-
-def _round(
-    before: Splats, cut: Removal, predicted: float, measured: float, psnr_db: float, kept: bool
-) -> Round:
-    return Round(
-        splats=len(before),
-        removed=int(cut.gone.sum()),
-        floaters=cut.floaters,
-        bands_cut=int(((cut.degrees < before.sh_degrees) & ~cut.gone).sum()),
-        predicted_sse=round(predicted, 3),
-        measured_sse=round(measured, 3),
-        psnr_db=round(psnr_db, 4),
-        kept=kept,
-    )
-
-
-def _least_tenth_db(worth: Contributions) -> float:
-    """By the worth of each alone."""
-    change = np.sort(worth.sse_change)[: max(1, len(worth.sse_change) // 10)].sum()
-    return 10 * math.log10(max(1e-12, 1 + float(change) / worth.sse)) if worth.sse else 0.0
+def _least_tenth_db(state: Contributions) -> float:
+    """Loss if the tenth of the splats with the smallest contributions were removed, as if the
+    effects of single removals added up."""
+    change = np.sort(state.sse_change)[: max(1, len(state.sse_change) // 10)].sum()
+    return 10 * math.log10(max(1e-12, 1 + float(change) / state.sse)) if state.sse else 0.0

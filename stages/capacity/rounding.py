@@ -1,11 +1,11 @@
-"""Splats that learn to live with what a file rounds.
+"""Fine-tunes splats to the rounding of a file format.
 
-One kind of value after the other is rounded as the file will, stands still from then on, and the
-others make up for it.
+One attribute after the other is rounded as the file will round it and is frozen from then on, and
+the remaining attributes are fine-tuned to compensate.
 
-Rounding through which gradients pass as if it were not there (Bengio et al. 2013) was tried
-instead: on the sample it found nothing back, for values that swing between two steps disturb the
-others.
+Rounding through which gradients pass unchanged (the straight-through estimator, Bengio et al. 2013)
+was tried instead: on the sample it recovered nothing, because values that alternate between two
+quantisation steps disturb the others.
 """
 
 from __future__ import annotations
@@ -14,109 +14,117 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.lazy import load_object
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
 from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.scene import QuantisedSplats, Splats
 from stages.training.finetune import FineTuner
 
-# Fields of `LearningRates`, what others can make up for least first; colour last, which is rounded
-# finely and in which the picture is linear.
+# Parameters (fields of `LearningRates`) in the order in which they are rounded. First those that
+# the others compensate for least well; DC colour last: it is rounded finely, and the picture is
+# linear in it.
 ORDER = ("sh_rest", "opacity_logits", "quaternions", "means", "log_scales", "sh_dc")
-
-Rounded = Callable[[Splats], Splats]  # what a file holds of them, row by row
 
 
 @dataclass
-class Fitting:
-    """Fits splats to what files round. tuner: on the photographs of training; deciding: those of
-    them that tell whether it was worth it. steps: see `tuned_to`; seen: see `Tuner.tuned`."""
+class RoundingFinetuner:
+    """Fine-tunes splats to the rounding of formats.
 
-    tuner: FineTuner
-    deciding: Sequence[EvaluationView]
+    Args:
+        finetuner: on the training views.
+        deciding_views: training views that decide whether fine-tuning has helped.
+        backend: name of the rasteriser that draws those.
+        steps: of fine-tuning after each rounded attribute.
+        view_counts: [N] in how many views each splat is visible.
+    """
+
+    finetuner: FineTuner
+    deciding_views: Sequence[EvaluationView]
     backend: str
     steps: int
-    seen: NDArray[np.int32]
+    view_counts: NDArray[np.int32]
 
-    def fitted(self, row: Format, quantised: QuantisedSplats) -> tuple[Splats, dict[str, Any]]:
-        """(what a file of the format should hold, figures: PSNR of the photographs that decide, as
-        the file would be drawn without fine-tuning and with it). Raises Interrupted."""
-        self.tuner.steps = 0  # what a file holds does not depend on those written before it
+    def finetune(self, row: Format, quantised: QuantisedSplats) -> tuple[Splats, dict[str, float]]:
+        """(the splats that a file of the format should hold; mean PSNR of the deciding views drawn
+        from that file, without and with fine-tuning). Raises Interrupted."""
+        self.finetuner.steps = 0  # so that a file does not depend on those before it
         plain = splats_to_write(row, quantised)
-        exact = splats_to_write(row, replace(quantised, decisions={}))
+        found = splats_to_write(row, replace(quantised, decisions={}))
         bits = quantised.decisions.get("bits")
 
-        def read(splats: Splats) -> Splats:
-            return as_read(row, splats)
+        def written(splats: Splats) -> Splats:
+            return write_and_read(row, splats)
 
+        rounded = written
         if row.quantiser and isinstance(bits, dict):
-            exact, few = least_turned(exact), BitDepths(**bits)
-            found = tuned_to(
-                lambda s: quantise_splats(s, few), exact, self.tuner, self.steps, self.seen
-            )
-        else:
-            found = tuned_to(read, exact, self.tuner, self.steps, self.seen)
-        before, after = (
-            mean_psnr_db(read(splats), self.deciding, self.backend) for splats in (plain, found)
+            depths, found = BitDepths(**bits), smallest_rotations(found)
+
+            def rounded(splats: Splats) -> Splats:
+                return quantise_splats(splats, depths)
+
+        found = finetune_to_rounding(rounded, found, self.finetuner, self.steps, self.view_counts)
+        plain_db, finetuned_db = (
+            mean_psnr_db(written(splats), self.deciding_views, self.backend)
+            for splats in (plain, found)
         )
-        figures = {"plain_db": round(before, 3), "fitted_db": round(after, 3)}
-        return (found if after > before else plain), figures
+        figures = {"rounded_db": round(plain_db, 3), "finetuned_db": round(finetuned_db, 3)}
+        return (found if finetuned_db > plain_db else plain), figures
 
 
-def tuned_to(
-    rounded: Rounded, splats: Splats, tuner: FineTuner, steps: int, seen: NDArray[np.int32]
+def finetune_to_rounding(
+    rounded: Callable[[Splats], Splats],
+    splats: Splats,
+    finetuner: FineTuner,
+    steps: int,
+    view_counts: NDArray[np.int32],
 ) -> Splats:
-    """Splats that `rounded` leaves nearly as they are. steps: after each kind of value that it
-    changes. Raises Interrupted."""
-    still: list[str] = []
+    """Splats whose values `rounded`, which keeps the rows, leaves nearly unchanged.
+
+    steps: of fine-tuning after each attribute that it changes. Raises Interrupted."""
+    frozen: list[str] = []
     for name in ORDER:
-        coarse = _only(name, rounded(splats), splats)
-        if _equal(name, coarse, splats):
-            continue  # told as it is: it goes on learning
-        splats = coarse
-        still.append(name)
+        candidate = _with_attribute(name, splats, rounded(splats))
+        if np.array_equal(_attribute(name, candidate), _attribute(name, splats)):
+            continue  # stored exactly: it is not frozen
+        splats = candidate
+        frozen.append(name)
         if name != ORDER[-1]:
-            splats = tuner.finetune(splats, steps, seen, still)
+            splats = finetuner.finetune(splats, steps, view_counts, frozen)
     return splats
 
 
-def as_read(row: Format, splats: Splats) -> Splats:
-    """What a file of them says, in their order. All rows must be drawable."""
+def write_and_read(row: Format, splats: Splats) -> Splats:
+    """`splats` as a file of the format returns them, in their own order. All must be drawable."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / row.name("scene")
+        path = Path(folder) / row.file_name("scene")
         formats.write(path, splats)
-        read = formats.read(path)
-    found = read.with_sh_degree(splats.sh_degree)
+        found = formats.read(path).with_sh_degree(splats.sh_degree)
     if row.order:
-        places = np.argsort(load_object(row.order)(splats))
-        found = found.take(places)
+        found = found.take(np.argsort(load_object(row.order)(splats)))
     return replace(found, draw_settings=splats.draw_settings, origin=splats.origin)
 
 
-def _only(name: str, coarse: Splats, splats: Splats) -> Splats:
-    """`splats` with one kind of value of `coarse`; degrees stay."""
+def _attribute(name: str, splats: Splats) -> NDArray[np.floating]:
+    """The array of a field of `LearningRates`; for SH coefficients, a view."""
+    if name == "sh_dc":
+        return splats.sh[:, :1]
+    if name == "sh_rest":
+        return splats.sh[:, 1:]
+    found: NDArray[np.floating] = getattr(splats, name)
+    return found
+
+
+def _with_attribute(name: str, splats: Splats, source: Splats) -> Splats:
+    """`splats` with one attribute of `source`; SH degrees stay."""
     if not name.startswith("sh_"):
-        return replace(splats, **{name: getattr(coarse, name)})
-    bands = _bands(name)
-    sh = splats.sh.copy()
-    sh[:, bands] = coarse.sh[:, bands]
-    return replace(splats, sh=sh)
-
-
-def _equal(name: str, a: Splats, b: Splats) -> bool:
-    if not name.startswith("sh_"):
-        return np.array_equal(getattr(a, name), getattr(b, name))
-    bands = _bands(name)
-    return np.array_equal(a.sh[:, bands], b.sh[:, bands])
-
-
-def _bands(name: str) -> slice:
-    return slice(0, 1) if name == "sh_dc" else slice(1, None)
+        return replace(splats, **{name: getattr(source, name)})
+    found = replace(splats, sh=splats.sh.copy())
+    _attribute(name, found)[:] = _attribute(name, source)
+    return found

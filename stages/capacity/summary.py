@@ -1,55 +1,59 @@
-"""What was cut, why, what it cost, and whether more would pay, in sentences."""
+"""Sentences for the report of `prune`: what was removed, at what cost, and why it stopped."""
 
 from __future__ import annotations
 
 from stages.base.text import counted
-from stages.capacity.pruning import LOSS, PRICE, PruningResult
-from stages.capacity.targets import felt_share
+from stages.capacity.pruning import LOSS, RATE_DISTORTION, PruningResult
+from stages.capacity.targets import held_out_loss_ratio
 from stages.scene import TrainedSplats
 
-_WHY = {
-    PRICE: "what is left is worth its bits",
-    LOSS: "cutting more would lose more than is allowed",
+_REASONS = {
+    RATE_DISTORTION: "the remaining splats are worth their bits",
+    LOSS: "removing more would lose more than is allowed",
 }
 
 
 def summarise(
-    before: TrainedSplats, found: PruningResult, dial: float, finetune_steps: int
+    before: TrainedSplats, found: PruningResult, strength: float, finetune_steps: int
 ) -> list[str]:
-    """dial: the price that was asked for."""
-    price, after, start = found.price, found.splats, before.splats
-    told = [
-        f"Price: the photographs of training hold {price.samples:,} colour values, worth "
-        f"{price.independent_samples:,.0f} independent ones; so a number costs "
-        f"{price.bits_per_parameter:.1f} bits, and one dB is worth "
-        f"{price.bits_per_db / 8e3:,.0f} kB (dial at {dial:g})."
+    """One sentence or two each about the rate-distortion cost, the removal and its end.
+
+    finetune_steps: done in all rounds."""
+    cost, after, start = found.rate_distortion, found.splats, before.splats
+    lines = [
+        f"Rate-distortion: the training views hold {cost.samples:,} colour values, equivalent to "
+        f"{cost.independent_samples:,.0f} independent ones. So a parameter costs "
+        f"{cost.bits_per_parameter:.1f} bits, and one dB is worth {cost.bits_per_db / 8e3:,.0f} kB "
+        f"(pruning strength {strength:g})."
     ]
     kept = [one for one in found.rounds if one.kept]
     if not kept:
-        return [*told, "Nothing was cut."]
+        return [*lines, "Nothing was removed."]
     floaters = sum(one.floaters for one in kept)
-    poorer = int((after.sh_degrees < start.sh_degree).sum())
-    told.append(
-        f"Cut: {counted(len(start) - len(after), 'splat')} of {len(start):,}"
+    reduced = int((after.sh_degrees < start.sh_degree).sum())
+    lines.append(
+        f"Removed: {counted(len(start) - len(after), 'splat')} of {len(start):,}"
         f"{f' ({floaters:,} of them floaters)' if floaters else ''}; of the {len(after):,} left, "
-        f"{poorer:,} have fewer bands of colour than {start.sh_degree}. "
-        f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning in "
-        f"all: {found.end_db - found.start_db:+.2f} dB on the photographs of training; other views "
-        f"feel at most {felt_share(before.overfitted):.0%} of that."
+        f"{reduced:,} have an SH degree below {start.sh_degree}. "
+        f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning: "
+        f"{found.end_db - found.start_db:+.2f} dB on the training views; other views lose at most "
+        f"{held_out_loss_ratio(before.overfitted):.0%} of what these lose."
     )
-    why = _WHY.get(found.stopped_by, "the rounds that were asked for were done")
-    return [*told, f"It stopped since {why}."]
+    reason = _REASONS.get(found.stopped_by, "all rounds that were asked for were done")
+    return [*lines, f"Pruning stopped because {reason}."]
 
 
-def more_would_pay(found: PruningResult, dial: float) -> str:
-    """The sentence, or "" where it would not: the tenth of the splats that is worth least, before
-    anything was cut, against what as many cost; a next tenth would be worth less than this one."""
+def advise_more_splats(found: PruningResult, strength: float) -> str:
+    """A sentence for a model that is too small, otherwise "".
+
+    A model is too small if nothing was removed and its least useful tenth is still worth its size:
+    a further tenth would be worth less than this one."""
     if not found.rounds or any(one.kept and one.removed for one in found.rounds):
         return ""
+    if found.least_tenth_db <= 0.01 * strength:
+        return ""
     return (
-        "No tenth of the splats can be spared: the least of them is worth "
-        f"{found.least_tenth_db:.2f} dB, and a next tenth would buy at most as much. More splats "
-        "would pay: train with a higher --max-splats."
-        if found.least_tenth_db > 0.01 * dial
-        else ""
+        "No tenth of the splats can be removed: even the tenth that contributes least is worth "
+        f"{found.least_tenth_db:.2f} dB, and another tenth would add at most as much. More splats "
+        "would improve the pictures: train with a higher --max-splats."
     )

@@ -1,4 +1,4 @@
-"""What is wanted of a smaller model, and what to say where it cannot be had."""
+"""Targets of pruning: the loss allowed and the size wanted, and errors where these conflict."""
 
 from __future__ import annotations
 
@@ -12,34 +12,39 @@ from stages.base.errors import Family, SplatError
 from stages.base.text import counted
 from stages.scene import Splats
 
-WORST_VIEW_DB = 0.3  # that any one view may lose, at price 1
-# With half of the splats gone and the rest fine-tuned, other views lost, of what photographs in
-# training lost, nothing on a carpet that is learnt by heart, 0.15 on a toy, 0.2 on the sample.
-FELT, FELT_BY_HEART = 0.25, 0.05
+WORST_VIEW_DB = 0.3  # that any one view may lose, at strength 1
+# Loss of other views per loss of training views, at most. Measured with half of the splats removed
+# and the rest fine-tuned: 0 on an overfitted carpet, 0.15 on a toy, 0.2 on the sample.
+LOSS_RATIO, LOSS_RATIO_OVERFITTED = 0.25, 0.05
 
 
-def felt_share(overfitted: bool) -> float:
-    """How much of what training photographs lose other views lose as well, at most."""
-    return FELT_BY_HEART if overfitted else FELT
+def held_out_loss_ratio(overfitted: bool) -> float:
+    """Upper bound of the loss of other views (dB) per dB that training views lose."""
+    return LOSS_RATIO_OVERFITTED if overfitted else LOSS_RATIO
 
 
 @dataclass(frozen=True)
 class Targets:
-    """price: what a number must be worth, in units of what the photographs ask; the loss allowed
-    grows with it. max_loss_db: at price 1, mean over views that were not trained on. felt: see
-    `felt_share`. max_splats, max_bytes, min_psnr_db: targets that override the price; 0 for none.
-    size_bytes: of the file that max_bytes speaks of."""
+    """What pruning may cost, and what it must reach.
 
-    price: float
+    Args:
+        strength: factor of the Lagrange multiplier and of the loss allowed.
+        max_loss_db: mean loss of views that were not trained on, at strength 1.
+        loss_ratio: see `held_out_loss_ratio`.
+        max_splats, max_bytes, min_psnr_db: these override the strength; 0 for none.
+        size_bytes: gives the size of the file that `max_bytes` is about.
+    """
+
+    strength: float
     max_loss_db: float
-    felt: float
+    loss_ratio: float
     max_splats: int
     max_bytes: float
     min_psnr_db: float
     size_bytes: Callable[[Splats], int]
 
     def excess(self, splats: Splats) -> int:
-        """How many splats are too many for the targets."""
+        """How many splats are too many for the size targets."""
         count = len(splats)
         allowed = self.max_splats or count
         if self.max_bytes:
@@ -48,22 +53,23 @@ class Targets:
                 allowed = min(allowed, int(count * self.max_bytes / size))
         return count - max(1, min(allowed, count))
 
-    def holds(self, psnr_db: NDArray[np.float64], best_db: NDArray[np.float64]) -> bool:
-        """Whether photographs [P] of training may look like this, and `best_db` before."""
+    def allows(self, psnr_db: NDArray[np.float64], best_db: NDArray[np.float64]) -> bool:
+        """Whether V training views may have `psnr_db` [V] where they had `best_db` [V]."""
         if self.min_psnr_db:
             return float(psnr_db.mean()) >= self.min_psnr_db
-        loss = (best_db - psnr_db) * self.felt / self.price
+        loss = (best_db - psnr_db) * self.loss_ratio / self.strength
         return float(loss.mean()) <= self.max_loss_db and float(loss.max()) <= WORST_VIEW_DB
 
     def check_start(self, psnr_db: float) -> None:
-        """Raises SplatError (prune-psnr-not-reached) where even the whole model is not as good."""
+        """Raises SplatError (prune-psnr-not-reached) if even the unpruned model is below."""
         if self.min_psnr_db > psnr_db:
             raise SplatError(
                 "prune-psnr-not-reached",
-                given=f"--min-psnr {self.min_psnr_db:g}, and all splats that were trained reach "
-                f"{psnr_db:.2f} dB on the photographs of training.",
+                given=f"--min-psnr {self.min_psnr_db:g}, but all trained splats together reach "
+                f"{psnr_db:.2f} dB on the training views.",
                 wanted=f"At most {np.floor(psnr_db * 100) / 100:.2f}.",
-                hint="Pruning only takes away: train longer, or with more splats, for more.",
+                hint="Pruning only removes splats. For a higher PSNR train longer, or with more "
+                "splats.",
                 family=Family.USAGE,
             )
 
@@ -82,8 +88,8 @@ class Targets:
         if self.min_psnr_db > psnr_db:
             raise SplatError(
                 "prune-targets-contradict",
-                given=f"--min-psnr {self.min_psnr_db:g} and the size asked for cannot both be had: "
-                f"{counted(len(splats), 'splat')} reach {psnr_db:.2f} dB.",
+                given=f"--min-psnr {self.min_psnr_db:g} and the size asked for contradict each "
+                f"other: {counted(len(splats), 'splat')} reach {psnr_db:.2f} dB.",
                 wanted="Targets that this scene can meet together.",
                 hint=f"Ask for --min-psnr {np.floor(psnr_db * 100) / 100:.2f}, or allow more.",
                 family=Family.USAGE,

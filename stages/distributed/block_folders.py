@@ -66,6 +66,7 @@ def _finish(folder: Path, like: Manifest) -> Manifest:
         outputs=outputs,
         output_digest=combined_digest(outputs) if outputs else like.output_digest,
         seconds=0.0,
+        cpu_seconds=0.0,
         peak_memory_mib=0.0,
         libraries=versions(),
         metrics=dict(metrics),

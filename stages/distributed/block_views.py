@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stages.distributed.partition import Cell
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import settings_of
+from stages.raster.draw import raster_settings_of
 from stages.scene import Camera, Splats
 
 SIDE = 160  # longer side of the renderings, pixels
@@ -22,7 +22,11 @@ def block_fractions(
 ) -> NDArray[np.float64]:
     """[blocks, cameras] the fraction of each picture that comes from splats in each cell, 0 to 1;
     occluded splats do not count. All 0 for a camera that sees nothing."""
-    rasteriser, arrays, settings = rasteriser_of(backend), splat_arrays(splats), settings_of(splats)
+    rasteriser, arrays, settings = (
+        rasteriser_of(backend),
+        splat_arrays(splats),
+        raster_settings_of(splats),
+    )
     inside = [cell.holds(splats.means) for cell in cells]
     found = []
     for camera in cameras:

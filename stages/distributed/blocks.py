@@ -250,7 +250,7 @@ class _Scene:
 
         from stages.distributed import merge
         from stages.measure.evaluation import load_evaluation_views
-        from stages.scene import TrainedSplats, seen_extent
+        from stages.scene import TrainedSplats, training_extent
         from stages.training.finetune import FineTuner
 
         degree, backend = self.settings.sh_degree, backend_of_settings(self.settings)
@@ -264,7 +264,7 @@ class _Scene:
         if crossing:
             self.report.progress(0, 1, "seams")
             photographs = load_evaluation_views(self.whole.folder, crossing, draw_settings)
-            extent = seen_extent(self.whole)
+            extent = training_extent(self.whole)
             tuner = FineTuner(photographs, extent, backend, self.report, found.dropout)
             splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
         ends = np.cumsum([0, *counts])

@@ -95,4 +95,4 @@ def put_right(
         if squared_error(splats.take(~gone), photographs, backend) <= worth.sse:
             break
     steps = min(MOST_STEPS, STEPS_A_PHOTOGRAPH * len(photographs))
-    return tuner.finetune(splats.take(~gone), steps, worth.photographs[~gone]), gone
+    return tuner.finetune(splats.take(~gone), steps, worth.view_counts[~gone]), gone

@@ -257,14 +257,14 @@ class UploadListener(Listener):
         self._uploaded.clear()
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        from stages.training.checkpoint import FILE_NAME, checkpoint_files
+        from stages.training.checkpoint import FILE_NAME
 
         folder = self._local / self._partial
         with suppress(OSError, SplatError):  # without a checkpoint, a resumed run repeats more
             saved_ns = (folder / FILE_NAME).stat().st_mtime_ns
             if saved_ns != self._saved_ns:
                 self._saved_ns = saved_ns
-                for name in (REQUEST, *checkpoint_files(folder)):
+                for name in (REQUEST, FILE_NAME):
                     self._upload(folder, name)
 
     def _upload(self, folder: Path, name: str) -> None:

@@ -93,7 +93,7 @@ class Resources:
 
 def resources_of(train: Any) -> Resources:
     """The most that a run with these training settings needs."""
-    from stages.training.density import needed_mib
+    from stages.training.cap import needed_mib
 
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
     return Resources(memory_mib, gpus=int(train.backend == "gpu" or train.device == "cuda"))

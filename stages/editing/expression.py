@@ -1,7 +1,7 @@
-"""What `--keep` says of each splat: `opacity > 0.1 and scale < 0.5`.
+"""The conditions of `--keep`: `opacity > 0.1 and scale < 0.5`.
 
-Numbers, the names in `NAMES`, + - * /, comparisons, and, or, not and parentheses: Python's words,
-parsed by its parser and walked here. Nothing is ever evaluated by Python itself.
+A condition consists of numbers, the names in `VARIABLES`, + - * /, comparisons, and, or, not and
+parentheses. Python's parser builds the tree; it is checked and evaluated here, never by Python.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.base.errors import Family, SplatError
 from stages.scene import Splats, dc_to_rgb
 
 Column = Callable[[Splats], NDArray[np.floating]]
-NAMES: Mapping[str, Column] = {
+VARIABLES: Mapping[str, Column] = {
     "x": lambda splats: splats.means[:, 0],
     "y": lambda splats: splats.means[:, 1],
     "z": lambda splats: splats.means[:, 2],
@@ -53,27 +53,26 @@ _COMPARISONS: dict[type[ast.AST], Any] = {
 
 
 class _RefusedError(ValueError):
-    """What of the text is not allowed."""
+    """Why a text is no condition."""
 
 
 @dataclass(frozen=True)
 class Expression:
-    """A condition that was checked. text: as it was given."""
+    """A checked condition."""
 
-    text: str
     tree: ast.expr
 
-    def holds(self, splats: Splats) -> NDArray[np.bool_]:
-        """[N] for which splats it is true; never for values that are not numbers."""
+    def evaluate(self, splats: Splats) -> NDArray[np.bool_]:
+        """[N] whether the condition is true; false where a comparison meets NaN."""
         found = np.empty(len(splats), bool)
-        for rows in passing(len(splats)):
+        for rows in reported_blocks(len(splats)):
             with np.errstate(all="ignore"):
                 found[rows] = _value(self.tree, splats.take(rows))
         return found
 
 
-def parsed(text: str) -> Expression:
-    """Raises SplatError "edit-keep" for what is no condition in the names and signs above."""
+def parse_expression(text: str) -> Expression:
+    """Check `text`. Raises SplatError "edit-keep" for what is no condition."""
     try:
         if len(text) > _LONGEST:
             raise _RefusedError(f"it is longer than {_LONGEST} characters")
@@ -86,11 +85,11 @@ def parsed(text: str) -> Expression:
         raise _wrong(text, f"it cannot be read ({error.msg})") from error
     except (ValueError, MemoryError, RecursionError) as error:
         raise _wrong(text, "it cannot be read") from error
-    return Expression(text, tree)
+    return Expression(tree)
 
 
 def _checked(node: ast.expr, depth: int = 0) -> type:
-    """bool or float: what `node` says. Raises _RefusedError."""
+    """The type of `node`, bool or float. Raises _RefusedError."""
     if depth > _DEEPEST:
         raise _RefusedError(f"it is nested deeper than {_DEEPEST}")
 
@@ -98,7 +97,7 @@ def _checked(node: ast.expr, depth: int = 0) -> type:
         for part in parts:
             if _checked(part, depth + 1) is not wanted:
                 kind = "true or false" if wanted is bool else "a number"
-                raise _RefusedError(f"{ast.unparse(part)!r} stands where {kind} should")
+                raise _RefusedError(f"{ast.unparse(part)!r} stands where {kind} is wanted")
 
     match node:
         case ast.BoolOp(values=values):
@@ -124,21 +123,21 @@ def _checked(node: ast.expr, depth: int = 0) -> type:
                 raise _RefusedError("it holds a number that is too large")
             return float
         case ast.Name(id=name):
-            if name in NAMES:
+            if name in VARIABLES:
                 return float
-            raise _RefusedError(f"nothing is called {name!r}")
+            raise _RefusedError(f"there is no variable {name!r}")
     raise _RefusedError(f"{ast.unparse(node)[:60]!r} is not understood")
 
 
 def _value(node: Any, splats: Splats) -> Any:
-    """Of a tree that `_checked` let pass: [N], or one value for all."""
+    """The value of a checked tree: [N], or one value for all splats."""
     match node:
         case ast.Constant(value=bool() as truth):
             return truth
         case ast.Constant(value=int() | float() as number):
             return float(number)
         case ast.Name(id=name):
-            return NAMES[name](splats).astype(np.float64)
+            return VARIABLES[name](splats).astype(np.float64)
         case ast.BoolOp(op=sign, values=values):
             together = np.logical_and if isinstance(sign, ast.And) else np.logical_or
             return functools.reduce(together, [_value(part, splats) for part in values])
@@ -147,7 +146,7 @@ def _value(node: Any, splats: Splats) -> Any:
         case ast.UnaryOp(op=sign, operand=operand):
             return _ARITHMETIC[type(sign)](_value(operand, splats))
         case ast.BinOp(left=left, op=sign, right=right):
-            # one value for all divides by 0 as the others do
+            # as NumPy values, so that scalars divide by 0 like arrays
             both = np.float64(1) * _value(left, splats), np.float64(1) * _value(right, splats)
             return _ARITHMETIC[type(sign)](*both)
         case ast.Compare(left=left, ops=signs, comparators=others):
@@ -163,7 +162,7 @@ def _wrong(text: str, why: str) -> SplatError:
     return SplatError(
         "edit-keep",
         given=f"--keep {text[:100]!r}: {why}.",
-        wanted=f"A condition on {', '.join(NAMES)}, with numbers, + - * /, < <= > >= == !=, "
+        wanted=f"A condition on {', '.join(VARIABLES)}, with numbers, + - * /, < <= > >= == !=, "
         "and, or, not.",
         hint="For example: --keep 'opacity > 0.1 and scale < 0.5'",
         family=Family.USAGE,

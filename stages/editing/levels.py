@@ -1,36 +1,31 @@
-"""Levels of detail of one scene, each a quarter of the splats of the one before it; and a page."""
+"""Levels of detail of one scene, each with a quarter of the splats of the level before it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from stages.editing.decimate import FAR, decimated
-from stages.formats import html, streamed_sog
-from stages.formats.rows import kept_rows
+from stages import formats
+from stages.editing.decimate import FAR_ROUND_SHARE, decimate
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
 # On a surface a quarter of the splats are twice as large, and look as large twice as far away.
-A_LEVEL = 4
-_FEWEST = 20_000  # a level of so few is small enough to begin with
+LEVEL_RATIO = 4
+_FEWEST = 20_000  # a level of so few splats is small enough to be loaded first
 
 
-def levels_of(splats: Splats) -> list[Splats]:
-    """The finest first. Every splat must be drawable."""
-    found = [splats]
-    while len(found[-1]) > _FEWEST:
-        found.append(decimated(found[-1], len(found[-1]) // A_LEVEL, FAR))
-    return found
+def coarser_levels(splats: Splats) -> list[Splats]:
+    """The levels of detail below `splats`, finest first. Every splat must be drawable."""
+    levels = [splats]
+    while len(levels[-1]) > _FEWEST:
+        levels.append(decimate(levels[-1], len(levels[-1]) // LEVEL_RATIO, FAR_ROUND_SHARE))
+    return levels[1:]
 
 
 def write(
     path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
 ) -> int:
-    """Write `splats` and coarser levels of them as a streamed SOG, and beside it a page that shows
-    it on any web server; return how many could not be drawn and were left out.
-
-    views: cameras to look from. Raises SplatError when it cannot be written.
-    """
-    kept, dropped = kept_rows(splats)
-    streamed_sog.write_levels(Path(path), levels_of(kept), units)
-    html.write_beside(Path(path), kept, units, views)
-    return dropped
+    """As `formats.write`, with levels of detail where the format holds them."""
+    streamed = formats.format_of(path).streamed
+    coarser = coarser_levels(drop_undrawable(splats)[0]) if streamed else ()
+    return formats.write(path, splats, units=units, views=views, coarser=coarser)

@@ -1,8 +1,8 @@
-"""Two splats as one: the same mass of opacity, the same mean, covariance and mean colour.
+"""Merging two splats by moment matching: mass, mean, covariance and mean colour are preserved.
 
-The area of a splat is sqrt(ab ab + ac ac + bc bc) of its standard deviations a, b, c: up to a
-factor what it covers on average over all directions. Its mass is opacity x area. Both follow from
-the covariance without its axes, and a flat splat has them too.
+The area of a splat is sqrt(ab ab + ac ac + bc bc) for standard deviations a, b, c: up to a factor,
+the area that it covers on average over all directions. Its mass is opacity x area. Both follow from
+the covariance without its eigenvectors, and are defined for flat splats, too.
 """
 
 from __future__ import annotations
@@ -20,16 +20,24 @@ _OPACITY_MIN = 1e-6
 _I, _J = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])  # of a symmetric matrix
 _WHERE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _DIAGONAL = [0, 3, 5]
-# Squared colour that a pair counts besides its own difference, if it covers together what its two
-# did; more where the one splat covers what lay between. From 0.05 to 2 it hardly matters.
-_SHAPE = 0.2
+# Weight of the change of shape in the cost of merging, as a squared colour difference: counted once
+# if the merged splat covers the area of both, more if it also covers the gap between them. Values
+# from 0.05 to 2 hardly change the result.
+_SHAPE_WEIGHT = 0.2
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Of N splats, float64: means [N, 3], covariances [N, 6] (xx, xy, xz, yy, yz, zz),
-    opacities [N], colours [N, 3] without what depends on the view, areas [N]. Of two
-    axes, each column lies in one piece: a fifth less time for them all."""
+    """Moments of N splats, float64. Two-dimensional arrays are column-major, which saves a fifth of
+    the time.
+
+    Attributes:
+        means: [N, 3].
+        covariances: [N, 6] xx, xy, xz, yy, yz, zz.
+        opacities: [N].
+        colours: [N, 3] of SH degree 0.
+        areas: [N], see above.
+    """
 
     means: NDArray[np.float64]
     covariances: NDArray[np.float64]
@@ -66,32 +74,35 @@ class Moments:
         )
 
     def shapes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(quaternions [N, 4], log_scales [N, 3])."""
+        """(quaternions [N, 4], log_scales [N, 3]) of the covariances."""
         squares, axes = np.linalg.eigh(self.covariances[:, _WHERE])
         axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-        least = np.maximum(squares[:, 2:] * 1e-14, 1e-60)  # what rounding leaves of a flat one
+        least = np.maximum(squares[:, 2:] * 1e-14, 1e-60)  # rounding error of a flat splat
         return quaternions_of(axes), 0.5 * np.log(np.maximum(squares, least))
 
 
 def areas_of(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N] of covariances [N, 6]."""
+    """[N] areas of covariances [N, 6]."""
     xx, xy, xz, yy, yz, zz = covariances.T
     squares = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
     return np.asarray(np.sqrt(np.maximum(squares, 1e-120)))
 
 
-def merged(a: Moments, b: Moments) -> tuple[Moments, NDArray[np.float64]]:
-    """(the pairs as one each, a's share of the mass [N]).
+def merge(a: Moments, b: Moments) -> tuple[Moments, NDArray[np.float64]]:
+    """Merge each splat of `a` with the one of `b` in the same row.
 
-    What the two hide of each other is taken off the mass. A mass that would need an opacity above
-    what is drawn makes the splat larger instead: seen from afar it covers as much as both did.
+    The mass is reduced by the overlap of the two, which hide each other there. A mass that would
+    need an opacity above ALPHA_MAX enlarges the splat instead: from afar it then covers as much as
+    both did.
+
+    Returns (the merged splats, a's share of the mass [N]).
     """
     share = a.masses / (a.masses + b.masses)
     means, covariances = _mixed(a, b, share)
     spread = (a.covariances + b.covariances)[:, _DIAGONAL].sum(axis=1) / 3
     apart = np.square(a.means - b.means).sum(axis=1) / np.maximum(spread, 1e-60)
     both = a.opacities * b.opacities * np.minimum(a.areas, b.areas) * np.exp(-0.5 * apart)
-    # two equal Gaussians on one place have half of one's area in common
+    # two equal Gaussians at one place share half of the area of one
     opacities = (a.masses + b.masses - 0.5 * both) / areas_of(covariances)
     over = np.maximum(opacities / ALPHA_MAX, 1.0)
     covariances *= over[:, None]
@@ -101,22 +112,24 @@ def merged(a: Moments, b: Moments) -> tuple[Moments, NDArray[np.float64]]:
     return Moments(means, covariances, opacities, colours, areas_of(covariances)), share
 
 
-def costs(
+def merge_costs(
     a: Moments, b: Moments, weight_a: NDArray[np.float64], weight_b: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[N] squared error that each pair as one brings, weights being what is seen of each (its mass,
-    or summed over the pixels of photographs): Ward's criterion on colours, and on shapes."""
+    """[N] squared error of merging each pair: Ward's criterion on colours and on shapes.
+
+    weight_a, weight_b [N]: the visibility of each splat: its mass, or its contribution to views.
+    """
     _, covariances = _mixed(a, b, a.masses / (a.masses + b.masses))
     grown = np.square(areas_of(covariances) / (a.areas + b.areas))
     differ = np.square(a.colours - b.colours).sum(axis=1)
     together = weight_a * weight_b / (weight_a + weight_b)
-    return np.asarray(together * (differ + _SHAPE * grown))
+    return np.asarray(together * (differ + _SHAPE_WEIGHT * grown))
 
 
 def _mixed(
     a: Moments, b: Moments, share: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(means, covariances) of both together."""
+    """(means, covariances) of the mixture of each pair. share [N]: a's share of the mass."""
     apart = (b.means - a.means).T
     spread = share * (1 - share) * apart[_I] * apart[_J]
     covariances = share * a.covariances.T + (1 - share) * b.covariances.T + spread

@@ -1,10 +1,10 @@
-"""What each word of a chain does. All are checked before the first begins."""
+"""The operations of `splat edit`. All are checked before the first one runs."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,112 +13,107 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.base.atomic import partial_prefix
 from stages.base.errors import Family, SplatError
-from stages.editing import expression, regions, transform
-from stages.editing.decimate import FAR, NEAR, decimated
-from stages.editing.joining import joined
-from stages.editing.scene import Edited
+from stages.editing import expression, levels, regions, transform
+from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
+from stages.editing.scene import EditedScene
 from stages.editing.syntax import OPERATIONS, ParsedOperation
 from stages.editing.transform import Similarity
-from stages.formats.rows import chosen, kept_rows
-from stages.measure import floaters
-from stages.measure.contribution import floaters as hanging
+from stages.formats.values import concatenate, drop_undrawable, select_rows
+from stages.measure.floaters import isolated_splats, near_camera_floaters
 from stages.scene import Splats
 
-Operation = Callable[[Edited], Edited]
+Operation = Callable[[EditedScene], EditedScene]
 _AXES = {"x": (1.0, 0, 0), "y": (0, 1.0, 0), "z": (0, 0, 1.0)}
-_TRIES = 8  # to meet a size: one or two are enough where bytes grow with splats
-_SPARE = 0.995
+_ATTEMPTS = 8  # to meet a size: one or two are enough where bytes grow with splats
+_SAFETY = 0.995
 
 
 @dataclass(frozen=True)
-class Done:
-    """One operation that was done. before, after: how many splats."""
+class AppliedOperation:
+    """One operation that was applied. before, after: the numbers of splats."""
 
-    typed: ParsedOperation
+    parsed: ParsedOperation
     before: int
     after: int
-    scene: Edited
+    scene: EditedScene
 
 
-def prepared(
-    typed: Sequence[ParsedOperation], target: Path
+def prepare_operations(
+    parsed: Sequence[ParsedOperation], target: Path
 ) -> list[tuple[ParsedOperation, Operation]]:
-    """What to do; `target`: the file that comes of it. Raises SplatError for whatever of it is
-    wrong, files that are named included."""
-    return [(one, _prepared(one, target)) for one in typed]
+    """Check all operations before the first one runs. target: the file to be written, which
+    `max-mb` measures. Raises SplatError for wrong values and unreadable files."""
+    return [(one, _prepare(one, target)) for one in parsed]
 
 
-def done(scene: Edited, chain: Sequence[tuple[ParsedOperation, Operation]]) -> Iterator[Done]:
-    """One operation after the other. Raises SplatError "edit-nothing-left"."""
-    for typed, operation in chain:
+def apply_operations(
+    scene: EditedScene, chain: Sequence[tuple[ParsedOperation, Operation]]
+) -> Iterator[AppliedOperation]:
+    """Apply one operation after the other. Raises SplatError "edit-nothing-left"."""
+    for parsed, operation in chain:
         before = len(scene.splats)
         scene = operation(scene)
         if before and not len(scene.splats):
             raise SplatError(
                 "edit-nothing-left",
-                given=f"{typed} leaves none of {before:,} splats.",
-                wanted="At least one.",
-                hint="`splat info` tells the bounds, sizes and opacities of a file.",
+                given=f"{parsed} removes all {before:,} splats.",
+                wanted="At least one splat that remains.",
+                hint="`splat info` prints the bounds, sizes and opacities of a file.",
                 family=Family.USAGE,
             )
-        yield Done(typed, before, len(scene.splats), scene)
+        yield AppliedOperation(parsed, before, len(scene.splats), scene)
 
 
-def without_undrawable(splats: Splats) -> Splats:
-    """Those that a viewer can draw: what operations may count on."""
-    return kept_rows(splats)[0]
-
-
-def _prepared(typed: ParsedOperation, target: Path) -> Operation:
-    value = typed.value
-    match typed.word:
+def _prepare(parsed: ParsedOperation, target: Path) -> Operation:
+    value = parsed.value
+    match parsed.name:
         case "crop":
-            return _selecting(regions.parsed(value).holds)
+            return _keeping(regions.parse_region(value).contains)
         case "drop":
-            inside = regions.parsed(value).holds
-            return _selecting(lambda splats: ~inside(splats))
+            contains = regions.parse_region(value).contains
+            return _keeping(lambda splats: ~contains(splats))
         case "keep":
-            return _selecting(expression.parsed(value).holds)
+            return _keeping(expression.parse_expression(value).evaluate)
         case "drop-floaters":
             return _without_floaters
         case "rotate":
-            return _placing(Similarity(rotation=_rotation(typed)))
+            return _transforming(Similarity(rotation=_rotation(parsed)))
         case "scale":
-            return _placing(Similarity(scale=_number(typed, 1e-9, 1e9)))
+            return _transforming(Similarity(scale=_number(parsed, 1e-9, 1e9)))
         case "move":
-            return _placing(Similarity(offset=_vector(typed, value)))
+            return _transforming(Similarity(offset=_vector(parsed, value)))
         case "up":
-            return _placing(Similarity(rotation=transform.upright(_direction(typed, value))))
+            up = _direction(parsed, value)
+            return _transforming(Similarity(rotation=transform.rotation_to_up(up)))
         case "merge":
             return _merging(Path(value))
         case "degree":
-            degree = int(_number(typed, 0, 3, whole=True))
-            return lambda scene: scene.but(_of_degree(scene.splats, degree))
+            degree = int(_number(parsed, 0, 3, whole=True))
+            return lambda scene: scene.with_splats(
+                scene.splats.with_sh_degree(min(degree, scene.splats.sh_degree))
+            )
         case "decimate":
-            return _decimating(typed)
+            return _decimating(parsed)
         case "max-mb":
-            return _fitting(_number(typed, 1e-6, 1e9) * 1e6, target)
-    raise AssertionError(typed.word)
+            return _limiting_size(_number(parsed, 1e-6, 1e9) * 1e6, target)
+    raise AssertionError(parsed.name)
 
 
-def _selecting(holds: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
-    return lambda scene: scene.but(chosen(scene.splats, holds(scene.splats)))
+def _keeping(condition: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
+    return lambda scene: scene.with_splats(select_rows(scene.splats, condition(scene.splats)))
 
 
-def _of_degree(splats: Splats, degree: int) -> Splats:
-    return splats.with_sh_degree(min(degree, splats.sh_degree))
+def _transforming(similarity: Similarity) -> Operation:
+    return lambda scene: scene.transformed(similarity)
 
 
-def _placing(where: Similarity) -> Operation:
-    return lambda scene: scene.placed(where)
-
-
-def _without_floaters(scene: Edited) -> Edited:
-    if len(scene.photographs):
-        gone = hanging(scene.splats, scene.worth(), scene.cameras())
+def _without_floaters(scene: EditedScene) -> EditedScene:
+    """Floaters by their contributions where training views are known, else isolated splats."""
+    if len(scene.training_views):
+        found = near_camera_floaters(scene.splats, scene.contributions(), scene.training_cameras())
     else:
-        gone = floaters.isolated_splats(scene.splats)
-    return scene.but(chosen(scene.splats, ~gone))
+        found = isolated_splats(scene.splats)
+    return scene.with_splats(select_rows(scene.splats, ~found))
 
 
 def _merging(path: Path) -> Operation:
@@ -130,91 +125,109 @@ def _merging(path: Path) -> Operation:
             wanted="A splat file.",
             hint="Check the path.",
         )
-    return lambda scene: scene.but(joined(scene.splats, without_undrawable(formats.read(path))))
+
+    def merged(scene: EditedScene) -> EditedScene:
+        return scene.with_splats(join(scene.splats, drop_undrawable(formats.read(path))[0]))
+
+    return merged
 
 
-def fewer(scene: Edited, count: int) -> Splats:
-    """By what photographs say where they are known, else by shape and colour."""
-    if len(scene.photographs):
-        return decimated(scene.splats, count, FAR, scene.appraise)
-    return decimated(scene.splats, count, NEAR)
+def join(first: Splats, second: Splats) -> Splats:
+    """Both in one, in the frame and with the draw settings of `first`, at the higher SH degree.
+    The origins of both are in the coordinates of the capture."""
+    means = (second.means + (second.origin - first.origin)).astype(first.means.dtype)
+    both = concatenate([first, replace(second, means=means)])
+    return replace(both, origin=first.origin, draw_settings=first.draw_settings)
 
 
-def _decimating(typed: ParsedOperation) -> Operation:
-    if typed.value.endswith("%"):
-        part = _number(ParsedOperation(typed.word, typed.value[:-1]), 1e-6, 100) / 100
-        return lambda scene: scene.but(fewer(scene, round(part * len(scene.splats))))
-    count = int(_number(typed, 1, 1e9, whole=True))
-    return lambda scene: scene.but(fewer(scene, count))
+def decimate_scene(scene: EditedScene, count: int) -> Splats:
+    """At most `count` splats: by their contributions where training views are known, else by shape
+    and colour."""
+    if len(scene.training_views):
+        return decimate(scene.splats, count, FAR_ROUND_SHARE, scene.removal_costs)
+    return decimate(scene.splats, count, NEAR_ROUND_SHARE)
 
 
-def _fitting(most: float, target: Path) -> Operation:
-    """At most so many bytes of `target`, measured on files that are really written."""
+def _decimating(parsed: ParsedOperation) -> Operation:
+    if parsed.value.endswith("%"):
+        part = _number(ParsedOperation(parsed.name, parsed.value[:-1]), 1e-6, 100) / 100
+        return lambda scene: scene.with_splats(
+            decimate_scene(scene, round(part * len(scene.splats)))
+        )
+    count = int(_number(parsed, 1, 1e9, whole=True))
+    return lambda scene: scene.with_splats(decimate_scene(scene, count))
+
+
+def _limiting_size(max_bytes: float, target: Path) -> Operation:
+    """Decimate until `target` takes at most `max_bytes`, measured on written files."""
     row = formats.format_of(target)
 
-    def size_bytes(scene: Edited) -> int:
+    def size_bytes(scene: EditedScene) -> int:
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=partial_prefix()) as folder:
-            path = Path(folder) / row.name("scene")
-            formats.write(path, scene.splats, units=scene.units, views=scene.views_there())
+            path = Path(folder) / row.file_name("scene")
+            levels.write(path, scene.splats, units=scene.units, views=scene.placed_views())
             return row.size_bytes(path)
 
-    def fitted(scene: Edited) -> Edited:
-        for _ in range(_TRIES):
+    def limited(scene: EditedScene) -> EditedScene:
+        for _ in range(_ATTEMPTS):
             size, count = size_bytes(scene), len(scene.splats)
-            if size <= most:
+            if size <= max_bytes:
                 return scene
             if count == 1:
                 break
-            scene = scene.but(fewer(scene, int(_SPARE * count * most / size)))
+            scene = scene.with_splats(
+                decimate_scene(scene, int(_SAFETY * count * max_bytes / size))
+            )
         raise SplatError(
             "edit-too-small",
-            given=f"--max-mb {most / 1e6:g} is less than {count:,} splats take as .{row.ending}.",
+            given=f"--max-mb {max_bytes / 1e6:g} is less than {count:,} splats "
+            f"need as .{row.ending}.",
             wanted=f"At least {np.ceil(size / 1e4) / 100:g}.",
             hint="Ask for more megabytes, or for another format.",
             family=Family.USAGE,
         )
 
-    return fitted
+    return limited
 
 
-def _rotation(typed: ParsedOperation) -> NDArray[np.float64]:
-    axis, _, degrees = typed.value.rpartition(":")
-    angle = regions.numbers(degrees, 1)
+def _rotation(parsed: ParsedOperation) -> NDArray[np.float64]:
+    axis, _, degrees = parsed.value.rpartition(":")
+    angle = regions.parse_numbers(degrees, 1)
     if angle is None:
-        raise _wrong(typed)
-    return transform.about(_direction(typed, axis), float(angle[0]))
+        raise _wrong(parsed)
+    return transform.rotation_about(_direction(parsed, axis), float(angle[0]))
 
 
-def _direction(typed: ParsedOperation, text: str) -> NDArray[np.float64]:
-    """[3] of +x, -y, z, or three numbers; never of length 0."""
+def _direction(parsed: ParsedOperation, text: str) -> NDArray[np.float64]:
+    """[3] a unit vector from +x, -y, z, or three numbers."""
     if text[-1:] in _AXES and text[:-1] in ("", "+", "-"):
         return np.array(_AXES[text[-1]]) * (-1.0 if text[0] == "-" else 1.0)
-    found = _vector(typed, text)
+    found = _vector(parsed, text)
     length = np.linalg.norm(found)
     if not 0 < length < np.inf:
-        raise _wrong(typed)
+        raise _wrong(parsed)
     return np.asarray(found / length)
 
 
-def _vector(typed: ParsedOperation, text: str) -> NDArray[np.float64]:
-    found = regions.numbers(text, 3)
+def _vector(parsed: ParsedOperation, text: str) -> NDArray[np.float64]:
+    found = regions.parse_numbers(text, 3)
     if found is None:
-        raise _wrong(typed)
+        raise _wrong(parsed)
     return found
 
 
-def _number(typed: ParsedOperation, low: float, high: float, whole: bool = False) -> float:
-    found = regions.numbers(typed.value, 1)
+def _number(parsed: ParsedOperation, low: float, high: float, whole: bool = False) -> float:
+    found = regions.parse_numbers(parsed.value, 1)
     if found is None or not low <= found[0] <= high or (whole and found[0] != int(found[0])):
-        raise _wrong(typed, f" from {low:g} to {high:g}")
+        raise _wrong(parsed, f" from {low:g} to {high:g}")
     return float(found[0])
 
 
-def _wrong(typed: ParsedOperation, bounds: str = "") -> SplatError:
+def _wrong(parsed: ParsedOperation, bounds: str = "") -> SplatError:
     return SplatError(
-        f"edit-{typed.word}",
-        given=f"{typed} is not understood.",
-        wanted=f"--{typed.word} {OPERATIONS[typed.word].takes}{bounds}.",
-        hint=OPERATIONS[typed.word].help,
+        f"edit-{parsed.name}",
+        given=f"{parsed} has a value that is not understood.",
+        wanted=f"--{parsed.name} {OPERATIONS[parsed.name].takes}{bounds}.",
+        hint=OPERATIONS[parsed.name].help,
         family=Family.USAGE,
     )

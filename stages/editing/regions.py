@@ -1,4 +1,4 @@
-"""Parts of space: a box, a ball, what lies between given points, or within a lasso."""
+"""Regions of space: a box, a sphere, the convex hull of points, or a lasso."""
 
 from __future__ import annotations
 
@@ -10,65 +10,65 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, Kind, reading
-from stages.base.blocks import passing
+from stages.base.bad_files import BadFileError, FileKind, reading
+from stages.base.blocks import reported_blocks
 from stages.base.errors import Family, SplatError
 from stages.scene import Splats
 
 Inside = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points [M, 3] -> [M]
-_HULL = Kind(
+_HULL = FileKind(
     "edit-hull-unreadable",
     "the points of a hull",
     "A .json with a list of [x, y, z], or a .ply with vertices; at least four, not in one plane.",
     "Write the corners down, or save them as points from another program.",
 )
 _CELLS = 1 << 22  # point x face, of one block
-_VIEW = 12  # numbers of a lasso that say from where it was drawn
+_VIEW = 12  # numbers of a lasso that hold its camera
 
 
 @dataclass(frozen=True)
 class Region:
-    """inside: which points lie in it, its rim included."""
+    """inside: which points [M, 3] lie in the region, its boundary included."""
 
     inside: Inside
 
-    def holds(self, splats: Splats) -> NDArray[np.bool_]:
-        """[N] whose centres lie inside."""
+    def contains(self, splats: Splats) -> NDArray[np.bool_]:
+        """[N] whether the centre of each splat lies inside."""
         found = np.empty(len(splats), bool)
-        for rows in passing(len(splats)):
+        for rows in reported_blocks(len(splats)):
             found[rows] = self.inside(splats.means[rows].astype(np.float64))
         return found
 
 
-def parsed(text: str) -> Region:
-    """Of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or `lasso:...`, as the page of
-    `splat view` writes it. Raises SplatError "edit-region", "edit-hull-unreadable"."""
+def parse_region(text: str) -> Region:
+    """The region of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or `lasso:...`, which
+    the page of `splat view` writes. Raises SplatError "edit-region", "edit-hull-unreadable"."""
     kind, _, rest = text.partition(":")
-    if kind == "box" and (ends := numbers(rest, 6)) is not None:
+    if kind == "box" and (ends := parse_numbers(rest, 6)) is not None:
         low, high = ends[:3], ends[3:]
         if (low <= high).all():
             return Region(lambda at: np.asarray(((at >= low) & (at <= high)).all(axis=1)))
-    if kind == "sphere" and (ball := numbers(rest, 4)) is not None and ball[3] > 0:
+    if kind == "sphere" and (ball := parse_numbers(rest, 4)) is not None and ball[3] > 0:
         middle, radius = ball[:3], ball[3]
         return Region(lambda at: np.asarray(np.linalg.norm(at - middle, axis=1) <= radius))
     if kind == "hull" and rest:
         return Region(_inside_hull(Path(rest)))
-    if kind == "lasso" and (drawn := numbers(rest, rest.count(",") + 1)) is not None:
+    if kind == "lasso" and (drawn := parse_numbers(rest, rest.count(",") + 1)) is not None:
         view, corners = drawn[:_VIEW], drawn[_VIEW:]
         if len(corners) >= 6 and len(corners) % 2 == 0:
             return Region(_inside_lasso(view, corners.reshape(-1, 2)))
     raise SplatError(
         "edit-region",
-        given=f"{text[:100]!r} names no part of space.",
-        wanted="box:x0,y0,z0,x1,y1,z1 with its least corner first, sphere:x,y,z,r, hull:FILE, or "
+        given=f"{text[:100]!r} is no region of space.",
+        wanted="box:x0,y0,z0,x1,y1,z1 with its lowest corner first, sphere:x,y,z,r, hull:FILE, or "
         "lasso: and its numbers.",
-        hint="`splat info` tells the bounds of the scene; the page of `splat view` writes a lasso.",
+        hint="`splat info` prints the bounds; the page of `splat view` writes a lasso.",
         family=Family.USAGE,
     )
 
 
-def numbers(text: str, count: int) -> NDArray[np.float64] | None:
-    """[count] finite numbers between commas; None for anything else."""
+def parse_numbers(text: str, count: int) -> NDArray[np.float64] | None:
+    """[count] finite numbers separated by commas; None for any other text."""
     try:
         values = np.array([float(word) for word in text.split(",")])
     except ValueError:
@@ -103,10 +103,13 @@ def _inside_hull(path: Path) -> Inside:
 
 
 def _inside_lasso(view: NDArray[np.float64], corners: NDArray[np.float64]) -> Inside:
-    """view [12]: three rows that take (x, y, z, 1) to pixels times depth, and depth. corners
-    [K, 2]: pixels; inside is what an odd number of sides lies to the right of.
+    """Points whose projection lies inside a polygon (even-odd rule) and in front of the camera.
 
-    Added and multiplied in the order in which the page does it: to the last bit the same.
+    The operations keep the order of the page's script, so that both give the same bits.
+
+    Args:
+        view: [12] three rows that take (x, y, z, 1) to u * depth, v * depth and depth.
+        corners: [K, 2] the polygon in pixels.
     """
 
     def inside(at: NDArray[np.float64]) -> NDArray[np.bool_]:

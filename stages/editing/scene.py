@@ -1,4 +1,4 @@
-"""What operations work on: splats, and what is known of the photographs that they came from."""
+"""What operations edit: splats, and the cameras and pictures of the run that they come from."""
 
 from __future__ import annotations
 
@@ -9,80 +9,95 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.editing.decimate import Appraisal
+from stages.editing.decimate import RemovalCosts
 from stages.editing.transform import Similarity
 from stages.measure.contribution import Contributions, measure_contributions, near_view_frusta
 from stages.measure.evaluation import EvaluationView, mean_psnr_db
 from stages.raster.backends import AUTO
-from stages.scene import Splats, View
+from stages.scene import Camera, Splats, View
 
-_UNSEEN = 1e-3  # weight of what no photograph shows: the first to be merged, not all at no cost
+_UNSEEN_WEIGHT = 1e-3  # of splats that no view shows: they merge first, but not at zero cost
 
 
 @dataclass(frozen=True)
-class Edited:
-    """splats. units: "metres" or "arbitrary". photographs: of training, where they are known, and
-    judges: held out, or training again; views: the capture's cameras; moved: where all three are
-    now. backend: what draws."""
+class EditedScene:
+    """Splats and what is known about them.
+
+    Attributes:
+        splats: as they are after the operations so far.
+        units: "metres" or "arbitrary".
+        training_views: views that the splats were trained on; empty where they are not known.
+        held_out_views: views for the PSNR; the training views where none are held out.
+        views: the cameras of the capture.
+        placement: where the operations have moved the scene. The views above are those of the
+            capture; they see the splats after this transform.
+        backend: the rasteriser.
+    """
 
     splats: Splats
     units: str = "arbitrary"
-    photographs: Sequence[EvaluationView] = ()
-    judges: Sequence[EvaluationView] = ()
+    training_views: Sequence[EvaluationView] = ()
+    held_out_views: Sequence[EvaluationView] = ()
     views: tuple[View, ...] = ()
-    moved: Similarity = field(default_factory=Similarity)
+    placement: Similarity = field(default_factory=Similarity)
     backend: str = AUTO
 
-    def but(self, splats: Splats) -> Edited:
-        """The same with other splats."""
+    def with_splats(self, splats: Splats) -> EditedScene:
+        """The same scene with other splats."""
         return replace(self, splats=splats)
 
-    def placed(self, where: Similarity) -> Edited:
-        """All of it somewhere else. Metres times anything but 1 are no metres."""
-        there = where.of_splats(self.splats)
-        # what `of_splats` put into the origin, the cameras do not move
-        shift = there.origin - where.scale * where.rotation @ self.splats.origin
-        moved = replace(where, offset=where.offset - shift).after(self.moved)
-        units = self.units if where.scale == 1 else "arbitrary"
-        return replace(self, splats=there, moved=moved, units=units)
+    def transformed(self, transform: Similarity) -> EditedScene:
+        """The scene after `transform`. Its units are arbitrary if the scale is not 1."""
+        splats = transform.apply_to_splats(self.splats)
+        # The cameras do not move by what `apply_to_splats` put into the origin.
+        shift = splats.origin - transform.scale * transform.rotation @ self.splats.origin
+        placement = replace(transform, offset=transform.offset - shift).after(self.placement)
+        units = self.units if transform.scale == 1 else "arbitrary"
+        return replace(self, splats=splats, placement=placement, units=units)
 
     def psnr_db(self) -> float | None:
-        """Mean PSNR of the photographs that judge; None where none are known."""
-        if not len(self.judges):
+        """Mean PSNR of the held-out views; None where there are none."""
+        if not len(self.held_out_views):
             return None
-        return mean_psnr_db(self.splats, _Moved(self.judges, self.moved), self.backend)
+        views = _PlacedViews(self.held_out_views, self.placement)
+        return mean_psnr_db(self.splats, views, self.backend)
 
-    def views_there(self) -> tuple[View, ...]:
-        return tuple(replace(v, camera=self.moved.of_camera(v.camera)) for v in self.views)
+    def placed_views(self) -> tuple[View, ...]:
+        """The cameras of the capture in the edited scene."""
+        place = self.placement.apply_to_camera
+        return tuple(replace(view, camera=place(view.camera)) for view in self.views)
 
-    def worth(self) -> Contributions:
-        """Of each splat to the photographs of training; there must be some."""
-        return measure_contributions(
-            self.splats, _Moved(self.photographs, self.moved), self.backend
-        )
+    def training_cameras(self) -> list[Camera]:
+        """The cameras of the training views in the edited scene."""
+        return [self.placement.apply_to_camera(view.camera) for view in self.training_views]
 
-    def appraise(self, splats: Splats) -> Appraisal:
-        """Squared error, and nothing beyond a picture's rim is left out that the next view would
-        show. Not the change of the pictures, as pruning has it: there the splats that stay learn
-        on, here they do not. The sample's 31,741 at a half are 22.1 dB held out by error, 21.6 by
-        change."""
-        worth = self.but(splats).worth()
-        unseen = (worth.photographs == 0) & near_view_frusta(splats, self.cameras())
-        alone: NDArray[np.float64] = np.where(unseen, np.inf, worth.sse_change)
-        return Appraisal(worth.weight + _UNSEEN, alone)
+    def contributions(self) -> Contributions:
+        """The contribution of each splat to the training views, of which there must be some."""
+        views = _PlacedViews(self.training_views, self.placement)
+        return measure_contributions(self.splats, views, self.backend)
 
-    def cameras(self) -> list:  # type: ignore[type-arg]
-        return [photograph.camera for photograph in _Moved(self.photographs, self.moved)]
+    def removal_costs(self, splats: Splats) -> RemovalCosts:
+        """The squared error in the training views that removing each of `splats` causes.
+
+        Splats just outside the pictures must stay, because a neighbouring view would show them.
+        Pruning ranks by the change of the pictures instead: there the splats that stay are trained
+        further, here they are not. Of the sample's 31,741 splats, half are worth 22.1 dB held out
+        if chosen by error, and 21.6 dB if chosen by change.
+        """
+        found = self.with_splats(splats).contributions()
+        unseen = (found.view_counts == 0) & near_view_frusta(splats, self.training_cameras())
+        costs: NDArray[np.float64] = np.where(unseen, np.inf, found.sse_change)
+        return RemovalCosts(found.weight + _UNSEEN_WEIGHT, costs)
 
 
-class _Moved(Sequence[EvaluationView]):
-    """Photographs taken elsewhere; read when they are wanted."""
+class _PlacedViews(Sequence[EvaluationView]):
+    """Views with transformed cameras; each is read when it is used."""
 
-    def __init__(self, photographs: Sequence[EvaluationView], where: Similarity) -> None:
-        self._photographs, self._where = photographs, where
+    def __init__(self, views: Sequence[EvaluationView], placement: Similarity) -> None:
+        self._views, self._placement = views, placement
 
     def __len__(self) -> int:
-        return len(self._photographs)
+        return len(self._views)
 
     @overload
     def __getitem__(self, number: int) -> EvaluationView: ...
@@ -91,5 +106,5 @@ class _Moved(Sequence[EvaluationView]):
     def __getitem__(self, number: int | slice) -> EvaluationView | Sequence[EvaluationView]:
         if isinstance(number, slice):
             return [self[i] for i in range(len(self))[number]]
-        photograph = self._photographs[number]
-        return replace(photograph, camera=self._where.of_camera(photograph.camera))
+        view = self._views[number]
+        return replace(view, camera=self._placement.apply_to_camera(view.camera))

@@ -1,6 +1,6 @@
-"""The words of a chain of operations: on the command line, and in a file, one a line.
+"""The syntax of operations: on the command line, and in a file with one operation a line.
 
-A new operation: a row in `WORDS`, and what it does in `operations`.
+To add an operation, add a row to `OPERATIONS` and a case to `operations.prepare`.
 """
 
 from __future__ import annotations
@@ -15,84 +15,87 @@ from stages.base.errors import Family, SplatError
 
 @dataclass(frozen=True)
 class OperationSyntax:
-    """name: as typed, behind two dashes. takes: what its value looks like, "" if it takes none."""
+    """One operation.
+
+    Attributes:
+        name: as typed after two dashes.
+        takes: the form of its value; "" if it takes none.
+        help: one sentence for the command line.
+    """
 
     name: str
     takes: str
     help: str
 
 
+_REGION = "box:...|sphere:...|hull:FILE|lasso:..."
 OPERATIONS = {
-    word.name: word
-    for word in (
-        OperationSyntax("crop", "box:...|sphere:...|hull:FILE|lasso:...", "Keep what lies inside."),
-        OperationSyntax(
-            "drop", "box:...|sphere:...|hull:FILE|lasso:...", "Leave out what lies inside."
-        ),
+    operation.name: operation
+    for operation in (
+        OperationSyntax("crop", _REGION, "Keep the splats inside a region."),
+        OperationSyntax("drop", _REGION, "Remove the splats inside a region."),
         OperationSyntax(
             "keep", "CONDITION", "Keep where it is true: 'opacity > 0.1 and scale < 0.5'."
         ),
-        OperationSyntax("drop-floaters", "", "Leave out what hangs in empty space."),
-        OperationSyntax("rotate", "AXIS:DEGREES", "Turn about the origin: x:90, or 0,1,1:30."),
-        OperationSyntax("scale", "X", "Enlarge about the origin."),
+        OperationSyntax("drop-floaters", "", "Remove floaters: splats in free space."),
+        OperationSyntax("rotate", "AXIS:DEGREES", "Rotate about the origin: x:90, or 0,1,1:30."),
+        OperationSyntax("scale", "X", "Scale about the origin."),
         OperationSyntax("move", "X,Y,Z", "Move."),
         OperationSyntax(
-            "up", "AXIS", "Turn what points there upward: -y as it is, +z, or 0,-1,0.1."
+            "up", "AXIS", "Rotate so that this axis points up: -y as it is, +z, or 0,-1,0.1."
         ),
         OperationSyntax("merge", "FILE", "Add the splats of another file."),
-        OperationSyntax("degree", "N", "View-dependent colour of this degree at most, 0 to 3."),
-        OperationSyntax("decimate", "N", "At most so many splats, or 25%: neighbours become one."),
-        OperationSyntax(
-            "max-mb", "MB", "As many splats as fit into the file: neighbours become one."
-        ),
+        OperationSyntax("degree", "N", "Limit the SH degree, 0 to 3."),
+        OperationSyntax("decimate", "N", "Merge neighbours until N splats remain, or 25%."),
+        OperationSyntax("max-mb", "MB", "Merge neighbours until the file is this small."),
     )
 }
 
 
 @dataclass(frozen=True)
 class ParsedOperation:
-    """One operation as it was asked for."""
+    """One operation with its value."""
 
-    word: str
+    name: str
     value: str = ""
 
     def __str__(self) -> str:
-        return f"--{self.word} {self.value}".rstrip()
+        return f"--{self.name} {self.value}".rstrip()
 
 
 def parse_file(path: Path) -> list[ParsedOperation]:
-    """The operations of a text file: one a line, dashes before it or not, quotes around its value
-    or not; # begins a remark. Raises SplatError "edit-ops"."""
+    """The operations of a text file, one a line. Leading dashes and quotes around the value are
+    optional; # begins a comment. Raises SplatError "edit-ops"."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
-        raise _wrong(f"{path} cannot be read: {reason}.") from error
-    found = []
+        raise _invalid(f"{path} cannot be read: {reason}.") from error
+    operations = []
     for number, line in enumerate(lines, 1):
         line = re.sub(r"(^|\s)#.*", "", line).strip()
         if line:
-            found.append(_of_line(line, f"{path}, line {number}"))
-    return found
+            operations.append(_parse_line(line, f"{path}, line {number}"))
+    return operations
 
 
-def _of_line(line: str, where: str) -> ParsedOperation:
-    word, value = re.fullmatch(r"(?:--)?([^\s=]*)[\s=]*(.*)", line).groups()  # type: ignore[union-attr]
-    if word not in OPERATIONS:
-        raise _wrong(f"{where}: {word[:40]!r} is no operation.")
+def _parse_line(line: str, where: str) -> ParsedOperation:
+    name, value = re.fullmatch(r"(?:--)?([^\s=]*)[\s=]*(.*)", line).groups()  # type: ignore[union-attr]
+    if name not in OPERATIONS:
+        raise _invalid(f"{where}: {name[:40]!r} is no operation.")
     if value[:1] in ("'", '"') and value[-1] == value[0] and len(value) > 1:
         value = value[1:-1]
-    if bool(value) != bool(OPERATIONS[word].takes):
-        raise _wrong(f"{where}: {word} takes {OPERATIONS[word].takes or 'no value'}.")
-    return ParsedOperation(word, value)
+    if bool(value) != bool(OPERATIONS[name].takes):
+        raise _invalid(f"{where}: {name} takes {OPERATIONS[name].takes or 'no value'}.")
+    return ParsedOperation(name, value)
 
 
-def as_text(operations: Iterable[ParsedOperation]) -> str:
-    """What `from_file` reads."""
-    return "".join(f"{typed.word} {typed.value}".rstrip() + "\n" for typed in operations)
+def format_operations(operations: Iterable[ParsedOperation]) -> str:
+    """The text that `parse_file` reads."""
+    return "".join(f"{one.name} {one.value}".rstrip() + "\n" for one in operations)
 
 
-def _wrong(given: str) -> SplatError:
+def _invalid(given: str) -> SplatError:
     return SplatError(
         "edit-ops",
         given=given,

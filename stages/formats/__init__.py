@@ -1,30 +1,32 @@
-"""Files of splats: one table of formats, one or two modules each, read and write, nothing else.
+"""Splat files: one table of formats, and one or two modules for each that read and write it.
 
-`write` takes splats in our own conventions (y down, ln scales, logit opacity) and `read` gives
-them back so; each format's own axes and units of measure stay inside its module.
+`write` takes splats in our conventions (y down, ln scales, logit opacities) and `read` returns
+them so. The axes and encodings of a format stay inside its module.
 
-A new format, in five steps:
-1. A module here with `write(path, splats, *, units)`, which writes by `base.atomic.replacing` what
-   `rows.kept_rows` leaves, a block at a time by `base.blocks.passing`, and says how many it left
-   out.
-2. In the same module, or in one beside it if it grows, `read(path)`: its work inside
-   `base.bad_files.reading`, its result through `rows.checked`.
-3. A second reader, of a library that we did not write or of raw bytes, and an anatomy: in `proof`.
-   What each takes and gives is said at `table.Format`.
-4. A row in `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the fuzzer
-   and the tests of every format know it from then on.
-5. README's table: `pytest tests/formats/test_table.py` prints the line that is missing.
+To add a format, in six steps:
+1. Write `write(path, splats, *, units)` in a module here. It writes what `values.drop_undrawable`
+   leaves through `base.atomic.replacing`, one block of `base.blocks.reported_blocks` at a time, and
+   returns how many splats it left out.
+2. Write `read(path)` in the same module, or in one beside it. It works inside
+   `base.bad_files.reading` and returns its result through `values.check_finite`.
+3. Add a row to `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the
+   fuzzer and the tests of all formats are driven by this table.
+4. Write an independent reader (of a library, or of raw bytes) and a byte breakdown in
+   `stages.proof`, and add their row to `stages.proof.checks.CHECKS`.
+5. Run `python -m tests.docs_tables`, which writes the tables of the documentation.
+6. Run `pytest tests/formats tests/proof tests/fuzz`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.atomic import clear_left
+from stages.base.atomic import remove_abandoned_files
 from stages.base.lazy import load_object
-from stages.formats.table import BY_ENDING, FORMATS, MESHES, TABLE, ByteBreakdown, Format, format_of
+from stages.formats.table import BY_ENDING, FORMATS, Format, format_of
 from stages.formats.units import units_of
 
 if TYPE_CHECKING:
@@ -33,9 +35,6 @@ if TYPE_CHECKING:
 __all__ = [
     "BY_ENDING",
     "FORMATS",
-    "MESHES",
-    "TABLE",
-    "ByteBreakdown",
     "Format",
     "format_of",
     "read",
@@ -45,18 +44,30 @@ __all__ = [
 
 
 def write(
-    path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
+    path: Path,
+    splats: Splats,
+    *,
+    units: str = "arbitrary",
+    views: tuple[View, ...] = (),
+    coarser: Sequence[Splats] = (),
 ) -> int:
-    """Write `splats` in the format that the suffix of `path` names, whole or not at all; return
-    how many could not be drawn (values not finite, or too large) and were left out.
+    """Write `splats` in the format that the suffix of `path` stands for, completely or not at all.
 
-    units: "metres" or "arbitrary", noted in the formats that can carry it.
-    views: cameras in the frame of `splats.means` to look from, for the formats that show them.
+    Args:
+        path: the file to write.
+        splats: in our conventions: y down, ln scales, logit opacities.
+        units: "metres" or "arbitrary", noted in the formats that can hold it.
+        views: cameras in the frame of `splats.means`, for the formats that hold cameras.
+        coarser: coarser levels of detail, finest first, for the formats that hold levels.
+
+    Returns how many splats could not be drawn (values not finite, or too large) and were left out.
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
     row = format_of(path)
-    clear_left(Path(path).parent)
-    more: dict[str, Any] = {"views": views} if row.wants_views else {}
+    remove_abandoned_files(Path(path).parent)
+    more: dict[str, Any] = {"views": views} if row.takes_views else {}
+    if row.streamed:
+        more["coarser"] = coarser
     dropped: int = load_object(row.writer)(Path(path), splats, units=units, **more)
     return dropped
 
@@ -67,9 +78,9 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError as
     `format_of`, or "splats-unreadable".
     """
-    from stages.formats.rows import damage_kept
+    from stages.formats.values import nonfinite_allowed
 
     reader = load_object(format_of(path).reader)
-    with nullcontext() if strict else damage_kept():
+    with nullcontext() if strict else nonfinite_allowed():
         splats: Splats = reader(Path(path))
     return splats

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.formats.rows import unit_quaternions
+from stages.formats.values import unit_quaternions
 from stages.scene import Splats
 from stages.scene.rotations import matrices_of
 
 
-def least_turned(splats: Splats) -> Splats:
+def smallest_rotations(splats: Splats) -> Splats:
     """The same splats, axes named so that each is turned least."""
     quaternions = np.empty((len(splats), 4), np.float32)
     log_scales = np.empty_like(splats.log_scales)

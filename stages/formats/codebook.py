@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks, passing
+from stages.base.blocks import blocks, reported_blocks
 
 SIZE = 256
 _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
@@ -16,7 +16,7 @@ _ROWS_AT_ONCE = 1 << 14
 _LOOK = 2  # times as many vectors as a palette has rows: if they all differ, it is too small
 
 
-def of_numbers(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.float64]:
+def scalar_codebook(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.float64]:
     """[size] rising: near the values [M] in the least squares sense; all of them if few."""
     ordered = np.sort(values, axis=None)
     new = np.ones(len(ordered), bool)
@@ -67,7 +67,7 @@ def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDAr
     return indices
 
 
-def of_vectors(
+def vector_palette(
     vectors: NDArray[np.float32], size: int, seed: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """(palette [at most `size`, D], which of its rows stands for each of `vectors` [N, D]).
@@ -89,13 +89,13 @@ def of_vectors(
     sample = np.sort(rng.permutation(rows)[:_SAMPLE])
     coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)
     cluster = np.empty(len(rows), np.int32)
-    for part in passing(len(rows)):
+    for part in reported_blocks(len(rows)):
         cluster[part] = _assigned(vectors[rows[part]], coarse)
     # the rows of one cluster after the other, in their order
     rows = rows[np.argsort(cluster, kind="stable")]
     ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
     used = 1
-    for k in passing(len(coarse), 1):
+    for k in reported_blocks(len(coarse), 1):
         members = rows[ends[k.start - 1] if k.start else 0 : ends[k.start]]
         if not len(members):
             continue
@@ -112,7 +112,7 @@ def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[n
     """(row of the first of each kind, of which kind each is), told apart by 64 bits of a sum."""
     factors = np.random.default_rng(1).integers(1, 1 << 63, vectors.shape[1], np.uint64) | 1
     sums = np.empty(len(vectors), np.uint64)
-    for rows in passing(len(vectors)):
+    for rows in reported_blocks(len(vectors)):
         bits = np.ascontiguousarray(vectors[rows] + np.float32(0)).view(np.uint32)  # -0 is 0
         sums[rows] = (bits * factors).sum(axis=1)
     _, first, which = np.unique(sums, return_index=True, return_inverse=True)

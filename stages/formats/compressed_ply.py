@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
-from stages.formats.rows import (
-    allocated,
-    checked,
-    kept_rows,
+from stages.formats.values import (
+    allocate,
+    check_finite,
+    drop_undrawable,
     linear_opacities,
     logits_of,
     unit_quaternions,
@@ -56,10 +56,10 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Positions stay relative to `splats.origin`; a comment says it. One SH degree for all, and
     coefficients within -4..4. Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
-    splats, rows = splats.with_sh_degree(degree), morton.order(splats)
-    packed = [_pack(splats.take(rows[part])) for part in passing(len(splats), _BLOCK)]
+    splats, rows = splats.with_sh_degree(degree), morton.morton_order(splats)
+    packed = [_pack(splats.take(rows[part])) for part in reported_blocks(len(splats), _BLOCK)]
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header_text(splats, degree, units))
         for part in range(3):  # all chunks, then all words, then all SH
@@ -170,13 +170,13 @@ def unpack(path: Path, header: Header) -> Splats:
         raise BadFileError("it is a compressed .ply whose words are no uint")
     rest = _rest_rows(path, header)
     degree = 0 if rest is None else math.isqrt(len(rest.dtype.names or ()) // 3 + 1) - 1
-    splats = replace(allocated(len(vertices), degree), origin=header.origin)
-    for rows in passing(len(vertices), _BLOCK):
+    splats = replace(allocate(len(vertices), degree), origin=header.origin)
+    for rows in reported_blocks(len(vertices), _BLOCK):
         chunks = ranges[rows.start // CHUNK : -(-rows.stop // CHUNK)]
         _unpack_block(splats.take(rows), vertices[rows], chunks)
         if degree and rest is not None:
             splats.sh[rows, 1:] = _rest_values(rest[rows])
-    return checked(splats)
+    return check_finite(splats)
 
 
 def _unpack_block(out: Splats, vertices: NDArray[Any], ranges: NDArray[Any]) -> None:

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
-from stages.formats.rows import (
-    kept_rows,
+from stages.formats.values import (
+    drop_undrawable,
     linear_opacities,
     linear_scales,
     unit_quaternions,
 )
 from stages.scene import Splats, dc_to_rgb
-from stages.scene.turn import SH_SIGNS, turned
+from stages.scene.flip import SH_SIGNS, flipped
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
@@ -33,16 +33,16 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 
     Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     splats = splats.with_sh_degree(int(splats.sh_degrees.max(initial=0)))
     primitives = [_attributes(splats)] if len(splats) else []
-    write_file(Path(path), primitives, turned(splats.take(slice(0))).origin, units)
+    write_file(Path(path), primitives, flipped(splats.take(slice(0))).origin, units)
     return dropped
 
 
 def _attributes(splats: Splats) -> dict[str, Attribute]:
     """splats: y down, all of one degree."""
-    upright = turned(splats.with_sh_degree(0))
+    upright = flipped(splats.with_sh_degree(0))
     opacities = linear_opacities(splats)
     colours = np.empty((len(splats), 4), "<u2")
     for rows in blocks(len(splats)):

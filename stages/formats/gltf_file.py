@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.base.distribution import VERSION
 from stages.base.errors import Family, SplatError
 
@@ -211,5 +211,5 @@ def _write_pair(path: Path, document: dict[str, Any], arrays: Sequence[Rows], si
 
 def _write_arrays(file: BinaryIO, arrays: Sequence[Rows]) -> None:
     for array in arrays:
-        for rows in passing(len(array)):
+        for rows in reported_blocks(len(array)):
             file.write(np.ascontiguousarray(array[rows]).data)

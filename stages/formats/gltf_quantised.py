@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from stages.base.blocks import blocks
 from stages.formats.gltf import fallback_colours, sh_attributes
 from stages.formats.gltf_file import EXTENSION, Attribute, write_file
-from stages.formats.rows import (
-    kept_rows,
+from stages.formats.values import (
+    drop_undrawable,
     linear_opacities,
     linear_scales,
     unit_quaternions,
 )
 from stages.scene import Splats
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
 
 _U16 = 65535
 # A step of the scales may be this part of a middling splat's size. Where a few huge splats would
@@ -42,10 +42,10 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Normalised scales end at 1, so the node enlarges them by a power of two, and positions are
     divided by it, which costs no bits. Raises SplatError as `gltf.write`.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     unit = _unit(linear_scales(splats))
     primitives = [_attributes(group, unit) for group in _groups(splats)]
-    origin = turned(splats.take(slice(0))).origin
+    origin = flipped(splats.take(slice(0))).origin
     write_file(Path(path), primitives, origin, units, node_scale=unit or 1.0)
     return dropped
 
@@ -73,7 +73,7 @@ def _unit(scales: NDArray[np.float32]) -> float | None:
 
 def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
     """splats: y down, all of one degree. unit: see `_unit`."""
-    upright = turned(splats.with_sh_degree(0))
+    upright = flipped(splats.with_sh_degree(0))
     opacities = linear_opacities(splats)
     colours = np.empty((len(splats), 4), "u1")
     for rows in blocks(len(splats)):

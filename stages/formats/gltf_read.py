@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.formats.rows import checked, joined, logits_of, logs_of
+from stages.formats.values import check_finite, concatenate, log_scales_of, logits_of
 from stages.scene import Splats
-from stages.scene.far import recentred
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
+from stages.scene.recentring import recentred
 
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {5120: "i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -55,10 +55,10 @@ def read(path: Path) -> Splats:
         origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
         if not parts and "meshes" in document:
             raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
-        splats = joined(parts)
+        splats = concatenate(parts)
         del parts
         means, origin = recentred(splats.means.astype(np.float64), origin)
-        return checked(turned(replace(splats, means=means, origin=origin), reuse=True))
+        return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
@@ -261,7 +261,7 @@ class _Source:
             # float64: `read` brings them near zero
             means=means.astype(np.float64) * move.scale + np.array(move.offset),
             quaternions=rotations[:, [3, 0, 1, 2]],
-            log_scales=logs_of(scales, move.scale),
+            log_scales=log_scales_of(scales, move.scale),
             opacity_logits=logits_of(opacities[:, 0]),
             sh=sh,
             sh_degrees=np.full(len(means), degree, np.uint8),

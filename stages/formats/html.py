@@ -16,11 +16,11 @@ from pathlib import Path
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import tell
-from stages.formats import ply, streamed_sog
+from stages.base.blocks import report_progress
+from stages.formats import ply
 from stages.formats.page import document
-from stages.formats.page.shots import shots_of
-from stages.formats.rows import kept_rows
+from stages.formats.page.cameras import page_cameras
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
 _GZIP = 31  # zlib's name for the gzip container; its header holds no time then
@@ -38,8 +38,8 @@ def write(
 
     views: cameras to look from. Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
-    shots = shots_of(views, splats)
+    splats, dropped = drop_undrawable(splats)
+    shots = page_cameras(views, splats)
     scene = document.scene_data(path.stem, splats, shots, units=units, source=path.name)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(document.head(scene).encode("utf-8"))
@@ -51,15 +51,26 @@ def write(
     return dropped
 
 
-def write_beside(content: Path, splats: Splats, units: str, views: tuple[View, ...]) -> None:
-    """The page of an asset that streams, which holds none of its splats. Raises SplatError."""
+def write_beside(
+    content: Path, splats: Splats, units: str, views: tuple[View, ...], widths: list[float]
+) -> None:
+    """Write the page of a streamed asset, which itself holds no splats.
+
+    Args:
+        content: the asset's lod-meta.json; the page lies beside it.
+        splats: the finest level, to place the cameras.
+        units, views: as for `write`.
+        widths: width of the splats of each level, see `streamed_sog.widths`.
+
+    Raises SplatError when the file cannot be written.
+    """
     scene = document.scene_data(
         content.parent.absolute().name,
-        *(splats, shots_of(views, splats)),
+        *(splats, page_cameras(views, splats)),
         units=units,
         source=content.name,
         content=content.name,
-        levels=streamed_sog.widths(content, splats),
+        levels=widths,
     )
     with replacing(content.with_suffix(".html")) as temporary:
         temporary.write_text(document.head(scene) + document.tail(), encoding="utf-8")
@@ -113,7 +124,7 @@ def unzipped(path: Path) -> Iterator[bytes]:
                 while data:
                     yield unpacker.decompress(data, _INFLATED_AT_ONCE)
                     data = unpacker.unconsumed_tail
-                    tell(page.tell(), size)
+                    report_progress(page.tell(), size)
         except (zlib.error, binascii.Error) as error:
             raise BadFileError(f"the splats in it are damaged ({error})") from error
     if not unpacker.eof:

@@ -19,7 +19,7 @@ _WINDOW_BYTES = 1 << 27  # of zstd: what its own decoders allow; every encoder's
 _EXTRA_BYTES = 1 << 20  # after the splats: extensions, which are passed over
 
 
-class Inflated:
+class GzipReader:
     """The content of a gzip file. Every method raises BadFileError for what is damaged."""
 
     def __init__(self, file: BinaryIO, size_bytes: int) -> None:
@@ -76,7 +76,7 @@ def check_size(count: int, file_bytes: int) -> None:
         raise BadFileError(f"it declares {count} bytes in a file of {file_bytes}")
 
 
-def unpacked(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np.uint8]:
+def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np.uint8]:
     """[count] bytes: the zstd frame in the next `packed_bytes` of the file, whole.
 
     `count` must have passed `check_size`. Raises BadFileError for what is damaged.

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import forget, passing
+from stages.base.blocks import release_mapped_pages, reported_blocks
 from stages.formats import compressed_ply
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
-from stages.formats.rows import allocated, checked, kept_rows
+from stages.formats.values import allocate, check_finite, drop_undrawable
 from stages.scene import Splats
-from stages.scene.far import recentred
+from stages.scene.recentring import recentred
 
 _ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3: the columns of a block are gathered from the cache
 _Tables = Iterator[tuple[slice, NDArray[Any]]]
@@ -50,7 +50,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Positions stay relative to `splats.origin`, which float32 could not hold; a comment says it.
     Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
         for block in blocks(splats, units):
             file.write(block)
@@ -60,7 +60,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 def blocks(splats: Splats, units: str) -> Iterator[bytes]:
     """The bytes of the file, a part at a time; every splat must be drawable."""
     yield _header_text(splats, units)
-    for rows in passing(len(splats), _ROWS_AT_ONCE):
+    for rows in reported_blocks(len(splats), _ROWS_AT_ONCE):
         yield _table(splats, rows).tobytes()
 
 
@@ -111,7 +111,7 @@ def parse(path: Path) -> Splats:
             tables = _ascii_tables(file, header)
         else:
             tables = _binary_tables(binary_rows(path, header, "vertex"))
-        splats = allocated(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
+        splats = allocate(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
         wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
         exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
         for rows, table in tables:
@@ -122,9 +122,9 @@ def parse(path: Path) -> Splats:
             else:
                 splats.means[rows] = columns.floats(["x", "y", "z"])
     if exact is None:
-        return checked(replace(splats, origin=header.origin))
+        return check_finite(replace(splats, origin=header.origin))
     means, origin = recentred(exact, header.origin)
-    return checked(replace(splats, means=means, origin=origin))
+    return check_finite(replace(splats, means=means, origin=origin))
 
 
 def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:
@@ -152,9 +152,9 @@ def _binary_tables(mapped: NDArray[Any]) -> _Tables:
     """The rows of a binary file, some at a time: [M, P] where all columns are of one type, else
     [M] structured."""
     kinds = {mapped.dtype[name] for name in mapped.dtype.names or ()}
-    for rows in passing(len(mapped), _ROWS_AT_ONCE):
+    for rows in reported_blocks(len(mapped), _ROWS_AT_ONCE):
         block = np.array(mapped[rows])
-        forget(mapped)
+        release_mapped_pages(mapped)
         plain = block.view(block.dtype[0]).reshape(len(block), -1) if len(kinds) == 1 else block
         yield rows, plain
 
@@ -182,7 +182,7 @@ def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
         skipped -= len(held)
         held = more
     held = held[skipped:]
-    for rows in passing(header.vertex.count, _ROWS_AT_ONCE):
+    for rows in reported_blocks(header.vertex.count, _ROWS_AT_ONCE):
         wanted = (rows.stop - rows.start) * width
         parts, there = [held], len(held)
         while there < wanted:

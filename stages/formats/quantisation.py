@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from stages.base.lazy import load_object
 from stages.formats import codebook, smallest_three
-from stages.formats.axes import least_turned
-from stages.formats.rows import (
-    degrees_in_use,
-    kept_rows,
-    linear_opacities,
-    logits_of,
-    unit_quaternions,
-)
+from stages.formats.axes import smallest_rotations
 from stages.formats.sog import LOG_SCALE_LIMIT, STEPS, palette_size, symmetric_exp, symmetric_log
 from stages.formats.table import Format
+from stages.formats.values import (
+    drop_undrawable,
+    linear_opacities,
+    logits_of,
+    sh_degrees_used,
+    unit_quaternions,
+)
 from stages.scene import QuantisedSplats, Splats
 
 
@@ -40,7 +40,7 @@ class BitDepths:
 
 def quantise_for_sog(splats: Splats, bits: BitDepths) -> Splats:
     """What a .sog holds of them in so many bits, on the grids that its writer will find again."""
-    return quantise_splats(least_turned(splats), bits)
+    return quantise_splats(smallest_rotations(splats), bits)
 
 
 def quantise_splats(splats: Splats, bits: BitDepths) -> Splats:
@@ -69,7 +69,7 @@ def quantise_attribute(exact: Splats, splats: Splats, name: str, bits: int) -> S
         sh[:, 0] = _by_codebook(exact.sh[:, 0], bits)
     elif sh.shape[1] > 1:
         sh[:, 1:] = _by_palette(exact.sh[:, 1:], bits)
-    return replace(splats, sh=sh, sh_degrees=degrees_in_use(sh))
+    return replace(splats, sh=sh, sh_degrees=sh_degrees_used(sh))
 
 
 def palette_bits(count: int) -> int:
@@ -80,11 +80,13 @@ def palette_bits(count: int) -> int:
 def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
     """What a file of this format should hold: drawable splats, their mean colours where colours do
     not change with the view, in as many bits as were decided on."""
+    if row.ending in quantised.finetuned:
+        return quantised.finetuned[row.ending]
     splats = quantised.splats
     if not row.sh_degree and quantised.flat_dc is not None:
         sh = quantised.flat_dc[:, None].astype(splats.sh.dtype)
         splats = replace(splats.with_sh_degree(0), sh=sh)
-    splats = kept_rows(splats)[0]
+    splats = drop_undrawable(splats)[0]
     bits = quantised.decisions.get("bits")
     if not row.quantiser or not isinstance(bits, dict):
         return splats
@@ -112,14 +114,14 @@ def _rotations(quaternions: NDArray[np.floating], bits: int) -> NDArray[np.float
 
 
 def _by_codebook(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
-    book = codebook.of_numbers(values, 1 << bits)
+    book = codebook.scalar_codebook(values, 1 << bits)
     found: NDArray[np.float32] = book[codebook.nearest(book, values)].astype(np.float32)
     return found
 
 
 def _by_palette(rest: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
     vectors = rest.reshape(len(rest), -1).astype(np.float32)
-    palette, labels = codebook.of_vectors(vectors, min(palette_size(len(rest)), 1 << bits))
+    palette, labels = codebook.vector_palette(vectors, min(palette_size(len(rest)), 1 << bits))
     return palette[labels].reshape(rest.shape)
 
 

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.atomic import replacing
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import codebook, smallest_three
-from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
+from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
 
 # Beyond them scales look the same, and the codebook's entries are better spent between.
@@ -40,15 +40,15 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     Positions stay relative to `splats.origin`; meta.json says it. Raises SplatError when the file
     cannot be written.
     """
-    splats, dropped = kept_rows(splats)
-    found = members(splats, morton.order(splats), units)
+    splats, dropped = drop_undrawable(splats)
+    found = sog_members(splats, morton.morton_order(splats), units)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
         for name, content in found.items():
             _add(package, name, content)
     return dropped
 
 
-def members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, bytes]:
+def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, bytes]:
     """The content of meta.json and of each picture, by name; the splats, which must be drawable,
     in the order `places`."""
     degree = int(splats.sh_degrees.max(initial=0))
@@ -106,7 +106,7 @@ def _positions(
         low, high = (symmetric_log(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
     span = np.where(high > low, high - low, 1.0)
     halves = np.empty((2, len(splats), 3), np.uint8)
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         steps = np.rint((symmetric_log(splats.means[places[rows]]) - low) / span * STEPS).astype(
             np.uint16
         )
@@ -130,10 +130,10 @@ def symmetric_exp(curved: NDArray[np.float64]) -> NDArray[np.float64]:
 def _shapes(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
-    book = codebook.of_numbers(np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
+    book = codebook.scalar_codebook(np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
     meta["scales"] = {"codebook": _written(book), "files": ["scales.webp"]}
     scales, turns = (np.empty((len(splats), n), np.uint8) for n in (3, 4))
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         part = splats.take(places[rows])
         scales[rows] = codebook.nearest(book, part.log_scales)
         largest, others = smallest_three.split(unit_quaternions(part.quaternions))
@@ -146,10 +146,10 @@ def _shapes(
 def _colours(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
-    book = codebook.of_numbers(np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT))
+    book = codebook.scalar_codebook(np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT))
     meta["sh0"] = {"codebook": _written(book), "files": ["sh0.webp"]}
     pixels = np.empty((len(splats), 4), np.uint8)
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         part = splats.take(places[rows])
         pixels[rows, :3] = codebook.nearest(book, part.sh[:, 0])
         pixels[rows, 3] = np.rint(255 * linear_opacities(part))
@@ -166,11 +166,11 @@ def _rest(
 ) -> dict[str, NDArray[np.uint8]]:
     count = splats.sh.shape[1] - 1
     vectors = scratch.empty((len(splats), count, 3))
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
     size = palette_size(len(splats))
-    palette, labels = codebook.of_vectors(vectors.reshape(len(splats), -1), size)
-    book = codebook.of_numbers(palette)
+    palette, labels = codebook.vector_palette(vectors.reshape(len(splats), -1), size)
+    book = codebook.scalar_codebook(palette)
     book[np.abs(book).argmin()] = 0.0  # what does not change with the view stays so
     book.sort()
     lines = -(-len(palette) // PER_LINE)

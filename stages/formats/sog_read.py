@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.rows import allocated, checked, logits_of
+from stages.formats.values import allocate, check_finite, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16
@@ -43,7 +43,7 @@ def read(path: Path) -> Splats:
     with reading(path):
         try:
             with zipfile.ZipFile(path) as package:
-                return checked(Source(in_zip(package), path.stat().st_size).splats())
+                return check_finite(Source(in_zip(package), path.stat().st_size).splats())
         except (zipfile.BadZipFile, zlib.error, EOFError) as error:
             raise BadFileError(f"it is no whole zip ({error})") from error
         except (NotImplementedError, RuntimeError) as error:  # encrypted, or packed in another way
@@ -103,9 +103,9 @@ class Source:
         books = [_numbers(meta, part, "codebook", 256) for part in ("sh0", "scales")]
         palette, labels = self._palette(meta, count)
         splats = replace(
-            allocated(count, math.isqrt(1 + palette.shape[1]) - 1), origin=_origin(meta)
+            allocate(count, math.isqrt(1 + palette.shape[1]) - 1), origin=_origin(meta)
         )
-        for rows in passing(count):
+        for rows in reported_blocks(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
             bent = ends[0] + (ends[1] - ends[0]) * steps

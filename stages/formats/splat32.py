@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
-from stages.formats.rows import (
+from stages.base.blocks import reported_blocks
+from stages.formats.values import (
     LOG_SCALE_MIN,
-    allocated,
-    checked,
-    kept_rows,
+    allocate,
+    check_finite,
+    drop_undrawable,
     linear_opacities,
     linear_scales,
+    log_scales_of,
     logits_of,
-    logs_of,
     unit_quaternions,
 )
 from stages.scene import Splats, dc_to_rgb, rgb_to_dc
@@ -75,7 +75,7 @@ def decode(records: NDArray[np.void]) -> Splats:
     return Splats(
         means=records["mean"].astype(np.float32),
         quaternions=unit_quaternions(quaternions),
-        log_scales=logs_of(records["scale"]),
+        log_scales=log_scales_of(records["scale"]),
         opacity_logits=logits_of(rgba[:, 3]),
         sh=rgb_to_dc(rgba[:, None, :3]).astype(np.float32),
         sh_degrees=np.zeros(len(records), np.uint8),
@@ -88,10 +88,10 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     The format has no place for units, the origin and SH above degree 0: they are not written.
     Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     splats, places = splats.with_sh_degree(0), order(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
-        for rows in passing(len(splats)):
+        for rows in reported_blocks(len(splats)):
             file.write(encode(splats.take(places[rows])).tobytes())
     return dropped
 
@@ -103,10 +103,10 @@ def read(path: Path) -> Splats:
         size = path.stat().st_size
         if size % RECORD.itemsize:
             raise BadFileError(f"its {size} bytes are no multiple of {RECORD.itemsize}")
-        splats = allocated(size // RECORD.itemsize, 0)
+        splats = allocate(size // RECORD.itemsize, 0)
         with path.open("rb") as file:
-            for rows in passing(len(splats)):
+            for rows in reported_blocks(len(splats)):
                 block = decode(np.fromfile(file, RECORD, rows.stop - rows.start))
                 for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
                     getattr(splats, name)[rows] = getattr(block, name)
-        return checked(splats)
+        return check_finite(splats)

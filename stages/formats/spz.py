@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.rows import kept_rows, linear_opacities, unit_quaternions
 from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
+from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats
-from stages.scene.turn import FLIP, turned
+from stages.scene.flip import FLIP, flipped
 
 _LEVEL = 6  # 9 takes eight times as long for 1 % less
 _LEAST_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
@@ -41,7 +41,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     2048 units from the centre is drawn nearer along its ray and smaller, which looks the same from
     the middle. Raises SplatError when the file cannot be written.
     """
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
     bits = _fractional_bits(splats.means)
@@ -51,7 +51,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         _opacities,
         lambda block: _byte(255 * (COLOUR_SCALE * block.sh[:, 0].astype(np.float64) + 0.5)),
         lambda block: _byte(16 * (_within_reach(block).log_scales + 10)),
-        lambda block: _pack_rotations(turned(block.with_sh_degree(0)).quaternions),
+        lambda block: _pack_rotations(flipped(block.with_sh_degree(0)).quaternions),
         _rest,
     )
     with (
@@ -62,7 +62,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     ):
         packed.write(header)
         for array in arrays:
-            for rows in passing(len(splats)):
+            for rows in reported_blocks(len(splats)):
                 packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
     return dropped
 
@@ -98,7 +98,7 @@ def _positions(splats: Splats, bits: int) -> NDArray[np.uint8]:
 
 def _rest(splats: Splats) -> NDArray[np.uint8]:
     """[N, K, 3] SH above degree 0, upright."""
-    sh = turned(splats).sh[:, 1:]
+    sh = flipped(splats).sh[:, 1:]
     steps = np.array([_SH_STEPS[math.isqrt(k) - 1] for k in range(1, 1 + sh.shape[1])], np.float64)
     levels = np.rint(128 * sh.astype(np.float64)) + 128
     levels = np.floor((levels / steps[:, None]) + 0.5) * steps[:, None]

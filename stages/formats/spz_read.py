@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
+from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.inflate import Inflated, check_size, unpacked
-from stages.formats.rows import allocated, checked, logits_of, unit_quaternions
+from stages.formats.inflate import GzipReader, check_size, read_zstd_frame
+from stages.formats.values import allocate, check_finite, logits_of, unit_quaternions
 from stages.scene import Splats
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
 
 HEADER = struct.Struct("<4sIIBBBB")
 MAGIC = b"NGSP"
@@ -61,11 +61,11 @@ def read(path: Path) -> Splats:
         size = path.stat().st_size
         content = _plain(file, size) if plain else _gzipped(file, size)
         splats = _decoded(content)
-        return checked(turned(splats, reuse=True) if content.upright else splats)
+        return check_finite(flipped(splats, reuse=True) if content.upright else splats)
 
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:
-    stream = Inflated(file, size)
+    stream = GzipReader(file, size)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack(stream.read(HEADER.size))
     if magic != MAGIC:
         raise BadFileError("it does not hold 'NGSP'")
@@ -90,7 +90,7 @@ def _plain(file: BinaryIO, size: int) -> _Content:
     for width, (packed, declared) in zip(sizes, [*table, (0, 0)], strict=False):
         if declared != count * width:
             raise BadFileError(f"it declares {declared} bytes for {count} times {width}")
-        arrays.append(unpacked(file, packed, declared).reshape(count, width))
+        arrays.append(read_zstd_frame(file, packed, declared).reshape(count, width))
     upright = _is_upright(extra) if flags & _HAS_EXTENSIONS else True
     return _Content(version, degree, bits, arrays, upright)
 
@@ -148,8 +148,8 @@ def _is_upright(records: bytes) -> bool:
 def _decoded(content: _Content) -> Splats:
     """The splats in the file's axes."""
     positions, opacities, colours, scales, rotations, sh = content.arrays
-    splats = allocated(len(positions), content.degree)
-    for rows in passing(len(positions)):
+    splats = allocate(len(positions), content.degree)
+    for rows in reported_blocks(len(positions)):
         out = splats.take(rows)
         padded = np.zeros((len(out), 3, 4), np.uint8)
         padded[:, :, 1:] = positions[rows].reshape(-1, 3, 3)

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import passing
-from stages.formats import sog
-from stages.formats.rows import allocated, checked
+from stages.base.blocks import reported_blocks
+from stages.formats import html, sog
 from stages.formats.sog_read import Source, in_folder, in_zip
 from stages.formats.table import CHUNK
-from stages.scene import Splats, morton
+from stages.formats.values import allocate, check_finite, drop_undrawable
+from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
 
 LEAF, CHUNK_SPLATS = 1 << 15, 1 << 17  # splats of the finest level; of a chunk, about
@@ -48,6 +48,32 @@ def order(splats: Splats) -> NDArray[np.intp]:
     """[N] rows of the finest level as `read` finds them."""
     leaves = [leaf.rows[0] for leaf in _leaves(_cut([splats]))]
     return np.concatenate(leaves) if leaves else np.zeros(0, np.intp)
+
+
+def write(
+    path: Path,
+    splats: Splats,
+    *,
+    units: str = "arbitrary",
+    views: tuple[View, ...] = (),
+    coarser: Sequence[Splats] = (),
+) -> int:
+    """Write a streamed SOG and, beside it, a page that shows it on any web server.
+
+    Args:
+        path: the asset's lod-meta.json.
+        splats: the finest level.
+        units: "metres" or "arbitrary".
+        views: cameras of the page.
+        coarser: coarser levels of detail of the same scene, finest first, all drawable.
+
+    Returns how many of `splats` could not be drawn and were left out. Raises SplatError when the
+    asset cannot be written.
+    """
+    kept, dropped = drop_undrawable(splats)
+    write_levels(path, [kept, *coarser], units)
+    html.write_beside(path, kept, units, views, splat_widths(path, kept))
+    return dropped
 
 
 def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
@@ -105,7 +131,7 @@ def _cut(levels: Sequence[Splats]) -> _Tree:
                 below = [part[side] for part, side in zip(rows, sides, strict=True)]
                 above = [part[~side] for part, side in zip(rows, sides, strict=True)]
                 return node(below, depth + 1), node(above, depth + 1)
-        curves = (morton.order_of(levels[i].means[part]) for i, part in enumerate(rows))
+        curves = (morton.morton_order_of(levels[i].means[part]) for i, part in enumerate(rows))
         return _Leaf(tuple(part[curve] for part, curve in zip(rows, curves, strict=True)))
 
     return node([np.arange(len(level)) for level in levels], 0)
@@ -131,7 +157,7 @@ def _write_chunks(folder: Path, tree: _Tree, levels: Sequence[Splats], units: st
             _write_chunk(folder / f"{level}_{number}", splats.take(rows), units)
             number, held = number + 1, []
 
-        for index in passing(len(leaves), 1):
+        for index in reported_blocks(len(leaves), 1):
             rows = leaves[index.start].rows[level]
             if not len(rows):
                 continue
@@ -150,7 +176,7 @@ def _write_chunks(folder: Path, tree: _Tree, levels: Sequence[Splats], units: st
 
 def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
     make_folder(folder)
-    for name, content in sog.members(splats, np.arange(len(splats)), units).items():
+    for name, content in sog.sog_members(splats, np.arange(len(splats)), units).items():
         with replacing(folder / name) as temporary:
             temporary.write_bytes(content)
 
@@ -176,7 +202,7 @@ def _described(tree: _Tree, levels: Sequence[Splats], places: _Places) -> dict[s
 
 def _box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
     lows, highs = [], []
-    for part in passing(len(rows)):
+    for part in reported_blocks(len(rows)):
         some = rows[part]
         sizes = np.exp(splats.log_scales[some].astype(np.float64))
         reach = (np.abs(matrices_of(splats.quaternions[some])) * sizes[:, None, :]).sum(axis=2)
@@ -198,7 +224,7 @@ def read(path: Path) -> Splats:
     path = Path(path)
     with reading(path):
         try:
-            return checked(_read(path))
+            return check_finite(_read(path))
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
             raise BadFileError(f"one of its chunks is no whole zip ({error})") from error
 
@@ -220,7 +246,7 @@ def _read(path: Path) -> Splats:
     sources = [_source(path.parent, name) for name, _ in chunks]
     ranges = [_checked(source, wanted) for source, (_, wanted) in zip(sources, chunks, strict=True)]
     degree = max((found for found, _ in ranges), default=0)
-    splats = allocated(sum(n for _, each in ranges for _, n in each), degree)
+    splats = allocate(sum(n for _, each in ranges for _, n in each), degree)
     end = 0
     for source, (_, each) in zip(sources, ranges, strict=True):
         chunk = source.splats().with_sh_degree(degree)
@@ -268,7 +294,7 @@ def parts_of(path: Path) -> dict[str, Path]:
     return found
 
 
-def widths(path: Path, finest: Splats) -> list[float]:
+def splat_widths(path: Path, finest: Splats) -> list[float]:
     """How wide the splats of each level are, in world units: two standard deviations of the middle
     one of the finest, and so much more where there are fewer. Raises SplatError."""
     with reading(path):

@@ -1,4 +1,9 @@
-"""The table of formats: one row for each that is written, and what follows from the rows."""
+"""The table of splat formats: one row for each format, and what follows from the rows.
+
+This table lists what `stages.formats` itself reads and writes. How a file is checked by a parser
+that did not write it is listed in `stages.proof.checks`; the formats of meshes are listed in
+`stages.surface.files`. Both know their formats by the same endings.
+"""
 
 from __future__ import annotations
 
@@ -11,85 +16,69 @@ from stages.base.errors import Family, SplatError
 
 @dataclass(frozen=True)
 class Format:
-    """One row. Functions are named as "module:function" and imported when they are first wanted:
-    so rows may name rooms above this one, and reading the table costs nothing.
+    """One splat format. Functions are named as "module:function" and are imported at their first
+    use, so that reading the table imports nothing.
 
-    ending: what a file's name ends in, without the dot; also what `--format` takes.
-    opens_in, keeps: for README's table. loses: what of the splats is not the same any more, as the
-    end of "the format ..."; "" if everything comes back as float32. sh_degree: the highest kept.
-    y_up: whether its axes are y up, turned 180 degrees about x from ours. sidecar: the suffix of a
-    file beside it that belongs to it. wants_views: whether the writer takes cameras too.
-    needs_finetuning: whether it rounds so much that splats should learn to live with it.
-    streamed: of detail, which streams: the name is `ending` alone, its chunks lie in folders beside
-    it, and a folder holds one such asset; `splat edit` writes it.
-
-    Of splats:
-    writer (path, splats, *, units, and views if it wants them) -> how many could not be drawn;
-    reader (path) -> Splats, y down; raises SplatError "splats-unreadable";
-    second_reader (path) -> Splats in the file's axes, sharing no code with the writer; may raise
-    anything; anatomy (path) -> Anatomy; order (splats) -> [N] the row that each row of the file
-    comes from, if it sorts them; coarse (splats, bits) -> Splats in fewer bits, if the format packs
-    what repeats; validator (path) -> list of complaints, if another program has
-    one.
-
-    Of a mesh (no reader): writer (path, mesh, units); second_reader (path) -> (vertices [V, 3],
-    faces [F, 3]) in the world's axes.
+    Attributes:
+        ending: what a file's name ends in, without the dot; also the value of `--format`.
+        opens_in, keeps: two cells of README's table.
+        writer: (path, splats, *, units) -> number of splats that could not be drawn and were left
+            out. It also takes `views` if `takes_views`, and `coarser` if `streamed`.
+        reader: (path) -> Splats, y down; raises SplatError "splats-unreadable".
+        order: (splats) -> [N] the row of `splats` that each row of the file comes from; "" if the
+            format keeps the order.
+        quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses
+            repeated values; "" for the others.
+        loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
+            back as float32.
+        sh_degree: the highest SH degree that is kept.
+        y_up: whether the file's axes are y up, turned 180 degrees about x from ours.
+        sidecar: the suffix of a file beside it that belongs to it; "" if there is none.
+        takes_views: whether the file also holds cameras.
+        needs_finetuning: whether rounding is so coarse that splats are fine-tuned to it.
+        streamed: whether the asset has levels of detail. Its file name is `ending` alone, its
+            chunks lie in folders beside it, and a folder holds one such asset.
     """
 
     ending: str
     opens_in: str
     keeps: str
     writer: str
-    second_reader: str
-    reader: str = ""
-    anatomy: str = ""
+    reader: str
     order: str = ""
     quantiser: str = ""
-    validator: str = ""
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
     sidecar: str = ""
-    wants_views: bool = False
+    takes_views: bool = False
     needs_finetuning: bool = False
     streamed: bool = False
 
-    @property
-    def is_mesh(self) -> bool:
-        return not self.reader
-
     def matches(self, name: str) -> bool:
-        """Whether a file of this name, in small letters, is of this format."""
+        """Whether a file of this lower-case name is of this format."""
         return name == self.ending if self.streamed else name.endswith("." + self.ending)
 
-    def name(self, stem: str) -> str:
-        """What a file of this format is called."""
+    def file_name(self, stem: str) -> str:
+        """The name of a file of this format."""
         return self.ending if self.streamed else f"{stem}.{self.ending}"
 
     def files(self, path: Path) -> list[Path]:
-        """`path` and what lies beside it and belongs to it."""
+        """`path` and the files beside it that belong to it."""
         page = path.with_suffix(self.sidecar) if self.sidecar else path
         beside = [path, page] if page != path and page.is_file() else [path]
         if self.streamed:
-            every = sorted(path.parent.glob("*_*/*"))
-            return [*beside, *(file for file in every if CHUNK.match(file.parent.name))]
+            candidates = sorted(path.parent.glob("*_*/*"))
+            return [*beside, *(file for file in candidates if CHUNK.match(file.parent.name))]
         return beside
 
     def size_bytes(self, path: Path) -> int:
+        """The size of all files of the asset at `path`."""
         return sum(file.stat().st_size for file in self.files(path))
 
 
-@dataclass(frozen=True)
-class ByteBreakdown:
-    """Where the bytes of a file are. parts: by attribute. unpacked: whether they are counted before
-    the compression that packs them all together. unknown: why there are no parts."""
-
-    parts: dict[str, int]
-    unpacked: bool = False
-    unknown: str = ""
-
-
 CHUNK = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
+_MESH = re.compile(r"\.mesh\.(glb|ply)$")  # of the names of meshes
 
 _GLB = Format(
     "glb",
@@ -97,8 +86,6 @@ _GLB = Format(
     keeps="everything",
     writer="stages.formats.gltf:write",
     reader="stages.formats.gltf_read:read",
-    second_reader="stages.proof.independent_readers:gltf",
-    anatomy="stages.proof.byte_breakdown:gltf",
     y_up=True,
 )
 _USD = Format(
@@ -107,17 +94,7 @@ _USD = Format(
     keeps="everything",
     writer="stages.formats.usd:write",
     reader="stages.formats.usd_read:read",
-    second_reader="stages.proof.independent_readers:usd",
-    anatomy="stages.proof.byte_breakdown:usd",
-    validator="stages.proof.usd_validators:complaints",
     y_up=True,
-)
-_MESH = Format(
-    "mesh.ply",
-    opens_in="game engines, mesh tools",
-    keeps="no splats: triangles to collide with, see below",
-    writer="stages.surface.ply:write",
-    second_reader="stages.surface.files:read_ply",
 )
 TABLE = (
     Format(
@@ -126,8 +103,6 @@ TABLE = (
         keeps="everything, float32",
         writer="stages.formats.ply:write",
         reader="stages.formats.ply:read",
-        second_reader="stages.proof.independent_readers:ply",
-        anatomy="stages.proof.byte_breakdown:ply",
     ),
     Format(
         "splat",
@@ -135,8 +110,6 @@ TABLE = (
         keeps="8-bit colour and rotation; the mean of the colours that photographs see",
         writer="stages.formats.splat32:write",
         reader="stages.formats.splat32:read",
-        second_reader="stages.proof.independent_readers:splat",
-        anatomy="stages.proof.byte_breakdown:splat",
         order="stages.formats.splat32:order",
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
@@ -162,9 +135,7 @@ TABLE = (
         keeps="positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",
         writer="stages.formats.compressed_ply:write",
         reader="stages.formats.compressed_ply:read",
-        second_reader="stages.proof.independent_packed:compressed_ply",
-        anatomy="stages.proof.byte_breakdown:ply",
-        order="stages.scene.morton:order",
+        order="stages.scene.morton:morton_order",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
         needs_finetuning=True,
     ),
@@ -174,8 +145,6 @@ TABLE = (
         keeps="sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
-        second_reader="stages.proof.independent_packed:spz",
-        anatomy="stages.proof.byte_breakdown:spz",
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
         y_up=True,
@@ -186,9 +155,7 @@ TABLE = (
         keeps="16-bit positions, 256 sizes and colours, a palette of view-dependent colours",
         writer="stages.formats.sog:write",
         reader="stages.formats.sog_read:read",
-        second_reader="stages.proof.independent_packed:sog",
-        anatomy="stages.proof.byte_breakdown:sog",
-        order="stages.scene.morton:order",
+        order="stages.scene.morton:morton_order",
         quantiser="stages.formats.quantisation:quantise_for_sog",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         needs_finetuning=True,
@@ -197,14 +164,12 @@ TABLE = (
         "lod-meta.json",
         opens_in="PlayCanvas, SuperSplat, which load what is near first",
         keeps="as `sog`, in chunks and levels of detail; written by `splat edit`",
-        writer="stages.editing.levels:write",
+        writer="stages.formats.streamed_sog:write",
         reader="stages.formats.streamed_sog:read",
-        second_reader="stages.proof.independent_packed:streamed_sog",
-        anatomy="stages.proof.byte_breakdown:streamed_sog",
         order="stages.formats.streamed_sog:order",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         sidecar=".html",
-        wants_views=True,
+        takes_views=True,
         streamed=True,
     ),
     Format(
@@ -213,31 +178,27 @@ TABLE = (
         keeps="everything; the viewer and the cameras too",
         writer="stages.formats.html:write",
         reader="stages.formats.html:read",
-        second_reader="stages.proof.independent_readers:html",
-        anatomy="stages.proof.byte_breakdown:html",
-        wants_views=True,
+        takes_views=True,
     ),
-    replace(
-        _MESH,
-        ending="mesh.glb",
-        writer="stages.surface.gltf:write",
-        second_reader="stages.surface.files:read_glb",
-        y_up=True,
-    ),
-    _MESH,
 )
-# By ending: all of them, the formats of one file of splats, and those of meshes.
 BY_ENDING = {row.ending: row for row in TABLE}
-FORMATS = {row.ending: row for row in TABLE if not row.is_mesh and not row.streamed}
-MESHES = {row.ending: row for row in TABLE if row.is_mesh}
+FORMATS = {row.ending: row for row in TABLE if not row.streamed}  # one file each
 
 
 def format_of(path: Path) -> Format:
-    """The format of splats that the end of the name says.
+    """The splat format that the ending of the name stands for; the longest ending wins.
 
     Raises SplatError "format-unknown", and "format-mesh" for the name of a mesh.
     """
     name = Path(path).name.lower()
+    if mesh := _MESH.search(name):
+        raise SplatError(
+            "format-mesh",
+            given=f"{path} is the name of a mesh: .mesh.{mesh[1]} holds triangles, no splats.",
+            wanted="A file of splats: a mesh is made with the cameras of a run.",
+            hint=f"In the run's folder: splat export --format mesh.{mesh[1]}",
+            family=Family.USAGE,
+        )
     rows = [row for row in TABLE if row.matches(name)]
     if not rows:
         raise SplatError(
@@ -247,13 +208,4 @@ def format_of(path: Path) -> Format:
             hint="Choose a name with one of these suffixes.",
             family=Family.USAGE,
         )
-    found = max(rows, key=lambda row: len(row.ending))
-    if found.is_mesh:
-        raise SplatError(
-            "format-mesh",
-            given=f"{path} is the name of a mesh: .{found.ending} holds {found.keeps}.",
-            wanted="A file of splats: a mesh is made with the cameras of a run.",
-            hint=f"In the run's folder: splat export --format {found.ending}",
-            family=Family.USAGE,
-        )
-    return found
+    return max(rows, key=lambda row: len(row.ending))

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import partial_prefix, replacing
-from stages.base.blocks import passing
-from stages.formats.rows import kept_rows, linear_opacities, linear_scales, unit_quaternions
+from stages.base.blocks import reported_blocks
+from stages.formats.values import drop_undrawable, linear_opacities, linear_scales, unit_quaternions
 from stages.scene import Splats
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
 
 _ROOT, _PRIM = "/Scene", "/Scene/Splats"
 
@@ -35,7 +35,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     written.
     """
     path = Path(path)
-    splats, dropped = kept_rows(splats)
+    splats, dropped = drop_undrawable(splats)
     with replacing(path) as temporary:
         if path.suffix.lower() == ".usdz":
             _write_package(temporary, splats, units, f"{path.stem}.usdc")
@@ -55,7 +55,7 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
     stage.SetDefaultPrim(root)
     note: dict[str, Any] = {"units": units}
     if splats.origin.any():
-        note["origin"] = Gf.Vec3d(*map(float, turned(splats.take(slice(0))).origin))
+        note["origin"] = Gf.Vec3d(*map(float, flipped(splats.take(slice(0))).origin))
     layer.customLayerData = {"splat": note}
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PRIM)
@@ -85,8 +85,8 @@ def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any
     """A USD array of `values_of` the upright splats. The library copies what it is given, so it
     is given a block at a time."""
     array, end = kind(0), 0
-    for rows in passing(len(splats)):
-        values = np.ascontiguousarray(values_of(turned(splats.take(rows))), np.float32)
+    for rows in reported_blocks(len(splats)):
+        values = np.ascontiguousarray(values_of(flipped(splats.take(rows))), np.float32)
         if not end:
             array = kind(len(values) // (rows.stop - rows.start) * len(splats))
         array[end : end + len(values)] = kind.FromNumpy(values)
@@ -97,8 +97,8 @@ def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any
 def _extent(splats: Splats) -> NDArray[np.float32]:
     """[2, 3] the box of all ellipsoids of 3 standard deviations, upright."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for rows in passing(len(splats)):
-        block = turned(splats.take(rows))
+    for rows in reported_blocks(len(splats)):
+        block = flipped(splats.take(rows))
         reach = _reach(unit_quaternions(block.quaternions), linear_scales(block))
         low = np.minimum(low, (block.means - reach).min(axis=0))
         high = np.maximum(high, (block.means + reach).max(axis=0))

@@ -20,10 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
-from stages.formats.rows import checked, damage_kept, joined, keeps_damage, logits_of, logs_of
+from stages.formats.values import (
+    allows_nonfinite,
+    check_finite,
+    concatenate,
+    log_scales_of,
+    logits_of,
+    nonfinite_allowed,
+)
 from stages.scene import Splats, load_splats, save_splats
-from stages.scene.far import recentred
-from stages.scene.turn import turned
+from stages.scene.flip import flipped
+from stages.scene.recentring import recentred
 
 _TYPE = "ParticleField3DGaussianSplat"
 _REFUSED = 3  # exit status of the child when it found what is wrong
@@ -48,7 +55,7 @@ def read(path: Path) -> Splats:
             "stages.formats.usd_read",
             str(path.resolve()),
             str(output),
-            *(["keep-damage"] if keeps_damage() else []),
+            *(["keep-damage"] if allows_nonfinite() else []),
         ]
         try:
             child = subprocess.run(
@@ -75,10 +82,10 @@ def parse(path: Path) -> Splats:
     parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
     if not parts:
         raise BadFileError(f"it holds no {_TYPE}")
-    splats = joined(parts)
+    splats = concatenate(parts)
     del parts
     means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
-    return checked(turned(replace(splats, means=means, origin=origin), reuse=True))
+    return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
 
 
 def _open(path: Path) -> Any:
@@ -121,7 +128,7 @@ def _splats(prim: Any) -> Splats:
     return Splats(
         means=means.astype(np.float64) * scale + offset,  # `parse` brings them near zero
         quaternions=orientations[:, [3, 0, 1, 2]],
-        log_scales=logs_of(scales, scale),
+        log_scales=log_scales_of(scales, scale),
         opacity_logits=logits_of(opacities),
         sh=coefficients.reshape(n, (degree + 1) ** 2, 3).copy(),
         sh_degrees=np.full(n, degree, np.uint8),
@@ -129,8 +136,8 @@ def _splats(prim: Any) -> Splats:
 
 
 def _array(prim: Any, name: str, width: int) -> NDArray[np.float32]:
-    """[N, width] float32, not to be changed: the attribute, or its twin in half precision where
-    only that is set."""
+    """[N, width] float32, read-only: the attribute, or its half-precision form ("...h") where only
+    that is set."""
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(name + "h")):
         value = attribute.Get() if attribute else None
         if value is not None:
@@ -165,7 +172,7 @@ def main(arguments: list[str]) -> int:
     source, output = map(Path, arguments[:2])
     _limit_memory(source)
     try:
-        with damage_kept() if arguments[2:] else nullcontext():
+        with nonfinite_allowed() if arguments[2:] else nullcontext():
             splats = parse(source)
     except BadFileError as error:
         print(error)

@@ -1,4 +1,4 @@
-"""Is one better than the other? Paired differences, resampled, with what may be said of them."""
+"""Whether one of two results is better: paired differences and their bootstrap interval."""
 
 from __future__ import annotations
 
@@ -8,64 +8,73 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-DRAWS = 10_000
+RESAMPLES = 10_000
 CONFIDENCE = 0.95
-_SEED = 0  # equal differences get equal intervals, today and tomorrow
-BETTER, WORSE, INCONCLUSIVE = "better", "worse", "not told apart"
+_SEED = 0  # equal differences get equal intervals
+BETTER, WORSE, INCONCLUSIVE = "better", "worse", "no significant difference"
 
 
 @dataclass(frozen=True)
 class Difference:
-    """mean of the differences and the 95 % interval around it, in their own unit.
-    photographs, seeds: how many of each were drawn from."""
+    """The mean of paired differences and its 95 % interval, in their unit.
+
+    Args:
+        mean: candidate minus baseline.
+        low, high: ends of the interval; infinite for a single view.
+        views, seeds: how many of each the differences are of.
+    """
 
     mean: float
     low: float
     high: float
-    photographs: int
+    views: int
     seeds: int
 
     @property
     def verdict(self) -> str:
-        """ "better" or "worse" where the interval leaves 0 out, else "not told apart"."""
+        """`BETTER` or `WORSE` where the interval excludes 0, else `INCONCLUSIVE`."""
         if self.low > 0:
             return BETTER
         return WORSE if self.high < 0 else INCONCLUSIVE
 
 
 def paired_difference(differences: NDArray[np.floating]) -> Difference:
-    """What differences (candidate minus baseline, larger is better) say of the mean.
+    """The mean of `differences` (candidate minus baseline, larger is better) and its interval.
 
-    differences: [photographs] or [photographs, seeds]. Photographs and seeds are drawn with
-    replacement, independently of each other: the interval is about other photographs of the scene,
-    and, where there are several, about other seeds. A single photograph tells nothing of others,
-    so its interval has no ends; a single seed is taken as it is.
+    Views and seeds are resampled with replacement, independently of each other. So the interval is
+    about other views of the scene and, where there are several seeds, about other seeds. It has no
+    ends for a single view. A single seed is taken as it is.
 
-    Few values resampled spread less than what they were drawn from: the interval is widened by
-    Student's factor for the smaller of the two counts, and by sqrt(n / (n - 1)).
+    A resample of few values spreads less than the population that they come from: the interval is
+    widened by the ratio of Student's quantile to the normal one, for the smaller of the two counts,
+    and by sqrt(n / (n - 1)).
 
-    Raises ValueError if there are none, or one is not finite.
+    Args:
+        differences: [views] or [views, seeds].
+
+    Raises:
+        ValueError: there are none, or one is not finite.
     """
     table = np.asarray(differences, np.float64)
     table = table[:, None] if table.ndim == 1 else table
     if table.ndim != 2 or not table.size or not np.isfinite(table).all():
-        raise ValueError("differences must be [photographs] or [photographs, seeds], all finite")
-    photographs, seeds = table.shape
+        raise ValueError("differences must be [views] or [views, seeds], all finite")
+    views, seeds = table.shape
     mean = float(table.mean())
-    if photographs == 1:
-        return Difference(mean, -math.inf, math.inf, photographs, seeds)
+    if views == 1:
+        return Difference(mean, -math.inf, math.inf, views, seeds)
     random = np.random.default_rng(_SEED)
-    rows, columns = (_shares(random, count) for count in (photographs, seeds))
+    rows, columns = (_resample_weights(random, count) for count in (views, seeds))
     means = np.einsum("dp,ps,ds->d", rows, table, columns, optimize=True)
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(means, (tail, 100 - tail)) - mean
     wider = _widening(min(count for count in table.shape if count > 1))
-    return Difference(mean, mean + wider * low, mean + wider * high, photographs, seeds)
+    return Difference(mean, mean + wider * low, mean + wider * high, views, seeds)
 
 
-def _shares(random: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """[DRAWS, count] the share of each in a sample of as many, drawn with replacement."""
-    return random.multinomial(count, np.full(count, 1 / count), size=DRAWS) / count
+def _resample_weights(random: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """[RESAMPLES, count] the weight of each value in a resample of as many."""
+    return random.multinomial(count, np.full(count, 1 / count), size=RESAMPLES) / count
 
 
 def _widening(count: int) -> float:

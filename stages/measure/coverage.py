@@ -1,8 +1,8 @@
-"""Which surfaces photographs show, and from which sides: where a capture is thin.
+"""Capture coverage: which surfaces the photographs show, from which sides, and what they miss.
 
-Splats are gathered into patches, cubes of the scene. A photograph sees a patch if what it shows of
-it, in world units, is no less than a tenth of what the photograph that shows most of it does: so
-what lies behind something else is not seen, and what is seen edge on hardly is.
+Splats are gathered into patches, the cubes of a grid. A view sees a patch if the area that it shows
+of it is at least a tenth of the area that the best view of that patch shows. So an occluded patch
+is not seen, and a patch seen edge-on hardly is.
 """
 
 from __future__ import annotations
@@ -15,31 +15,37 @@ from numpy.typing import NDArray
 
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import render, settings_of
+from stages.raster.draw import raster_settings_of, render
 from stages.scene import Camera, Splats, look_at
 
-FEW_PHOTOGRAPHS = 3  # one sees, two measure, the third confirms
-SMALL_ANGLE_DEG = 10.0  # seen over less, a depth is little more than a guess
-PATCHES_ACROSS = 32  # of the middle nine tenths of what is seen, corner to corner
-LEAST_PX = 2.0  # a patch that shows less, summed over its pixels, is not seen
-LEAST_SHARE = 0.1
-OFTEN = 0.5  # of what most photographs share: what is seen so often is the subject
-_SIDE_PX = 240  # of the pictures that visibility is found from
+MIN_VIEWS = 3  # one shows a surface, two measure its depth, the third confirms it
+MIN_ANGLE_DEG = 10.0  # between views: over less, depth is hardly measured
+PATCHES_ACROSS = 32  # along the diagonal of the middle nine tenths of what is seen
+MIN_PX = 2.0  # summed blend weight: a patch that covers less of a picture is not seen
+MIN_SHARE = 0.1  # of the area that the best view shows
+SUBJECT_SHARE = 0.5  # of the largest view count: patches seen so often are the subject
+_SIDE_PX = 240  # of the pictures that visibility is measured in
 _PROBE_PX = 96
-FLOOR_DEG, TOP_DEG = 0.0, 80.0  # heights that somebody may hold a camera at, around a subject
-OUTWARD_DEG = 50.0  # up or down, where cameras look outward
-GAP_DEG = 40.0  # to the nearest photograph: less is not worth a word
+INWARD_ELEVATIONS_DEG = (0.0, 80.0)  # where somebody may hold a camera around a subject
+OUTWARD_ELEVATIONS_DEG = (-50.0, 50.0)  # where cameras look outward
+MIN_GAP_DEG = 40.0  # to the nearest view
 _DIRECTIONS = 400
 _CONE_DEG = 15.0
-_BLOCKED_SHARE = 0.1  # of a cone's cross section
+_BLOCKED_SHARE = 0.1  # of a cone's cross-section
 
 
 @dataclass(frozen=True)
 class Patches:
-    """What photographs show. centres [M, 3]; side: of each cube, world units. area [M]: what the
-    photograph that shows most of it shows, world units^2. seen [M, V]: by which photographs.
-    best [M]: the one that shows most. angles_deg [M]: between the two photographs farthest apart
-    that see it, as it sees them."""
+    """What V views show of M patches.
+
+    Args:
+        centres: [M, 3].
+        side: of each cube, world units.
+        area: [M] what the best view shows, world units^2.
+        seen: [M, V] by which views.
+        best: [M] the view that shows most of it.
+        angles_deg: [M] between the two farthest views that see it, as seen from the patch.
+    """
 
     centres: NDArray[np.float64]
     side: float
@@ -50,31 +56,33 @@ class Patches:
 
     @property
     def counts(self) -> NDArray[np.intp]:
-        """[M] photographs that see each."""
+        """[M] views that see each."""
         return np.asarray(self.seen.sum(axis=1))
 
     @property
     def median_count(self) -> int:
-        """Of photographs, by area: half of what is seen is seen by so many or more."""
+        """The median view count, weighted by area."""
         order = np.argsort(-self.counts, kind="stable")
         running = np.cumsum(self.area[order])
         return int(self.counts[order[np.searchsorted(running, running[-1] / 2)]])
 
     @property
-    def thin(self) -> NDArray[np.bool_]:
-        """[M] seen by too few, or from one side only."""
-        return (self.counts < FEW_PHOTOGRAPHS) | (self.angles_deg < SMALL_ANGLE_DEG)
+    def poorly_covered(self) -> NDArray[np.bool_]:
+        """[M] seen by too few views, or over too small an angle."""
+        return (self.counts < MIN_VIEWS) | (self.angles_deg < MIN_ANGLE_DEG)
 
 
 def patches_of(splats: Splats, cameras: Sequence[Camera], backend: str) -> Patches:
-    """Patches of `splats` as the cameras see them; none where they see nothing."""
+    """The patches that the cameras see of `splats`; none where they see nothing."""
     small = [camera.fitted(_SIDE_PX) for camera in cameras]
-    rasteriser, arrays, settings = rasteriser_of(backend), splat_arrays(splats), settings_of(splats)
+    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    settings = raster_settings_of(splats)
     pixels = np.zeros((len(splats), len(small)), np.float32)
     for column, camera in enumerate(small):
         forward = rasteriser.forward(arrays, camera, settings)
-        nothing = np.zeros((3, camera.height, camera.width), np.float32)
-        pixels[forward.visible, column] = rasteriser.contributions(forward, nothing)[:, WEIGHT]
+        no_residual = np.zeros((3, camera.height, camera.width), np.float32)
+        found = rasteriser.contributions(forward, no_residual)
+        pixels[forward.visible, column] = found[:, WEIGHT]
     means, total = splats.means.astype(np.float64), pixels.sum(axis=1)
     shown = np.flatnonzero(total > 0)
     if not len(shown):
@@ -102,10 +110,10 @@ def _patches(
     depths = np.stack([camera.project(centres)[1] for camera in cameras], axis=1)
     focals = np.array([camera.fx * camera.fy for camera in cameras])
     areas = pixels * np.maximum(depths, 0.0) ** 2 / focals
-    areas[pixels < LEAST_PX] = 0.0
-    there = areas.any(axis=1)
-    centres, areas = centres[there], areas[there]
-    seen = areas >= LEAST_SHARE * areas.max(axis=1, initial=0.0, keepdims=True)
+    areas[pixels < MIN_PX] = 0.0
+    shown = areas.any(axis=1)
+    centres, areas = centres[shown], areas[shown]
+    seen = areas >= MIN_SHARE * areas.max(axis=1, initial=0.0, keepdims=True)
     best, area = areas.argmax(axis=1), areas.max(axis=1, initial=0.0)
     eyes = np.array([camera.centre for camera in cameras])
     angles = np.array(
@@ -117,7 +125,7 @@ def _patches(
 def _weighted_quantile(
     points: NDArray[np.float64], weights: NDArray[np.floating], share: float
 ) -> NDArray[np.float64]:
-    """[3] by coordinate."""
+    """[3] for each coordinate."""
     found = []
     for column in points.T:
         order = np.argsort(column)
@@ -126,7 +134,7 @@ def _weighted_quantile(
     return np.array(found)
 
 
-def _units(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normalised(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, 1e-12))
 
@@ -135,100 +143,112 @@ def _widest_deg(offsets: NDArray[np.float64]) -> float:
     """The largest angle between any two of the vectors [K, 3]; 0 for one."""
     if len(offsets) < 2:
         return 0.0
-    unit = _units(offsets)
+    unit = _normalised(offsets)
     return float(np.degrees(np.arccos(np.clip((unit @ unit.T).min(), -1.0, 1.0))))
 
 
 @dataclass(frozen=True)
-class Around:
-    """Where cameras stand around what they show, or, where they look outward, where they look.
+class CameraLayout:
+    """How the cameras of a capture are arranged.
 
-    inward: which of the two. middle [3]: of what they show. directions [V, 3]: unit, from the
-    middle to each camera, or along its view. up [3]. reach: of the median camera, world units.
+    Args:
+        inward: whether they look at a subject that they stand around; else they look outward.
+        middle: [3] of what they show.
+        directions: [V, 3] unit vectors: from the middle to each camera, or along its view where
+            they look outward.
+        up: [3] unit vector.
+        distance: of the median camera from the middle, world units.
     """
 
     inward: bool
     middle: NDArray[np.float64]
     directions: NDArray[np.float64]
     up: NDArray[np.float64]
-    reach: float
+    distance: float
 
-    def heights_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def elevations_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Above the horizon, of [..., 3]."""
         return np.asarray(np.degrees(np.arcsin(np.clip(directions @ self.up, -1.0, 1.0))))
 
-    def headings_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def azimuths_deg(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """On the map, clockwise from its top, of [..., 3]; from -180 to 180."""
-        right, ahead = self.plan
+        right, ahead = self.map_axes
         return np.asarray(np.degrees(np.arctan2(directions @ right, directions @ ahead)))
 
     @property
-    def plan(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def map_axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Two horizontal unit vectors [3]: to the right and up on a map seen from above."""
         z = np.array([0.0, 0.0, 1.0])
         ahead = z - (z @ self.up) * self.up
         if np.linalg.norm(ahead) < 0.1:  # up is along z
             ahead = np.array([0.0, 1.0, 0.0])
             ahead = ahead - (ahead @ self.up) * self.up
-        ahead = _units(ahead)
+        ahead = _normalised(ahead)
         return np.cross(ahead, self.up), ahead
 
 
-def around(cameras: Sequence[Camera], patches: Patches, levelled: bool) -> Around:
-    """levelled: whether up is -Y; else it is where most cameras' tops point."""
+def camera_layout(cameras: Sequence[Camera], patches: Patches, levelled: bool) -> CameraLayout:
+    """levelled: whether up is -Y; else it is the mean of the cameras' own up directions."""
     up = np.array([0.0, -1.0, 0.0])
     if not levelled:
-        up = _units(-np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0))
-    often = patches.counts >= OFTEN * patches.counts.max()
-    middle = _weighted_quantile(patches.centres[often], patches.area[often], 0.5)
+        up = _normalised(-np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0))
+    subject = patches.counts >= SUBJECT_SHARE * patches.counts.max()
+    middle = _weighted_quantile(patches.centres[subject], patches.area[subject], 0.5)
     eyes = np.array([camera.centre for camera in cameras])
     inward = np.mean([_shows(camera, middle) for camera in cameras]) > 0.5
-    views = np.array([camera.forward for camera in cameras])
-    reach = float(np.median(np.linalg.norm(eyes - middle, axis=1)))
-    return Around(bool(inward), middle, _units(eyes - middle) if inward else views, up, reach)
+    forward = np.array([camera.forward for camera in cameras])
+    distance = float(np.median(np.linalg.norm(eyes - middle, axis=1)))
+    directions = _normalised(eyes - middle) if inward else forward
+    return CameraLayout(bool(inward), middle, directions, up, distance)
 
 
-def _shows(camera: Camera, place: NDArray[np.float64]) -> bool:
-    pixels, z = camera.project(place[None])
+def _shows(camera: Camera, point: NDArray[np.float64]) -> bool:
+    pixels, z = camera.project(point[None])
     return bool(z[0] > 0 and camera.shows(pixels)[0])
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A side that no photograph is near. direction [3]: unit, as in `Around`. angle_deg: to the
-    nearest photograph, number `nearest`."""
+    """A direction that no view is near.
+
+    Args:
+        direction: [3] unit vector, as in `CameraLayout`.
+        angle_deg: to the nearest view.
+        nearest: index of that view.
+    """
 
     direction: NDArray[np.float64]
     angle_deg: float
     nearest: int
 
 
-def gaps(ring: Around, patches: Patches, most: int = 3) -> tuple[Gap, ...]:
-    """The emptiest sides, each as if a photograph had filled those before; none where something
-    stands in the way, or where nobody could hold a camera."""
+def find_gaps(layout: CameraLayout, patches: Patches, most: int = 3) -> tuple[Gap, ...]:
+    """The emptiest directions, largest gap first; each is found as if the gaps before it were
+    filled. Directions where a surface is in the way, or where nobody could hold a camera, are left
+    out."""
     tried = _sphere(_DIRECTIONS)
-    heights = ring.heights_deg(tried)
-    lowest, highest = (FLOOR_DEG, TOP_DEG) if ring.inward else (-OUTWARD_DEG, OUTWARD_DEG)
-    tried = tried[(heights >= lowest) & (heights <= highest)]
-    if ring.inward:
-        tried = tried[[not _blocked(ring, patches, direction) for direction in tried]]
-    known, found = ring.directions, []
+    elevations = layout.elevations_deg(tried)
+    lowest, highest = INWARD_ELEVATIONS_DEG if layout.inward else OUTWARD_ELEVATIONS_DEG
+    tried = tried[(elevations >= lowest) & (elevations <= highest)]
+    if layout.inward:
+        tried = tried[[not _blocked(layout, patches, direction) for direction in tried]]
+    known, found = layout.directions, []
     for _ in range(most):
         if not len(tried):
             break
         closeness = np.clip(tried @ known.T, -1.0, 1.0)
         emptiest = int(closeness.max(axis=1).argmin())
         angle = float(np.degrees(np.arccos(closeness[emptiest].max())))
-        if angle < GAP_DEG:
+        if angle < MIN_GAP_DEG:
             break
-        photographs = closeness[emptiest, : len(ring.directions)]
-        found.append(Gap(tried[emptiest], angle, int(photographs.argmax())))
+        views = closeness[emptiest, : len(layout.directions)]
+        found.append(Gap(tried[emptiest], angle, int(views.argmax())))
         known = np.concatenate([known, tried[emptiest][None]])
     return tuple(found)
 
 
 def _sphere(count: int) -> NDArray[np.float64]:
-    """[count, 3] directions, evenly."""
+    """[count, 3] directions, evenly spaced (Fibonacci lattice)."""
     number = np.arange(count) + 0.5
     y = 1 - 2 * number / count
     turn = np.pi * (1 + 5**0.5) * number
@@ -236,51 +256,59 @@ def _sphere(count: int) -> NDArray[np.float64]:
     return np.stack([across * np.cos(turn), y, across * np.sin(turn)], axis=1)
 
 
-def _blocked(ring: Around, patches: Patches, direction: NDArray[np.float64]) -> bool:
-    """Whether a surface stands between the middle and where a camera would."""
-    offsets = patches.centres - ring.middle
+def _blocked(layout: CameraLayout, patches: Patches, direction: NDArray[np.float64]) -> bool:
+    """Whether a surface is between the middle and where a camera would be."""
+    offsets = patches.centres - layout.middle
     along = offsets @ direction
     beside = np.linalg.norm(offsets - along[:, None] * direction, axis=1)
     cone = np.tan(np.radians(_CONE_DEG))
-    inside = (along > 0.5 * ring.reach) & (along < ring.reach) & (beside < cone * along)
-    return bool(patches.area[inside].sum() > _BLOCKED_SHARE * np.pi * (cone * ring.reach) ** 2)
+    inside = (along > 0.5 * layout.distance) & (along < layout.distance) & (beside < cone * along)
+    cross_section = np.pi * (cone * layout.distance) ** 2
+    return bool(patches.area[inside].sum() > _BLOCKED_SHARE * cross_section)
 
 
 @dataclass(frozen=True)
-class Place:
-    """Thin patches that lie together. centre [3]. share: of all that is seen, by area. photographs:
-    how many see the median patch. angle_deg: over which angle. best: the photograph that shows most
-    of it. step: where to stand next to it ("left", "right", "higher"); "" where none would see."""
+class Region:
+    """Adjacent patches that are poorly covered.
+
+    Args:
+        centre: [3].
+        share: of the area of all patches.
+        views: how many see the median patch.
+        angle_deg: over which they see it.
+        best: the view that shows most of it.
+        move: from where the best view was taken: "left", "right" or "higher"; "" where the region
+            is occluded from all three.
+    """
 
     centre: NDArray[np.float64]
     share: float
-    photographs: int
+    views: int
     angle_deg: float
     best: int
-    step: str
+    move: str
 
 
-def thin_places(
+def poorly_covered_regions(
     splats: Splats, patches: Patches, cameras: Sequence[Camera], backend: str, most: int = 3
-) -> tuple[Place, ...]:
-    """The largest, first."""
-    thin = np.flatnonzero(patches.thin)
-    groups = _together(patches.centres[thin], patches.side)
+) -> tuple[Region, ...]:
+    """The regions of the largest area, largest first."""
+    poor = np.flatnonzero(patches.poorly_covered)
     found = []
-    for group in groups:
-        rows = thin[group]
+    for group in _connected(patches.centres[poor], patches.side):
+        rows = poor[group]
         area = patches.area[rows]
         best = int(np.bincount(patches.best[rows], area).argmax())
         own = rows[patches.best[rows] == best]
         centre = patches.centres[own[patches.area[own].argmax()]]
-        middle = np.median(patches.counts[rows]), np.median(patches.angles_deg[rows])
+        views, angle = np.median(patches.counts[rows]), np.median(patches.angles_deg[rows])
         share = float(area.sum() / patches.area.sum())
-        found.append(Place(centre, share, int(middle[0]), float(middle[1]), best, ""))
-    found = sorted(found, key=lambda place: -place.share)[:most]
-    return tuple(replace(p, step=_step(splats, p, cameras[p.best], backend)) for p in found)
+        found.append(Region(centre, share, int(views), float(angle), best, ""))
+    found = sorted(found, key=lambda region: -region.share)[:most]
+    return tuple(replace(r, move=_move(splats, r, cameras[r.best], backend)) for r in found)
 
 
-def _together(centres: NDArray[np.float64], side: float) -> list[NDArray[np.intp]]:
+def _connected(centres: NDArray[np.float64], side: float) -> list[NDArray[np.intp]]:
     """Groups of rows whose cubes touch."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -295,16 +323,17 @@ def _together(centres: NDArray[np.float64], side: float) -> list[NDArray[np.intp
     return np.split(order, np.cumsum(np.bincount(labels))[:-1])
 
 
-def _step(splats: Splats, place: Place, camera: Camera, backend: str) -> str:
-    """The first step aside, twice the angle that is wanted, from which the place is not hidden."""
-    distance, side = float(np.linalg.norm(place.centre - camera.centre)), _PROBE_PX
-    stride = distance * np.tan(np.radians(2 * SMALL_ANGLE_DEG))
+def _move(splats: Splats, region: Region, camera: Camera, backend: str) -> str:
+    """The first move, by twice the smallest sufficient angle, from which the region is not
+    occluded."""
+    offset, side = float(np.linalg.norm(region.centre - camera.centre)), _PROBE_PX
+    length = offset * np.tan(np.radians(2 * MIN_ANGLE_DEG))
     right, down = camera.world_to_camera[0, :3], camera.world_to_camera[1, :3]
-    for word, way in (("left", -right), ("right", right), ("higher", -down)):
-        eye = camera.centre + stride * way
-        pose = look_at(eye, place.centre, up=-down)
+    for move, direction in (("left", -right), ("right", right), ("higher", -down)):
+        eye = camera.centre + length * direction
+        pose = look_at(eye, region.centre, up=-down)
         probe = Camera(side, side, side, side, side / 2, side / 2, pose)
         depth = float(np.median(render(splats, probe, backend=backend).depth[46:50, 46:50]))
-        if depth > 0.9 * float(np.linalg.norm(place.centre - eye)):
-            return word
+        if depth > 0.9 * float(np.linalg.norm(region.centre - eye)):
+            return move
     return ""

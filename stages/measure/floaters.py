@@ -1,22 +1,65 @@
-"""Splats that hang alone in space, told without photographs."""
+"""Floaters: splats in free space, where no surface is.
+
+A floater fits the few training views that it was made for and hides the scene from others. What can
+be known of free space differs by the moment, so there are three rules, from the most to the least
+that is known. Merging any two would change which splats go.
+
+- `stages.training.free_space`, during training: free space is what at least two and fewer than four
+  training views look past, by the depths of the seed points. It needs these depths, and removes
+  what densification puts there.
+- `near_camera_floaters`, once training is over: a splat close to a camera, compared with the depth
+  that is drawn there, which at most two views need. It needs the views and a measurement of each
+  splat's contribution.
+- `isolated_splats`, for a file without its views: a splat far from its neighbours, compared with
+  their own distances.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import passing
-from stages.scene import Splats
+from stages.base.blocks import reported_blocks
+from stages.measure.contribution import Contributions
+from stages.scene import Camera, Splats
 
+NEAR_CAMERA = 0.25  # of the median depth that is drawn for that camera
+MOST_VIEWS = 2  # a splat that more views need is taken to be a surface
 _NEIGHBOURS = 8
-_ALONE = 6.0  # times as far from its neighbours as they are from theirs,
-_REACH = 3.0  # and farther than so many of its own standard deviations
+_ISOLATED = 6.0  # times the median distance of its neighbours from theirs
+_REACH = 3.0  # standard deviations: a splat that covers its neighbours is not isolated
+
+
+def near_camera_floaters(
+    splats: Splats, contributions: Contributions, cameras: Sequence[Camera]
+) -> NDArray[np.bool_]:
+    """Splats close to a camera that at most two views need.
+
+    Args:
+        splats: N splats.
+        contributions: of these splats to the views.
+        cameras: of the same views, in the same order.
+
+    Returns:
+        [N] whether each is a floater.
+    """
+    close = np.zeros(len(splats), bool)
+    for camera, depth in zip(cameras, contributions.scene_depth, strict=True):
+        if np.isfinite(depth):
+            distance = np.linalg.norm(splats.means - camera.centre, axis=1)
+            close |= distance < NEAR_CAMERA * depth
+    return np.asarray(close & (contributions.view_counts <= MOST_VIEWS))
 
 
 def isolated_splats(splats: Splats) -> NDArray[np.bool_]:
-    """[N] splats that are farther from their neighbours than these from theirs, by far, and do not
-    reach them. Sparse surroundings are not alone: there all are far from each other. Means must be
-    finite."""
+    """[N] splats that are much farther from their neighbours than these are from theirs, and do not
+    reach them.
+
+    In a sparse background every distance is large, so no splat there is isolated. Means must be
+    finite.
+    """
     from scipy.spatial import KDTree
 
     count = min(_NEIGHBOURS, len(splats) - 1)
@@ -25,12 +68,12 @@ def isolated_splats(splats: Splats) -> NDArray[np.bool_]:
     tree = KDTree(splats.means.astype(np.float64))
     nearest = np.empty((len(splats), count), np.int32)
     far = np.empty(len(splats))
-    for rows in passing(len(splats)):
+    for rows in reported_blocks(len(splats)):
         distances, found = tree.query(splats.means[rows].astype(np.float64), count + 1)
         nearest[rows], far[rows] = found[:, 1:], distances[:, -1]
-    found_alone = np.empty(len(splats), bool)
-    for rows in passing(len(splats)):
+    isolated = np.empty(len(splats), bool)
+    for rows in reported_blocks(len(splats)):
         usual = np.median(far[nearest[rows]], axis=1)
         reach = _REACH * np.exp(splats.log_scales[rows].max(axis=1).astype(np.float64))
-        found_alone[rows] = far[rows] > np.maximum(_ALONE * usual, reach)
-    return found_alone
+        isolated[rows] = far[rows] > np.maximum(_ISOLATED * usual, reach)
+    return isolated

@@ -1,4 +1,5 @@
-"""How far two images are apart. Definitions: data range 1, sRGB values as stored."""
+"""Image quality metrics: PSNR, SSIM and FLIP. Images are [H, W, 3], data range 1, sRGB values as
+stored. `valid` [H, W] marks the pixels that count; None for all."""
 
 from __future__ import annotations
 
@@ -7,24 +8,39 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-Kept = NDArray[np.bool_] | None  # [H, W]: the pixels that count; None for all
+IDENTICAL_DB = 99.0  # the PSNR of identical pictures is infinite, which JSON has no number for
+Valid = NDArray[np.bool_] | None
 
 
-def psnr(image: NDArray[np.floating], truth: NDArray[np.floating], kept: Kept = None) -> float:
-    """Peak signal to noise ratio in dB over all samples, in float64; inf for equal images."""
+def psnr(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None) -> float:
+    """Peak signal-to-noise ratio in dB over all samples, in float64; inf for equal images."""
     difference = np.asarray(image, np.float64) - np.asarray(truth, np.float64)
-    if kept is not None:
-        difference = difference[kept]
+    if valid is not None:
+        difference = difference[valid]
     mse = float(np.mean(difference * difference))
     return math.inf if mse == 0 else -10.0 * math.log10(mse)
 
 
-def ssim(image: NDArray[np.floating], truth: NDArray[np.floating], kept: Kept = None) -> float:
+def capped_psnr_db(
+    image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None
+) -> float:
+    """PSNR of `image`, clipped to [0, 1] as a screen does, at most `IDENTICAL_DB`; 0 if it is not a
+    number."""
+    found = psnr(np.clip(image, 0.0, 1.0), truth, valid)
+    return 0.0 if np.isnan(found) else min(found, IDENTICAL_DB)
+
+
+def psnr_text(psnr_db: float, digits: int = 2) -> str:
+    """A capped PSNR for people: "34.21 dB", or "lossless" for identical pictures."""
+    return "lossless" if psnr_db >= IDENTICAL_DB else f"{psnr_db:.{digits}f} dB"
+
+
+def ssim(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None) -> float:
     """Mean structural similarity (Wang et al. 2004): Gaussian window 11x11, sigma 1.5, zero
-    padded, K1 = 0.01, K2 = 0.03; computed in float64. What does not count is taken to be alike."""
+    padded, K1 = 0.01, K2 = 0.03; in float64. Pixels that do not count are taken to be equal."""
     import cv2
 
-    image = _alike_outside(image, truth, kept)
+    image = _equal_outside(image, truth, valid)
     a = np.asarray(image, np.float64)
     b = np.asarray(truth, np.float64)
     weights = cv2.getGaussianKernel(11, 1.5)
@@ -39,26 +55,26 @@ def ssim(image: NDArray[np.floating], truth: NDArray[np.floating], kept: Kept = 
     c1, c2 = 0.01**2, 0.03**2
     score = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
     score /= (mean_a * mean_a + mean_b * mean_b + c1) * (var_a + var_b + c2)
-    return _mean(score, kept)
+    return _mean(score, valid)
 
 
-def flip(image: NDArray[np.floating], truth: NDArray[np.floating], kept: Kept = None) -> float:
+def flip(image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid = None) -> float:
     """Mean FLIP error (Andersson et al. 2020, "FLIP: A Difference Evaluator for Alternating
-    Images"), 0 for equal images to 1: what an eye sees that changes between the two at 67 pixels a
-    degree, as its authors' own evaluator computes it."""
+    Images"), from 0 for equal images to 1, at 67 pixels per degree: the difference that is seen
+    when the two alternate. Computed by its authors' evaluator."""
     import flip_evaluator
 
-    image = _alike_outside(image, truth, kept)
+    image = _equal_outside(image, truth, valid)
     pair = (np.ascontiguousarray(x, np.float32) for x in (truth, image))
     errors, mean, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)
-    return float(mean) if kept is None else _mean(np.asarray(errors)[..., 0], kept)
+    return float(mean) if valid is None else _mean(np.asarray(errors)[..., 0], valid)
 
 
-def _alike_outside(
-    image: NDArray[np.floating], truth: NDArray[np.floating], kept: Kept
+def _equal_outside(
+    image: NDArray[np.floating], truth: NDArray[np.floating], valid: Valid
 ) -> NDArray[np.floating]:
-    return image if kept is None else np.where(kept[..., None], image, truth)
+    return image if valid is None else np.where(valid[..., None], image, truth)
 
 
-def _mean(values: NDArray[np.floating], kept: Kept) -> float:
-    return float(np.mean(values if kept is None else values[kept]))
+def _mean(values: NDArray[np.floating], valid: Valid) -> float:
+    return float(np.mean(values if valid is None else values[valid]))

@@ -24,7 +24,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "sharpness": (float, int),
     "log2_luminance": (float, int),
     "exposure_ev": (float, int, type(None)),
-    "twin": (str,),
+    "duplicate_of": (str,),
     "mask": (str,),
     "outside": (str,),
     "gps": (list, type(None)),

@@ -1,1 +1,1 @@
-"""What is in a file of splats, and whether it is what it was made from."""
+"""Statistics of splat files, and the proof that a file holds the splats it was made from."""

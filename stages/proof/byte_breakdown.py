@@ -8,14 +8,13 @@ import struct
 import zipfile
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stages.base.bad_files import reading
-from stages.base.lazy import load_object
-from stages.formats import ByteBreakdown, format_of, spz_read
+from stages.formats import format_of, spz_read
 from stages.formats.html import unzipped
-from stages.formats.inflate import Inflated
+from stages.formats.inflate import GzipReader
 from stages.formats.ply_header import Header, read_header
 from stages.formats.splat32 import RECORD
 
@@ -43,17 +42,19 @@ _SPZ = ("positions", "opacities", "colours", "scales", "rotations", "SH")
 _SOG = {"means": "positions", "quats": "rotations", "sh0": "colours, opacities", "shN": "SH"}
 
 
-def byte_breakdown_of(path: Path) -> ByteBreakdown:
-    """Where the bytes of a file of splats are, "other" for what belongs to no attribute. Raises
-    SplatError as `format_of`, or "splats-unreadable"."""
-    path = Path(path)
-    row = format_of(path)
-    with reading(path):
-        found: ByteBreakdown = load_object(row.anatomy)(path)
-    other = row.size_bytes(path) - sum(found.parts.values())
-    if found.unknown or found.unpacked or other <= 0:
-        return found
-    return ByteBreakdown({**found.parts, "other": other})
+@dataclass(frozen=True)
+class ByteBreakdown:
+    """Where the bytes of a file are.
+
+    Attributes:
+        parts: bytes by attribute.
+        unpacked: whether they are counted before the compression that packs all of them together.
+        unknown: why there are no parts; "" if there are.
+    """
+
+    parts: dict[str, int]
+    unpacked: bool = False
+    unknown: str = ""
 
 
 def ply(path: Path) -> ByteBreakdown:
@@ -115,7 +116,7 @@ def spz(path: Path) -> ByteBreakdown:
     if sizes:
         return ByteBreakdown(dict(zip(_SPZ, sizes, strict=False)))
     with path.open("rb") as file:
-        head = Inflated(file, path.stat().st_size).read(spz_read.HEADER.size)
+        head = GzipReader(file, path.stat().st_size).read(spz_read.HEADER.size)
     _, version, count, degree, bits, _, _ = spz_read.HEADER.unpack(head)
     widths = spz_read.widths(version, degree, bits)
     parts = {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}

@@ -12,10 +12,10 @@ from stages.base import scratch
 from stages.base.blocks import blocks
 from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, Format
-from stages.proof.independent_readers import FileContent
+from stages.proof.content import FileContent
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.scene import SH_C0, Splats
-from stages.scene.turn import FLIP, turned
+from stages.scene.flip import FLIP, flipped
 
 _BLOCK = 1 << 16  # rows compared at a time: copies stay small however large the file is
 
@@ -73,7 +73,7 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
     for block in blocks(len(file), _BLOCK):
         a = splats.take(rows[block]).with_sh_degree(degree)
         b = file.take(block).with_sh_degree(degree)
-        a = turned(a) if upright else a
+        a = flipped(a) if upright else a
         for name, values in _block(a, b).items():
             if name not in errors:
                 errors[name] = scratch.empty((len(file),))

@@ -1,4 +1,4 @@
-"""What second readers hand out, and how they make splats of the values in a file."""
+"""The result of independent readers, and how they build splats from the values of a file."""
 
 from __future__ import annotations
 
@@ -13,26 +13,32 @@ from stages.base import scratch
 from stages.base.blocks import blocks
 from stages.scene import Splats
 
-# From a file's axes to ours; spelled out here: a wrong turn must not check itself.
+# From the axes of a file to ours. Not taken from the writers: their error must not check itself.
 Y_DOWN, Y_UP = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class FileContent:
-    """splats: as the file holds them, in its axes. world_from_file [4, 4]: from those axes to
-    ours (y down)."""
+    """What a file holds.
+
+    Attributes:
+        splats: in the axes of the file.
+        world_from_file: [4, 4] from these axes to ours (y down).
+    """
 
     splats: Splats
     world_from_file: NDArray[np.float64]
 
 
 def logits(p: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Logits of opacities, which are kept away from 0 and 1."""
     inside = np.clip(p, 1e-30, 1 - 1e-9, dtype=np.float64)
     found: NDArray[np.float64] = np.log(inside / (1 - inside))
     return found
 
 
 def splats_of(**arrays: NDArray[np.floating]) -> Splats:
+    """Splats of float32 arrays, named as the fields of `Splats`; the degree follows from `sh`."""
     values = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items()}
     n, k = values["sh"].shape[:2]
     for name, width in {"means": 3, "quaternions": 4, "log_scales": 3}.items():
@@ -43,7 +49,7 @@ def splats_of(**arrays: NDArray[np.floating]) -> Splats:
 def splats_by_rows(
     count: int, values_of: Callable[[slice], dict[str, NDArray[np.floating]]]
 ) -> Splats:
-    """`splats_of` what `values_of` says for some rows, asked for one block after the other."""
+    """`splats_of` the arrays that `values_of` returns for slices of rows, block after block."""
     arrays: dict[str, NDArray[np.floating]] = {}
     for rows in blocks(count) if count else [slice(0, 0)]:
         for name, values in values_of(rows).items():

@@ -1,7 +1,7 @@
-"""Which of the mistakes that files in the wild are made with would explain a wrong one.
+"""Diagnosis of a wrong file: which common writer error explains the differences.
 
-A wrong order of axes, of quaternion components or of SH coefficients looks consistent to every
-reader; only what the file should hold tells it. Each is tried, and one that explains is named.
+A wrong order of axes, quaternion components or SH coefficients looks consistent to every reader and
+only shows in comparison with the original. Each error is tried, and one that fits is named.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from stages.proof.compare import Differences, rotations_apart
 from stages.proof.content import FileContent
 from stages.proof.matching import extent_of
 from stages.scene import Splats
-from stages.scene.turn import FLIP, turned
+from stages.scene.flip import FLIP, flipped
 
-_WORDS = {
+_ATTRIBUTE_NAMES = {
     "position": "positions",
     "log_scale": "sizes",
     "opacity": "opacities",
@@ -25,37 +25,38 @@ _WORDS = {
     "colour": "colours",
     "sh": "view-dependent colours",
 }
-_SAMPLE = 20_000  # splats that a guess is tried on
+_SAMPLE = 20_000  # splats that a hypothesis is tested on
 _FITS_EXTENT = 0.02
 _FITS_DEGREES = 3.0
-_FITS_ENERGY = 0.3  # of the squares of the coefficients
+_FITS_ENERGY = 0.3  # share of the squared coefficients
 _QUANTILES = np.linspace(3, 97, 33)
 
 
-def explained(splats: Splats, content: FileContent, found: Differences) -> str:
-    """What most splats of a file have wrong, and what it looks like; "" if nothing."""
+def explain(splats: Splats, content: FileContent, found: Differences) -> str:
+    """What is wrong with most splats of a file, and the likely error; "" if nothing is."""
     if not found.wrong:
         return ""
-    if "position" in found.wrong:  # then the wrong splats are paired, and all else differs too
-        return _joined("most positions are wrong", _axes(splats, content))
-    what = f"most {' and '.join(_WORDS[name] for name in found.wrong)} are wrong"
+    if "position" in found.wrong:  # rows cannot be matched then, and all else differs
+        return _with_cause("most positions are wrong", _axes(splats, content))
+    what = f"most {' and '.join(_ATTRIBUTE_NAMES[name] for name in found.wrong)} are wrong"
     rows = np.arange(0, len(splats), max(1, len(splats) // _SAMPLE))
     truth, file = splats.take(found.rows[rows]), content.splats.take(rows)
     pairs = [(truth, file)]
-    if content.world_from_file[1, 1] < 0:  # the mistake was made after the turn, or before
-        pairs = [(turned(truth), file), (truth, turned(file))]
+    if content.world_from_file[1, 1] < 0:  # the error was made after the turn to y up, or before
+        pairs = [(flipped(truth), file), (truth, flipped(file))]
     for tried, name in ((_quaternions, "rotation"), (_sh, "sh")):
         if name in found.wrong:
-            what = _joined(what, next(filter(None, (tried(*pair) for pair in pairs)), ""))
+            what = _with_cause(what, next(filter(None, (tried(*pair) for pair in pairs)), ""))
     return what
 
 
-def _joined(what: str, guess: str) -> str:
-    return f"{what}: {guess}" if guess else what
+def _with_cause(what: str, cause: str) -> str:
+    return f"{what}: {cause}" if cause else what
 
 
 def _axes(splats: Splats, content: FileContent) -> str:
-    """From the spread along each axis alone, so in any order of the rows."""
+    """The permutation, scale or offset of positions that fits; "" if none does. Uses quantiles on
+    each axis, so the order of the rows does not matter."""
     means = splats.means * (FLIP if content.world_from_file[1, 1] < 0 else np.ones(3))
     wanted = np.percentile(means, _QUANTILES, axis=0)
     given = np.percentile(content.splats.means, _QUANTILES, axis=0)
@@ -79,7 +80,7 @@ def _axes(splats: Splats, content: FileContent) -> str:
         return f"its x, y, z look like {best}"
     if best:
         return ""
-    # not turned: moved, or of another size
+    # neither permuted nor mirrored: moved, or scaled
     times = float(np.ptp(given, axis=0).sum() / max(float(np.ptp(wanted, axis=0).sum()), 1e-30))
     moved = np.median(given - times * wanted, axis=0)
     if float(np.abs(given - times * wanted - moved).max()) > _FITS_EXTENT * extent * times:
@@ -87,7 +88,7 @@ def _axes(splats: Splats, content: FileContent) -> str:
     if abs(times - 1) > _FITS_EXTENT:
         return f"the scene is {times:.3g} times as large"
     steps = np.round(moved / extent, 3) * extent + 0.0
-    return f"all lie {', '.join(f'{value:.3g}' for value in steps)} away"
+    return f"all are moved by {', '.join(f'{value:.3g}' for value in steps)}"
 
 
 def _quaternions(truth: Splats, file: Splats) -> str:
@@ -111,16 +112,19 @@ def _sh(truth: Splats, file: Splats) -> str:
     right, given = (s.with_sh_degree(degree).sh[:, 1:].astype(np.float64) for s in (truth, file))
     n = len(given)
     tried = [
-        ("they look as if not turned with the axes", turned(file).with_sh_degree(degree).sh[:, 1:])
+        (
+            "they look as if not rotated with the axes",
+            flipped(file).with_sh_degree(degree).sh[:, 1:],
+        )
     ]
-    # a reader may have made room for more bands than the file holds
+    # a reader may have allocated a higher degree than the file holds
     for width in {(d + 1) ** 2 - 1 for d in range(1, degree + 1)}:
         part, rest = given[:, :width], np.zeros_like(given[:, width:])
-        in_turn = part.transpose(0, 2, 1).reshape(n, width, 3)
-        apart = part.reshape(n, 3, width).transpose(0, 2, 1)
+        interleaved = part.transpose(0, 2, 1).reshape(n, width, 3)
+        planar = part.reshape(n, 3, width).transpose(0, 2, 1)
         for words, guess in (
-            ("red, green, blue in turn, taken for all reds first", in_turn),
-            ("all reds first, taken for red, green, blue in turn", apart),
+            ("coefficient-major (RGB together), read as channel-major", interleaved),
+            ("channel-major (all of red first), read as coefficient-major", planar),
         ):
             tried.append((f"the coefficients look like {words}", np.concatenate([guess, rest], 1)))
     energy = max(float(np.square(right).sum()), 1e-30)

@@ -1,4 +1,5 @@
-"""Second readers of the packed formats: plyfile, gzip, zipfile and Pillow, and plain arithmetic."""
+"""Independent readers of the packed formats: plyfile, gzip, zipfile and Pillow, and plain
+arithmetic. They share no code with `stages.formats`."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.formats.rows import joined
+from stages.formats.values import concatenate
 from stages.proof.content import logits, splats_by_rows
 from stages.scene import Splats
 
@@ -37,8 +38,10 @@ def compressed_ply(path: Path) -> Splats:
                 parts.append(low * (1 - fraction) + high * fraction)
             return np.stack(parts, axis=1)
 
-        turns = words["packed_rotation"].astype(np.int64)
-        others = [((turns >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)]
+        rotations = words["packed_rotation"].astype(np.int64)
+        others = [
+            ((rotations >> shift) % 1024 / 1023 - 0.5) * math.sqrt(2) for shift in (20, 10, 0)
+        ]
         colours = unpacked("packed_color", [("r", 24, 8), ("g", 16, 8), ("b", 8, 8)])
         sh = np.zeros((len(words), per_channel + 1, 3), np.float32)
         sh[:, 0] = (colours - 0.5) * math.sqrt(4 * math.pi)
@@ -46,7 +49,7 @@ def compressed_ply(path: Path) -> Splats:
             sh[:, 1 + i % per_channel, i // per_channel] = (rest[name][rows] + 0.5) / 32 - 4
         return {
             "means": unpacked("packed_position", axes),
-            "quaternions": _with_largest(turns >> 30, np.stack(others, axis=1)),
+            "quaternions": _with_largest(rotations >> 30, np.stack(others, axis=1)),
             "log_scales": unpacked("packed_scale", [("scale_" + s, low, n) for s, low, n in axes]),
             "opacity_logits": logits(words["packed_color"].astype(np.int64) % 256 / 255),
             "sh": sh,
@@ -73,13 +76,13 @@ def spz(path: Path) -> Splats:
     ]
 
     def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
-        places, alphas, colours, sizes, turns, rest = (part[rows] for part in parts)
+        places, alphas, colours, sizes, rotations, rest = (part[rows] for part in parts)
         low, middle, high = places.reshape(-1, 3, 3).astype(np.int64).transpose(2, 0, 1)
         fixed = low + 256 * middle + 65536 * high
         sh = np.zeros((len(alphas), k + 1, 3), np.float32)
         sh[:, 0] = (colours.reshape(-1, 3) / 255 - 0.5) / 0.15
         sh[:, 1:] = rest.reshape(len(alphas), k, 3) / 128 - 1
-        xyzw = _xyz_in_bytes(turns) if version == 2 else _smallest_three(turns)
+        xyzw = _xyz_in_bytes(rotations) if version == 2 else _smallest_three(rotations)
         return {
             "means": np.where(fixed < 1 << 23, fixed, fixed - (1 << 24)) / 2**fraction,
             "quaternions": np.roll(xyzw, 1, axis=1),
@@ -92,13 +95,13 @@ def spz(path: Path) -> Splats:
 
 
 def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """[N, 4] x, y, z, w, where w is what is missing to 1 and never negative."""
+    """[N, 4] x, y, z, w from x, y, z in bytes; w completes the norm to 1 and is not negative."""
     xyz = parts.reshape(-1, 3).astype(np.float64) * 2 / 255 - 1
     return np.insert(xyz, 3, np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1))), axis=1)
 
 
 def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """[N, 4] x, y, z, w from two bits for the largest and a sign and nine bits for the others."""
+    """[N, 4] x, y, z, w: 2 bits name the largest component; sign and 9 bits for each other."""
     words = np.ascontiguousarray(parts).view("<u4").reshape(-1).astype(np.int64)
     tens = [words >> shift & 1023 for shift in (20, 10, 0)]
     others = [math.sqrt(0.5) / 511 * np.where(t < 512, t, 512 - t) for t in tens]
@@ -106,7 +109,7 @@ def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def streamed_sog(path: Path) -> Splats:
-    """The finest level, its leaves in the order of their chunks and rows."""
+    """The finest level, leaves in the order of their chunks and rows."""
     import io
     import json
     import zipfile
@@ -129,7 +132,7 @@ def streamed_sog(path: Path) -> Splats:
                     package.write(part, part.name)
             chunks[file] = sog(packed)
         parts.append(chunks[file].take(slice(offset, offset + count)))
-    return joined(parts)
+    return concatenate(parts)
 
 
 def sog(path: Path | BinaryIO) -> Splats:
@@ -145,29 +148,29 @@ def sog(path: Path | BinaryIO) -> Splats:
             with package.open(meta[part]["files"][number]) as file:
                 return np.array(Image.open(file).convert("RGBA"))
 
-        def a_splat(part: str, number: int = 0) -> NDArray[np.uint8]:
+        def per_splat(part: str, number: int = 0) -> NDArray[np.uint8]:
             return pixels(part, number).reshape(-1, 4)[: meta["count"]]
 
-        lows, highs = a_splat("means"), a_splat("means", 1)
-        turns, colours, sizes = a_splat("quats"), a_splat("sh0"), a_splat("scales")
-        k, palette, halves = 0, np.zeros((1, 0, 3), np.uint8), np.zeros_like(turns)
+        lows, highs = per_splat("means"), per_splat("means", 1)
+        rotations, colours, sizes = per_splat("quats"), per_splat("sh0"), per_splat("scales")
+        k, palette, halves = 0, np.zeros((1, 0, 3), np.uint8), np.zeros_like(rotations)
         if "shN" in meta:
             k = (meta["shN"]["bands"] + 1) ** 2 - 1
-            halves, palette = a_splat("shN", 1), pixels("shN")[:, :, :3].reshape(-1, k, 3)
+            halves, palette = per_splat("shN", 1), pixels("shN")[:, :, :3].reshape(-1, k, 3)
     low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
     books = {part: np.array(meta[part]["codebook"]) for part in ("sh0", "scales")}
     book = np.array(meta["shN"]["codebook"]) if k else np.zeros(256)
 
     def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
         part = (lows[rows, :3] + 256.0 * highs[rows, :3]) / 65535
-        bent = low * (1 - part) + high * part
-        sh = np.zeros((len(bent), k + 1, 3), np.float32)
+        encoded = low * (1 - part) + high * part
+        sh = np.zeros((len(encoded), k + 1, 3), np.float32)
         sh[:, 0] = books["sh0"][colours[rows, :3]]
         sh[:, 1:] = book[palette[halves[rows, 0] + 256 * halves[rows, 1].astype(np.int64)]]
-        others = (turns[rows, :3] / 127.5 - 1) / 2**0.5
+        others = (rotations[rows, :3] / 127.5 - 1) / 2**0.5
         return {
-            "means": np.where(bent < 0, -1, 1) * (np.exp(np.abs(bent)) - 1),
-            "quaternions": _with_largest(turns[rows, 3].astype(np.int64) - 252, others),
+            "means": np.where(encoded < 0, -1, 1) * (np.exp(np.abs(encoded)) - 1),
+            "quaternions": _with_largest(rotations[rows, 3].astype(np.int64) - 252, others),
             "log_scales": books["scales"][sizes[rows, :3]],
             "opacity_logits": logits(colours[rows, 3] / 255),
             "sh": sh,
@@ -177,7 +180,8 @@ def sog(path: Path | BinaryIO) -> Splats:
 
 
 def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[N, 4] where `others` [N, 3] leave out the component `column`, which is the largest."""
+    """[N, 4] unit quaternions. column [N]: the index of the largest component; others [N, 3]: the
+    other components in their order."""
     quaternions = np.zeros((len(others), 4))
     for k in range(4):
         rows = column == k

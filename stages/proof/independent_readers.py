@@ -1,10 +1,9 @@
-"""Second readers, for checking what the writers wrote.
+"""Independent readers, which check what the writers wrote.
 
-None of them shares code with its writer: plyfile, pygltflib with raw accessors, usd-core's
-attributes, a byte-wise reading of .splat, and for .html the standard library's HTML parser. They
-leave the splats in the file's own axes, and the table of formats says how those lie in our world,
-so that a check can move the camera instead of the splats: then a wrong turn of positions,
-rotations or SH shows in the picture.
+None of them shares code with its writer: plyfile, pygltflib with raw accessors, attributes from
+usd-core, the bytes of .splat, and the standard library's HTML parser for .html. They leave the
+splats in the axes of the file. The check moves the camera into these axes instead of turning the
+splats, so that a wrong rotation of positions, quaternions or SH shows in the picture.
 """
 
 from __future__ import annotations
@@ -21,31 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import forget, passing
-from stages.base.lazy import load_object
-from stages.formats import format_of
-from stages.proof.content import (
-    Y_DOWN,
-    Y_UP,
-    FileContent,
-    logits,
-    splats_by_rows,
-    splats_of,
-)
+from stages.base.blocks import release_mapped_pages, reported_blocks
+from stages.proof.content import logits, splats_by_rows, splats_of
 from stages.scene import Splats
 
-__all__ = ["FileContent", "read_back"]
-
 _PLY_ROWS = 1 << 14  # columns are gathered from the cache
-_PAGE_PIECE = 1 << 22  # characters: the parser goes over an unfinished element once a piece
-
-
-def read_back(path: Path) -> FileContent:
-    """What another program would find in the file. Raises whatever its parser raises: a file that
-    was just written has no excuse."""
-    with np.errstate(all="ignore"):  # flat splats have a logarithm of -infinity
-        row = format_of(path)
-        return FileContent(load_object(row.second_reader)(path), Y_UP if row.y_up else Y_DOWN)
+_PAGE_PIECE = 1 << 22  # characters: the parser scans an unfinished element once a piece
 
 
 def ply(path: Path) -> Splats:
@@ -62,7 +42,7 @@ def ply(path: Path) -> Splats:
         "opacity_logits": scratch.empty((count,)),
         "sh": scratch.empty((count, per_channel + 1, 3)),
     }
-    for part in passing(count, _PLY_ROWS):
+    for part in reported_blocks(count, _PLY_ROWS):
         rows = vertex.data[part]
         for i in range(3):
             arrays["means"][part, i] = rows["xyz"[i]]
@@ -73,12 +53,12 @@ def ply(path: Path) -> Splats:
         for i in range(4):
             arrays["quaternions"][part, i] = rows[f"rot_{i}"]
         arrays["opacity_logits"][part] = rows["opacity"]
-        forget(vertex.data)
+        release_mapped_pages(vertex.data)
     return splats_of(**arrays)
 
 
 class _Chunks(HTMLParser):
-    """Unpacks what a browser would find in the script elements of class "splats" into a file."""
+    """Unpacks the script elements of class "splats" into a file, as a browser would."""
 
     def __init__(self, target: BinaryIO) -> None:
         super().__init__()
@@ -109,7 +89,7 @@ def html(path: Path) -> Splats:
             while piece := page.read(_PAGE_PIECE):
                 parser.feed(piece)
             parser.close()
-        assert parser.unpacker.eof, "the splats in it are cut short"
+        assert parser.unpacker.eof, "its splats are cut short"
         return ply(inside)
 
 
@@ -133,7 +113,7 @@ def splat(path: Path) -> Splats:
 
 
 class _Bytes:
-    """A file's bytes from `start`, read where they are looked at."""
+    """The bytes of a file from `start`; a slice of it is read from disk."""
 
     def __init__(self, path: Path, start: int = 0) -> None:
         self.path, self.start = path, start
@@ -175,15 +155,15 @@ def gltf(path: Path) -> Splats:
     prefix = "KHR_gaussian_splatting:"
     parts = []
     for primitive in document.meshes[0].primitives if document.meshes else []:
-        bands = [
+        coefficients = [
             f"{prefix}SH_DEGREE_{d}_COEF_{i}"
             for d in range(4)
             for i in range(2 * d + 1)
             if hasattr(primitive.attributes, f"{prefix}SH_DEGREE_{d}_COEF_{i}")
         ]
-        degree_0 = document.accessors[getattr(primitive.attributes, bands[0])]
+        degree_0 = document.accessors[getattr(primitive.attributes, coefficients[0])]
         sh = np.zeros((degree_0.count, 16, 3), np.float32)
-        for k, name in enumerate(bands):
+        for k, name in enumerate(coefficients):
             sh[:, k] = values(primitive, name)
         xyzw = values(primitive, f"{prefix}ROTATION")
         parts.append(
@@ -206,7 +186,7 @@ def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.float
     element = np.dtype((kind, ({"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type],)))
     step = view.byteStride or element.itemsize
     start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
-    # a record with what lies between two elements as padding; the last need not have it
+    # a record whose padding is the space between two elements; the last element may lack it
     record = np.dtype({"names": ["v"], "formats": [element], "offsets": [0], "itemsize": step})
     data = blob[start : start + accessor.count * step].ljust(accessor.count * step, b"\0")
     values = np.frombuffer(data, record, accessor.count)["v"]
@@ -218,7 +198,7 @@ def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.float
 def usd(path: Path) -> Splats:
     from pxr import Gf, Sdf, Usd, Vt
 
-    # In which column each of w, x, y, z arrives, found out and not assumed.
+    # The column in which each of w, x, y, z arrives, measured instead of assumed.
     columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
     # Without the library's cache, which may hold an older file of the same name.
     stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(str(path)))
@@ -228,7 +208,7 @@ def usd(path: Path) -> Splats:
             continue
         get = prim.GetAttribute
         degree = get("radiance:sphericalHarmonicsDegree").Get()
-        # Copied, because for arrays that cannot be written all drawing would be compiled anew.
+        # Copied, because Numba would compile all kernels again for read-only arrays.
         coefficients = np.array(get("radiance:sphericalHarmonicsCoefficients").Get(), np.float32)
         parts.append(
             splats_of(

@@ -16,18 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, format_of
-from stages.formats.rows import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, kept_rows
-from stages.measure.evaluation import IDENTICAL_DB, capped_psnr_db
-from stages.proof import diagnosis, independent_readers
+from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
+from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
+from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
 from stages.proof.content import FileContent
 from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
-from stages.raster.draw import renderer, settings_of
-from stages.scene import Camera, Splats, View, split_held_out, spread_over
-from stages.scene.framing import around
+from stages.raster.draw import raster_settings_of, renderer
+from stages.scene import Camera, Splats, View, evenly_spaced, split_held_out
+from stages.scene.framing import orbit_cameras
 
 _SIDE_PX = 480
 _CAMERAS = 3
@@ -60,8 +59,8 @@ def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...
     training, held = split_held_out(tuple(views))
     chosen = held or training
     if not chosen:
-        return tuple(camera.fitted(_SIDE_PX) for camera in around(splats, _CAMERAS, _MIDDLE))
-    return tuple(view.camera.fitted(_SIDE_PX) for view in spread_over(chosen, _CAMERAS))
+        return tuple(camera.fitted(_SIDE_PX) for camera in orbit_cameras(splats, _CAMERAS, _MIDDLE))
+    return tuple(view.camera.fitted(_SIDE_PX) for view in evenly_spaced(chosen, _CAMERAS))
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class Prover:
         came_as: str = "",
     ) -> Prover:
         drawn = _middle(splats)
-        draw = renderer(splats.take(drawn), settings_of(splats), backend)
+        draw = renderer(splats.take(drawn), raster_settings_of(splats), backend)
         pictures = tuple(draw(camera).image for camera in cameras)
         return cls(splats, drawn, cameras, pictures, backend, came_as)
 
@@ -102,13 +101,13 @@ class Prover:
         """
         row = format_of(path)
         try:
-            content = _drawable(independent_readers.read_back(path))
-            said = load_object(row.validator)(path) if row.validator else []
+            content = _drawable(checks.read_back(path))
+            errors = checks.CHECKS[row.ending].validate(path)
         except Exception as error:  # whatever another parser raises: the file is wrong
             return Proof(0, {}, f"another reader refused it ({_words(error)})")
         count = len(content.splats)
-        if said:
-            return Proof(count, {}, f"its validator says: {said[0]}")
+        if errors:
+            return Proof(count, {}, f"its validator says: {errors[0]}")
         if count != len(self.splats):
             return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
         names = tuple(filter(None, (row.ending, self.came_as)))
@@ -127,7 +126,7 @@ class Prover:
             "worst_attribute": found.worst,
             "worst_splat": found.worst_row,
         }
-        fault = diagnosis.explained(self.splats, content, found)
+        fault = diagnosis.explain(self.splats, content, found)
         if not lossy and worst < _LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn
@@ -139,7 +138,7 @@ class Prover:
         file's splats into ours: so the turn of positions, rotations and SH is checked by something
         other than itself."""
         drawn = self.drawn if isinstance(self.drawn, slice) else self.drawn[rows]
-        draw = renderer(content.splats.take(drawn), settings_of(self.splats), self.backend)
+        draw = renderer(content.splats.take(drawn), raster_settings_of(self.splats), self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
             capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))
@@ -176,7 +175,7 @@ def _drawable(content: FileContent) -> FileContent:
                 splats.opacity_logits,
             ),
         )
-    return replace(content, splats=kept_rows(splats)[0])
+    return replace(content, splats=drop_undrawable(splats)[0])
 
 
 def _words(error: Exception) -> str:

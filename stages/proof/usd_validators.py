@@ -1,15 +1,15 @@
-"""What the validators that come with the USD library say about a file."""
+"""The validators that come with the USD library."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 
-def complaints(path: Path) -> list[str]:
-    """One line for each error that any of its registered validators finds.
+def errors_in(path: Path) -> list[str]:
+    """One line for each error that a registered validator finds.
 
-    They know stages, packages and prims, but nothing of particle fields: values are for the
-    readers to check. Warnings and remarks are left out.
+    The validators check stages, packages and prims, but not particle fields: the independent
+    readers check the values. Warnings and remarks are ignored.
     """
     from pxr import Usd, UsdValidation
 

@@ -29,8 +29,8 @@ MEAN, ROTATION, LOG_SCALE, OPACITY, SH, SH_REST = 0, 3, 7, 10, 11, 14
 # A row of contributions, of one splat to one picture w its weights, r render less photograph, sums
 # over pixels: change of the squared error without the splat, of w, the largest w, of w^2, and of
 # w r by channel (PULL to PULL + 2).
-CHANGE, WEIGHT, LARGEST, SQUARES, PULL = range(5)
-CONTRIBUTIONS = PULL + 3
+ERROR_CHANGE, WEIGHT, LARGEST_WEIGHT, SQUARED_WEIGHT, WEIGHTED_RESIDUAL = range(5)
+CONTRIBUTIONS = WEIGHTED_RESIDUAL + 3
 
 
 def used_columns(bands: int) -> int:

@@ -40,7 +40,7 @@ def renderer(
 ) -> Callable[[Camera], Rendering]:
     """What draws the same splats from one camera after another, and keeps its buffers between
     them. What it hands out is the caller's own. As `render` for the rest."""
-    chosen = settings or settings_of(splats)
+    chosen = settings or raster_settings_of(splats)
     widths = NO_SMOOTHING if smoothing is None else np.ascontiguousarray(smoothing, np.float32)
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
 
@@ -58,7 +58,7 @@ def renderer(
     return draw
 
 
-def settings_of(splats: Splats) -> RasterSettings:
+def raster_settings_of(splats: Splats) -> RasterSettings:
     """How these splats are drawn: by their own look, or by their size where they have none."""
     near = splats.draw_settings.near or near_plane_of(splats.means)
     return RasterSettings(near=near, background=(splats.draw_settings.background,) * 3)

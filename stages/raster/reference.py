@@ -128,7 +128,7 @@ class Projected:
     depths: Tensor
 
 
-def smooth(p: Parameters, widths: Tensor) -> tuple[Tensor, Tensor]:
+def apply_smoothing(p: Parameters, widths: Tensor) -> tuple[Tensor, Tensor]:
     """([N, 3] scales, [N] factor of the opacity) under 3D smoothing filters of `widths` [N].
 
     A product of ratios per axis: a ratio of determinants underflows.
@@ -151,7 +151,7 @@ def project(
     p = p.rows(index)
     scales, kept = p.log_scales.exp(), torch.ones_like(z[index])
     if smoothing is not None:
-        scales, kept = smooth(p, smoothing[index])
+        scales, kept = apply_smoothing(p, smoothing[index])
     at = p.means @ rotation.T + translation
     z = at[:, 2]
     slope_x, slope_y = at[:, 0] / z, at[:, 1] / z

@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import (
-    CHANGE,
     CONTRIBUTIONS,
-    LARGEST,
+    ERROR_CHANGE,
+    LARGEST_WEIGHT,
     NO_SMOOTHING,
-    PULL,
-    SQUARES,
+    SQUARED_WEIGHT,
     WEIGHT,
+    WEIGHTED_RESIDUAL,
     Arrays,
     Backward,
     RasterSettings,
     gradient_columns,
 )
-from stages.raster.gpu.device import failures_told
+from stages.raster.gpu.device import gpu_errors_explained
 from stages.raster.reference import (
     Parameters,
     Projected,
@@ -74,7 +74,7 @@ class ReferenceRasteriser:
         depths: bool = False,
     ) -> ReferenceForward:
         """See `definition.Rasteriser`."""
-        with failures_told(len(arrays[0])), torch.no_grad():
+        with gpu_errors_explained(len(arrays[0])), torch.no_grad():
             p, widths = self._parameters(arrays), self._widths(smoothing)
             projected = project(p, camera, settings, widths)
             image, *planes = render_projected(p, projected, camera, settings)
@@ -94,7 +94,7 @@ class ReferenceRasteriser:
     ) -> Backward:
         """See `definition.Rasteriser`."""
         rows, degree = forward.visible, forward.settings.sh_degree
-        with failures_told(len(arrays[0])):
+        with gpu_errors_explained(len(arrays[0])):
             p = self._parameters(arrays)
             for tensor in p.tensors():
                 tensor.requires_grad_()
@@ -136,7 +136,7 @@ class ReferenceRasteriser:
         p, planes = self._parameters(forward.arrays), self._tensor(residual)
         like: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
         found = torch.zeros(len(forward.arrays[0]), CONTRIBUTIONS, **like)
-        with failures_told(len(found)), torch.no_grad():
+        with gpu_errors_explained(len(found)), torch.no_grad():
             projected = project(p, camera, settings, self._widths(forward.smoothing))
             rgb = colours(p.rows(projected.index), self._tensor(camera.centre), settings.sh_degree)
             for place, rows, pixels in picture_blocks(projected, camera):
@@ -153,11 +153,13 @@ class ReferenceRasteriser:
                     shift = torch.where(weights > 0, shift, torch.zeros_like(shift))
                     change += shift * (shift + 2 * errors[channel])
                 index = projected.index[rows]
-                found[index, CHANGE] += change.sum(1)
+                found[index, ERROR_CHANGE] += change.sum(1)
                 found[index, WEIGHT] += weights.sum(1)
-                found[index, LARGEST] = torch.maximum(found[index, LARGEST], weights.amax(1))
-                found[index, SQUARES] += weights.square().sum(1)
-                found[index, PULL:] += weights @ errors.T
+                found[index, LARGEST_WEIGHT] = torch.maximum(
+                    found[index, LARGEST_WEIGHT], weights.amax(1)
+                )
+                found[index, SQUARED_WEIGHT] += weights.square().sum(1)
+                found[index, WEIGHTED_RESIDUAL:] += weights @ errors.T
         return _host(found).astype(np.float64)[forward.visible]
 
     def _parameters(self, arrays: Arrays) -> Parameters:

@@ -27,8 +27,8 @@ def device_named(name: str) -> Any:
             "raster-no-device",
             given=f"--device {name}: torch {torch.__version__} finds no such device here.",
             wanted=f"One that is there: {', '.join(filter(is_there, DEVICES))}.",
-            hint="Choose that, or another backend. docs/gpu.md says which build of torch brings "
-            "which device.",
+            hint="Choose that, or another backend. docs/guide/gpu.md says which build of torch "
+            "brings which device.",
             family=Family.RESOURCES,
         )
     return torch.device(name)

@@ -1,8 +1,9 @@
-"""One attempt at one stage: run it in its working folder, account for it, make it final."""
+"""One attempt at one stage: run it in its working folder, measure it, make its output final."""
 
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -14,7 +15,7 @@ from stages.base.errors import Interrupted
 from stages.base.libraries import versions
 from stages.base.memory import PeakMemory
 from stages.base.stage import (
-    Draw,
+    DrawView,
     Numbers,
     Report,
     Stage,
@@ -29,25 +30,25 @@ _NOTE_EVERY_S = 5.0
 
 
 class Listener:
-    """Hears what happens in a run; a method that is left as it is does nothing."""
+    """Receives the events of a run. Subclasses override the methods that they need."""
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        """`resumed`: an interrupted attempt at the same request left work to go on with."""
+        """`resumed`: an interrupted attempt at the same request is continued."""
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         """As `Report.progress`."""
 
-    def drawable(self, stage: Stage, draw: Draw) -> None:
-        """As `Report.offer`."""
+    def drawable(self, stage: Stage, draw: DrawView) -> None:
+        """As `Report.offer`: the work so far can be drawn."""
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        """The stage ran and its output is final."""
+        """The stage ran, and its output is final."""
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        """The stage was finished before and nothing changed."""
+        """The stage was finished before, and nothing changed."""
 
     def stopping(self) -> None:
-        """A signal asked the run to stop; it will, at the next safe place."""
+        """A signal requested a stop; the run stops at the next safe boundary."""
 
     def ended(self) -> None:
         """The run is over, whether it succeeded or not."""
@@ -62,16 +63,16 @@ def attempt(
     stop: Event,
     listener: Listener,
 ) -> Manifest:
-    """Run `stage` in `space.partial`, which `Workspace.begin` made ready, and make it final.
+    """Run `stage` in `space.partial`, which `Workspace.begin` prepared, and make its output final.
 
-    Raises Interrupted (the working folder is kept), SplatError for what the machine refused, and
-    whatever else the stage raises.
+    Raises Interrupted (the working folder is kept), SplatError for an error of the operating
+    system, and whatever else the stage raises.
     """
     report = Report(stop_requested=stop)
     report.listener = lambda label, done, total, numbers: listener.progressed(
         stage, label, done, total, numbers
     )
-    report.onlooker = lambda draw: listener.drawable(stage, draw)
+    report.preview = lambda draw: listener.drawable(stage, draw)
     usage = _Usage(space.partial)
     try:
         with PeakMemory(tick=usage.note) as memory:
@@ -81,8 +82,8 @@ def attempt(
     except Exception as error:
         explained = as_splat_error(error, stage.name, space.run_folder)
         if explained is None:
-            said = str(error).splitlines()[0] if str(error) else "no more is known"
-            space.note_failure("bug", f"{type(error).__name__}: {said}.")
+            message = str(error).splitlines()[0] if str(error) else "no message"
+            space.note_failure("bug", f"{type(error).__name__}: {message}.")
             raise
         space.note_failure(explained.code, explained.given)
         if explained is error:
@@ -106,6 +107,7 @@ def _manifest(request: Request, report: Report, folder: Path, usage: _Usage) -> 
         outputs=outputs,
         output_digest=combined_digest(outputs),
         seconds=round(usage.seconds, 3),
+        cpu_seconds=round(usage.cpu_seconds, 3),
         peak_memory_mib=round(usage.peak_mib, 1),
         device=report.device,
         seed=request.settings.get("seed"),
@@ -116,28 +118,41 @@ def _manifest(request: Request, report: Report, folder: Path, usage: _Usage) -> 
 
 
 class _Usage:
-    """Seconds and peak memory of all attempts together, noted in the working folder now and then,
-    so that a run that is killed and resumed still accounts for the time before."""
+    """Wall-clock seconds, CPU seconds and peak memory of all attempts together. They are saved in
+    the working folder now and then, so that a run that is killed and resumed counts them all."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._start = self._noted = time.monotonic()
-        self._seconds_before = self.peak_mib = 0.0
+        self._noted = time.monotonic()
+        self._start, self._cpu_start = self._noted, _cpu_seconds()
+        self.peak_mib = 0.0
         with suppress(OSError, ValueError, KeyError, TypeError):
             before = json.loads((folder / USAGE).read_text(encoding="utf-8"))
-            self._seconds_before = float(before["seconds"])
             self.peak_mib = float(before["peak_memory_mib"])
+            self._start -= float(before["seconds"])
+            self._cpu_start -= float(before["cpu_seconds"])
 
     @property
     def seconds(self) -> float:
-        return self._seconds_before + time.monotonic() - self._start
+        return time.monotonic() - self._start
+
+    @property
+    def cpu_seconds(self) -> float:
+        return _cpu_seconds() - self._cpu_start
 
     def note(self, peak_mib: float, now: bool = False) -> None:
         self.peak_mib = max(self.peak_mib, peak_mib)
         if now or time.monotonic() - self._noted >= _NOTE_EVERY_S:
             self._noted = time.monotonic()
-            with suppress(OSError):  # an account that cannot be kept must not stop the work
-                write_json(
-                    self._folder / USAGE,
-                    {"seconds": self.seconds, "peak_memory_mib": self.peak_mib},
-                )
+            usage = {
+                "seconds": self.seconds,
+                "cpu_seconds": self.cpu_seconds,
+                "peak_memory_mib": self.peak_mib,
+            }
+            with suppress(OSError):  # a full disk must not stop the work here
+                write_json(self._folder / USAGE, usage)
+
+
+def _cpu_seconds() -> float:
+    """User and system time of this process and of its child processes that have ended."""
+    return sum(os.times()[:4])

@@ -1,33 +1,36 @@
-"""What the machine refused, as an error that says what to do: disk, permissions, memory."""
+"""Errors of the operating system (disk, permissions, memory) as errors that say what to do."""
 
 from __future__ import annotations
 
 import errno
 from pathlib import Path
 
-from stages.base.disk import is_full
+from stages.base.disk import DISK_FULL, is_full
 from stages.base.errors import Family, SplatError
 
-_DISK = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _USER = (Family.USAGE, Family.INPUT, Family.RUN_FOLDER)
 _MEMORY_WORDS = ("can't allocate memory", "out of memory", "not enough memory")
 
 
 def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError | None:
-    """The SplatError that explains `error`, or None if it is not the machine's refusal.
+    """The SplatError that explains `error`, or None if the operating system did not cause it.
 
-    doing: what was going on ("train"). folder: where it wrote. The chain of causes is searched,
-    since libraries wrap what the system told them.
+    The chain of causes is searched, because libraries wrap the system's own errors.
+
+    Args:
+        error: what was raised.
+        doing: what was going on, such as "train".
+        folder: where output was written.
     """
     chain = _chain(error)
-    if any(isinstance(link, OSError) and link.errno in _DISK for link in chain):
+    if any(isinstance(link, OSError) and link.errno in DISK_FULL for link in chain):
         return disk_full(doing, folder)
-    # Libraries report a full disk as something else.
+    # Some libraries report a full disk as another error.
     full = isinstance(error, Exception) and is_full(folder)
     for link in chain:
         if isinstance(link, SplatError):
-            # What ended in a process of its own cannot say why: a full disk explains it.
+            # A child process that ended cannot say why; a full disk explains it.
             return disk_full(doing, folder) if full and link.family not in _USER else link
         if isinstance(link, OSError) and link.errno in _DENIED:
             return not_writable(Path(link.filename or folder), link)
@@ -49,8 +52,8 @@ def disk_full(doing: str, folder: Path) -> SplatError:
     return SplatError(
         "disk-full",
         given=f"The disk of {folder} became full during {doing}.",
-        wanted="Room for what the stage writes.",
-        hint="Free some space and give the same command again: finished stages are kept.",
+        wanted="Free space for the output of the stage.",
+        hint="Free some space and run the same command again: finished stages are kept.",
         family=Family.RESOURCES,
     )
 
@@ -59,7 +62,7 @@ def not_writable(path: Path, error: OSError) -> SplatError:
     return SplatError(
         "not-permitted",
         given=f"{path}: {error.strerror or error}.",
-        wanted="A place that may be written to.",
+        wanted="A folder that can be written to.",
         hint="Change its permissions, or name another folder with --out.",
         family=Family.RESOURCES,
     )

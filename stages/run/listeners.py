@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stages.base.stage import Draw, Numbers, Stage
+from stages.base.stage import DrawView, Numbers, Stage
 from stages.run.attempt import Listener
 from stages.run.manifest import Manifest
 
@@ -21,7 +21,7 @@ class Listeners(Listener):
         for one in self._listeners:
             one.progressed(stage, label, done, total, numbers)
 
-    def drawable(self, stage: Stage, draw: Draw) -> None:
+    def drawable(self, stage: Stage, draw: DrawView) -> None:
         for one in self._listeners:
             one.drawable(stage, draw)
 

@@ -1,7 +1,7 @@
-"""What a finished stage wrote down about itself.
+"""The manifest of a finished stage.
 
-`manifest.json` is written last: its presence is what "finished" means. It carries a digest of its
-own contents, so that one edited by hand is noticed and not believed.
+`manifest.json` is written last: a stage is finished if and only if it exists. It holds a digest of
+its own contents, so that a manifest edited by hand is detected.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 from stages.base.errors import Family, SplatError
 from stages.run.digests import FileRecords, records_from_data, records_to_data
 
-SCHEMA = 1  # raised when an older program could not read what this one writes
+SCHEMA = 2  # of manifests and `run.json`; raised when their keys or settings are renamed
 MANIFEST = "manifest.json"
 
 
@@ -26,13 +26,22 @@ MANIFEST = "manifest.json"
 class Manifest:
     """One finished stage.
 
-    stage, version: which code ran. settings: all of them, as plain data.
-    inputs: digest of each input by name. input_files: for inputs that are the user's own files,
-        each file, so that the one that changed can be named.
-    outputs: each file that the stage made. output_digest: one digest over their names and bytes.
-    seconds: wall clock, all attempts together. peak_memory_mib: of the process and its children
-        while the stage ran. device, libraries, seed: what ran it.
-    metrics: plain figures from the stage. warnings: (code, sentence) pairs.
+    Args:
+        stage, version: the stage's name and version.
+        settings: all settings, as plain data.
+        inputs: digest of each input by name.
+        outputs: record of each output file by name.
+        output_digest: one digest over names and contents of the outputs.
+        seconds: wall-clock seconds, all attempts together.
+        cpu_seconds: CPU seconds of the process and its child processes, all attempts together.
+        peak_memory_mib: of the process and its children while the stage ran.
+        device: hardware that it ran on.
+        seed: the random seed, if the stage has one.
+        input_files: for inputs that are the user's own files, the record of each file, so that
+            the one that changed can be named.
+        libraries: versions by distribution name.
+        metrics: plain figures from the stage.
+        warnings: (code, sentence) pairs.
     """
 
     stage: str
@@ -42,6 +51,7 @@ class Manifest:
     outputs: FileRecords
     output_digest: str
     seconds: float
+    cpu_seconds: float
     peak_memory_mib: float
     device: str
     seed: int | None = None
@@ -56,7 +66,7 @@ class Manifest:
         return sum(record.size for record in self.outputs.values())
 
     def write(self, folder: Path) -> None:
-        """Write `manifest.json` into `folder`, whole or not at all. Raises OSError."""
+        """Write `manifest.json` into `folder` atomically. Raises OSError."""
         data = asdict(self)
         data["outputs"] = records_to_data(self.outputs)
         data["input_files"] = {k: records_to_data(v) for k, v in self.input_files.items()}
@@ -66,7 +76,7 @@ class Manifest:
     def read(cls, folder: Path) -> Manifest | None:
         """The manifest in `folder`, or None if there is none.
 
-        Raises SplatError (run-folder-newer, manifest-edited).
+        Raises SplatError as `read_sealed` does.
         """
         data = read_sealed(folder / MANIFEST)
         if data is None:
@@ -81,8 +91,8 @@ class Manifest:
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON holds it: arrays and tuples as lists, numpy scalars as numbers, infinity and
-    NaN as the words "inf", "-inf", "nan" (JSON has none)."""
+    """`value` as JSON data: arrays and tuples as lists, numpy scalars as numbers, infinity and NaN
+    as the strings "inf", "-inf" and "nan", which JSON numbers cannot express."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -108,16 +118,16 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def write_sealed(path: Path, data: Mapping[str, Any]) -> None:
-    """`write_json` with the schema version and a digest of the contents added."""
+    """Write JSON with the schema version and a digest of the contents added. Raises OSError."""
     body = {"schema": SCHEMA, **plain(data)}
     write_json(path, {**body, "digest": _seal(body)})
 
 
 def read_sealed(path: Path) -> dict[str, Any] | None:
-    """What `write_sealed` wrote, or None if there is no such file.
+    """The data that `write_sealed` wrote, or None if there is no such file.
 
-    Raises SplatError: run-folder-newer for another schema, manifest-edited if it is not JSON, not
-    of the right shape, or does not match its own digest; run-folder-unreadable.
+    Raises SplatError: run-folder-older and run-folder-newer for another schema; manifest-edited if
+    it is not JSON, not of the right shape, or does not match its digest; run-folder-unreadable.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -135,11 +145,19 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
         raise _edited(path) from error
     if not isinstance(data, dict) or not isinstance(data.get("schema"), int):
         raise _edited(path)
+    if data["schema"] < SCHEMA:
+        raise SplatError(
+            "run-folder-older",
+            given=f"{path} was written by an older version of splat (schema {data['schema']}).",
+            wanted=f"A run folder of schema {SCHEMA}. Nothing in the folder was changed.",
+            hint="Start a new run folder: splat process PHOTOS --out NEW_RUN",
+            family=Family.RUN_FOLDER,
+        )
     if data["schema"] > SCHEMA:
         raise SplatError(
             "run-folder-newer",
             given=f"{path} was written by a newer version of splat (schema {data['schema']}).",
-            wanted=f"A run folder of schema {SCHEMA} or older.",
+            wanted=f"A run folder of schema {SCHEMA}.",
             hint="Upgrade splat, or start a new run folder with --out.",
             family=Family.RUN_FOLDER,
         )
@@ -156,11 +174,11 @@ def _seal(body: Mapping[str, Any]) -> str:
 
 def _edited(path: Path) -> SplatError:
     what = f"the folder {path.parent}" if path.name == MANIFEST else path
-    again = "its stage runs again" if path.name == MANIFEST else "it is written anew"
+    again = "its stage runs again" if path.name == MANIFEST else "it is written again"
     return SplatError(
         "manifest-edited",
         given=f"{path} was changed after it was written, or is damaged.",
-        wanted="The file as splat wrote it: what was made from what depends on it.",
+        wanted="The file as splat wrote it: later stages depend on it.",
         hint=f"Restore the file, or delete {what}: then {again}. Nothing else is lost.",
         family=Family.RUN_FOLDER,
     )

@@ -1,4 +1,4 @@
-"""Opening a run folder: is it ours, is it for these photographs, is anyone else at work in it?"""
+"""Checks when a run folder is opened: made by splat, from these photographs, not in use."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stages.base.errors import Family, SplatError
 from stages.run.digests import combined_digest, record_files
-from stages.run.lock import LOCK, locked
+from stages.run.lock import HOLDER, LOCK, locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.planning import PHOTOS
 from stages.run.runfile import RUN_FILE, RunFile
@@ -20,34 +20,35 @@ def is_run_folder(folder: Path) -> bool:
 
 
 def has_finished_work(folder: Path) -> bool:
-    """Whether any stage ever came to its end in this run folder."""
+    """Whether any stage has finished in this run folder."""
     return any(folder.glob(f"[1-9]-*/{MANIFEST}"))
 
 
 @contextmanager
 def opened(folder: Path, photos: Path | None) -> Iterator[None]:
-    """The run folder, made if it is new, and locked.
+    """Lock the run folder inside the block; make it if it is new.
 
-    photos: where new ones come from; None means that the folder must exist. Raises SplatError
-    (photographs-missing, run-folder-inside-photographs, run-folder-missing, run-folder-foreign,
-    run-folder-busy), OSError.
+    Without `photos` the folder must exist. Raises SplatError (photographs-missing,
+    run-folder-inside-photographs, run-folder-missing, run-folder-foreign, run-folder-busy, and
+    those of `RunFile.read`, before anything is written), OSError.
     """
     if photos is not None:
         _check_photos(folder, photos)
     if not is_run_folder(folder):
         if photos is None:
             raise missing(folder)
-        if folder.exists() and any(path.name != LOCK for path in folder.iterdir()):
+        if folder.exists() and any(path.name not in (LOCK, HOLDER) for path in folder.iterdir()):
             raise _foreign(folder)
+    RunFile.read(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
         yield
 
 
 def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) -> RunFile:
-    """The folder's run file, speaking of `photos` (absolute) if they are given.
+    """The folder's run file, with `photos` (an absolute path) as its photographs if given.
 
-    A moved folder of photographs, or a copy of it, is the same one; another is an error
+    A moved or copied folder of photographs is accepted. Other photographs are an error
     (run-folder-other-photographs) once a stage has finished. A new run folder gets an empty run
     file. Raises SplatError.
     """

@@ -14,10 +14,10 @@ from stages.scene.capture import (
     Photo,
     Reconstruction,
     View,
+    evenly_spaced,
     scene_extent,
-    seen_extent,
     split_held_out,
-    spread_over,
+    training_extent,
 )
 from stages.scene.draw_settings import DrawSettings, draw_settings_of, near_plane
 from stages.scene.splats import (
@@ -27,7 +27,7 @@ from stages.scene.splats import (
     TrainedSplats,
     dc_to_rgb,
     logit,
-    numbers_of,
+    parameters_per_splat,
     rgb_to_dc,
 )
 from stages.scene.storage import load_splats, save_splats
@@ -49,16 +49,16 @@ __all__ = [
     "View",
     "dc_to_rgb",
     "draw_settings_of",
+    "evenly_spaced",
     "fitted_size",
     "load_splats",
     "logit",
     "look_at",
     "near_plane",
-    "numbers_of",
+    "parameters_per_splat",
     "rgb_to_dc",
     "save_splats",
     "scene_extent",
-    "seen_extent",
     "split_held_out",
-    "spread_over",
+    "training_extent",
 ]

@@ -21,20 +21,23 @@ IGNORE, TRANSPARENT = "ignore", "transparent"  # what masks may mean
 
 @dataclass(frozen=True)
 class Photo:
-    """One usable photograph, as ingest left it.
+    """One usable photograph, as ingest wrote it.
 
-    name: the user's own relative path, posix style ("day 1/IMG_01.HEIC").
-    image: the normalised picture (upright, sRGB, 8 bit), relative to the capture's folder.
-    width, height: of the normalised picture, pixels.
-    focal_px: focal length from EXIF in pixels of the normalised picture, or None.
-    camera: a key that is equal for photographs of the same camera, lens setting and size.
-    sharpness: the higher the sharper; comparable within one capture.
-    twin: the first photograph of those that show nearly the same as this one; "" if none does.
-    log2_luminance: log2 of the median linear luminance. exposure_ev: EV at ISO 100 from EXIF.
-    mask: a grey picture of the same size, relative to the capture's folder; "" for none. 0 is
-        outside. outside: what that means: IGNORE (nobody knows what is there) or TRANSPARENT
-        (nothing is there; `image` is over black, and the mask says how much of it is solid).
-    gps: latitude and longitude in degrees from EXIF, or None.
+    Args:
+        name: the user's own relative path in posix style ("day 1/IMG_01.HEIC").
+        image: the normalised picture (upright, sRGB, 8 bit), relative to the capture's folder.
+        width, height: of the normalised picture, pixels.
+        focal_px: focal length from EXIF in pixels of the normalised picture, or None.
+        camera: a key that is equal for photographs of the same camera, lens setting and size.
+        sharpness: higher is sharper; comparable within one capture.
+        log2_luminance: log2 of the median linear luminance.
+        exposure_ev: EV at ISO 100 from EXIF, or None.
+        duplicate_of: name of the first photograph that shows nearly the same; "" if none does.
+        mask: a grey picture of the same size, relative to the capture's folder; "" for none. 0 is
+            outside.
+        outside: what pixels outside the mask mean. IGNORE: unknown content, which counts nowhere.
+            TRANSPARENT: nothing is there; `image` is composited over black, and the mask is alpha.
+        gps: latitude and longitude in degrees from EXIF, or None.
     """
 
     name: str
@@ -46,21 +49,21 @@ class Photo:
     sharpness: float
     log2_luminance: float
     exposure_ev: float | None
-    twin: str = ""
+    duplicate_of: str = ""
     mask: str = ""
     outside: str = ""
     gps: tuple[float, float] | None = None
 
     @property
     def picture(self) -> str:
-        """What every later picture of this photograph is called too, with its suffix: decided once,
-        by ingest, so that no two photographs share one ("day 1/IMG_01.jpg")."""
+        """The file name, with suffix, of this photograph in every later stage ("day 1/IMG_01.jpg").
+        Ingest chooses it once and makes sure that no two photographs share one."""
         return self.image.removeprefix(PHOTOS_FOLDER)
 
 
 @dataclass(frozen=True)
 class Capture:
-    """The usable photographs of one folder. folder: where `Photo.image` paths start."""
+    """The usable photographs of one folder. `Photo.image` is relative to `folder`."""
 
     folder: Path
     photos: tuple[Photo, ...]
@@ -68,15 +71,20 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """A registered photograph, undistorted. image: relative to the reconstruction's folder. twin:
-    as in `Photo`. role: "train" or "test" where a benchmark says so; "" where nobody does. mask,
-    outside: as in `Photo`, the mask relative to the reconstruction's folder. light: see
-    `scene.light`; None where it could not be measured."""
+    """A registered photograph, undistorted.
+
+    Args:
+        name, duplicate_of, outside: as in `Photo`.
+        image, mask: as in `Photo`, relative to the reconstruction's folder.
+        camera: pose and intrinsics.
+        role: "train" or "test" where a benchmark defines the split; "" elsewhere.
+        light: exposure and white balance, see `scene.light`; None if they could not be measured.
+    """
 
     name: str
     image: str
     camera: Camera
-    twin: str = ""
+    duplicate_of: str = ""
     role: str = ""
     mask: str = ""
     outside: str = ""
@@ -85,13 +93,18 @@ class View:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Posed pinhole views and a sparse cloud, in the levelled and recentred world.
+    """Posed pinhole views and a sparse point cloud, in the levelled and recentred world.
 
-    points [P, 3] float64, colours [P, 3] uint8, errors_px [P] mean reprojection error, tracks [P]
-    number of photographs that see the point.
-    origin [3]: what to add to be back in the coordinates that `units` speaks of (float64).
-    units: "metres", or "arbitrary" where nothing says how large the scene is.
-    levelled: whether up = -Y was found from the cameras.
+    Args:
+        folder: `View.image` is relative to it.
+        views: the registered photographs.
+        points: [P, 3] float64.
+        colours: [P, 3] uint8.
+        errors_px: [P] mean reprojection error, pixels.
+        tracks: [P] number of photographs that see the point.
+        origin: [3] float64, added to positions to get back to the coordinates of `units`.
+        units: "metres", or "arbitrary" if the scale of the scene is unknown.
+        levelled: whether the up direction (-Y) was found from the cameras.
     """
 
     folder: Path
@@ -106,46 +119,50 @@ class Reconstruction:
 
 
 def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """(training, held out): of every eight by name the first is held out, to judge and for nothing
-    else. Where views have roles, those for "test" are.
+    """(training views, held-out test views): the first of every eight views by name is held out and
+    used for evaluation only. Where views have roles, those with the role "test" are.
 
-    A photograph that has a twin would be judged by how well its twin was learnt: the first of the
-    eight that has none takes its place. Fewer than 4 views are too few to spare one: then nothing
-    is held out.
+    A near-duplicate of another view would measure how well that other view was learnt, so the first
+    of the eight that is no near-duplicate is held out instead. With fewer than 4 views nothing is.
     """
     ordered = tuple(sorted(views, key=lambda view: view.name))
     if any(view.role for view in ordered):
-        judges = tuple(view for view in ordered if view.role == "test")
-        return tuple(view for view in ordered if view.role != "test"), judges
+        test = tuple(view for view in ordered if view.role == "test")
+        return tuple(view for view in ordered if view.role != "test"), test
     if len(ordered) < 4:
         return ordered, ()
     eights = (ordered[i : i + HELD_OUT_EVERY] for i in range(0, len(ordered), HELD_OUT_EVERY))
-    alone = ([view for view in eight if not view.twin] for eight in eights)
-    held = tuple(eight[0] for eight in alone if eight)
+    distinct = ([view for view in eight if not view.duplicate_of] for eight in eights)
+    held = tuple(eight[0] for eight in distinct if eight)
     names = {view.name for view in held}
     return tuple(view for view in ordered if view.name not in names), held
 
 
-def spread_over(items: Sequence[Item], most: int) -> list[Item]:
-    """At most so many of them, evenly: photographs next to each other say the same."""
+def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:
+    """At most `most` of the items, evenly spaced: neighbouring photographs show much the same."""
     count = min(most, len(items))
     return [items[i * len(items) // count] for i in range(count)]
 
 
 def scene_extent(views: tuple[View, ...]) -> float:
-    """The reference trainer's scale of a scene: 1.1 x the largest distance of a camera from the
-    cameras' centre, with the median taken as centre and the 95th percentile as "largest" so that
-    one stray camera does not set it: the percentile is a camera's own distance, not a mean of two,
-    which the stray one could be among. Never 0."""
+    """Extent of the scene as in the reference trainer, world units: 1.1 x the largest distance of a
+    camera from the cameras' centre. Never 0.
+
+    The centre is the median and "largest" is the 95th percentile, so that one stray camera does not
+    decide. The percentile is one camera's own distance, not a mean of two that could include the
+    stray one.
+    """
     centres = np.array([view.camera.centre for view in views])
     distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
     return max(1.1 * float(np.percentile(distances, 95, method="lower")), 1e-6)
 
 
-def seen_extent(reconstruction: Reconstruction) -> float:
-    """What training measures strides and sizes by, world units: `scene_extent`, or how far away the
-    median camera sees its median point, if that is more. Cameras close together, of a phone held
-    almost still, tell little about the size of what is before them."""
+def training_extent(reconstruction: Reconstruction) -> float:
+    """The extent that training scales learning rates and splat sizes by, world units.
+
+    The larger of `scene_extent` and the depth at which the median camera sees its median point:
+    the cameras of a phone held almost still say little about the size of the scene before them.
+    """
     depths = []
     for view in reconstruction.views:
         pixels, z = view.camera.project(reconstruction.points)

@@ -13,12 +13,12 @@ _WIDTH_WITHOUT_A_PHOTOGRAPH_PX = 960
 _MEANS_FOR_DEPTH = 4000
 
 
-def in_front_of(splats: Splats) -> Camera:
+def front_camera(splats: Splats) -> Camera:
     """A camera that sees the middle nine tenths of the splats, from -z and a little above."""
-    return around(splats, 1, 0.9)[0]
+    return orbit_cameras(splats, 1, 0.9)[0]
 
 
-def around(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
+def orbit_cameras(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
     """`count` cameras evenly around the middle `part` of the splats, the first in front; each sees
     all of that part."""
     low, high = quantiles(splats.means, (0.5 - part / 2, 0.5 + part / 2))
@@ -34,7 +34,7 @@ def around(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def depth_of_interest(camera: Camera, means: NDArray[np.floating]) -> float:
+def median_depth(camera: Camera, means: NDArray[np.floating]) -> float:
     """The median z of what lies in the picture; of all in front if nothing does."""
     points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
     pixels, z = camera.project(points)

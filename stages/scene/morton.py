@@ -10,12 +10,12 @@ from stages.scene import Splats
 _BITS = 21  # three times 21 fit into 64
 
 
-def order(splats: Splats) -> NDArray[np.intp]:
+def morton_order(splats: Splats) -> NDArray[np.intp]:
     """[N] rows of `splats` in the order of their means; see `order_of`."""
-    return order_of(splats.means)
+    return morton_order_of(splats.means)
 
 
-def order_of(means: NDArray[np.floating]) -> NDArray[np.intp]:
+def morton_order_of(means: NDArray[np.floating]) -> NDArray[np.intp]:
     """[N] rows of means [N, 3] along a Morton curve (interleaved bits of x, y, z); equals keep
     their order.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -128,16 +129,18 @@ class QuantisedSplats:
     splats: the values to export, SH already cut to the degree decided for each splat.
     degree: the SH degree kept. decisions: plain data for the manifest (what was kept, its cost).
     flat_dc [N, 3]: DC coefficients for formats without view-dependent colour; None where those of
-    the splats do.
+    the splats do. finetuned: by format that
+    rounds its values, the splats that its file should hold, fine-tuned to that rounding.
     """
 
     splats: Splats
     degree: int
     decisions: dict[str, object]
     flat_dc: NDArray[np.floating] | None = None
+    finetuned: Mapping[str, Splats] = field(default_factory=dict)
 
 
-def numbers_of(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
+def parameters_per_splat(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
     """[N] how many numbers a splat of each degree is: place, rotation, scales and opacity, and
     three for each term of its colour."""
     return np.asarray(3 + 4 + 3 + 1 + 3 * (sh_degrees.astype(np.int64) + 1) ** 2)

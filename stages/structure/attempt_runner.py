@@ -1,7 +1,7 @@
-"""One rung after another, made real: which databases, which jobs, what is kept for resuming.
+"""Runs configurations of structure from motion: databases, worker jobs and what is kept to resume.
 
-Everything lies under one work folder. A step that is finished leaves a marker, and a run that was
-killed goes on after the last marker; half-done extraction and matching go on inside COLMAP's
+Everything lies under one work folder. A finished step leaves a marker file, and a run that was
+killed continues after the last marker. Unfinished extraction and matching continue inside COLMAP's
 database, whose content does not depend on how often it was interrupted.
 """
 
@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import json
 import re
-import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,6 @@ from statistics import median
 from stages.base.atomic import replacing
 from stages.base.stage import Report
 from stages.structure import database as sqlite
-from stages.structure import worker_progress
 from stages.structure.chunks import ChunkExecutor, extract_features_in_chunks, match_pairs_in_chunks
 from stages.structure.fallbacks import CONFIGURATIONS, Attempt, Configuration
 from stages.structure.gates import (
@@ -31,18 +29,26 @@ from stages.structure.gates import (
     check_pairs,
 )
 from stages.structure.job import Job, compared_pairs_path
-from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_worker
+from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_step
 from stages.structure.sparse_model import load_result, model_statistics, without_implausible_views
 
-MORE_FEATURES = 2.0  # times as many, at most
-LOWER_PEAK = 0.4  # times SIFT's peak threshold
+MORE_FEATURES = 2.0  # factor on the number of features
+LOWER_PEAK = 0.4  # factor on SIFT's peak threshold
 _SECONDS = "seconds.json"
 
 
 @dataclass
 class AttemptRunner:
-    """Runs rungs for one capture. base: the job that rungs vary. deadline: time.monotonic().
-    hands: who does shares of features and matching; None: this machine, unshared."""
+    """Runs configurations for one capture.
+
+    Args:
+        folder: the work folder.
+        base: the job of the standard configuration, which the others vary.
+        report: receives progress, and says when to stop.
+        deadline: of all configurations together, in seconds of `time.monotonic`.
+        allow_partial: go on to mapping although the gates before it failed.
+        executor: runs chunks of features and matching; None: one worker process does it all.
+    """
 
     folder: Path
     base: Job
@@ -57,22 +63,23 @@ class AttemptRunner:
     def seconds_left(self) -> float:
         return self.deadline - time.monotonic()
 
-    def try_rung(self, rung: Configuration) -> Attempt:
-        """Features, matches, mapping and all gates for one rung.
+    def run_configuration(self, configuration: Configuration) -> Attempt:
+        """Features, matches, mapping and all gates of one configuration.
 
         Raises SplatError for crashes of extraction and matching, and Interrupted.
         """
         photographs = len(self.base.names)
-        nothing = ModelStatistics(photographs=photographs, mapper=rung.mapper)
-        job = self._job(rung)
+        empty = ModelStatistics(photographs=photographs, mapper=configuration.mapper)
+        job = self._job(configuration)
         try:
-            self._features(job)
+            self._extract_features(job)
             counts = sqlite.keypoint_counts(Path(job.database), photographs)
-            attempt = Attempt(rung, (), nothing, keypoints_median=float(median(counts)))
+            attempt = Attempt(configuration, (), empty, keypoints_median=float(median(counts)))
             failures = check_keypoints(counts)
-            if failures and not self._hopeful(rung):
+            # A partial model may come of few features, but more features are tried before that.
+            if failures and not (self.allow_partial and configuration.more_features):
                 return replace(attempt, failures=tuple(failures))
-            job = self._matching(job, rung)
+            job = self._match(job, configuration)
             verified = sqlite.verified_pairs(Path(job.database))
             attempt = replace(
                 attempt,
@@ -80,26 +87,22 @@ class AttemptRunner:
                 pairs_verified=len(verified),
             )
             failures = check_pairs(verified, photographs)
-            if failures and not self.allow_partial:
-                return replace(attempt, failures=tuple(failures))
-            if any(failure.code == "sfm-no-matches" for failure in failures):
+            unmatched = any(failure.code == "sfm-no-matches" for failure in failures)
+            if failures and (unmatched or not self.allow_partial):
                 return replace(attempt, failures=tuple(failures))
         except WorkerTimedOut:
-            return Attempt(rung, (_too_slow(photographs),), nothing)
+            return Attempt(configuration, (_too_slow(photographs),), empty)
         except WorkerCrashed as crash:
             raise crash_error(crash, self.folder) from crash
         return self._mapped(job, attempt, failures)
 
-    def _hopeful(self, rung: Configuration) -> bool:
-        """Whether to go on with few features: only if there is no richer rung to come."""
-        return self.allow_partial and rung.more_features
-
     def _mapped(self, job: Job, attempt: Attempt, before: list[Failure]) -> Attempt:
+        """The attempt with the model of `job` and its failures, added to those `before`."""
         try:
-            self._mapping(job, attempt.rung)
+            self._map(job, attempt.configuration)
         except WorkerTimedOut:
-            figures = replace(attempt.figures, timed_out=True)
-            return replace(attempt, figures=figures, failures=tuple(check_model(figures)))
+            statistics = replace(attempt.statistics, timed_out=True)
+            return replace(attempt, statistics=statistics, failures=tuple(check_model(statistics)))
         except WorkerCrashed as crash:
             error = crash_error(crash, self.folder)
             failure = Failure(error.code, error.given, error.wanted, error.hint)
@@ -107,90 +110,86 @@ class AttemptRunner:
         result = load_result(Path(job.out))
         if result.model is not None:
             result = replace(result, model=without_implausible_views(result.model))
-        figures = model_statistics(result, len(self.base.names), attempt.rung.mapper)
-        failures = tuple(before) + tuple(check_model(figures))
-        return replace(attempt, figures=figures, failures=failures, result=result)
+        statistics = model_statistics(result, len(self.base.names), attempt.configuration.mapper)
+        failures = tuple(before) + tuple(check_model(statistics))
+        return replace(attempt, statistics=statistics, failures=failures, result=result)
 
-    def _job(self, rung: Configuration) -> Job:
-        base = self.base
-        name = "more" if rung.more_features else "base"
+    def _job(self, configuration: Configuration) -> Job:
+        base, more = self.base, configuration.more_features
+        model_folder = "model-" + re.sub(r"\W+", "-", configuration.name)
         return replace(
             base,
-            database=str(self.folder / f"{name}.db"),
-            out=str(self.folder / ("model-" + re.sub(r"\W+", "-", rung.name))),
+            database=str(self.folder / ("more.db" if more else "base.db")),
+            out=str(self.folder / model_folder),
             progress=str(self.folder / "progress.json"),
-            max_features=round(base.max_features * (MORE_FEATURES if rung.more_features else 1)),
-            peak_threshold=base.peak_threshold * (LOWER_PEAK if rung.more_features else 1.0),
-            matching="exhaustive" if rung.exhaustive else base.matching,
-            drop_stationary=rung.drop_stationary,
-            mapper=rung.mapper,
-            loose=rung.loose,
-            other_pair=rung.other_pair,
+            max_features=round(base.max_features * (MORE_FEATURES if more else 1)),
+            peak_threshold=base.peak_threshold * (LOWER_PEAK if more else 1.0),
+            matching="exhaustive" if configuration.exhaustive else base.matching,
+            drop_stationary=configuration.drop_stationary,
+            mapper=configuration.mapper,
+            loose=configuration.loose,
+            other_pair=configuration.other_pair,
         )
 
-    def _features(self, job: Job) -> None:
+    def _extract_features(self, job: Job) -> None:
         database = Path(job.database)
         marker = database.with_suffix(".features-done")
         if marker.exists() and database.exists():
             return
-        if database.exists():
-            _repair_or_delete(database)
+        sqlite.repair_or_delete(database)
         if self.executor is not None:
             with self._timed("features"):
-                extract_features_in_chunks(job, self.executor, self._look)
-        self._run(replace(job, step="features"), lambda: self._tick(job, "photographs"))
+                extract_features_in_chunks(job, self.executor, self._check_deadline)
+        self._run(replace(job, step="features"))
         marker.touch()
 
-    def _matching(self, job: Job, rung: Configuration) -> Job:
-        """Match; returns the job with the database that holds the geometries to use."""
+    def _match(self, job: Job, configuration: Configuration) -> Job:
+        """Match; returns the job with the database that holds the two-view geometries to use."""
         database = Path(job.database)
-        if rung.drop_stationary:
+        if configuration.drop_stationary:
             copied = database.with_name(database.stem + "-moving.db")
             if not copied.exists():
                 sqlite.copy(database, copied)
-                sqlite.forget_geometries(copied)
+                sqlite.delete_geometries(copied)
             database = copied
             job = replace(job, database=str(copied))
         marker = database.with_suffix(f".{job.matching}-done")
         if marker.exists() and database.exists():
             return job
-        if not rung.drop_stationary:
+        if not configuration.drop_stationary:
             sqlite.repair(database)
         if self.executor is not None:
-            self._share_matching(job, self.executor)
-        self._run(replace(job, step="matching"), lambda: self._tick(job, "pairs"))
+            self._match_in_chunks(job, self.executor)
+        self._run(replace(job, step="matching"))
         marker.touch()
         return job
 
-    def _share_matching(self, job: Job, executor: ChunkExecutor) -> None:
-        """Until no pairs are left to choose: which those are depends on how the others matched."""
+    def _match_in_chunks(self, job: Job, executor: ChunkExecutor) -> None:
+        """Match until no pair is left to select; the selection depends on earlier matches."""
         left = 1
         while left:
-            self._run(replace(job, step="choosing"), lambda: self._tick(job, "photographs"))
+            self._run(replace(job, step="pair selection"))
             with self._timed("matching"):
-                left = match_pairs_in_chunks(job, executor, self._look)
+                left = match_pairs_in_chunks(job, executor, self._check_deadline)
 
-    def _look(self) -> None:
-        """At the clock."""
+    def _check_deadline(self) -> None:
         if self.out_of_time():
             raise WorkerTimedOut
 
-    def _mapping(self, job: Job, rung: Configuration) -> None:
-        if _finished(Path(job.out)):
+    def _map(self, job: Job, configuration: Configuration) -> None:
+        if _is_mapped(Path(job.out)):
             return
-        total = len(job.names)
-        more = "" if rung is CONFIGURATIONS[0] else f" ({rung.name})"
-        budget = min(self.seconds_left(), mapping_seconds(total))
-        timed = replace(job, step="mapping", max_seconds=max(1, int(budget)))
+        budget = min(self.seconds_left(), mapping_seconds(len(job.names)))
+        job = replace(job, step="mapping", max_seconds=max(1, int(budget)))
+        suffix = "" if configuration is CONFIGURATIONS[0] else f" ({configuration.name})"
+        # COLMAP checks its own time limit only between photographs.
+        self._run(job, suffix, job.max_seconds + 60.0)
 
-        # COLMAP looks at its own clock only between photographs.
-        self._run(timed, lambda: self._tick(job, "photographs", more), timed.max_seconds + 60.0)
-
-    def _run(self, job: Job, tick: Callable[[], None], max_seconds: float | None = None) -> None:
+    def _run(self, job: Job, suffix: str = "", max_seconds: float | None = None) -> None:
+        """Run one step in a worker. suffix: of the phases in progress reports."""
         seconds = self.seconds_left() if max_seconds is None else max_seconds
-        Path(job.progress).unlink(missing_ok=True)
-        with self._timed("matching" if job.step == "choosing" else job.step):
-            run_worker(job, self.folder, self.report.stop_requested, seconds, tick)
+        with self._timed("matching" if job.step == "pair selection" else job.step):
+            run_step(job, self.folder, self.report, seconds, suffix)
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
@@ -203,40 +202,26 @@ class AttemptRunner:
                 path.write_text(json.dumps(before))
 
     def seconds_by_step(self) -> dict[str, float]:
-        """Of all rungs and of interrupted runs; wall clock."""
+        """Wall-clock seconds of each step, over all configurations and interrupted runs."""
         try:
             return dict(json.loads((self.folder / _SECONDS).read_text()))
         except (OSError, ValueError):
             return {}
 
-    def pairs_looked_at(self) -> int:
-        """By the first looks, each pair counted once."""
+    def pairs_compared(self) -> int:
+        """Pairs that pair selection compared by their largest features."""
         path = compared_pairs_path(self._job(CONFIGURATIONS[0]))
         return int(path.read_text()) if path.exists() else 0
 
-    def _tick(self, job: Job, unit: str, more: str = "") -> None:
-        """Pass on how far the worker says it is."""
-        told = worker_progress.read_progress(Path(job.progress))
-        if told is not None:
-            phase, done, total = told
-            self.report.progress(done, total, phase + more, **{unit: done})
-
 
 def mapping_seconds(photographs: int) -> float:
-    """Time for one mapping: several times what good captures need on two slow cores, because
-    captures that cannot be mapped go on for ever."""
+    """Time limit of one mapping: several times what good captures need on two slow cores. Captures
+    that cannot be mapped would otherwise go on without end."""
     return 240.0 + 10.0 * photographs
 
 
-def _repair_or_delete(database: Path) -> None:
-    try:
-        sqlite.repair(database)
-    except sqlite3.DatabaseError:
-        sqlite.delete(database)
-
-
-def _finished(out: Path) -> bool:
-    """Whether an earlier run came to the end of this mapping, and not of its time."""
+def _is_mapped(out: Path) -> bool:
+    """Whether an earlier run finished this mapping before its time limit."""
     try:
         return not load_result(out).timed_out
     except (OSError, ValueError):
@@ -246,7 +231,7 @@ def _finished(out: Path) -> bool:
 def _too_slow(photographs: int) -> Failure:
     return Failure(
         "sfm-timed-out",
-        f"Features and matches of {photographs} photographs were not ready in time.",
-        "The search must come to an end.",
+        f"Features and matches of {photographs} photographs were not finished in time.",
+        "Structure from motion must finish within --max-minutes.",
         "Allow more time with --max-minutes, or use fewer or smaller photographs (--max-side).",
     )

@@ -1,9 +1,9 @@
-"""Features and matches of many photographs in shares, which others may do at the same time.
+"""Features and matches of many photographs in chunks, which an executor may run on other machines.
 
-A share reads photographs, and features from the job's database, to which nobody writes meanwhile.
-It leaves a database of its own in the work folder, whole or not at all; the next step of the job
-takes it in. What comes of it does not depend on who did what: each photograph and each pair is
-found for itself, under words that are made once.
+A chunk reads photographs, and features from the job's database, which nothing writes to meanwhile.
+It writes a database of its own to the work folder, completely or not at all, and the next step of
+the job merges that. The result does not depend on who ran which chunk: each photograph and each
+pair is processed independently, with a vocabulary that is built once.
 """
 
 from __future__ import annotations
@@ -27,16 +27,21 @@ from stages.structure.process import WorkerCrashed, crash_error, run_worker
 if TYPE_CHECKING:
     from stages.structure.pairs import Pair
 
-PHOTOGRAPHS_PER_CHUNK, PAIRS_PER_CHUNK = 16, 128  # in a share: some seconds of one core
-CHUNK_MEMORY_MIB = (
-    2560.0  # sorted features of so many photographs, or the pictures they are found in
-)
-_MOST_S = 7 * 86400.0  # who hands shares out looks at the clock
+PHOTOGRAPHS_PER_CHUNK, PAIRS_PER_CHUNK = 16, 128  # some seconds of one core
+CHUNK_MEMORY_MIB = 2560.0  # the pictures of one chunk, or the indexed features that it matches
+_MAX_SECONDS = 7 * 86400.0  # the process that submits chunks checks the deadline
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """job: file of the whole job. out: the database to leave. photographs, or pairs: positions."""
+    """Some photographs or pairs of a job.
+
+    Args:
+        job: file of the whole job.
+        out: the database to write.
+        photographs: positions of photographs, for features.
+        pairs: positions of pairs, for matching.
+    """
 
     job: Path
     out: Path
@@ -45,59 +50,62 @@ class Chunk:
 
 
 ChunkExecutor = Callable[[Sequence[Chunk], Callable[[], None]], None]
-"""Does shares to their ends, in any order, and calls the second each time that one ends. Raises as
-`do` and as the second, and Interrupted."""
+"""Runs chunks (`run_chunk`) in any order, and calls its second argument after each. Passes on what
+either raises; raises Interrupted when it is stopped."""
 
 
-def extract_features_in_chunks(job: Job, executor: ChunkExecutor, look: Callable[[], None]) -> None:
-    """Have the features found that neither the job's database nor a finished share holds."""
+def extract_features_in_chunks(
+    job: Job, executor: ChunkExecutor, on_chunk: Callable[[], None]
+) -> None:
+    """Extract the features that neither the job's database nor a finished chunk holds."""
     have: set[int] = set()
     for database in (Path(job.database), *chunks_path(job).glob("*.db")):
         if database.exists():
             have |= sqlite.photographs_with_features(database)
     missing = [position for position in range(len(job.names)) if position not in have]
-    file, folder = _written(job)
+    file, folder = _write_job(job)
     parts = (tuple(missing[part]) for part in blocks(len(missing), PHOTOGRAPHS_PER_CHUNK))
-    executor([Chunk(file, folder / f"photograph-{p[0]}.db", p) for p in parts], look)
+    executor([Chunk(file, folder / f"photograph-{p[0]}.db", p) for p in parts], on_chunk)
 
 
-def match_pairs_in_chunks(job: Job, executor: ChunkExecutor, look: Callable[[], None]) -> int:
-    """Have the pairs matched that the step "choosing" chose; how many they are."""
-    chosen = [(first, second) for first, second in json.loads(selected_pairs_path(job).read_text())]
-    file, folder = _written(job)
-    parts = (tuple(chosen[part]) for part in blocks(len(chosen), PAIRS_PER_CHUNK))
-    executor([Chunk(file, folder / f"pair-{p[0][0]}-{p[0][1]}.db", pairs=p) for p in parts], look)
-    return len(chosen)
+def match_pairs_in_chunks(job: Job, executor: ChunkExecutor, on_chunk: Callable[[], None]) -> int:
+    """Match the pairs that the step "pair selection" selected; returns how many these are."""
+    pairs = [(first, second) for first, second in json.loads(selected_pairs_path(job).read_text())]
+    file, folder = _write_job(job)
+    parts = (tuple(pairs[part]) for part in blocks(len(pairs), PAIRS_PER_CHUNK))
+    names = ((f"pair-{p[0][0]}-{p[0][1]}.db", p) for p in parts)
+    executor([Chunk(file, folder / name, pairs=p) for name, p in names], on_chunk)
+    return len(pairs)
 
 
-def _written(job: Job) -> tuple[Path, Path]:
-    """(the job's file, the folder for its shares), at paths that mean the same everywhere."""
-    whole = replace(job, database=str(Path(job.database).absolute()))
-    folder = chunks_path(whole)
+def _write_job(job: Job) -> tuple[Path, Path]:
+    """(the file of the job, the folder of its chunks), with absolute paths."""
+    job = replace(job, database=str(Path(job.database).absolute()))
+    folder = chunks_path(job)
     folder.mkdir(exist_ok=True)
-    return whole.write(folder / "job.json"), folder
+    return job.write(folder / "job.json"), folder
 
 
-def run_chunk(share: Chunk) -> None:
-    """Do a share, unless it is done, in a worker process. Raises SplatError."""
-    if share.out.exists():
+def run_chunk(chunk: Chunk) -> None:
+    """Run a chunk in a worker process, unless its database exists. Raises SplatError."""
+    if chunk.out.exists():
         return
-    job = Job.read(share.job)
-    # Beside the others' and not where they are: a share that seemed lost may be done twice at once.
-    folder = Path(tempfile.mkdtemp(prefix=f"{share.out.stem}-", dir=share.out.parent))
+    job = Job.read(chunk.job)
+    # A folder of its own: a chunk that seemed lost may run twice at once.
+    folder = Path(tempfile.mkdtemp(prefix=f"{chunk.out.stem}-", dir=chunk.out.parent))
     part = replace(
         job,
-        step="features share" if share.photographs else "matching share",
+        step="features chunk" if chunk.photographs else "matching chunk",
         source=job.database,
-        database=str(folder / "share.db"),
+        database=str(folder / "chunk.db"),
         progress=str(folder / "progress.json"),
         threads=threads.count(),
-        photographs=share.photographs,
-        pairs=share.pairs,
+        photographs=chunk.photographs,
+        pairs=chunk.pairs,
     )
     try:
-        run_worker(part, folder, Event(), _MOST_S, lambda: None)
+        run_worker(part, folder, Event(), _MAX_SECONDS, lambda: None)
     except WorkerCrashed as crash:
         raise crash_error(crash, folder) from crash
-    os.replace(part.database, share.out)
+    os.replace(part.database, chunk.out)
     shutil.rmtree(folder, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""COLMAP's SQLite database, seen through the standard library alone.
+"""COLMAP's SQLite database, read and repaired with the standard library.
 
 The parent process reads counts from it, and repairs what a killed worker left half-written.
 Nothing here imports pycolmap.
@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MAX_IMAGES = 2147483647  # COLMAP: pair id = first id x this + second id, first < second
-_KEYPOINT = 4  # numbers of one, see `features.find`
+_KEYPOINT = 4  # numbers per keypoint, see `features.sift_features`
 
 
 def keypoint_counts(database: Path, photographs: int) -> list[int]:
-    """[photographs] keypoints of each, in order of the capture (image id - 1)."""
+    """[photographs] number of keypoints of each, by position in the capture (image id - 1)."""
     counts = [0] * photographs
     with closing(_open_read_only(database)) as connection:
         for image_id, rows in connection.execute("SELECT image_id, rows FROM keypoints"):
@@ -31,7 +31,7 @@ def keypoint_counts(database: Path, photographs: int) -> list[int]:
 
 
 def photographs_with_features(database: Path) -> set[int]:
-    """Positions of photographs whose features are there."""
+    """Positions of photographs whose features are in the database."""
     with closing(_open_read_only(database)) as connection:
         return {
             image_id - 1 for (image_id,) in connection.execute("SELECT image_id FROM descriptors")
@@ -63,7 +63,7 @@ def verified_pairs(database: Path) -> list[tuple[int, int, int, int]]:
 
 
 def repair(database: Path) -> None:
-    """Delete rows whose counterpart a killed worker had no time to write.
+    """Delete rows whose counterpart in another table a killed worker had not written yet.
 
     Raises sqlite3.DatabaseError if the file is no database.
     """
@@ -81,13 +81,25 @@ def repair(database: Path) -> None:
         connection.commit()
 
 
-class Features:
-    """Features and matches in a database, for several threads at once. still: nobody writes to it
-    now, so that machines which share its disk and no locks can read it."""
+def repair_or_delete(database: Path) -> None:
+    """`repair` the database if there is one; delete it if that fails."""
+    if database.exists():
+        try:
+            repair(database)
+        except sqlite3.DatabaseError:
+            delete(database)
 
-    def __init__(self, database: Path, still: bool = False) -> None:
+
+class Features:
+    """Reads features and matches from a database, from several threads at once.
+
+    immutable: nothing writes to the database meanwhile, so it is read without locks (which network
+    file systems may lack).
+    """
+
+    def __init__(self, database: Path, immutable: bool = False) -> None:
         self._lock = Lock()
-        self._connection = _open_read_only(database, still, check_same_thread=False)
+        self._connection = _open_read_only(database, immutable, check_same_thread=False)
 
     def __enter__(self) -> Features:
         return self
@@ -101,18 +113,18 @@ class Features:
         self._connection.close()
 
     def descriptors(self, position: int) -> NDArray[np.uint8]:
-        """[N, 128], largest features first."""
+        """[N, 128] uint8, largest features first."""
         data = self._data("descriptors", "image_id", position + 1)
         return np.frombuffer(data or b"", np.uint8).reshape(-1, 128)
 
     def points(self, position: int) -> NDArray[np.float64]:
-        """[N, 2] x, y of features (pixels)."""
+        """[N, 2] x, y of keypoints (pixels)."""
         data = self._data("keypoints", "image_id", position + 1)
         rows = np.frombuffer(data or b"", np.float32).reshape(-1, _KEYPOINT)
         return rows[:, :2].astype(np.float64)
 
     def matches(self, first: int, second: int) -> NDArray[np.uint32] | None:
-        """[M, 2] rows of features that match, None where nobody has looked."""
+        """[M, 2] indices of features that match; None if the pair was not matched yet."""
         data = self._data("matches", "pair_id", (first + 1) * _MAX_IMAGES + second + 1)
         return None if data is None else np.frombuffer(data, np.uint32).reshape(-1, 2)
 
@@ -125,30 +137,30 @@ class Features:
 
 
 def take_cameras(database: Path, source: Path) -> None:
-    """Let the cameras of `database` be those of `source`, to which nobody writes."""
+    """Replace the cameras of `database` by those of `source`, which nothing writes to."""
     with closing(_attached(database, source)) as connection, connection:
         connection.execute("DELETE FROM cameras")
         connection.execute("INSERT INTO cameras SELECT * FROM other.cameras")
 
 
-def gather(database: Path, shares: Iterable[Path]) -> None:
-    """Add the features and matches in `shares`, databases that nobody writes to; what was there
-    stays. A share that is in is deleted."""
-    for share in shares:
-        with closing(_attached(database, share)) as connection, connection:
+def merge_chunks(database: Path, chunks: Iterable[Path]) -> None:
+    """Move features and matches from the databases of finished `chunks` into `database`; rows that
+    it has already stay. Each chunk is deleted after its transaction."""
+    for chunk in chunks:
+        with closing(_attached(database, chunk)) as connection, connection:
             for table in ("keypoints", "descriptors", "matches", "two_view_geometries"):
                 connection.execute(f"INSERT OR IGNORE INTO {table} SELECT * FROM other.{table}")
-        share.unlink()
+        chunk.unlink()
 
 
 def delete(database: Path) -> None:
-    """Remove the database and what SQLite keeps beside it."""
+    """Remove the database and the files that SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         database.with_name(database.name + suffix).unlink(missing_ok=True)
 
 
 def copy(source: Path, target: Path) -> None:
-    """A copy of a database that nobody writes to, made whole or not at all."""
+    """Copy a database that nothing writes to; the target appears when it is complete."""
     partial = target.with_name(target.name + ".partial")
     delete(partial)
     with closing(_open_read_only(source)) as old, closing(sqlite3.connect(partial)) as new:
@@ -157,24 +169,24 @@ def copy(source: Path, target: Path) -> None:
     partial.replace(target)
 
 
-def forget_geometries(database: Path) -> None:
-    """Delete what verification found, and keep the matches that it started from."""
+def delete_geometries(database: Path) -> None:
+    """Delete the two-view geometries, and keep the matches."""
     with closing(sqlite3.connect(database, timeout=30.0)) as connection:
         connection.execute("DELETE FROM two_view_geometries")
         connection.commit()
 
 
 def _attached(database: Path, other: Path) -> sqlite3.Connection:
-    """A connection to `database`, with `other` for reading under the name "other"."""
+    """A connection to `database`, with `other` attached read-only under the name "other"."""
     connection = sqlite3.connect(database.absolute().as_uri(), uri=True, timeout=30.0)
     connection.execute("ATTACH ? AS other", (f"{other.absolute().as_uri()}?immutable=1",))
     return connection
 
 
 def _open_read_only(
-    database: Path, still: bool = False, check_same_thread: bool = True
+    database: Path, immutable: bool = False, check_same_thread: bool = True
 ) -> sqlite3.Connection:
-    how = "immutable=1" if still else "mode=ro"
+    how = "immutable=1" if immutable else "mode=ro"
     return sqlite3.connect(
         f"{database.absolute().as_uri()}?{how}",
         uri=True,

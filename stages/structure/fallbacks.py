@@ -1,13 +1,13 @@
-"""What to try next when a reconstruction fails its gates.
+"""Which configuration to try next when a reconstruction fails its gates.
 
-Each rung names the failures that it can mend, so that no time goes into rungs that cannot help:
-nothing but other photographs mends a lack of parallax.
+Each configuration lists the failures that it may fix, so that no time is spent on those that cannot
+help: only other photographs fix a lack of parallax.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from stages.structure.gates import Failure, ModelStatistics
 from stages.structure.sparse_model import MappingResult
@@ -15,11 +15,14 @@ from stages.structure.sparse_model import MappingResult
 
 @dataclass(frozen=True)
 class Configuration:
-    """One way to reconstruct.
+    """One way to run structure from motion.
 
-    more_features: lower SIFT's threshold and allow more. exhaustive: match every pair even where
-    the settings say otherwise. drop_stationary, loose, other_pair, mapper: as in `job.Job`.
-    mends: codes of the failures for which this rung is worth its time.
+    Args:
+        name: for messages and metrics.
+        more_features: lower SIFT's peak threshold and allow more features.
+        exhaustive: match every pair, whatever the settings say.
+        drop_stationary, loose, other_pair, mapper: as in `job.Job`.
+        fixes: codes of the failures after which this configuration is tried.
     """
 
     name: str
@@ -29,48 +32,58 @@ class Configuration:
     loose: bool = False
     other_pair: bool = False
     mapper: str = "incremental"
-    mends: frozenset[str] = frozenset()
+    fixes: frozenset[str] = frozenset()
 
 
-_UNPLACED = frozenset({"sfm-too-few-registered", "sfm-no-model", "sfm-weak-photographs"})
+_UNREGISTERED = frozenset({"sfm-too-few-registered", "sfm-no-model", "sfm-weak-photographs"})
 _SPARSE = frozenset({"sfm-too-few-points", "sfm-short-tracks", "sfm-too-few-features"})
-_UNLINKED = frozenset({"sfm-separate-groups", "sfm-no-matches"})
+_UNCONNECTED = frozenset({"sfm-separate-groups", "sfm-no-matches"})
 _CAMERA = frozenset({"sfm-implausible-distortion", "sfm-implausible-focal"})
 
 CONFIGURATIONS = (
     Configuration("standard"),
-    Configuration("without stationary matches", drop_stationary=True, mends=_CAMERA),
-    Configuration("looser registration", loose=True, mends=_UNPLACED),
-    Configuration("every pair matched", exhaustive=True, mends=_UNPLACED | _UNLINKED | _SPARSE),
+    Configuration("without stationary matches", drop_stationary=True, fixes=_CAMERA),
+    Configuration("looser registration", loose=True, fixes=_UNREGISTERED),
+    Configuration(
+        "every pair matched", exhaustive=True, fixes=_UNREGISTERED | _UNCONNECTED | _SPARSE
+    ),
     Configuration(
         "more features",
         more_features=True,
         exhaustive=True,
         loose=True,
-        mends=_UNPLACED | _UNLINKED | _SPARSE,
+        fixes=_UNREGISTERED | _UNCONNECTED | _SPARSE,
     ),
     Configuration(
-        "another first pair",
+        "another initial pair",
         exhaustive=True,
         loose=True,
         other_pair=True,
-        mends=_UNPLACED | _CAMERA | {"sfm-high-error", "sfm-crashed"},
+        fixes=_UNREGISTERED | _CAMERA | {"sfm-high-error", "sfm-crashed"},
     ),
     Configuration(
-        "global mapper", exhaustive=True, mapper="global", mends=_UNPLACED | {"sfm-crashed"}
+        "global mapper", exhaustive=True, mapper="global", fixes=_UNREGISTERED | {"sfm-crashed"}
     ),
 )
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """What one rung gave. failures: empty if it passed. result: None where mapping was not
-    reached. keypoints_median: before matching. pairs_matched, pairs_verified: of photographs that
-    were compared in full, and that were found to show the same thing."""
+    """The result of one configuration.
 
-    rung: Configuration
+    Args:
+        configuration: what was run.
+        failures: of its gates; empty if it passed.
+        statistics: of the model found.
+        result: None if mapping was not reached.
+        keypoints_median: per photograph.
+        pairs_matched: pairs whose features were matched.
+        pairs_verified: those of them with a two-view geometry.
+    """
+
+    configuration: Configuration
     failures: tuple[Failure, ...]
-    figures: ModelStatistics
+    statistics: ModelStatistics
     result: MappingResult | None = None
     keypoints_median: float = 0.0
     pairs_matched: int = 0
@@ -81,59 +94,56 @@ class Attempt:
         return not self.failures
 
     @property
-    def merit(self) -> tuple[int, int, int, int]:
-        """For choosing among attempts that failed: the more photographs and points, the better,
-        then those of any model, who know best why it is none; the global mapper's word counts
-        least."""
-        trusted = self.figures.mapper != "global"
-        found = max(self.figures.models, default=0)
-        return (int(trusted), self.figures.registered, self.figures.points, found)
+    def rank(self) -> tuple[bool, int, int, int]:
+        """Orders attempts that failed: any incremental model before the global mapper's, then by
+        registered photographs, points, and the size of any model found."""
+        largest = max(self.statistics.models, default=0)
+        incremental = self.statistics.mapper != "global"
+        return (incremental, self.statistics.registered, self.statistics.points, largest)
 
 
-@dataclass
-class Attempts:
-    """All attempts in order, and the one to use: the first that passed, else the best."""
-
-    attempts: list[Attempt] = field(default_factory=list)
-
-    @property
-    def best(self) -> Attempt:
-        for attempt in self.attempts:
-            if attempt.passed:
-                return attempt
-        return max(self.attempts, key=lambda attempt: attempt.merit)
+def best_attempt(attempts: list[Attempt]) -> Attempt:
+    """The first attempt that passed, else the one of the highest rank."""
+    for attempt in attempts:
+        if attempt.passed:
+            return attempt
+    return max(attempts, key=lambda attempt: attempt.rank)
 
 
 def try_configurations(
-    try_rung: Callable[[Configuration], Attempt],
+    run: Callable[[Configuration], Attempt],
     *,
     already_exhaustive: bool,
     out_of_time: Callable[[], bool],
-) -> Attempts:
-    """Try rungs until one passes, none that is left can mend what failed, or time is up.
+) -> list[Attempt]:
+    """The attempts, in order, until one passes, no configuration left may help, or time is up.
 
-    already_exhaustive: the settings match every pair anyway, so that a rung which adds nothing
-    else is skipped.
+    Args:
+        run: runs one configuration.
+        already_exhaustive: the settings match every pair anyway, so a configuration that adds
+            nothing else is skipped.
+        out_of_time: whether to stop; the first configuration is run all the same.
     """
-    climbed = Attempts()
-    wanted: set[str] = set()
-    for rung in CONFIGURATIONS:
-        if rung is not CONFIGURATIONS[0] and not _worth_trying(rung, wanted, already_exhaustive):
-            continue
-        if climbed.attempts and out_of_time():
+    attempts: list[Attempt] = []
+    for configuration in CONFIGURATIONS:
+        if attempts:
+            failures = {failure.code for failure in attempts[-1].failures}
+            if not _may_help(configuration, failures, already_exhaustive):
+                continue
+            if out_of_time():
+                break
+        attempts.append(run(configuration))
+        if attempts[-1].passed:
             break
-        attempt = try_rung(rung)
-        climbed.attempts.append(attempt)
-        if attempt.passed:
-            break
-        wanted = {failure.code for failure in attempt.failures}
-    return climbed
+    return attempts
 
 
-def _worth_trying(rung: Configuration, failures: set[str], already_exhaustive: bool) -> bool:
+def _may_help(configuration: Configuration, failures: set[str], already_exhaustive: bool) -> bool:
     if "sfm-no-parallax" in failures:
         return False
-    only_exhaustive = rung == Configuration(rung.name, exhaustive=True, mends=rung.mends)
-    if already_exhaustive and only_exhaustive:
+    only_adds_pairs = configuration == Configuration(
+        configuration.name, exhaustive=True, fixes=configuration.fixes
+    )
+    if already_exhaustive and only_adds_pairs:
         return False
-    return bool(rung.mends & failures)
+    return bool(configuration.fixes & failures)

@@ -1,6 +1,6 @@
 """SIFT features of every photograph, in the worker process (imports pycolmap).
 
-Found by OpenCV, several times as fast as by COLMAP, and written as COLMAP writes its own.
+OpenCV's SIFT is several times as fast as COLMAP's. Features are written as COLMAP writes its own.
 """
 
 from __future__ import annotations
@@ -22,48 +22,48 @@ from stages.structure import new_database
 from stages.structure.job import Job, chunks_path
 from stages.structure.worker_progress import ProgressWriter
 
-LARGEST_SIDE = 3200  # pixels; larger photographs are made smaller for finding features
-LAYERS = 3  # of an octave
-# Six blurred pictures and five differences, of float32, of a picture of twice the size, and of its
-# halves and quarters.
+LARGEST_SIDE = 3200  # pixels; features of larger photographs are found at this size
+LAYERS = 3  # per octave
+# Bytes per pixel: six blurred pictures and five differences, float32, of a picture of twice the
+# size, of its half, its quarter and so on.
 _PIXEL_BYTES = 11 * 4 * 4 * 4 / 3
-_LENGTH = 512.0  # of a descriptor
+_LENGTH = 512.0  # norm of a descriptor
 
 Features = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 def extract_features(job: Job) -> None:
-    """SIFT features of every photograph into the job's database; goes on where it stopped, with
-    what finished shares hold."""
+    """Write the SIFT features of every photograph to the job's database, which may already hold
+    some; features of finished chunks are merged first."""
     path = Path(job.database)
     if not path.exists():
         new_database.create(path, job)
-    sqlite.gather(path, sorted(chunks_path(job).glob("*.db")))
+    sqlite.merge_chunks(path, sorted(chunks_path(job).glob("*.db")))
     have = sqlite.photographs_with_features(path)
     missing = [position for position in range(len(job.names)) if position not in have]
     _extract(job, missing, len(have))
 
 
 def extract_chunk(job: Job) -> None:
-    """Those of the job's share of the photographs, into a database of their own."""
+    """Write the features of the job's chunk of photographs to a database of its own."""
     new_database.create(Path(job.database), job, job.photographs)
     _extract(job, list(job.photographs), 0)
 
 
 def _extract(job: Job, missing: list[int], have: int) -> None:
-    ticks = ProgressWriter(Path(job.progress))
-    cv2.setNumThreads(1)  # a thread a photograph is quicker than several
+    progress = ProgressWriter(Path(job.progress))
+    cv2.setNumThreads(1)  # one thread per photograph is faster than several
     with pycolmap.Database.open(job.database) as database:
-        for done, (position, (keypoints, descriptors)) in enumerate(_found(job, missing), 1):
+        for done, (position, (keypoints, descriptors)) in enumerate(_features(job, missing), 1):
             database.write_keypoints(position + 1, keypoints)
             plain = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, descriptors)
             database.write_descriptors(position + 1, plain)
-            ticks.write("finding features", have + done, have + len(missing))
+            progress.write("extracting features", have + done, have + len(missing))
 
 
-def _found(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
-    """(position, features) of each photograph in order, found by several threads that are never
-    more than a photograph each ahead."""
+def _features(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
+    """(position, features) of each photograph in order, from several threads that run at most one
+    photograph each ahead."""
     threads = _threads(job)
     with ThreadPoolExecutor(threads) as pool:
         waiting: list[tuple[int, Future[Features]]] = []
@@ -80,7 +80,7 @@ def _found(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
 
 
 def _threads(job: Job) -> int:
-    """One a core, as long as half of the free memory holds their pictures."""
+    """One per core, as long as their pictures fit in half of the free memory."""
     pixels = max(math.prod(_reduced(camera.width, camera.height)) for camera in job.cameras)
     available_mib = memory.available_mib() or math.inf
     return max(1, int(min(job.threads, 0.5 * available_mib / (pixels * _PIXEL_BYTES / MIB))))
@@ -89,12 +89,17 @@ def _threads(job: Job) -> int:
 def sift_features(
     photograph: Path, most: int, peak_threshold: float, mask: Path | None = None
 ) -> Features:
-    """(keypoints, descriptors) of a picture on disk, largest first, in COLMAP's conventions.
+    """(keypoints, descriptors) of a picture file, largest first, in COLMAP's conventions.
 
     keypoints [N, 4] float32: x, y (pixels, pixel centres at +0.5), scale (pixels), orientation
-    (radians, from x to y). descriptors [N, 128] uint8 (RootSIFT: Arandjelovic 2012). most: the
-    strongest are kept. peak_threshold: of differences of blurred pictures, white being 1. mask:
-    a picture of the same size; none are looked for where it is below half.
+    (radians, from x to y). descriptors [N, 128] uint8 (RootSIFT: Arandjelovic 2012).
+
+    Args:
+        photograph: the picture.
+        most: how many features to keep, the strongest.
+        peak_threshold: of differences of blurred pictures, for white = 1.
+        mask: a picture of the same size; features where it is below half are not extracted.
+
     Raises ValueError if a picture cannot be read.
     """
     picture = _grey(photograph)
@@ -110,7 +115,7 @@ def sift_features(
         nfeatures=most,
         nOctaveLayers=LAYERS,
         contrastThreshold=peak_threshold * LAYERS,
-        # Otherwise everything lies a quarter of a pixel off: the doubled picture is.
+        # Without it, keypoints are a quarter of a pixel off, as the doubled picture is.
         enable_precise_upscale=True,
     )
     found, descriptors = sift.detectAndCompute(picture, inside)
@@ -133,12 +138,12 @@ def _grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _reduced(width: int, height: int) -> tuple[int, int]:
-    share = min(1.0, LARGEST_SIDE / max(width, height))
-    return max(1, round(width * share)), max(1, round(height * share))
+    scale = min(1.0, LARGEST_SIDE / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _root(descriptors: np.ndarray) -> NDArray[np.uint8]:
-    """RootSIFT: distances of square roots of histograms tell more than those of histograms."""
+    """RootSIFT: square roots of L1-normalised histograms (Hellinger kernel)."""
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
     roots: NDArray[np.float32] = np.rint(_LENGTH * np.sqrt(descriptors / sums))
     return np.minimum(roots, 255).astype(np.uint8)

@@ -1,14 +1,17 @@
-"""What a reconstruction must fulfil, and what to tell the photographer if it does not.
+"""Quality gates: what a reconstruction must fulfil, and advice for the photographer if it does not.
 
-A bad reconstruction looks plausible: most of its photographs may be registered with a small
-reprojection error although the scene is wrong. So several figures are looked at, each of which
-catches what the others let through. Pure functions on plain numbers.
-"""
+A bad reconstruction looks plausible: most photographs may be registered with a small reprojection
+error although the scene is wrong. So several statistics are checked, each of which catches failures
+that the others miss."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from statistics import median
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from stages.base.text import counted
 
@@ -17,22 +20,31 @@ CALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC = 2, 4, 5, 6  # COLMAP's TwoV
 
 @dataclass(frozen=True)
 class ModelStatistics:
-    """What is known of one reconstruction.
+    """Statistics of one reconstruction.
 
-    photographs: given; registered: in the largest model; models: sizes of all models found.
-    mean_reprojection_error_px: over points, of each point's mean, as COLMAP counts it;
-    long_side_px: of the photographs.
-    median_triangulation_angle_deg: over points, of the widest angle between two of its rays.
-    baseline_over_depth: spread of the cameras over distance to the points.
-    weak_photographs: registered with fewer than 30 points in view.
-    distortion: k of SIMPLE_RADIAL, of the camera where it is largest. focal_over_prior: of the
-    camera that is farthest from EXIF, None without EXIF.
-    pairs_checked: of photographs with many matches that agree with each other;
-    pairs_contradicting: those of them whose matches do not fit the model; contradicting: one such
-    pair's names. turn_of_other_deg: the largest angle between this model's directions of
-    photographs and those in another model of some of them.
-    link_points, link_views: where the model hangs together most loosely: points seen from both
-    parts, and photographs of the smaller part (0: too small to have parts).
+    Args:
+        photographs: how many were given.
+        registered: how many are in the largest model.
+        models: registered photographs of each model found.
+        mapper: "incremental" or "global".
+        timed_out: whether the mapper ran out of time.
+        points: in the largest model.
+        mean_reprojection_error_px: mean over points of each point's mean error, as in COLMAP.
+        long_side_px: longer side of the photographs.
+        mean_track_length: mean number of photographs that observe a point.
+        median_triangulation_angle_deg: median over points of the widest angle between two rays.
+        baseline_over_depth: spread of the cameras over their distance to the points.
+        weak_photographs: registered photographs that observe fewer than 30 points.
+        distortion: k of SIMPLE_RADIAL, of the camera with the largest |k|.
+        focal_over_prior: estimated focal length over that of EXIF, of the camera where this ratio
+            is farthest from 1; None without EXIF.
+        pairs_checked: pairs of photographs with many verified matches.
+        pairs_inconsistent: those of them whose matches do not fit the poses of the model.
+        inconsistent_pair: the names of one such pair.
+        rotation_to_other_deg: largest disagreement between this model and another one about the
+            relative rotation of photographs that are in both.
+        cut_points: points observed from both sides of the weakest cut of the view graph.
+        cut_views: photographs on the smaller side of that cut; 0: the model is too small to cut.
     """
 
     photographs: int
@@ -50,24 +62,24 @@ class ModelStatistics:
     distortion: float = 0.0
     focal_over_prior: float | None = None
     pairs_checked: int = 0
-    pairs_contradicting: int = 0
-    contradicting: tuple[str, ...] = ()
-    turn_of_other_deg: float = 0.0
-    link_points: int = 0
-    link_views: int = 0
+    pairs_inconsistent: int = 0
+    inconsistent_pair: tuple[str, ...] = ()
+    rotation_to_other_deg: float = 0.0
+    cut_points: int = 0
+    cut_views: int = 0
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Where the gates stand. Each figure is explained at `Figures`.
+    """The thresholds of the gates. Each statistic is explained at `ModelStatistics`.
 
-    Measured on bad captures: turning on the spot gives triangulation angles of 2.2 degrees; a date
+    Measured on bad captures: a turn on the spot gives triangulation angles of 2.2 degrees; a date
     stamp k = -8.6 and 3.9 times the focal length; a blank wall 15 points a photograph at 0.13 px;
-    strong blur 76 keypoints a photograph (mild blur, which works, 257). Good ones: 450 and 250
+    strong blur 76 keypoints a photograph (mild blur, which works, 257). Good captures: 450 and 250
     points a photograph at 0.34 and 1.02 px of 1600.
-    Of pairs with many matches, good models contradict none (of 150, 35 and 777), that of an object
-    turned over half-way 15 of 67; where good ones hang together most loosely, 1,032, 222 and 1,406
-    points are seen from both sides.
+    Good models are inconsistent with none of their pairs (of 150, 35 and 777), that of an object
+    turned over half-way with 15 of 67. The weakest cuts of good models hold 1,032, 222 and 1,406
+    points.
     """
 
     registered_share: float = 0.8
@@ -82,17 +94,17 @@ class Thresholds:
     weak_share: float = 0.25
     distortion: float = 1.0
     focal_ratio: float = 2.0
-    contradicting_share: float = 0.1
-    fewest_contradicting: int = 3
-    turn_of_other_deg: float = 15.0
-    link_points: int = 30
-    link_points_global: int = 100
-    same_place_share: float = 0.9
+    inconsistent_share: float = 0.1
+    fewest_inconsistent: int = 3
+    rotation_to_other_deg: float = 15.0
+    cut_points: int = 30
+    cut_points_global: int = 100
+    same_position_share: float = 0.9
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A gate that did not open; the fields are those of `SplatError`."""
+    """A gate that was not passed; the fields are those of `SplatError`."""
 
     code: str
     given: str
@@ -109,8 +121,8 @@ MOVE = (
     "another place, a step apart."
 )
 
-_UNIQUE = "Everything must stay where it is, and look the same nowhere else."
-_APART = (
+_STATIC = "Nothing may move between photographs, and no part of the scene may look like another."
+_REPEATED = (
     "If the subject was turned or moved between photographs, put those before and those after into "
     "folders of their own, or hide everything else by masks; if the same picture or pattern is "
     "there twice, hide one of the two. If the arrangement is right all the same, --allow-partial "
@@ -118,17 +130,17 @@ _APART = (
 )
 
 
-def check_keypoints(counts: list[int], limits: Thresholds | None = None) -> list[Failure]:
-    """Before matching: enough features in the typical photograph?"""
-    limits = limits or Thresholds()
+def check_keypoints(counts: list[int], thresholds: Thresholds | None = None) -> list[Failure]:
+    """Before matching: does the median photograph have enough features?"""
+    thresholds = thresholds or Thresholds()
     typical = median(counts) if counts else 0
-    if typical >= limits.keypoints:
+    if typical >= thresholds.keypoints:
         return []
     return [
         Failure(
             "sfm-too-few-features",
-            f"The typical photograph shows only {typical:.0f} recognisable spots.",
-            f"At least {limits.keypoints} are needed to find out where it was taken.",
+            f"The median photograph has only {typical:.0f} features that can be matched.",
+            f"At least {thresholds.keypoints} are needed to find its camera pose.",
             "Check that the photographs are sharp and well lit, and that the subject is no blank "
             "or shiny surface; patterned paper or cloth in the scene helps.",
         )
@@ -136,30 +148,30 @@ def check_keypoints(counts: list[int], limits: Thresholds | None = None) -> list
 
 
 def check_pairs(
-    pairs: list[tuple[int, int, int, int]], photographs: int, limits: Thresholds | None = None
+    pairs: list[tuple[int, int, int, int]], photographs: int, thresholds: Thresholds | None = None
 ) -> list[Failure]:
-    """After matching: do the photographs hang together, and were they taken from several places?
+    """After matching: is the view graph connected, and did the camera move?
 
     pairs: (first, second, inliers, configuration) as `database.verified_pairs` gives them.
     """
-    limits = limits or Thresholds()
+    thresholds = thresholds or Thresholds()
     if not pairs:
         return [
             Failure(
                 "sfm-no-matches",
-                "No two photographs show the same thing.",
+                "No two photographs match.",
                 "Neighbouring photographs must overlap.",
                 MORE_OVERLAP,
             )
         ]
     failures = []
-    # A turn on the spot maps one picture to the next by a homography. COLMAP calls that panoramic
-    # where it also finds no translation; a flat scene alone (drones, walls) is called planar.
-    turning = sum(config in (PANORAMIC, PLANAR_OR_PANORAMIC) for _, _, _, config in pairs)
-    if turning >= limits.same_place_share * len(pairs):
+    # A pure rotation maps one picture to the next by a homography. COLMAP calls such a pair
+    # panoramic if it also finds no translation; a flat scene alone (drones, walls) is planar.
+    rotating = sum(config in (PANORAMIC, PLANAR_OR_PANORAMIC) for _, _, _, config in pairs)
+    if rotating >= thresholds.same_position_share * len(pairs):
         failures.append(_no_parallax("Nearly all pairs of photographs"))
     groups = connected_groups(pairs, photographs)
-    if len(groups[0]) < limits.registered_share * photographs:
+    if len(groups[0]) < thresholds.registered_share * photographs:
         others = [len(group) for group in groups[1:] if len(group) > 1]
         single = sum(len(group) == 1 for group in groups)
         failures.append(_separate(len(groups[0]), others, single, photographs))
@@ -167,137 +179,133 @@ def check_pairs(
 
 
 def connected_groups(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[list[int]]:
-    """Photographs that are linked by matches, directly or through others; largest group first."""
-    parent = list(range(photographs))
-
-    def root(i: int) -> int:
-        while parent[i] != i:
-            parent[i] = parent[parent[i]]
-            i = parent[i]
-        return i
-
-    for first, second, _, _ in pairs:
-        parent[max(root(first), root(second))] = min(root(first), root(second))
-    groups: dict[int, list[int]] = {}
-    for i in range(photographs):
-        groups.setdefault(root(i), []).append(i)
-    return sorted(groups.values(), key=lambda group: (-len(group), group))
+    """The connected components of the view graph, as sorted positions; largest first."""
+    links = np.array([pair[:2] for pair in pairs], np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(photographs, photographs))
+    _, component = connected_components(graph, directed=False)
+    groups = [np.flatnonzero(component == c).tolist() for c in range(component.max() + 1)]
+    return sorted(groups, key=lambda group: (-len(group), group))
 
 
-def check_model(figures: ModelStatistics, limits: Thresholds | None = None) -> list[Failure]:
-    """After mapping: every gate that the largest model fails, the gravest first."""
-    limits = limits or Thresholds()
-    if figures.timed_out:
-        return [_timed_out(figures)]
-    if figures.models and not figures.points:
-        # Photographs were placed, but every ray to a point ran parallel and was thrown away.
+def check_model(model: ModelStatistics, thresholds: Thresholds | None = None) -> list[Failure]:
+    """After mapping: every gate that the largest model fails, the most serious first."""
+    thresholds = thresholds or Thresholds()
+    if model.timed_out:
+        return [_timed_out(model)]
+    if model.models and not model.points:
+        # Photographs were registered, but all points were dropped because their rays are parallel.
         return [_no_parallax("No depth could be measured: photographs")]
-    if figures.registered < limits.fewest_views or not figures.points:
-        return [_no_model(figures)]
-    checks = (_check_geometry, _check_camera, _check_registered, _check_support, _check_unity)
-    return [failure for check in checks for failure in check(figures, limits)]
+    if model.registered < thresholds.fewest_views or not model.points:
+        return [_no_model(model)]
+    checks = (_check_geometry, _check_camera, _check_registered, _check_support, _check_consistency)
+    return [failure for check in checks for failure in check(model, thresholds)]
 
 
-def borderline_failures(figures: ModelStatistics) -> list[Failure]:
-    """What is too little to refuse a model, and too much to be silent about it."""
-    return _check_unity(figures, Thresholds(contradicting_share=0.02, link_points=100))
+def borderline_failures(model: ModelStatistics) -> list[Failure]:
+    """Failures of stricter thresholds, which deserve a warning but do not refuse a model."""
+    return _check_consistency(model, Thresholds(inconsistent_share=0.02, cut_points=100))
 
 
-def _check_geometry(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
-    angle, baseline = figures.median_triangulation_angle_deg, figures.baseline_over_depth
-    if angle < limits.triangulation_angle_deg:
-        return [_no_parallax(f"Points are seen under an angle of {angle:.1f} degrees: photographs")]
-    if baseline < limits.baseline_over_depth:
-        return [_no_parallax(f"The cameras moved by {baseline:.3f} of their distance: photographs")]
+def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
+    angle, baseline = model.median_triangulation_angle_deg, model.baseline_over_depth
+    if angle < thresholds.triangulation_angle_deg:
+        return [_no_parallax(f"The median triangulation angle is {angle:.1f} degrees: photographs")]
+    if baseline < thresholds.baseline_over_depth:
+        return [
+            _no_parallax(
+                f"The cameras moved by {baseline:.3f} of their distance to the scene: photographs"
+            )
+        ]
     return []
 
 
-def _check_camera(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
+def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
     failures = []
     hint = (
         "Look for something that stays in the same place of every picture (a date stamp, a frame, "
         "a dirty lens) and crop it away; and do not mix zoom settings."
     )
-    if abs(figures.distortion) > limits.distortion:
+    if abs(model.distortion) > thresholds.distortion:
         failures.append(
             Failure(
                 "sfm-implausible-distortion",
-                f"The lens came out with a distortion of k = {figures.distortion:.2f}.",
-                f"Lenses have |k| below {limits.distortion:g}.",
+                f"The radial distortion of the lens was estimated as k = {model.distortion:.2f}.",
+                f"Lenses have |k| below {thresholds.distortion:g}.",
                 hint,
             )
         )
-    ratio = figures.focal_over_prior
-    if ratio is not None and not 1 / limits.focal_ratio <= ratio <= limits.focal_ratio:
+    ratio = model.focal_over_prior
+    if ratio is not None and not 1 / thresholds.focal_ratio <= ratio <= thresholds.focal_ratio:
         failures.append(
             Failure(
                 "sfm-implausible-focal",
-                f"The focal length came out as {ratio:.2f} times what the photographs' EXIF says.",
-                f"It should lie within a factor of {limits.focal_ratio:g}.",
+                f"The focal length was estimated as {ratio:.2f} times that in EXIF.",
+                f"It should lie within a factor of {thresholds.focal_ratio:g}.",
                 hint,
             )
         )
     return failures
 
 
-def _check_registered(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
-    share = figures.registered / max(1, figures.photographs)
-    if share >= limits.registered_share:
+def _check_registered(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
+    share = model.registered / max(1, model.photographs)
+    if share >= thresholds.registered_share:
         return []
-    others = f" ({len(figures.models)} separate models)" if len(figures.models) > 1 else ""
+    others = f" ({len(model.models)} separate models)" if len(model.models) > 1 else ""
     return [
         Failure(
             "sfm-too-few-registered",
-            f"Only {figures.registered} of {figures.photographs} photographs could be placed "
-            f"together{others}.",
-            f"At least {limits.registered_share:.0%} are wanted.",
+            f"Only {model.registered} of {model.photographs} photographs could be "
+            f"registered in one model{others}.",
+            f"At least {thresholds.registered_share:.0%} are needed.",
             MORE_OVERLAP + " If the folder holds several scenes, put each into a folder of its "
-            "own. --allow-partial goes on with what there is.",
+            "own. --allow-partial goes on with the largest model.",
         )
     ]
 
 
-def _check_support(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
-    """Enough points, seen often enough, accurately enough?"""
+def _check_support(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
+    """Are there enough points, with long enough tracks and small enough errors?"""
     failures = []
     texture = "Add texture to blank surfaces (patterned paper, cloth), and take more photographs."
-    if figures.points < limits.points_per_view * figures.registered:
+    if model.points < thresholds.points_per_view * model.registered:
         failures.append(
             Failure(
                 "sfm-too-few-points",
-                f"Only {counted(figures.points, 'point')} could be found in "
-                f"{counted(figures.registered, 'photograph')}.",
-                f"At least {limits.points_per_view} a photograph are wanted.",
+                f"Only {counted(model.points, 'point')} could be triangulated from "
+                f"{counted(model.registered, 'photograph')}.",
+                f"At least {thresholds.points_per_view} for each photograph are needed.",
                 texture,
             )
         )
-    if figures.weak_photographs > limits.weak_share * figures.registered:
+    if model.weak_photographs > thresholds.weak_share * model.registered:
         failures.append(
             Failure(
                 "sfm-weak-photographs",
-                f"{figures.weak_photographs} of {figures.registered} photographs see fewer than "
-                "30 of the points found.",
-                f"At most {limits.weak_share:.0%} may.",
+                f"{model.weak_photographs} of {model.registered} photographs observe fewer "
+                "than 30 points.",
+                f"At most {thresholds.weak_share:.0%} of them may.",
                 MORE_OVERLAP,
             )
         )
-    if figures.mean_track_length < limits.track_length:
+    if model.mean_track_length < thresholds.track_length:
         failures.append(
             Failure(
                 "sfm-short-tracks",
-                f"A point is seen by {figures.mean_track_length:.2f} photographs on average.",
-                f"At least {limits.track_length} are wanted.",
+                f"A point is observed in {model.mean_track_length:.2f} photographs on average.",
+                f"At least {thresholds.track_length} are needed.",
                 MORE_OVERLAP,
             )
         )
-    largest = max(limits.error_floor_px, limits.error_share_of_long_side * figures.long_side_px)
-    if not figures.mean_reprojection_error_px <= largest:
+    largest = max(
+        thresholds.error_floor_px, thresholds.error_share_of_long_side * model.long_side_px
+    )
+    if not model.mean_reprojection_error_px <= largest:
         failures.append(
             Failure(
                 "sfm-high-error",
-                f"Points miss their place by {figures.mean_reprojection_error_px:.2f} px on "
-                "average.",
-                f"At most {largest:.2f} px are wanted.",
+                f"The mean reprojection error is {model.mean_reprojection_error_px:.2f} px.",
+                f"It may be {largest:.2f} px at most.",
                 "The scene must stand still while it is photographed, and the photographs must be "
                 "sharp; leave out moving things and stabilised video.",
             )
@@ -305,55 +313,52 @@ def _check_support(figures: ModelStatistics, limits: Thresholds) -> list[Failure
     return failures
 
 
-def _check_unity(figures: ModelStatistics, limits: Thresholds) -> list[Failure]:
-    """Do pairs of photographs, and the parts of the model, belong together?"""
+def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
+    """Do the verified pairs fit the model, and are its parts well connected?"""
     failures = []
-    odd, checked = figures.pairs_contradicting, figures.pairs_checked
-    if odd >= limits.fewest_contradicting and odd > limits.contradicting_share * checked:
+    bad, checked = model.pairs_inconsistent, model.pairs_checked
+    if bad >= thresholds.fewest_inconsistent and bad > thresholds.inconsistent_share * checked:
         failures.append(
             Failure(
                 "sfm-contradictions",
-                f"{odd} of {checked} pairs of photographs that match well ({_pair_of(figures)}, "
-                "for example) contradict the arrangement found.",
-                _UNIQUE,
-                _APART,
+                f"The matches of {bad} of {checked} pairs of photographs "
+                f"({' and '.join(model.inconsistent_pair)}, for example) contradict the camera "
+                "poses found.",
+                _STATIC,
+                _REPEATED,
             )
         )
-    if figures.turn_of_other_deg > limits.turn_of_other_deg:
+    if model.rotation_to_other_deg > thresholds.rotation_to_other_deg:
         failures.append(
             Failure(
                 "sfm-contradictions",
-                "Some photographs fit two arrangements, which turn them by "
-                f"{figures.turn_of_other_deg:.0f} degrees against each other.",
-                _UNIQUE,
-                _APART,
+                "Some photographs are in two models, whose relative rotations differ by "
+                f"{model.rotation_to_other_deg:.0f} degrees.",
+                _STATIC,
+                _REPEATED,
             )
         )
-    # The global mapper places everything; without a common point that is a guess.
-    least = limits.link_points_global if figures.mapper == "global" else limits.link_points
-    if figures.link_views and figures.link_points < least:
+    # The global mapper registers every photograph; without common points such a pose is a guess.
+    least = thresholds.cut_points_global if model.mapper == "global" else thresholds.cut_points
+    if model.cut_views and model.cut_points < least:
         failures.append(
             Failure(
                 "sfm-weak-link",
-                f"{figures.link_views} of {figures.registered} photographs hang together with the "
-                f"others by {counted(figures.link_points, 'point')} only, so that nobody knows "
-                "where they belong.",
-                f"At least {least} points must be seen from both sides.",
+                f"{model.cut_views} of {model.registered} photographs share only "
+                f"{counted(model.cut_points, 'point')} with the others, too few to know where "
+                "they belong.",
+                f"At least {least} points must be observed in both parts.",
                 MORE_OVERLAP,
             )
         )
     return failures
 
 
-def _pair_of(figures: ModelStatistics) -> str:
-    return " and ".join(figures.contradicting)
-
-
 def _no_parallax(what: str) -> Failure:
     return Failure(
         "sfm-no-parallax",
         f"{what} were taken from nearly the same place.",
-        "Depth shows only when the camera moves sideways.",
+        "Depth can be measured only when the camera moves sideways.",
         MOVE,
     )
 
@@ -371,26 +376,26 @@ def _separate(largest: int, others: list[int], single: int, photographs: int) ->
     )
 
 
-def _no_model(figures: ModelStatistics) -> Failure:
+def _no_model(model: ModelStatistics) -> Failure:
     return Failure(
         "sfm-no-model",
-        f"No arrangement of the {figures.photographs} photographs could be found"
+        f"The {model.photographs} photographs could not be registered"
         + (
-            f" ({figures.registered} placed, {counted(figures.points, 'point')})."
-            if figures.registered
+            f" ({model.registered} were, with {counted(model.points, 'point')})."
+            if model.registered
             else "."
         ),
-        "At least 3 photographs must see the same points from different places.",
+        "At least 3 photographs must show the same points from different places.",
         f"{MOVE} {MORE_OVERLAP}",
     )
 
 
-def _timed_out(figures: ModelStatistics) -> Failure:
+def _timed_out(model: ModelStatistics) -> Failure:
     return Failure(
         "sfm-timed-out",
-        f"The search was cut off with {figures.registered} of {figures.photographs} photographs "
-        "placed.",
-        "It must come to an end.",
-        "Allow more time with --max-minutes, use fewer or smaller photographs, or accept what "
-        "there is with --allow-partial.",
+        f"Mapping ran out of time with {model.registered} of {model.photographs} "
+        "photographs registered.",
+        "Mapping must finish.",
+        "Allow more time with --max-minutes, use fewer or smaller photographs, or accept the "
+        "model found so far with --allow-partial.",
     )

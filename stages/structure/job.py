@@ -1,21 +1,28 @@
-"""What the worker process is told: plain data that travels as JSON."""
+"""A job of the worker process: plain data, passed as JSON."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.base import threads
+
+if TYPE_CHECKING:
+    from stages.scene import Capture
 
 STEPS = (
     *("features", "matching", "mapping"),
-    *("neighbours", "triangulation"),  # of known cameras
-    *("choosing", "features share", "matching share"),  # where others help
+    *("neighbours", "triangulation"),  # with known cameras
+    *("pair selection", "features chunk", "matching chunk"),  # with an executor
 )
 
 
 @dataclass(frozen=True)
 class CameraGuess:
-    """A camera as known before structure from motion. focal_px: from EXIF, or None."""
+    """Intrinsics as known before structure from motion. focal_px: from EXIF, or None."""
 
     width: int
     height: int
@@ -24,22 +31,30 @@ class CameraGuess:
 
 @dataclass(frozen=True)
 class Job:
-    """One step of structure from motion.
+    """One step of structure from motion for P photographs.
 
-    step: one of `STEPS`. images_root: folder that `names` are relative to. database: COLMAP's.
-    out: where mapping leaves its model (`sparse_model.save_model`). progress: where the worker says
-    how far it is (`ticks`).
-    names [P] in order of the capture, which fixes the image ids (position + 1);
-    camera_of [P] position in `cameras` of each photograph's camera.
-    masks [P] of the photographs, relative to images_root, "" for none; () where none has one.
-    max_features, peak_threshold: of SIFT (Lowe 2004). matching: "chosen" by a first
-    look, "exhaustive" or "sequential".
-    drop_stationary: leave out matches that stay in place in the picture (a date stamp).
-    mapper: "incremental" or "global". loose: register photographs with fewer matches.
-    other_pair: start from another pair of photographs than COLMAP would. refine: move the known
-    cameras to where the matches want them. max_seconds: of mapping.
-    Of a share: source: the database of the whole job; photographs, or pairs: the positions that it
-    is about.
+    Args:
+        step: one of `STEPS`.
+        images_root: folder that `names` and `masks` are relative to.
+        database: COLMAP's database.
+        out: folder for the model of mapping (`sparse_model.save_model`).
+        progress: file for the worker's progress (`worker_progress`).
+        names: [P] in the capture's order, which fixes the image ids (position + 1).
+        camera_of: [P] index into `cameras`.
+        cameras: known intrinsics.
+        masks: [P] mask files, "" for none; () if no photograph has one.
+        seed: of RANSAC and the mapper.
+        threads: how many to use.
+        max_features, peak_threshold: of SIFT (Lowe 2004).
+        matching: which pairs: "selected" by retrieval, "exhaustive" or "sequential".
+        drop_stationary: drop matches that stay in place in the picture (a date stamp).
+        mapper: "incremental" or "global".
+        loose: register photographs with fewer inliers.
+        other_pair: start from another initial pair than COLMAP would.
+        refine: refine the poses of known cameras.
+        max_seconds: time limit of mapping.
+        source: of a chunk: the database of the whole job.
+        photographs, pairs: of a chunk: the positions to process.
     """
 
     step: str
@@ -55,7 +70,7 @@ class Job:
     threads: int = 1
     max_features: int = 12288
     peak_threshold: float = 0.0045
-    matching: str = "chosen"
+    matching: str = "selected"
     drop_stationary: bool = False
     mapper: str = "incremental"
     loose: bool = False
@@ -82,32 +97,83 @@ class Job:
         return cls(**data)
 
 
+def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching: str) -> Job:
+    """The job of the standard configuration: photographs of the same key and size share a camera.
+
+    matching: "auto", "exhaustive" or "sequential". See `Job` for the rest.
+    """
+    positions: dict[tuple[str, int, int], int] = {}
+    guesses: list[CameraGuess] = []
+    camera_of = []
+    for photo in capture.photos:
+        key = (photo.camera, photo.width, photo.height)
+        if key not in positions:
+            positions[key] = len(guesses)
+            guesses.append(CameraGuess(photo.width, photo.height, photo.focal_px))
+        camera_of.append(positions[key])
+    return Job(
+        step="",
+        images_root=str(capture.folder.resolve()),
+        database=str(work / "base.db"),
+        out="",
+        progress="",
+        names=tuple(photo.image for photo in capture.photos),
+        masks=tuple(photo.mask for photo in capture.photos),
+        camera_of=tuple(camera_of),
+        cameras=tuple(guesses),
+        seed=seed,
+        threads=threads.count(),
+        max_features=max_features,
+        matching="selected" if matching == "auto" else matching,
+    )
+
+
+def prepare_work_folder(work: Path, job: Job, known_cameras: str = "") -> None:
+    """Keep what an interrupted run left in `work` if it was the same job; clear it otherwise.
+
+    known_cameras: digest of the known cameras.
+    """
+    description = work / "description.json"
+    # Locations and the number of threads change no result.
+    same = {"images_root": "", "database": "", "out": "", "progress": "", "threads": 0}
+    data = asdict(job) | same | {"known_cameras": known_cameras}
+    wanted = json.dumps(data, ensure_ascii=False, sort_keys=True)
+    try:
+        unchanged = description.read_text(encoding="utf-8") == wanted
+    except (OSError, ValueError):
+        unchanged = False
+    if not unchanged:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        description.write_text(wanted, encoding="utf-8")
+
+
 def known_cameras_path(job: Job) -> Path:
-    """Of the steps "neighbours" and "triangulation": what is known of the cameras of `job.names`.
+    """File with the known cameras of `job.names`, for the steps "neighbours" and "triangulation":
     intrinsics [V, 4] fx, fy, cx, cy; sizes [V, 2]; world_to_camera [V, 4, 4]; pairs [Q, 2]."""
     return Path(job.database).with_suffix(".known.npz")
 
 
 def compared_pairs_path(job: Job) -> Path:
-    """Where matching says how many pairs it looked at before it chose some."""
-    return Path(job.database).with_suffix(".looked")
+    """File with the number of pairs that pair selection compared by their largest features."""
+    return Path(job.database).with_suffix(".compared")
 
 
 def similarity_path(job: Job) -> Path:
-    """Where matching keeps what its first look found: alike [P, P]."""
-    return Path(job.database).with_suffix(".alike.npz")
+    """File with the matches that pair selection found: similarity [P, P]."""
+    return Path(job.database).with_suffix(".similarity.npz")
 
 
 def vocabulary_path(job: Job) -> Path:
-    """Where matching keeps the vocabulary of the whole job: [W, 128]."""
-    return Path(job.source or job.database).with_suffix(".words.npy")
+    """File with the vocabulary of the whole job: [W, 128]."""
+    return Path(job.source or job.database).with_suffix(".vocabulary.npy")
 
 
 def selected_pairs_path(job: Job) -> Path:
-    """Where the step "choosing" leaves the pairs to match next, as JSON."""
-    return Path(job.database).with_suffix(".chosen.json")
+    """File with the pairs that the step "pair selection" selected to match next, as JSON."""
+    return Path(job.database).with_suffix(".pairs.json")
 
 
 def chunks_path(job: Job) -> Path:
-    """The folder for finished shares of the job."""
-    return Path(job.database).with_suffix(".shares")
+    """Folder for finished chunks of the job."""
+    return Path(job.database).with_suffix(".chunks")

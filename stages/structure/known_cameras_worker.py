@@ -1,4 +1,4 @@
-"""Matches and points for cameras that are known, in the worker process (imports pycolmap)."""
+"""Matches and points for known cameras, in the worker process (imports pycolmap)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from stages.structure.job import Job, known_cameras_path
 from stages.structure.mapping import observations
 from stages.structure.matching import match_pairs
 
-# Of each round of refinement: points may lie so many times as far off as usual. Rough poses give no
-# points to begin with otherwise.
+# Factor on COLMAP's error thresholds of triangulation, for each round of refinement: with the usual
+# thresholds, rough poses give no points to begin with.
 REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
-FEWEST_MATCHES = 30  # of a pair that is asked whether poses are right
+FEWEST_MATCHES = 30  # of a pair by which poses are checked
 
 
 def match_neighbours(job: Job) -> None:
-    """Match and verify the pairs of the job's known cameras, whose lenses are known exactly."""
+    """Match and verify the selected pairs, with the exact intrinsics of the known cameras."""
     known = np.load(known_cameras_path(job))
     with pycolmap.Database.open(job.database) as database:
         for number, lens in enumerate(zip(known["intrinsics"], known["sizes"], strict=True), 1):
@@ -34,8 +34,11 @@ def match_neighbours(job: Job) -> None:
 
 
 def triangulate(job: Job) -> None:
-    """Leave in `job.out`: agreement.json, how well matches fit the poses and what others would fit
-    better (see `agreement`); points.npz, what the matches and the poses give."""
+    """Check the poses against the matches, and triangulate points with the poses held fixed.
+
+    Writes to `job.out`: pose_check.json, inlier ratios of the given poses and of corrections of
+    likely mistakes (see `epipolar`); points.npz, points, observations and poses.
+    """
     known = np.load(known_cameras_path(job))
     out = Path(job.out)
     shutil.rmtree(out, ignore_errors=True)
@@ -47,17 +50,17 @@ def triangulate(job: Job) -> None:
         "pairs": len(pairs),
         "matches": sum(len(pair[2]) for pair in pairs),
         "given": median_inlier_ratio(pairs, lens, poses, side),
-        "roughly": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
-        "others": {
-            name: median_inlier_ratio(pairs, lens, turned, side)
-            for name, turned in likely_mistakes(poses)
+        "rough": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
+        "mistakes": {
+            name: median_inlier_ratio(pairs, lens, corrected, side)
+            for name, corrected in likely_mistakes(poses)
         },
     }
     if job.refine:
         poses = _refined(job, known, out / "colmap")
         found["refined"] = median_inlier_ratio(pairs, lens, poses, side)
         known = {**known, "world_to_camera": poses}
-    (out / "agreement.json").write_text(json.dumps(found), encoding="utf-8")
+    (out / "pose_check.json").write_text(json.dumps(found), encoding="utf-8")
     _save_points(_triangulated(job, known, out / "colmap"), poses, out / "points.npz")
 
 
@@ -71,8 +74,8 @@ def _camera(number: int, lens: NDArray[np.float64], size: NDArray[np.int32]) -> 
 
 
 def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDArray[np.float64]]]:
-    """(first, second, pixels in the first [N, 2], in the second) of each pair with matches enough
-    that pass a fundamental matrix of their own, whatever the poses are."""
+    """(first, second, pixels in the first [N, 2], in the second) of each pair with enough matches
+    that two-view geometry verified, independently of the given poses."""
     found = []
     with pycolmap.Database.open(path) as database:
         ids, geometries = database.read_two_view_geometries()
@@ -91,9 +94,11 @@ def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDA
 
 
 def _refined(job: Job, known: Mapping[str, Any], scratch: Path) -> NDArray[np.float64]:
-    """[V, 4, 4] the poses, moved to where the matches want them; the lenses stay as they are. What
-    the first rounds believe may lie far off, since the poses do. The world stays the given one: the
-    similarity that brings the new centres nearest the old ones is taken out."""
+    """[V, 4, 4] the poses after rounds of triangulation and bundle adjustment, intrinsics fixed.
+
+    Early rounds use wide error thresholds, since the poses are rough. The result is aligned to the
+    given camera centres by a similarity, so that the world stays the given one.
+    """
     given = np.asarray(known["world_to_camera"], np.float64)
     poses = given
     for slack in REFINEMENTS:
@@ -122,7 +127,7 @@ def _centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 def _triangulated(
     job: Job, known: Mapping[str, Any], scratch: Path, slack: float = 1.0
 ) -> pycolmap.Reconstruction:
-    """Points of the matches, the poses held. slack: times as far off as usual that they may lie."""
+    """Triangulate the matches with fixed poses. slack: factor on COLMAP's error thresholds."""
     scratch.mkdir()
     model = pycolmap.Reconstruction()
     for number, (name, lens, size, pose) in enumerate(

@@ -49,7 +49,7 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
     ]
     spread = spread_ev(lights)
     report.metric("light_spread_ev", round(spread, 4))
-    report.metric("light_told_otherwise_ev", round(differ, 4))
+    report.metric("light_disagreement_ev", round(differ, 4))
     if differ > ALIKE * spread:
         return reconstruction
     views = (replace(v, light=light) for v, light in zip(reconstruction.views, lights, strict=True))

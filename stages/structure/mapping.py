@@ -1,4 +1,4 @@
-"""Camera poses and points from the matches, in the worker process (imports pycolmap)."""
+"""Camera poses and points from verified matches, in the worker process (imports pycolmap)."""
 
 from __future__ import annotations
 
@@ -14,59 +14,57 @@ import pycolmap
 from stages.structure import database as sqlite
 from stages.structure.epipolar import inlier_ratios
 from stages.structure.job import Job
-from stages.structure.placing import Placing
 from stages.structure.sparse_model import SparseModel, save_model
 from stages.structure.worker_progress import ProgressWriter
 
-# Of a smaller model that may contradict the largest.
-CREDIBLE_VIEWS, CREDIBLE_SHARE, CREDIBLE_POINTS = 4, 0.1, 20  # points: for each view
-SMALLEST_MODEL = 3  # photographs; COLMAP's own 10 hides a second scene without a word
+# A smaller model is compared with the largest one only if it has this many photographs, this share
+# of the largest model's photographs, and this many points for each of its photographs.
+CREDIBLE_VIEWS, CREDIBLE_SHARE, CREDIBLE_POINTS = 4, 0.1, 20
+SMALLEST_MODEL = 3  # photographs; COLMAP's default of 10 would hide a small second scene
 MOST_MODELS = 8
 LOOSE_INLIERS = 15
-PAIR_INLIERS = 30  # fewer may be chance, and say nothing against a model
+PAIR_INLIERS = 30  # pairs with fewer may match by chance and are not held against a model
 ROBUST_ADJUSTMENT_ITERATIONS = 25
 _LEAST_NOISE = 0.05  # px
 
 
 def map_photographs(job: Job) -> None:
-    """Write the largest model to `job.out`, with the names in each model that was found."""
+    """Write the largest model, and the names in each model found, to the folder `job.out`."""
     out = Path(job.out)
-    if not out.name:  # "" is the folder that the process happens to stand in
+    if not out.name:  # "" would be the working directory
         raise ValueError("the job names no folder to leave its model in")
     shutil.rmtree(out, ignore_errors=True)
     scratch = out.with_name(out.name + "-colmap")
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     started = time.monotonic()
-    with Placing(ProgressWriter(Path(job.progress)), len(job.names)) as placing:
-        if job.mapper == "global":
-            models = _global(job, scratch)
-        else:
-            models = _incremental(job, scratch, placing)
-        timed_out = job.mapper != "global" and time.monotonic() - started >= job.max_seconds
-        ordered = sorted(
-            (m for m in models.values() if m.num_reg_images() > 0),
-            key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
-        )
-        if ordered:
-            placing.ending()
-            _settle(ordered[0])
+    models = _global(job, scratch) if job.mapper == "global" else _incremental(job, scratch)
+    timed_out = job.mapper != "global" and time.monotonic() - started >= job.max_seconds
+    ordered = sorted(
+        (m for m in models.values() if m.num_reg_images() > 0),
+        key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
+    )
+    if ordered:
+        _robust_bundle_adjustment(ordered[0])
     groups = [sorted(m.images[i].name for i in m.reg_image_ids()) for m in ordered]
-    model = _plain(ordered[0], ordered[1:], job) if ordered else None
+    model = _sparse_model(ordered[0], ordered[1:], job) if ordered else None
     save_model(out, model, groups=groups, timed_out=timed_out)
     shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _settle(model: pycolmap.Reconstruction) -> None:
-    """Move all of it to where most of what is seen wants it. The mapper adjusts by plain least
-    squares, in which the worst matches pull hardest, and together bend a long arc of cameras. The
-    lens stays: a focal length hardly differs from a bend, and moved either way by chance."""
+def _robust_bundle_adjustment(model: pycolmap.Reconstruction) -> None:
+    """Refine all poses and points once more, with a Cauchy loss.
+
+    The mapper minimises squared errors, which the worst matches dominate: together they bend a long
+    arc of cameras. The intrinsics stay fixed, because a change of focal length is nearly the same
+    as such a bend, and noise alone would decide between the two.
+    """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     model.update_point_3d_errors()
-    usual = model.compute_mean_reprojection_error()
-    options.ceres.loss_function_scale = max(usual, _LEAST_NOISE)
+    mean_error_px = model.compute_mean_reprojection_error()
+    options.ceres.loss_function_scale = max(mean_error_px, _LEAST_NOISE)
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = ROBUST_ADJUSTMENT_ITERATIONS
     options.print_summary = False
@@ -74,7 +72,7 @@ def _settle(model: pycolmap.Reconstruction) -> None:
     model.update_point_3d_errors()
 
 
-def _incremental(job: Job, scratch: Path, placing: Placing) -> dict[int, pycolmap.Reconstruction]:
+def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1  # more threads sum residuals in another order each time
     options.random_seed = options.mapper.random_seed = job.seed
@@ -83,11 +81,11 @@ def _incremental(job: Job, scratch: Path, placing: Placing) -> dict[int, pycolma
     options.min_model_size = SMALLEST_MODEL
     options.max_num_models = MOST_MODELS
     options.max_runtime_seconds = job.max_seconds
-    # An eighth of the time less than COLMAP's 5 and 2, and the same poses.
+    # Takes an eighth less time than COLMAP's 5 and 2, and gives the same poses.
     options.ba_global_max_refinements, options.ba_local_max_refinements = 3, 1
-    # All cameras are adjusted after each fifth photograph more, not each tenth, and only until that
-    # gains next to nothing: what is left, settling does. COLMAP goes on until gradients vanish that
-    # grow with the model.
+    # Global bundle adjustment runs each time the model has grown by a fifth (COLMAP: a tenth), and
+    # stops once the cost hardly falls; the robust bundle adjustment at the end does the rest.
+    # COLMAP waits for gradients to vanish, and those grow with the model.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.2
     options.ba_global_function_tolerance = 1e-4
     if job.loose:
@@ -101,14 +99,25 @@ def _incremental(job: Job, scratch: Path, placing: Placing) -> dict[int, pycolma
             options.init_image_id1, options.init_image_id2 = pair
             options.multiple_models = False
             options.mapper.init_min_tri_angle = 4.0
+    registered = itertools.count(1)
+    progress = ProgressWriter(Path(job.progress))
+
+    def new_model() -> None:
+        nonlocal registered
+        registered = itertools.count(2)
+        one_more()
+
+    def one_more() -> None:
+        progress.write("registering photographs", next(registered), len(job.names))
+
     return dict(
         pycolmap.incremental_mapping(
             job.database,
             job.images_root,
             scratch,
             options,
-            initial_image_pair_callback=placing.began,
-            next_image_callback=placing.placed,
+            initial_image_pair_callback=new_model,
+            next_image_callback=one_more,
         )
     )
 
@@ -133,8 +142,8 @@ def _global(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
 
 
 def _other_pair(database: Path) -> tuple[int, int] | None:
-    """Image ids of the calibrated pair with most inliers among pairs that are far apart in the
-    order of shooting, which COLMAP, looking for most inliers, tries last."""
+    """Image ids of the calibrated pair with most inliers among pairs that are not neighbours in the
+    capture's order. COLMAP prefers pairs with most inliers, so it tries these last."""
     pairs = [pair for pair in sqlite.verified_pairs(database) if pair[3] == 2]
     far = [pair for pair in pairs if pair[1] - pair[0] >= 2] or pairs
     if not far:
@@ -143,17 +152,21 @@ def _other_pair(database: Path) -> tuple[int, int] | None:
     return first + 1, second + 1
 
 
-def _plain(
+def _sparse_model(
     model: pycolmap.Reconstruction, others: list[pycolmap.Reconstruction], job: Job
 ) -> SparseModel:
-    """COLMAP's model as arrays, everything in order of ids. others: smaller models."""
+    """COLMAP's model as arrays, cameras, photographs and points in order of their ids.
+
+    Args:
+        model: the largest model.
+        others: the smaller models.
+        job: the job that both come from.
+    """
     image_ids = sorted(model.reg_image_ids())
     position = {image_id: i for i, image_id in enumerate(image_ids)}
     point_ids = sorted(model.point3D_ids())
     points = [model.points3D[point_id] for point_id in point_ids]
-    seen = observations(model, points, position)
-    pairs = _pairs(job, model, position)
-    turns = [_turn_between(model, other) for other in others if _credible(other, model)]
+    rotations = [_rotation_between(model, other) for other in others if _credible(other, model)]
     cameras = [
         model.cameras[camera_id + 1]
         for camera_id in range(len(job.cameras))
@@ -173,28 +186,31 @@ def _plain(
         ),
         points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
         colours=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-        **seen,
-        **pairs,
-        turns_of_others=np.array([turn for turn in turns if turn is not None], np.float64),
+        **observations(model, points, position),
+        **_pair_inlier_ratios(job, model, position),
+        rotations_to_others_deg=np.array([r for r in rotations if r is not None], np.float64),
     )
 
 
 def _credible(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> bool:
-    """Whether a smaller model is more than a few photographs that happened to fit."""
+    """Whether a smaller model is more than a few photographs that fit by chance."""
     views = other.num_reg_images()
     enough = max(CREDIBLE_VIEWS, CREDIBLE_SHARE * model.num_reg_images())
     return views >= enough and other.num_points3D() >= CREDIBLE_POINTS * views
 
 
-def _turn_between(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> float | None:
-    """Degrees between what the two say of the directions of photographs that both placed, the
-    largest over pairs of them; None with fewer than two."""
+def _rotation_between(
+    model: pycolmap.Reconstruction, other: pycolmap.Reconstruction
+) -> float | None:
+    """By how many degrees the two models disagree about the relative rotation of two photographs
+    that both registered; the largest over all such pairs. None with fewer than two photographs in
+    common."""
     both = sorted(set(model.reg_image_ids()) & set(other.reg_image_ids()))
     ours, theirs = (
         [m.images[image].cam_from_world().rotation.matrix() for image in both]
         for m in (model, other)
     )
-    worlds = [a.T @ b for a, b in zip(ours, theirs, strict=True)]  # the same, if both are right
+    worlds = [a.T @ b for a, b in zip(ours, theirs, strict=True)]  # all equal if the models agree
     cosines = [(np.trace(a.T @ b) - 1.0) / 2.0 for a, b in itertools.combinations(worlds, 2)]
     return float(np.degrees(np.arccos(np.clip(min(cosines), -1.0, 1.0)))) if cosines else None
 
@@ -208,6 +224,10 @@ def _matrix(pose: Any) -> np.ndarray:
 def observations(
     model: pycolmap.Reconstruction, points: list[Any], position: dict[int, int]
 ) -> dict[str, np.ndarray]:
+    """Observations of `points` as in `SparseModel`: observed_points, observing_views, observed_px.
+
+    position: index of each registered photograph by image id.
+    """
     keypoints = {i: model.images[i].points2D for i in position}
     rows = []
     for number, point in enumerate(points):
@@ -223,34 +243,35 @@ def observations(
     }
 
 
-def _pairs(
+def _pair_inlier_ratios(
     job: Job, model: pycolmap.Reconstruction, position: dict[int, int]
 ) -> dict[str, np.ndarray]:
-    """How many of the matches that two photographs alone agree on fit the model."""
-    ticks = ProgressWriter(Path(job.progress))
-    straight: dict[int, np.ndarray] = {}  # pixels of a pinhole without a principal point
+    """`SparseModel.pairs` and `pair_inlier_ratios`: of the matches that two-view geometry verified,
+    the share that also fits the model's poses."""
+    progress = ProgressWriter(Path(job.progress))
+    normalised: dict[int, np.ndarray] = {}  # undistorted pixels, relative to the principal point
     focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
-    lenses = np.array([(focal[i], focal[i], 0.0, 0.0) for i in position])
+    intrinsics = np.array([(focal[i], focal[i], 0.0, 0.0) for i in position])
     poses = np.array([_matrix(model.images[i].cam_from_world()) for i in position])
     side = max(max(c.width, c.height) for c in model.cameras.values())
-    pairs, shares = [], []
+    pairs, ratios = [], []
     with pycolmap.Database.open(job.database) as database:
         ids, geometries = database.read_two_view_geometries()
         for done, (pair_id, geometry) in enumerate(zip(ids, geometries, strict=True), 1):
             both = pycolmap.pair_id_to_image_pair(pair_id)
             matches = np.asarray(geometry.inlier_matches)
-            ticks.write("checking pairs", done, len(ids))
+            progress.write("checking pairs", done, len(ids))
             if len(matches) < PAIR_INLIERS or any(image not in position for image in both):
                 continue
             for image in both:
-                if image not in straight:
+                if image not in normalised:
                     camera = model.cameras[model.images[image].camera_id]
                     pixels = database.read_keypoints(image)[:, :2].astype(np.float64)
-                    straight[image] = focal[image] * np.asarray(camera.cam_from_img(pixels))
-            a, b = (straight[image][matches[:, k]] for k, image in enumerate(both))
+                    normalised[image] = focal[image] * np.asarray(camera.cam_from_img(pixels))
+            a, b = (normalised[image][matches[:, k]] for k, image in enumerate(both))
             pairs.append((position[both[0]], position[both[1]]))
-            shares += inlier_ratios([(*pairs[-1], a, b)], lenses, poses, side).tolist()
+            ratios += inlier_ratios([(*pairs[-1], a, b)], intrinsics, poses, side).tolist()
     return {
         "pairs": np.array(pairs, np.int32).reshape(-1, 2),
-        "pair_fits": np.nan_to_num(np.array(shares, np.float64), nan=1.0),
+        "pair_inlier_ratios": np.nan_to_num(np.array(ratios, np.float64), nan=1.0),
     }

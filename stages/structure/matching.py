@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.structure import database as sqlite
-from stages.structure import descriptor_matching, new_database, pairs, retrieval
+from stages.structure import new_database, pairs, retrieval
+from stages.structure.descriptor_matching import match_descriptors
 from stages.structure.job import (
     Job,
     chunks_path,
@@ -34,37 +35,37 @@ from stages.structure.vocabulary import (
 )
 from stages.structure.worker_progress import ProgressWriter
 
-FIRST_LOOK = 1000  # features: the largest, which are seen from farthest
-FIRST_COMPARED = 64  # see `words.COMPARED`; a first look need not be right about single features
-FEWEST_INLIERS = 15  # COLMAP's
-MOST_TRIALS = 3000  # where few matches fit, as between pictures of other places
-_KEPT = 256  # photographs whose sorted features stay in memory
+LARGEST_FEATURES = 1000  # compared for pair selection; they are seen from the farthest
+FEWEST_COMPARED_SMALL = 64  # as `vocabulary.FEWEST_COMPARED`, for pair selection: it may err more
+FEWEST_INLIERS = 15  # as in COLMAP
+MOST_TRIALS = 3000  # of RANSAC, for pairs with few inliers
+_CACHED = 256  # photographs whose feature indices stay in memory
 
 
 def match_all(job: Job) -> None:
-    """Match and verify pairs of photographs; pairs that the database holds are not done again."""
+    """Match and verify pairs of photographs, except those that the database holds."""
     with _matcher(job, job.database) as matcher:
-        for wanted in _rounds(job, matcher.album, matcher.inliers):
+        for wanted in _rounds(job, matcher.features, matcher.inliers):
             matcher.run(wanted)
 
 
 def match_pairs(job: Job, wanted: list[Pair]) -> None:
-    """Match and verify the `wanted` pairs, less those that the database holds."""
+    """Match and verify the `wanted` pairs, except those that the database holds."""
     with _matcher(job, job.database) as matcher:
         matcher.run(wanted)
 
 
 def select_pairs(job: Job) -> None:
-    """Take in what finished shares hold, and leave the pairs to match next (`chosen_path`): none
-    once `match` would find nothing to do."""
+    """Merge finished chunks, and write the pairs to match next (`selected_pairs_path`): none once
+    `match_all` would find nothing to do."""
     database = Path(job.database)
-    sqlite.gather(database, sorted(chunks_path(job).glob("*.db")))
+    sqlite.merge_chunks(database, sorted(chunks_path(job).glob("*.db")))
     inliers = sqlite.inliers_of_pairs(database)
     missing: list[Pair] = []
-    with sqlite.Features(database) as features:
-        album = _Album(job, features)
-        album.words()  # once, and not in each share
-        for wanted in _rounds(job, album, inliers):
+    with sqlite.Features(database) as stored:
+        features = _IndexedFeatures(job, stored)
+        features.vocabulary()  # built once, and not in each chunk
+        for wanted in _rounds(job, features, inliers):
             missing = [pair for pair in wanted if pair not in inliers]
             if missing:
                 break
@@ -72,89 +73,91 @@ def select_pairs(job: Job) -> None:
 
 
 def match_chunk(job: Job) -> None:
-    """Match and verify the job's share of the pairs, into a database of their own."""
+    """Match and verify the pairs of the job's chunk, into a database of its own."""
     new_database.create(Path(job.database), job, ())
     sqlite.take_cameras(Path(job.database), Path(job.source))
-    with _matcher(job, job.source, still=True) as matcher:
+    with _matcher(job, job.source, immutable=True) as matcher:
         matcher.run(list(job.pairs))
 
 
 @contextmanager
-def _matcher(job: Job, features: str, still: bool = False) -> Iterator[_Matcher]:
-    """features: the database that has them, see `database.Features`. Readers leave first: the last
-    to close a database puts it in order."""
+def _matcher(job: Job, source: str, immutable: bool = False) -> Iterator[_Matcher]:
+    """A matcher with features from the database `source`; immutable: as in `database.Features`. Its
+    reader is closed before the writer, because the last to close a database tidies it up."""
     with (
         pycolmap.Database.open(job.database) as database,
-        sqlite.Features(Path(features), still) as found,
+        sqlite.Features(Path(source), immutable) as stored,
     ):
-        yield _Matcher(job, database, found)
+        yield _Matcher(job, database, stored)
 
 
-def _rounds(job: Job, album: _Album, inliers: Mapping[Pair, int]) -> Iterator[list[Pair]]:
-    """Pairs to match, each list once the ones before are matched. inliers: of those that are."""
+def _rounds(
+    job: Job, features: _IndexedFeatures, inliers: Mapping[Pair, int]
+) -> Iterator[list[Pair]]:
+    """Lists of pairs to match, each selected when the one before is matched. inliers: of the pairs
+    that are matched."""
     photographs = len(job.names)
     if job.matching == "exhaustive":
         yield pairs.exhaustive_pairs(photographs)
     elif job.matching == "sequential":
         yield pairs.sequential_pairs(photographs)
     else:
-        alike = _first_look(job, album)
-        first = pairs.initial_pairs(alike)
+        similarity = _similarity(job, features)
+        first = pairs.initial_pairs(similarity)
         yield first
-        yield pairs.linking_pairs(alike, first, {pair: inliers[pair] for pair in first})
+        yield pairs.linking_pairs(similarity, first, {pair: inliers[pair] for pair in first})
 
 
-class _Album:
-    """The features of photographs by position, sorted by word; read by several threads."""
+class _IndexedFeatures:
+    """Features of photographs by position, indexed by visual word; for several threads."""
 
-    def __init__(self, job: Job, features: sqlite.Features) -> None:
-        self._job, self._features = job, features
-        self.words = functools.cache(self._vocabulary)
-        self.sorted = functools.lru_cache(_KEPT)(self._sorted)
-        self.points = functools.lru_cache(_KEPT)(features.points)
+    def __init__(self, job: Job, stored: sqlite.Features) -> None:
+        self._job, self._stored = job, stored
+        self.vocabulary = functools.cache(self._vocabulary)
+        self.index = functools.lru_cache(_CACHED)(self._index)
+        self.points = functools.lru_cache(_CACHED)(stored.points)
 
     def _vocabulary(self) -> NDArray[np.float32]:
-        """Of all photographs; kept beside the database, for shares and for another time."""
+        """Of all photographs; stored beside the database, for chunks and resumed runs."""
         path, photographs = vocabulary_path(self._job), len(self._job.names)
         if not path.exists():
-            ticks, each = (
-                ProgressWriter(Path(self._job.progress)),
-                max(1, SAMPLED_DESCRIPTORS // photographs),
-            )
+            progress = ProgressWriter(Path(self._job.progress))
+            most = max(1, SAMPLED_DESCRIPTORS // photographs)
             rows = []
             for i in range(photographs):
-                rows.append(_spread(self._features.descriptors(i), each))
-                ticks.write("sorting features", i + 1, 2 * photographs)
+                descriptors = self._stored.descriptors(i)
+                rows.append(descriptors[:: max(1, len(descriptors) // most)][:most])
+                progress.write("indexing features", i + 1, 2 * photographs)
             with replacing(path) as partial:
                 np.save(partial, build_vocabulary(np.concatenate(rows)))
         found: NDArray[np.float32] = np.load(path)
         return found
 
     def largest(self, position: int) -> tuple[FeatureIndex, NDArray[np.int64]]:
-        """For a first look: the largest features, and what words they are."""
-        first, words = self._features.descriptors(position)[:FIRST_LOOK], self.words()
-        return index_by_word(first, words, FIRST_COMPARED), word_pairs(first, words)
+        """For pair selection: the largest features, and their words for retrieval."""
+        first, words = self._stored.descriptors(position)[:LARGEST_FEATURES], self.vocabulary()
+        return index_by_word(first, words, FEWEST_COMPARED_SMALL), word_pairs(first, words)
 
-    def _sorted(self, position: int) -> FeatureIndex:
-        return index_by_word(self._features.descriptors(position), self.words())
+    def _index(self, position: int) -> FeatureIndex:
+        return index_by_word(self._stored.descriptors(position), self.vocabulary())
 
 
 class _Matcher:
-    """Matches and verifies pairs in several threads, and writes what they find. inliers: of the
-    pairs that are matched."""
+    """Matches and verifies pairs in several threads, and writes the results. inliers: of the pairs
+    that are matched."""
 
-    def __init__(self, job: Job, database: pycolmap.Database, features: sqlite.Features) -> None:
-        self.album = _Album(job, features)
+    def __init__(self, job: Job, database: pycolmap.Database, stored: sqlite.Features) -> None:
+        self.features = _IndexedFeatures(job, stored)
         self.inliers = sqlite.inliers_of_pairs(Path(job.database))
-        self._job, self._database, self._features = job, database, features
+        self._job, self._database, self._stored = job, database, stored
         self._cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
-        self._ticks = ProgressWriter(Path(job.progress))
+        self._progress = ProgressWriter(Path(job.progress))
 
     def run(self, wanted: list[Pair]) -> None:
-        """Match the `wanted` pairs, less those that are matched."""
+        """Match the `wanted` pairs, except those that are matched."""
         missing = [pair for pair in wanted if pair not in self.inliers]
         done = len(wanted) - len(missing)
-        self.album.words()  # now, and not in several threads at once
+        self.features.vocabulary()  # now, and not in several threads at once
         with ThreadPoolExecutor(self._job.threads) as pool:
             for pair, (matches, geometry) in zip(
                 missing, pool.map(self._match, missing), strict=True
@@ -165,24 +168,23 @@ class _Matcher:
                 self._database.write_two_view_geometry(first, second, geometry)
                 self.inliers[pair] = len(geometry.inlier_matches)
                 done += 1
-                self._ticks.write("matching", done, len(wanted))
+                self._progress.write("matching", done, len(wanted))
 
     def _match(self, pair: Pair) -> tuple[NDArray[np.uint32] | None, pycolmap.TwoViewGeometry]:
-        """(matches, None if the database has them, geometry without inliers if it has few)."""
+        """(matches; None if the database has them, two-view geometry; without inliers if it has too
+        few)."""
         first, second = pair
-        known = self._features.matches(first, second)
+        known = self._stored.matches(first, second)
         matches = known
         if matches is None:
-            matches = descriptor_matching.match_descriptors(
-                self.album.sorted(first), self.album.sorted(second)
-            )
+            matches = match_descriptors(self.features.index(first), self.features.index(second))
         geometry = pycolmap.TwoViewGeometry()
         if len(matches) >= FEWEST_INLIERS:
             found = pycolmap.estimate_two_view_geometry(
                 self._cameras[first],
-                self.album.points(first),
+                self.features.points(first),
                 self._cameras[second],
-                self.album.points(second),
+                self.features.points(second),
                 matches,
                 _verification(self._job),
             )
@@ -191,48 +193,44 @@ class _Matcher:
         return (matches if known is None else None), geometry
 
 
-def _first_look(job: Job, album: _Album) -> NDArray[np.int32]:
-    """[P, P] matches among the largest features of each two photographs that may look alike; none
-    of others. It is kept for another time, and how many were looked at for the parent."""
-    photographs, kept = len(job.names), similarity_path(job)
-    if kept.exists():
-        found: NDArray[np.int32] = np.load(kept)["alike"]
+def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
+    """[P, P] matches among the largest features of the pairs that retrieval proposes; 0 for others.
+    Stored for resumed runs, with the number of these pairs for the parent process."""
+    photographs, stored = len(job.names), similarity_path(job)
+    if stored.exists():
+        found: NDArray[np.int32] = np.load(stored)["similarity"]
         return found
-    album.words()
-    ticks = ProgressWriter(Path(job.progress))
-    alike = np.zeros((photographs, photographs), np.int32)
-    sorted_, held = [], []
+    features.vocabulary()
+    progress = ProgressWriter(Path(job.progress))
+    similarity = np.zeros((photographs, photographs), np.int32)
+    indices, words_of = [], []
     with ThreadPoolExecutor(job.threads) as pool:
-        for done, (largest, words) in enumerate(pool.map(album.largest, range(photographs)), 1):
-            sorted_.append(largest)
-            held.append(words)
-            ticks.write("sorting features", photographs + done, 2 * photographs)
+        for done, (index, words) in enumerate(pool.map(features.largest, range(photographs)), 1):
+            indices.append(index)
+            words_of.append(words)
+            progress.write("indexing features", photographs + done, 2 * photographs)
         wanted = retrieval.candidate_pairs(
-            held, lambda done: ticks.write("comparing words", done, photographs)
+            words_of, lambda done: progress.write("retrieving pairs", done, photographs)
         )
 
-        def look(pair: Pair) -> int:
-            return len(descriptor_matching.match_descriptors(sorted_[pair[0]], sorted_[pair[1]]))
+        def count_matches(pair: Pair) -> int:
+            return len(match_descriptors(indices[pair[0]], indices[pair[1]]))
 
-        for done, (pair, count) in enumerate(zip(wanted, pool.map(look, wanted), strict=True), 1):
-            alike[pair] = count
-            ticks.write("looking for pairs", done, len(wanted))
+        counts = pool.map(count_matches, wanted)
+        for done, (pair, count) in enumerate(zip(wanted, counts, strict=True), 1):
+            similarity[pair] = count
+            progress.write("selecting pairs", done, len(wanted))
     compared_pairs_path(job).write_text(str(len(wanted)))
-    alike += alike.T
-    with replacing(kept) as partial:
-        np.savez_compressed(partial, alike=alike)
-    return alike
-
-
-def _spread(rows: NDArray[np.uint8], most: int) -> NDArray[np.uint8]:
-    """About `most` of `rows`, evenly taken."""
-    return rows[:: max(1, len(rows) // most)][:most]
+    similarity += similarity.T
+    with replacing(stored) as partial:
+        np.savez_compressed(partial, similarity=similarity)
+    return similarity
 
 
 def _verification(job: Job) -> pycolmap.TwoViewGeometryOptions:
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.seed
     options.ransac.max_num_trials = MOST_TRIALS
-    options.compute_relative_pose = True  # also tells a turn on the spot from a planar scene
+    options.compute_relative_pose = True  # also tells a pure rotation from a planar scene
     options.filter_stationary_matches = job.drop_stationary
     return options

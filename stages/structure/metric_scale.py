@@ -91,7 +91,7 @@ def find_metric_scale(
     else:
         photos = {photo.name: photo for photo in capture.photos}
         metric = _from_gps([photos[name] for name in names], centres, levelled, report)
-    report.metric("metres_from", metric.source if metric else "nothing")
+    report.metric("scale_source", metric.source if metric else "nothing")
     report.metric("metres_per_unit", metric.metres if metric else None)
     return metric
 

@@ -12,12 +12,12 @@ from stages.structure.gates import connected_groups
 
 Pair = tuple[int, int]
 
-NEIGHBOURS = 20  # in order of the capture, for sequential matching; and 32, 64, ... apart
-BEST = 14  # pairs that a photograph asks for
-FEWEST_SEEN_ALIKE = 4  # matches of a first look; pairs of other places have up to that many
+NEIGHBOURS = 20  # in the capture's order, for sequential matching; besides those 32, 64, ... apart
+BEST = 14  # pairs for each photograph
+FEWEST_SIMILAR = 4  # matches of the largest features; unrelated pairs have fewer
 LINK_INLIERS = 30
 FEWEST_LINKS = 3
-MOST_TO_CLOSE_GAPS = 20  # pairs, for each photograph of the capture
+MOST_LINKING_PAIRS = 20  # for each photograph of the capture
 
 
 def exhaustive_pairs(photographs: int) -> list[Pair]:
@@ -26,33 +26,36 @@ def exhaustive_pairs(photographs: int) -> list[Pair]:
 
 
 def sequential_pairs(photographs: int) -> list[Pair]:
-    """Neighbours in order of the capture, and some that are farther apart."""
+    """Neighbours in the capture's order, and some that are farther apart."""
     steps = [*range(1, NEIGHBOURS + 1), *(2**k for k in range(5, photographs.bit_length()))]
     return sorted((i, i + step) for step in steps for i in range(photographs - step))
 
 
-def initial_pairs(alike: NDArray[np.int32]) -> list[Pair]:
-    """The pairs to begin with: the best few of each photograph, and the next in order.
+def initial_pairs(similarity: NDArray[np.int32]) -> list[Pair]:
+    """The pairs to match first: the most similar of each photograph, and the next in order.
 
-    alike [P, P] symmetric: matches that a first look found.
+    similarity [P, P] symmetric: matches among the largest features.
     """
-    photographs = len(alike)
+    photographs = len(similarity)
     pairs = {(i, i + 1) for i in range(photographs - 1)}
-    for i, row in enumerate(alike):
+    for i, row in enumerate(similarity):
         best = np.lexsort((np.abs(np.arange(photographs) - i), -row))[:BEST]
-        pairs |= {_pair(i, int(j)) for j in best if j != i and row[j] >= FEWEST_SEEN_ALIKE}
+        pairs |= {_pair(i, int(j)) for j in best if j != i and row[j] >= FEWEST_SIMILAR}
     return sorted(pairs)
 
 
 def linking_pairs(
-    alike: NDArray[np.int32], matched: Iterable[Pair], inliers: dict[Pair, int]
+    similarity: NDArray[np.int32], matched: Iterable[Pair], inliers: dict[Pair, int]
 ) -> list[Pair]:
-    """Pairs to match besides: all others of photographs with few links, and all between groups
-    that nothing links; where these are too many, those that look most alike.
+    """More pairs to match so that the view graph is connected: all others of photographs with few
+    links, and all between components; if these are too many, the most similar ones.
 
-    inliers: of the `matched` pairs that were verified.
+    Args:
+        similarity: [P, P] as in `initial_pairs`.
+        matched: pairs that were matched.
+        inliers: of those that were verified; enough of them make a link.
     """
-    photographs = len(alike)
+    photographs = len(similarity)
     links = [pair for pair, count in inliers.items() if count >= LINK_INLIERS]
     degree = np.bincount(np.array(links, np.int64).reshape(-1), minlength=photographs)
     group = np.zeros(photographs, np.int64)
@@ -61,11 +64,11 @@ def linking_pairs(
     ):
         group[members] = number
     few = degree < FEWEST_LINKS
-    apart = few[:, None] | few[None, :] | (group[:, None] != group[None, :])
-    apart[tuple(np.array(list(matched), np.int64).reshape(-1, 2).T)] = False
-    first, second = np.nonzero(np.triu(apart, 1))
-    order = np.lexsort((second, first, -alike[first, second]))
-    order = order[: MOST_TO_CLOSE_GAPS * photographs]
+    wanted = few[:, None] | few[None, :] | (group[:, None] != group[None, :])
+    wanted[tuple(np.array(list(matched), np.int64).reshape(-1, 2).T)] = False
+    first, second = np.nonzero(np.triu(wanted, 1))
+    order = np.lexsort((second, first, -similarity[first, second]))
+    order = order[: MOST_LINKING_PAIRS * photographs]
     return sorted(zip(first[order].tolist(), second[order].tolist(), strict=True))
 
 

@@ -1,4 +1,4 @@
-"""Runs the worker process, watches it, and turns its end into something that can be handled."""
+"""Runs the worker process, watches it, and turns its exit status into exceptions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from pathlib import Path
 from threading import Event
 
 from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.stage import Report
 from stages.structure.job import Job
+from stages.structure.worker_progress import read_progress
 
 _POLL_SECONDS = 0.1
 _TICK_SECONDS = 0.5
 _TAIL_LINES = 15
-_PROGRESS = re.compile(r"I\d{8} ")  # a line of glog at the level of information
+_PROGRESS = re.compile(r"I\d{8} ")  # an INFO line of glog
 _DISK_FULL = ("no space left on device", "database or disk is full", "disk quota exceeded")
 
 
@@ -30,17 +32,22 @@ class WorkerCrashed(Exception):  # noqa: N818 - says what happened
 
 
 class WorkerTimedOut(Exception):  # noqa: N818 - says what happened
-    """The worker was ended because its time was over."""
+    """The worker was killed because its time was up."""
 
 
 def run_worker(
     job: Job, folder: Path, stop: Event, max_seconds: float, tick: Callable[[], None]
 ) -> None:
-    """Run one job to its end; `tick` is called about twice a second meanwhile.
+    """Run one job to its end. The worker never outlives this call, nor this process.
 
-    The worker's words go to `folder`/log.txt. Raises Interrupted when `stop` is set,
-    WorkerTimedOut after `max_seconds`, WorkerCrashed when the worker fails, and SplatError
-    "disk-full". The worker never outlives this call, nor this process.
+    Args:
+        job: what to do.
+        folder: receives job.json and the worker's output, log.txt.
+        stop: when it is set, the worker is killed and Interrupted raised.
+        max_seconds: after this time the worker is killed and WorkerTimedOut raised.
+        tick: called about twice a second meanwhile, and once at the end.
+
+    Also raises WorkerCrashed when the worker fails, and SplatError "disk-full".
     """
     path = job.write(folder / "job.json")
     log = folder / "log.txt"
@@ -48,11 +55,11 @@ def run_worker(
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     }
-    # A BLAS of several threads may add up in another order when its cores are busy; COLMAP has
-    # threads of its own.
+    # A BLAS with several threads may add in another order when cores are busy; COLMAP has its own
+    # threads.
     environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     with log.open("wb") as output:
-        # A session of its own: Ctrl-C goes to the parent alone, which then decides.
+        # In a session of its own, so that Ctrl-C reaches the parent alone.
         worker = subprocess.Popen(
             _command(path),
             stdin=subprocess.PIPE,
@@ -76,8 +83,23 @@ def run_worker(
     tick()
 
 
+def run_step(job: Job, folder: Path, report: Report, max_seconds: float, suffix: str = "") -> None:
+    """`run_worker`, with the worker's progress passed to `report`. suffix: added to its phases."""
+    path = Path(job.progress)
+    unit = "pairs" if job.step in ("matching", "neighbours") else "photographs"
+    path.unlink(missing_ok=True)
+
+    def tick() -> None:
+        progress = read_progress(path)
+        if progress is not None:
+            phase, done, total = progress
+            report.progress(done, total, phase + suffix, **{unit: done})
+
+    run_worker(job, folder, report.stop_requested, max_seconds, tick)
+
+
 def _command(job: Path) -> list[str]:
-    # -P: the current folder may hold anything, also photographs beside a file named numpy.py.
+    # -P: modules in the current folder, such as a file named numpy.py, must not be imported.
     return [sys.executable, "-P", "-m", "stages.structure.worker", str(job)]
 
 
@@ -99,32 +121,32 @@ def _watch(
 
 def _tail(log: Path) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    # COLMAP follows what went wrong by the addresses of its stack, which tell a user nothing.
+    # COLMAP prints stack addresses after an error, which do not help a user.
     lines = [line for line in lines if not line.lstrip().startswith(("@ ", "PC: @", "***"))]
-    # Other threads and processes go on saying how far they are.
-    telling = [line for line in lines if not _PROGRESS.match(line)]
-    return "\n".join((telling or lines)[-_TAIL_LINES:])
+    # Other threads and processes go on printing their progress.
+    errors = [line for line in lines if not _PROGRESS.match(line)]
+    return "\n".join((errors or lines)[-_TAIL_LINES:])
 
 
 def _disk_full(folder: Path) -> SplatError:
     return SplatError(
         "disk-full",
         given=f"The disk of {folder} became full during structure from motion.",
-        wanted="About 10 MB a photograph are needed while it works.",
+        wanted="About 10 MB of free disk space are needed for each photograph.",
         hint="Free some space and give the same command again: finished work is kept.",
         family=Family.RESOURCES,
     )
 
 
 def crash_error(crash: WorkerCrashed, folder: Path) -> SplatError:
-    """A worker's crash as an error for the user; the log stays in `folder`."""
+    """A worker's crash as an error for the user, which names the log in `folder`."""
     lines = [line for line in crash.tail.splitlines() if line.strip()]
-    last = lines[-1] if lines else "it said nothing"
+    last = lines[-1] if lines else "(none)"
     how = f"signal {-crash.status}" if crash.status < 0 else f"status {crash.status}"
     return SplatError(
         "sfm-crashed",
-        given=f"COLMAP ended with {how} during {crash.step}. Its last words: {last}",
-        wanted="It should have come to its end.",
+        given=f"COLMAP ended with {how} during {crash.step}. The last line of its log: {last}",
+        wanted="COLMAP must finish without an error.",
         hint=f"Give the same command again; if it ends the same way, use smaller photographs "
         f"(--max-side). The whole log is {folder / 'log.txt'}.",
         family=Family.RECONSTRUCTION,

@@ -77,7 +77,7 @@ def _view_to_dict(view: View) -> dict[str, Any]:
     return {
         "name": view.name,
         "image": view.image,
-        "twin": view.twin,
+        "duplicate_of": view.duplicate_of,
         **({"role": view.role} if view.role else {}),
         **({"mask": view.mask, "outside": view.outside} if view.mask else {}),
         **({"light": list(view.light)} if view.light else {}),
@@ -97,10 +97,10 @@ def _view_from_dict(data: dict[str, Any]) -> View:
     camera = Camera(
         width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
     )
-    twin, role, mask, outside = (
-        str(data.get(name, "")) for name in ("twin", "role", "mask", "outside")
+    duplicate_of, role, mask, outside = (
+        str(data.get(name, "")) for name in ("duplicate_of", "role", "mask", "outside")
     )
     red, green, blue = data.get("light", (None,) * 3)
     light = None if red is None else (float(red), float(green), float(blue))
     name, image = str(data["name"]), str(data["image"])
-    return View(name, image, camera, twin, role, mask, outside, light)
+    return View(name, image, camera, duplicate_of, role, mask, outside, light)

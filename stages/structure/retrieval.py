@@ -1,6 +1,7 @@
-"""Which photographs may show the same thing, from the words that both hold.
+"""Image retrieval: pairs of photographs with similar bags of visual words (TF-IDF).
 
-Costs next to nothing a pair, so that a first look need not be at every two of many photographs.
+Cheap enough to compare every pair of many photographs; only the best pairs are then compared by
+their largest features.
 """
 
 from __future__ import annotations
@@ -13,24 +14,27 @@ from scipy import sparse
 
 from stages.base.blocks import blocks
 
-CANDIDATES = 48  # of each photograph; up to so many others, all are
-NEIGHBOURS = 4  # in order of the capture, either way
-_AT_ONCE = 64  # photographs compared with all others between two ticks
+CANDIDATES = 48  # for each photograph
+NEIGHBOURS = 4  # in the capture's order, on either side
+_BLOCK = 64  # photographs compared with all others between two progress reports
 
 
 def candidate_pairs(
-    held: Sequence[NDArray[np.int64]], tick: Callable[[int], None] = lambda done: None
+    words_of: Sequence[NDArray[np.int64]], tick: Callable[[int], None] = lambda done: None
 ) -> list[tuple[int, int]]:
-    """Pairs (first, second) to look at: the most alike of each photograph, and neighbours.
+    """Pairs (first, second): the most similar photographs of each, and neighbours.
 
-    held: the words of each photograph's features. Alike are those that share many rare words
-    (Sivic and Zisserman 2003). tick: told how many photographs are compared with all others.
+    Photographs are similar if they share many rare words (Sivic and Zisserman 2003).
+
+    Args:
+        words_of: the words of each photograph's features.
+        tick: called with the number of photographs that are compared with all others.
     """
-    photographs = len(held)
-    alike = _likeness(held, tick)
+    photographs = len(words_of)
+    similarity = _cosines(words_of, tick)
     index = np.arange(photographs)
     pairs = set()
-    for i, row in enumerate(alike):
+    for i, row in enumerate(similarity):
         row[i] = -1.0
         best = np.lexsort((np.abs(index - i), -row))[:CANDIDATES].tolist()
         near = range(max(0, i - NEIGHBOURS), min(photographs, i + NEIGHBOURS + 1))
@@ -38,25 +42,24 @@ def candidate_pairs(
     return sorted(pairs)
 
 
-def _likeness(
-    held: Sequence[NDArray[np.int64]], tick: Callable[[int], None]
+def _cosines(
+    words_of: Sequence[NDArray[np.int64]], tick: Callable[[int], None]
 ) -> NDArray[np.float64]:
-    """[P, P] cosines between photographs as vectors of words; the rarer a word, the more it
-    counts. Rounded, so that no machine's last digit decides."""
-    photographs = len(held)
-    rows = np.repeat(np.arange(photographs), [len(words) for words in held])
-    words, columns = np.unique(np.concatenate(held), return_inverse=True)
+    """[P, P] cosines between TF-IDF vectors, rounded so that they are the same on every machine."""
+    photographs = len(words_of)
+    rows = np.repeat(np.arange(photographs), [len(words) for words in words_of])
+    words, columns = np.unique(np.concatenate(words_of), return_inverse=True)
     table = sparse.csr_matrix(
         (np.ones(len(rows)), (rows, columns)), shape=(photographs, max(1, len(words)))
     )
     table.data = np.sqrt(table.data)
-    holders = np.bincount(table.indices, minlength=table.shape[1])
-    table.data *= np.log(photographs / np.maximum(holders, 1))[table.indices]
+    documents = np.bincount(table.indices, minlength=table.shape[1])
+    table.data *= np.log(photographs / np.maximum(documents, 1))[table.indices]
     lengths = np.sqrt(np.asarray(table.multiply(table).sum(axis=1)).ravel())
     scaled = (sparse.diags(1.0 / np.maximum(lengths, 1e-12)) @ table).tocsr()
     others = scaled.T.tocsr()
-    likeness = np.empty((photographs, photographs))
-    for part in blocks(photographs, _AT_ONCE):
-        likeness[part] = np.round((scaled[part] @ others).toarray(), 9)
+    cosines = np.empty((photographs, photographs))
+    for part in blocks(photographs, _BLOCK):
+        cosines[part] = np.round((scaled[part] @ others).toarray(), 9)
         tick(part.stop)
-    return likeness
+    return cosines

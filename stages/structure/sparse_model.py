@@ -1,4 +1,4 @@
-"""A sparse model as plain arrays: what the worker hands over, and the figures that judge it."""
+"""A sparse model as plain arrays, written by the worker process, and its statistics."""
 
 from __future__ import annotations
 
@@ -14,28 +14,35 @@ from numpy.typing import NDArray
 from stages.structure.gates import ModelStatistics, Thresholds
 from stages.structure.view_graph import weakest_cut
 
-_SAMPLED_POINTS = 4000  # angles need every pair of rays of a point: a sample is enough
+_SAMPLED_POINTS = 4000  # every pair of rays of a point is compared, so a sample must do
 _SAMPLED_RAYS = 24
 FEWEST_OBSERVATIONS = 15
-ODD_SHARE = 0.1  # of the photographs
+IMPLAUSIBLE_SHARE = 0.1  # of the photographs
 _WEAK_OBSERVATIONS = 30
-FITS = 0.25  # of a pair's matches; pairs of a good model have 0.9 and more, false ones 0.05
+CONSISTENT_RATIO = (
+    0.25  # of a pair's matches; pairs of a good model have 0.9 and more, false ones 0.05
+)
 
 
 @dataclass(frozen=True)
 class SparseModel:
     """V registered photographs, C cameras, P points, O observations, Q verified pairs.
 
-    names [V]. view_cameras [V] position of each photograph's camera. world_to_camera [V, 4, 4].
-    camera_sizes [C, 2] width, height. camera_params [C, 4] f, cx, cy, k of COLMAP's SIMPLE_RADIAL:
-    x = f (1 + k r^2) u + cx with u = X / Z, r^2 = u^2 + v^2; pixels, pixel centres at +0.5.
-    focal_priors_px [C], NaN where EXIF said nothing.
-    points [P, 3], colours [P, 3] uint8.
-    observed_points [O], observing_views [O], observed_px [O, 2]; sorted by point, then view.
-    pairs [Q, 2] positions of photographs that share many matches; pair_fits [Q] share of those
-    matches that fit the model.
-    turns_of_others [M] of each smaller model with photographs in common: degrees between what the
-    two say of those photographs' directions.
+    Args:
+        names: [V].
+        view_cameras: [V] index of each photograph's camera.
+        world_to_camera: [V, 4, 4].
+        camera_sizes: [C, 2] width, height.
+        camera_params: [C, 4] f, cx, cy, k of COLMAP's SIMPLE_RADIAL: x = f (1 + k r^2) u + cx with
+            u = X / Z, r^2 = u^2 + v^2; pixels, pixel centres at +0.5.
+        focal_priors_px: [C], NaN without EXIF.
+        points: [P, 3].
+        colours: [P, 3] uint8.
+        observed_points, observing_views, observed_px: [O], [O], [O, 2]; sorted by point, then view.
+        pairs: [Q, 2] indices of photographs that share many matches.
+        pair_inlier_ratios: [Q] share of those matches that fits the poses of the model.
+        rotations_to_others_deg: [M] for each smaller model with photographs in common: the largest
+            disagreement about their relative rotations.
     """
 
     names: tuple[str, ...]
@@ -50,8 +57,8 @@ class SparseModel:
     observing_views: NDArray[np.int32]
     observed_px: NDArray[np.float64]
     pairs: NDArray[np.int32]
-    pair_fits: NDArray[np.float64]
-    turns_of_others: NDArray[np.float64]
+    pair_inlier_ratios: NDArray[np.float64]
+    rotations_to_others_deg: NDArray[np.float64]
 
     @property
     def centres(self) -> NDArray[np.float64]:
@@ -64,7 +71,7 @@ class SparseModel:
 
     @property
     def tracks(self) -> NDArray[np.int32]:
-        """[P] photographs that see each point (COLMAP lets a photograph see one twice)."""
+        """[P] photographs that observe each point (COLMAP may list one twice in a track)."""
         first = np.ones(len(self.observed_points), np.bool_)
         first[1:] = (np.diff(self.observed_points) != 0) | (np.diff(self.observing_views) != 0)
         seen = self.observed_points[first]
@@ -116,26 +123,29 @@ def load_result(folder: Path) -> MappingResult:
     return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
 
 
-def without_implausible_views(model: SparseModel, limits: Thresholds | None = None) -> SparseModel:
-    """The model less photographs whose poses are guesses: those that see too few points, and the
-    few (a tenth at most) whose camera came out implausible. If more cameras are implausible, the
-    whole model is, and the gates shall see it."""
-    limits = limits or Thresholds()
+def without_implausible_views(
+    model: SparseModel, thresholds: Thresholds | None = None
+) -> SparseModel:
+    """The model without photographs whose poses are unreliable: those that observe fewer than 15
+    points, and those with implausible intrinsics. The latter stay if they are more than a tenth:
+    then the whole model is implausible, and the gates must refuse it."""
+    thresholds = thresholds or Thresholds()
     seen = np.bincount(model.observing_views, minlength=len(model.names))
     keep = seen >= FEWEST_OBSERVATIONS
     with np.errstate(invalid="ignore"):
         zoom = np.abs(np.log(model.camera_params[:, 0] / model.focal_priors_px))
-        odd = (np.abs(model.camera_params[:, 3]) > limits.distortion) | (
-            zoom > np.log(limits.focal_ratio)
+        implausible = (np.abs(model.camera_params[:, 3]) > thresholds.distortion) | (
+            zoom > np.log(thresholds.focal_ratio)
         )
-    odd_views = odd[model.view_cameras]
-    if odd_views.mean() <= ODD_SHARE:
-        keep &= ~odd_views
+    views = implausible[model.view_cameras]
+    if views.mean() <= IMPLAUSIBLE_SHARE:
+        keep &= ~views
     return model if keep.all() else _with_views(model, keep)
 
 
 def _with_views(model: SparseModel, keep_view: NDArray[np.bool_]) -> SparseModel:
-    """The views to keep; points that fewer than 2 of them see go, and cameras without a view."""
+    """The model of some of its views; drops points with fewer than two observations in these, and
+    cameras without a view."""
     kept = keep_view[model.observing_views]
     tracks = np.bincount(model.observed_points[kept], minlength=len(model.points))
     keep_point = tracks >= 2
@@ -160,7 +170,7 @@ def _with_views(model: SparseModel, keep_view: NDArray[np.bool_]) -> SparseModel
         observing_views=new_view[model.observing_views[kept]].astype(np.int32),
         observed_px=model.observed_px[kept],
         pairs=new_view[model.pairs[pairs]].astype(np.int32),
-        pair_fits=model.pair_fits[pairs],
+        pair_inlier_ratios=model.pair_inlier_ratios[pairs],
     )
 
 
@@ -204,8 +214,8 @@ def triangulation_angles(model: SparseModel, index: NDArray[np.integer]) -> NDAr
 
 
 def baseline_over_depth(model: SparseModel) -> float:
-    """How far the cameras are spread (90th percentile of distances from their median position,
-    doubled) over the median distance from them to the points that they see."""
+    """Spread of the cameras (twice the 90th percentile of distances from their median position)
+    over the median distance from a camera to a point that it observes."""
     if not len(model.observed_points):
         return 0.0
     centres = model.centres
@@ -216,7 +226,7 @@ def baseline_over_depth(model: SparseModel) -> float:
 
 
 def model_statistics(result: MappingResult, photographs: int, mapper: str) -> ModelStatistics:
-    """The figures that the gates look at."""
+    """The statistics that the gates check. photographs: how many were given."""
     model = result.model
     sizes = tuple(len(group) for group in result.groups)
     if model is None or not model.names:
@@ -227,8 +237,8 @@ def model_statistics(result: MappingResult, photographs: int, mapper: str) -> Mo
     angles = triangulation_angles(model, sample)
     errors = point_errors(model)
     seen = np.bincount(model.observing_views, minlength=len(model.names))
-    against = np.flatnonzero(model.pair_fits < FITS)
-    link = weakest_cut(model.observed_points, model.observing_views, len(model.names))
+    inconsistent = np.flatnonzero(model.pair_inlier_ratios < CONSISTENT_RATIO)
+    cut = weakest_cut(model.observed_points, model.observing_views, len(model.names))
     return ModelStatistics(
         photographs=photographs,
         registered=len(model.names),
@@ -245,11 +255,11 @@ def model_statistics(result: MappingResult, photographs: int, mapper: str) -> Mo
         distortion=_largest(model.camera_params[:, 3]),
         focal_over_prior=_focal_over_prior(model),
         pairs_checked=len(model.pairs),
-        pairs_contradicting=len(against),
-        contradicting=_names(model, model.pairs[against[0]]) if len(against) else (),
-        turn_of_other_deg=float(model.turns_of_others.max(initial=0.0)),
-        link_points=link.points,
-        link_views=len(link.views),
+        pairs_inconsistent=len(inconsistent),
+        inconsistent_pair=_names(model, model.pairs[inconsistent[0]]) if len(inconsistent) else (),
+        rotation_to_other_deg=float(model.rotations_to_others_deg.max(initial=0.0)),
+        cut_points=cut.points,
+        cut_views=len(cut.views),
     )
 
 

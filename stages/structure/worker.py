@@ -1,7 +1,7 @@
 """`python -m stages.structure.worker job.json`: one step of structure from motion.
 
-COLMAP aborts the process on some inputs, and importing it before zlib corrupts the heap where
-Python links the system's zlib. In a process of its own neither can take a run down.
+COLMAP aborts the process on some inputs, and importing it before zlib corrupts the heap if Python
+links the system's zlib. In a separate process neither can end a run.
 """
 
 import zlib  # noqa: F401, I001 - must come before pycolmap: see above
@@ -25,9 +25,9 @@ def main(arguments: list[str]) -> int:
         "mapping": mapping.map_photographs,
         "neighbours": known_cameras_worker.match_neighbours,
         "triangulation": known_cameras_worker.triangulate,
-        "choosing": matching.select_pairs,
-        "features share": features.extract_chunk,
-        "matching share": matching.match_chunk,
+        "pair selection": matching.select_pairs,
+        "features chunk": features.extract_chunk,
+        "matching chunk": matching.match_chunk,
     }
     steps[job.step](job)
     return 0

@@ -1,4 +1,4 @@
-"""How far the worker process is, in a small file that its parent reads."""
+"""Progress of the worker process, in a small file that its parent reads."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import os
 import time
 from pathlib import Path
 
-_SECONDS = 0.2  # between two writings
+_SECONDS = 0.2  # between two writes
 
 
 class ProgressWriter:
-    """Keeps the file at `path` up to date."""
+    """Writes the file at `path`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._next = 0.0
 
     def write(self, phase: str, done: int, total: int) -> None:
-        """Say that `done` of `total` units of this phase are finished; seldom enough to cost
-        nothing."""
+        """Record that `done` of `total` units of `phase` are finished; at most every 0.2 s, and
+        always at the end."""
         now = time.monotonic()
         if now < self._next and done < total:
             return

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
-from stages.scene import Camera, Splats, spread_over
+from stages.scene import Camera, Splats, evenly_spaced
 
 SIDE_PX = 480
 CAMERAS_AT_MOST = 200  # more add nothing to a proxy; 1.4 MB each are held
@@ -50,7 +50,7 @@ def unproject(camera: Camera, depth: NDArray[np.floating]) -> NDArray[np.float64
 
 def chosen(cameras: list[Camera]) -> list[Camera]:
     """At most CAMERAS_AT_MOST of them, evenly, at the size at which depth is drawn."""
-    return [camera.fitted(SIDE_PX) for camera in spread_over(cameras, CAMERAS_AT_MOST)]
+    return [camera.fitted(SIDE_PX) for camera in evenly_spaced(cameras, CAMERAS_AT_MOST)]
 
 
 def draw(

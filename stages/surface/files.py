@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.lazy import load_object
-from stages.formats import Format
 from stages.surface.mesh import Mesh
+from stages.surface.table import MeshFormat
 
 _Y_UP = np.array([1.0, -1.0, -1.0])  # spelled out here: a wrong turn must not check itself
 
 
-def fault_of(path: Path, row: Format, mesh: Mesh) -> str:
-    """What is wrong with a file that should hold `mesh`, as `row`'s second reader finds it; "" if
+def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
+    """What is wrong with a file that should hold `mesh`, as the independent reader finds it; "" if
     nothing is."""
     try:
-        vertices, faces = load_object(row.second_reader)(path)
+        vertices, faces = load_object(row.independent_reader)(path)
     except Exception as error:  # whatever another parser raises: the file is wrong
         return f"another reader refused it ({error})"
     if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):

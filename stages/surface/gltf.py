@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.formats.gltf import linear_light
 from stages.formats.gltf_file import Attribute, accessor, asset, write_glb
-from stages.scene.turn import FLIP
+from stages.scene.flip import FLIP
 from stages.surface.mesh import NOTE, Mesh
 
 _UNSIGNED_INT = 5125

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
-from stages.raster.draw import settings_of
+from stages.raster.draw import raster_settings_of
 from stages.scene import Reconstruction, Splats, split_held_out
 from stages.surface import colour, depth_maps, extract, fuse
 from stages.surface.depth_maps import DepthMap
@@ -49,7 +49,7 @@ def make(
     """
     training, _ = split_held_out(reconstruction.views)
     cameras = depth_maps.chosen([view.camera for view in training])
-    settings = settings_of(splats)
+    settings = raster_settings_of(splats)
 
     def tick(number: int) -> None:
         if report.stop_requested.is_set():

@@ -12,14 +12,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.lib import format as npy
 
-from stages.base.atomic import replacing
 from stages.training.clock import Elapsed
 from stages.training.optimiser import Model
-from stages.training.validation import Answer, Trial
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATCP9"
-KEPT = "model-{}.bin"  # after so many steps
+MAGIC = b"SPLATC10"
 
 
 @dataclass(frozen=True)
@@ -34,16 +31,15 @@ class Provenance:
 @dataclass(frozen=True)
 class TrainingState:
     """What is told of a run besides its model. step: done. plan: (steps in all, since when, share
-    done by then), see `schedule.Schedule`. history: as logged. trial, answers, stopped: whether
-    lent photographs are being asked, what they said, and whether growth ended for it. times: of
-    each entry of the history, and, last, now. makers: one after the other."""
+    done by then), see `schedule.Schedule`. history: as logged. validation_best_db,
+    densification_stopped_at: see `validation.EarlyStopping`. times: of each entry of the history,
+    and, last, now. makers: one after the other."""
 
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
-    trial: Trial | None
-    answers: list[Answer]
-    stopped: bool
+    validation_best_db: list[float]
+    densification_stopped_at: int
     times: list[Elapsed]
     makers: list[Provenance]
 
@@ -76,39 +72,12 @@ def load_checkpoint(folder: Path) -> tuple[Model, TrainingState] | None:
         int(header["step"]),
         (int(steps), int(since), float(share)),
         header["history"],
-        Trial(**_with_tuples(header["trial"])) if header["trial"] else None,
-        [Answer(**_with_tuples(answer)) for answer in header["answers"]],
-        header["stopped"],
+        header["validation_best_db"],
+        header["densification_stopped_at"],
         [Elapsed(**t) for t in header["times"]],
         [Provenance(**maker) for maker in header["makers"]],
     )
-    asked_of = [saved.trial.begun] if saved.trial else []
-    asked_of += [answer.step for answer in saved.answers]
-    if not all((folder / KEPT.format(step)).exists() for step in asked_of):
-        return None
     return model, saved
-
-
-def _with_tuples(told: dict[str, Any]) -> dict[str, Any]:
-    """As it was: JSON knows lists alone."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
-
-
-def checkpoint_files(folder: Path) -> list[str]:
-    """Names of all that `load_checkpoint` and `kept_model` read, the checkpoint itself last."""
-    return [*sorted(path.name for path in folder.glob(KEPT.format("*"))), FILE_NAME]
-
-
-def keep_model(folder: Path, step: int, model: Model) -> None:
-    """Put the model after `step` steps aside until the stage is finished. Raises SplatError."""
-    with replacing(folder / KEPT.format(step)) as temporary, temporary.open("wb") as file:
-        _write(file, model)
-
-
-def kept_model(folder: Path, step: int) -> Model:
-    """What `keep_model` put aside."""
-    with (folder / KEPT.format(step)).open("rb") as file:
-        return _read(file)
 
 
 def _write(file: BinaryIO, model: Model) -> None:
@@ -125,5 +94,5 @@ def _read(file: BinaryIO) -> Model:
 
 def remove_checkpoint(folder: Path) -> None:
     """A finished stage keeps its result, not its way there."""
-    for name in (*checkpoint_files(folder), f"{FILE_NAME}.tmp"):
+    for name in (FILE_NAME, f"{FILE_NAME}.tmp"):
         (folder / name).unlink(missing_ok=True)

@@ -1,8 +1,8 @@
-"""`python -m stages.training.compile_kernels cpu`: compile the kernels of a run.
+"""`python -m stages.training.compile_kernels cpu`: compile the kernels that a run needs.
 
-By drawing a single splat and learning from it, so that they are compiled for the very types that
-training gives them. Whoever runs it beside other work waits for its end before drawing: what two
-processes compile at once, both would write.
+It renders one splat and makes one training step with it, so that the kernels are compiled for the
+types that training calls them with. A process that runs it in the background must wait for its end
+before it renders: two processes that compile the same kernel would both write it to the cache.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.training.strategy import photographs_that_see
+from stages.training.density import estimated_view_counts
 
 FEW = 2.0  # photographs: the share of steps is (FEW / n)^2
 LARGEST_SHARE = 0.3  # of the steps, however few photographs see a splat
@@ -32,8 +32,8 @@ class Dropout:
     key: int
 
     def resting(self, seen: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """[N] which splats sit out. seen [N]: see `photographs_that_see`."""
-        photographs = photographs_that_see(seen, self.views)
+        """[N] which splats sit out. seen [N]: see `estimated_view_counts`."""
+        photographs = estimated_view_counts(seen, self.views)
         share = np.minimum(LARGEST_SHARE, np.square(FEW / np.maximum(photographs, 1.0)))
         return np.asarray(noise(len(seen), self.key) < share * _UINT32)
 

@@ -1,4 +1,9 @@
-"""Splats that go on learning after a cut, a little and carefully."""
+"""Continues the training of given splats on given views, with small learning rates.
+
+This is the only way to train splats that already exist: `prune` fine-tunes after each removal,
+`quantise` fine-tunes to what file formats round, and blocks of a large scene are fine-tuned where
+they meet. The number of splats never changes.
+"""
 
 from __future__ import annotations
 
@@ -13,99 +18,108 @@ from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
-from stages.raster.draw import settings_of
+from stages.raster.draw import raster_settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.dropout import Dropout
-from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.steps import step_of
 from stages.training.views import Level
 
-# Of the rates that the recipe begins with: a round starts at the first and ends at the second.
+# Factors of the default learning rates: at the first step of a call, and at its last.
 RATE, RATE_END = 1.2, 0.6
 MEANS_LR, MEANS_LR_END = 6e-5, 3e-5  # x scene extent
+_SH_COLUMNS = {"sh_dc": slice(0, 1), "sh_rest": slice(1, None)}
 
 
 class FineTuner:
-    """Goes on with splats where training left them. extent: of the scene, world units. sits_out:
-    whether splats sit steps out here, as they did in training, and colours are settled for the
-    whole after it."""
+    """Fine-tunes splats on a set of training views.
+
+    Args:
+        views: training views; each step uses one, in a new random order each epoch.
+        extent: of the scene, in world units; the learning rate of the means scales with it.
+        backend: name of the rasteriser.
+        report: asked before each step whether to stop.
+        dropout: whether to use dropout, and to refit colours afterwards, as training did.
+    """
 
     def __init__(
         self,
-        photographs: Sequence[EvaluationView],
+        views: Sequence[EvaluationView],
         extent: float,
         backend: str,
         report: Report,
         dropout: bool = False,
     ) -> None:
-        self.photographs, self.extent, self.report = photographs, extent, report
-        self.dropout = dropout
-        self.cameras = [photograph.camera for photograph in photographs]
-        self._means: dict[int, NDArray[np.float32]] = {}  # steps know a photograph by this object
-        self.stepper, self.rasteriser = step_of(backend), rasteriser_of(backend)
-        self.steps = 0  # made so far
+        self.views, self.extent, self.report, self.dropout = views, extent, report, dropout
+        self.cameras = [view.camera for view in views]
+        self.steps = 0  # done in all calls; the order of views and dropout depend on it
+        self._means: dict[int, NDArray[np.float32]] = {}  # steps tell views apart by this object
+        self._stepper, self._rasteriser = step_of(backend), rasteriser_of(backend)
 
     def finetune(
         self,
         splats: Splats,
         steps: int,
-        seen: NDArray[np.int32],
-        still: Collection[str] = (),
+        view_counts: NDArray[np.int32],
+        frozen: Collection[str] = (),
     ) -> Splats:
-        """After `steps` more. seen [N]: how many photographs show each splat. No splat gets smaller
-        than what they show, unless it was; bands above a splat's own degree stay empty. still: what
-        does not change to the bit, of the fields of `LearningRates`. Raises Interrupted."""
+        """The same splats after more steps; SH coefficients above each splat's degree stay zero.
+
+        Args:
+            splats: N of them.
+            steps: how many; 0 returns `splats`.
+            view_counts: [N] in how many views each splat is visible.
+            frozen: parameters that keep their exact values, by the names of `LearningRates`.
+
+        Raises Interrupted when the report asks to stop.
+        """
         if not steps or not len(splats):
             return splats
         model = new_model(*(np.array(a, np.float32, order="C") for a in splats.arrays))
-        model.sh_degrees[:], model.gradient_count[:] = splats.sh_degrees, seen
-        self.stepper.load(model)
-        settings = replace(settings_of(splats), sh_degree=splats.sh_degree)
+        model.sh_degrees[:], model.gradient_count[:] = splats.sh_degrees, view_counts
+        self._stepper.load(model)
+        settings = replace(raster_settings_of(splats), sh_degree=splats.sh_degree)
         for number in range(steps):
             if self.report.stop_requested.is_set():
                 raise Interrupted("stopped while fine-tuning")
-            share = number / steps
+            done = number / steps
             rates = LearningRates().scaled(
-                MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** share,
-                RATE * (RATE_END / RATE) ** share,
+                MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** done,
+                RATE * (RATE_END / RATE) ** done,
             )
-            rates = replace(rates, **dict.fromkeys(still, 0.0))
-            self.stepper.step(self._level(), settings, rates, False, self._dropout())
-        finetune = _with(self._finished(self.stepper.model(), splats), splats, still)
-        if needs_colour_refit(self.dropout, len(self.photographs)):
-            return self._recoloured(finetune, settings, still)
-        return finetune
+            rates = replace(rates, **dict.fromkeys(frozen, 0.0))
+            self._stepper.step(self._next_level(), settings, rates, False, self._dropout())
+        found = _with_frozen(self._to_splats(self._stepper.model(), splats), splats, frozen)
+        if needs_colour_refit(self.dropout, len(self.views)) and "sh_dc" not in frozen:
+            found = self._refit_colours(found, settings, "sh_rest" in frozen)
+        return found
 
-    def _recoloured(
-        self, splats: Splats, settings: RasterSettings, still: Collection[str]
-    ) -> Splats:
-        """See `training.colours`."""
-        if "sh_dc" in still:
-            return splats
+    def _refit_colours(self, splats: Splats, settings: RasterSettings, only_dc: bool) -> Splats:
         model = new_model(*splat_arrays(splats))
-        model.sh_degrees[:] = 0 if "sh_rest" in still else splats.sh_degrees
-        where = self.rasteriser, settings, lambda: map(_level, self.photographs), NO_SMOOTHING
-        return replace(splats, sh=ColourRefit(*where).of(model).sh)
+        model.sh_degrees[:] = 0 if only_dc else splats.sh_degrees
+        refit = ColourRefit(
+            self._rasteriser, settings, lambda: map(_level_of, self.views), NO_SMOOTHING
+        )
+        return replace(splats, sh=refit.of(model).sh)
 
     def _dropout(self) -> Dropout | None:
         if not self.dropout:
             return None
         key = int(np.random.default_rng([8, self.steps]).integers(1 << 32))
-        return Dropout(len(self.photographs), key)
+        return Dropout(len(self.views), key)
 
-    def _level(self) -> Level:
-        """Every photograph once in each round, in a new order each round."""
-        number, place = divmod(self.steps, len(self.photographs))
+    def _next_level(self) -> Level:
+        epoch, place = divmod(self.steps, len(self.views))
         self.steps += 1
-        order = np.random.default_rng([7, number]).permutation(len(self.photographs))
-        which = int(order[place])
-        level = _level(self.photographs[which])
-        return replace(level, means=self._means.setdefault(which, level.means))
+        row = int(np.random.default_rng([7, epoch]).permutation(len(self.views))[place])
+        level = _level_of(self.views[row])
+        return replace(level, means=self._means.setdefault(row, level.means))
 
-    def _finished(self, model: Model, before: Splats) -> Splats:
+    def _to_splats(self, model: Model, before: Splats) -> Splats:
+        """With unit quaternions, all N rows. No splat is finer than its views can show, unless it
+        already was."""
         norms = np.linalg.norm(model.quaternions, axis=1, keepdims=True)
         with np.errstate(divide="ignore"):
             finest = np.log(smoothing_widths(before.means, self.cameras, before.draw_settings.near))
@@ -120,20 +134,17 @@ class FineTuner:
         )
 
 
-def _with(finetune: Splats, before: Splats, still: Collection[str]) -> Splats:
-    """`tuned`, with `still` as it was: lengths of quaternions and clamped sizes were looked at."""
-    sh = finetune.sh.copy()
-    for name, bands in (("sh_dc", slice(0, 1)), ("sh_rest", slice(1, None))):
-        if name in still:
-            sh[:, bands] = before.sh[:, bands]
-    arrays = {name: getattr(before, name) for name in still if not name.startswith("sh_")}
-    return replace(finetune, sh=sh, **arrays)
+def _with_frozen(splats: Splats, before: Splats, frozen: Collection[str]) -> Splats:
+    """`splats` with the frozen parameters of `before`: normalising and clamping changed them."""
+    sh = splats.sh.copy()
+    for name in _SH_COLUMNS.keys() & frozen:
+        sh[:, _SH_COLUMNS[name]] = before.sh[:, _SH_COLUMNS[name]]
+    arrays = {name: getattr(before, name) for name in frozen if name not in _SH_COLUMNS}
+    return replace(splats, sh=sh, **arrays)
 
 
-def _level(photograph: EvaluationView) -> Level:
-    """In the light and over the background that it is judged in, without what is not judged."""
-    planar: NDArray[np.uint8] = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
-    kept = photograph.kept
-    mask = None if kept is None else kept.astype(np.uint8)
-    outside = "" if mask is None else IGNORE
-    return Level(photograph.camera, planar, channel_means(planar), mask, outside)
+def _level_of(view: EvaluationView) -> Level:
+    """The view as a training step takes it: its pixels as they are evaluated, masked pixels
+    ignored."""
+    mask = None if view.valid is None else view.valid.astype(np.uint8)
+    return Level.from_pixels(view.camera, view.pixels, mask, IGNORE if mask is not None else "")

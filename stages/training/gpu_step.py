@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.raster.definition import OPACITY, SH, RasterSettings, gradient_columns
-from stages.raster.gpu.device import failures_told, interpreted
+from stages.raster.gpu.device import gpu_errors_explained, interpreted
 from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
 from stages.scene import Camera
 from stages.training import gpu_kernels
@@ -86,7 +86,7 @@ class GpuStep:
         """See `step.TrainingStep`."""
         self._room = int(self._room * len(model) / max(1, self._splats))
         self._splats, self._on_host = len(model), model  # known even if there is no room for it
-        with failures_told(len(model)):
+        with gpu_errors_explained(len(model)):
             self._scene = self.rasteriser.scene(model.arrays)
             self._smoothing = self._on_device(model.smoothing)
             self._sh_degrees, self._own = model.sh_degrees, self._own_columns(model)
@@ -117,7 +117,7 @@ class GpuStep:
         dropout: Dropout | None = None,
     ) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
-        with failures_told(len(self)):
+        with gpu_errors_explained(len(self)):
             known = id(level.means) in self._photographs
             photograph = self._resident(level)
             view = photograph.view(self.rasteriser, settings)

@@ -257,7 +257,7 @@ class Model:
         found.sh_degrees[:] = self.sh_degrees
         return found
 
-    def forget_gradients(self) -> None:
+    def reset_gradients(self) -> None:
         self.gradient_sum[:] = 0.0
         self.gradient_count[:] = 0
 

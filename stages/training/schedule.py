@@ -10,7 +10,7 @@ import numpy as np
 RECIPE_STEPS = 30_000
 MEANS_LR = 1.6e-4  # x scene extent
 MEANS_LR_END = 0.01  # of the first
-GROWTH_ENDS = 0.5  # share of the run in which the model grows
+DENSIFICATION_END = 0.5  # share of the run in which the model grows
 BOOST_POWER, BOOST_MAX = 0.6, 6.0
 SETTLE_FROM, SETTLE_TO = 0.6, 0.1  # share of the run; share of the rate at its end
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer do not see enough of the scene to judge a splat by
@@ -55,19 +55,17 @@ class Schedule:
         course is gone through faster, or more slowly."""
         return replace(self, steps=max(steps, step + 1), since=(step, self.share(step)))
 
-    def grown(self, step: int) -> Schedule:
-        """A run that grows no more: what is left takes as long as if that had been the plan."""
-        if self.share(step) >= GROWTH_ENDS:
+    def without_densification(self, step: int) -> Schedule:
+        """The same run if densification ends after `step` steps. The total becomes what it would be
+        if that had been planned."""
+        if self.share(step) >= DENSIFICATION_END:
             return self
-        return self.settling(step, max(step + 1, round(step / GROWTH_ENDS)))
+        steps = max(step + 1, round(step / DENSIFICATION_END))
+        return replace(self, steps=steps, since=(step, DENSIFICATION_END))
 
-    def settling(self, step: int, end: int) -> Schedule:
-        """How the run would end if it grew no more from `step` on, and ended at `end`."""
-        return replace(self, steps=end, since=(step, GROWTH_ENDS))
-
-    def grows(self, step: int) -> bool:
-        """Whether the model is to grow further after `step` steps."""
-        return self.share(step) < GROWTH_ENDS
+    def densifying(self, step: int) -> bool:
+        """Whether the model is still densified after `step` steps."""
+        return self.share(step) < DENSIFICATION_END
 
     @property
     def boost(self) -> float:
@@ -92,13 +90,13 @@ class Schedule:
         """Whether to densify once `step` is done."""
         interval = max(self._scaled(100), MIN_DENSIFY_INTERVAL)
         done = step + 1
-        starts, ends = 500 / RECIPE_STEPS, GROWTH_ENDS
+        starts, ends = 500 / RECIPE_STEPS, DENSIFICATION_END
         return starts <= self.share(done) <= ends and done % interval == 0
 
     def budget(self, step: int, cap: int) -> int:
         """Splats allowed after `step`: grows evenly to the cap, so that early, noisy gradients do
         not spend what later, better ones will want."""
-        share = min(1.0, self.share(step + 1) / GROWTH_ENDS)
+        share = min(1.0, self.share(step + 1) / DENSIFICATION_END)
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
     def prunes_giants(self, step: int) -> bool:

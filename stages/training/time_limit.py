@@ -30,7 +30,3 @@ class TimeLimit:
         self._last = step, spent
         left = self.seconds - self.reserve - spent
         return step + max(1, int(left * since / lasted))
-
-    def restart(self) -> None:
-        """Look at the pace anew: steps were made that do not count."""
-        self._last = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,14 +24,12 @@ from stages.training.cap import lower_cap, most_opaque
 from stages.training.checkpoint import (
     Provenance,
     TrainingState,
-    keep_model,
-    kept_model,
     load_checkpoint,
     save_checkpoint,
 )
 from stages.training.clock import Clock, Elapsed
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
-from stages.training.density import Within
+from stages.training.density import AdaptiveDensity, BoundedDensity
 from stages.training.dropout import Dropout
 from stages.training.free_space import known_free_space
 from stages.training.memory_limited_step import MemoryLimitedStep
@@ -40,23 +37,14 @@ from stages.training.optimiser import LearningRates, Model, empty_model, new_mod
 from stages.training.schedule import Schedule
 from stages.training.step import TrainingStep
 from stages.training.steps import step_of
-from stages.training.strategies import STRATEGIES
 from stages.training.target import target_of
 from stages.training.time_limit import TimeLimit
-from stages.training.validation import (
-    DOUBT_DB,
-    SURE_DB,
-    Answer,
-    Trial,
-    gives_too_little,
-    trial_at,
-)
+from stages.training.validation import EVALUATIONS, EarlyStopping, uses_dropout
 from stages.training.views import Level, TrainingView
 
 CHECKPOINT_SECONDS = 30.0
 SMOOTHING_INTERVAL = 100  # steps after which the filters are measured anew
-EVALUATIONS = 10  # during a run, evenly spaced
-CLEARINGS = 20  # likewise: how often what hangs in the open air is taken away
+FLOATER_REMOVALS = 20  # likewise: how often floaters are removed
 LAST_WORDS = 8.0  # times as long as one of them: the last judgement, with FLIP, and what is written
 
 
@@ -65,11 +53,10 @@ class Trainer:
     """One run. schedule: as planned so far; a time limit or a plateau changes it. held_out: what
     judges it. look: how they are drawn. cap: splats at most. folder: where checkpoints go. smooth:
     under the 3D smoothing filter. over_any: over another background at each step, as cut-out
-    photographs always are. backend: what draws and steps. lent: rows of `train` that decide, and
-    are trained on only once it grows no more. patience_db: what growing for as long again must give
-    one of them, or else its growth ends where it began; 0: nothing.
+    photographs always are. backend: what draws and steps. validation: rows of `train` that are
+    trained on only after densification. patience_db: see `validation.EarlyStopping`.
     seconds: of wall time in all, 0 for as long as the steps take. within: where it grows, see
-    `density.Within`; () for everywhere. growth: by which of STRATEGIES."""
+    `density.BoundedDensity`; () for everywhere."""
 
     schedule: Schedule
     train: list[TrainingView]
@@ -81,23 +68,19 @@ class Trainer:
     smooth: bool = False
     over_any: bool = False
     backend: str = AUTO
-    lent: tuple[int, ...] = ()
+    validation: tuple[int, ...] = ()
     patience_db: float = 0.0
     seconds: float = 0.0
     within: tuple[float, ...] = ()
-    growth: str = "adaptive"
 
     def __post_init__(self) -> None:
         self.stepper: TrainingStep = step_of(self.backend)
         if self.backend == AUTO:
             self.stepper = MemoryLimitedStep(self.stepper, self._memory_full)
         self.makers: list[Provenance] = []
-        self._strategy = STRATEGIES[self.growth](self.schedule.extent, len(self.train))
-        if self.within:
-            self._strategy = Within(self._strategy, self.within)
-        self.trial: Trial | None = None
-        self.answers: list[Answer] = []  # of the photographs lent
-        self.stopped = False  # by the last of them: training went back to the one before
+        density = AdaptiveDensity(self.schedule.extent, len(self.train))
+        self._strategy = BoundedDensity(density, self.within) if self.within else density
+        self.early_stopping = EarlyStopping(self.patience_db, self.validation)
         self.over_any |= any(view.levels[0].outside == TRANSPARENT for view in self.train)
         # The course is told by some of very many, so that judging does not outlast training.
         self._onlookers = [self.held_out[i] for i in evaluation_subset(len(self.held_out))]
@@ -114,20 +97,18 @@ class Trainer:
         self.report.progress(0, 1, "compiling kernels")  # a phase of its own, with its own pace
         self.clock, self._pace = Clock(), TimeLimit(self.seconds)
         step = self._begin(start)
-        self._open_air = known_free_space(start.means, self._full_cameras)
+        self._free_space = known_free_space(start.means, self._full_cameras)
         last_saved = time.monotonic()
         while step < self.schedule.steps:
             loss = self.step(step)
-            if not self.trial:
-                self._adapt(step)
+            self._adapt(step)
             step += 1
             if step == self.schedule.steps and needs_colour_refit(self.dropout, len(self.train)):
-                self._recolour()
-            if not self.trial:
-                if self.schedule.passes(step, EVALUATIONS):
-                    self._record(step)
-                self._replan(step)
-            step = self._asked(step)
+                self._refit_colours()
+            if self.schedule.passes(step, EVALUATIONS):
+                self._record(step)
+            self._replan(step)
+            self.schedule = self.early_stopping.next_schedule(self.schedule, step, self._db)
             if self.report.stop_requested.is_set() and step < self.schedule.steps:
                 self._save(step)
                 raise Interrupted(f"train stopped after step {step} of {self.schedule.steps}")
@@ -138,7 +119,7 @@ class Trainer:
             self.report.offer(partial(self.draw, step))
         return self.model
 
-    def _recolour(self) -> None:
+    def _refit_colours(self) -> None:
         """See `colours`; at full size, in all of its view-dependent colour."""
         model = self.model
         self.stepper.load(empty_model())  # a device may have no room for both
@@ -151,33 +132,9 @@ class Trainer:
         return (view.levels[-1] for view in self.train)
 
     @property
-    def gain_db(self) -> float | None:
-        """What lent photographs gain by splats sitting steps out; None before they were asked."""
-        if not self.lent:
-            return math.inf  # so few photographs are learnt by heart
-        told = self.answers[:-1] if self.stopped else self.answers
-        return told[-1].gain_db if told else None
-
-    @property
-    def ended(self) -> str:
-        """Why training ended before all of its steps, if it did."""
-        if not self.stopped:
-            return ""
-        kept, last = self.answers[-2:]
-        return (
-            f"growing on from {kept.splats:,} to {last.splats:,} splats gave none of the "
-            f"photographs lent more than {last.gained_db(kept):.2f} dB"
-        )
-
-    @property
     def dropout(self) -> bool:
-        """Whether splats sit steps out from where growth ends, as lent photographs told."""
-        return self.gain_db is not None and self.gain_db > DOUBT_DB
-
-    @property
-    def overfitted(self) -> bool:
-        """Whether photographs are learnt by heart, as lent ones told."""
-        return self.gain_db is not None and self.gain_db > SURE_DB
+        """Whether splats are dropped from steps once densification has ended."""
+        return uses_dropout(len(self.train))
 
     @property
     def model(self) -> Model:
@@ -189,8 +146,9 @@ class Trainer:
         saved = load_checkpoint(self.folder)
         if saved is not None:
             model, told = saved
-            step, self.history, self.trial = told.step, told.history, told.trial
-            self.answers, self.stopped = told.answers, told.stopped
+            step, self.history = told.step, told.history
+            self.early_stopping.best_db = told.validation_best_db
+            self.early_stopping.stopped_at = told.densification_stopped_at
             *self.times, spent = told.times
             self.schedule = self.schedule.as_planned(*told.plan)
             self.clock, self.makers = Clock(spent), told.makers
@@ -220,7 +178,7 @@ class Trainer:
     def _save(self, step: int) -> None:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.spent()]
-        told = self.trial, self.answers, self.stopped
+        told = self.early_stopping.best_db, self.early_stopping.stopped_at
         saved = TrainingState(step, plan, self.history, *told, times, self.makers)
         save_checkpoint(self.folder, self.model, saved)
 
@@ -228,7 +186,7 @@ class Trainer:
         start = start.with_sh_degree(self.schedule.sh_degree)
         if len(start) > self.cap:
             start = start.take(np.linspace(0, len(start) - 1, self.cap).round().astype(np.int64))
-        start = start.take(morton.order(start))
+        start = start.take(morton.morton_order(start))
         return new_model(*(np.array(a, np.float32, order="C") for a in start.arrays))
 
     def settings(self, degree: int) -> RasterSettings:
@@ -249,7 +207,7 @@ class Trainer:
         """One step of Adam on one photograph; the loss before it."""
         if self.smooth and step % SMOOTHING_INTERVAL == 0:
             self._smooth_anew(self.model)
-        course = self._course
+        course = self.schedule
         view = self.train[self._row(step)]
         level = view.levels[course.level(step)]
         if step + 1 < course.steps:
@@ -260,23 +218,16 @@ class Trainer:
         rates = LearningRates().scaled(course.means_lr(step), course.rate_factor(step))
         return self.stepper.step(level, settings, rates, self.smooth, self._dropout(step))
 
-    @property
-    def _course(self) -> Schedule:
-        """What steps go by: the schedule, or how it would end from where a trial began."""
-        trial = self.trial
-        return self.schedule.settling(trial.begun, trial.ends) if trial else self.schedule
-
     def _dropout(self, step: int) -> Dropout | None:
         """Once the model grows no more: before that, who sits out would be pulled at less than it
         deserves."""
-        dropout = self.trial.dropout if self.trial else self.dropout
-        if not dropout or self._course.grows(step):
+        if not self.dropout or self.schedule.densifying(step):
             return None
         return Dropout(len(self.train), self.schedule.key(step))
 
     def _row(self, step: int) -> int:
-        """Which photograph is trained on in `step`: none that is lent, while they are asked."""
-        lent = self.lent if self.trial or self.schedule.grows(step) else ()
+        """Which photograph is trained on in `step`: none that is lent, while it is densified."""
+        lent = self.validation if self.schedule.densifying(step) else ()
         rows = [row for row in range(len(self.train)) if row not in lent]
         return rows[self.schedule.view(step, len(rows))]
 
@@ -291,41 +242,6 @@ class Trainer:
         if steps := self._pace.steps(step, self.clock.spent().seconds):
             self.schedule = self.schedule.replanned(step, steps)
 
-    def _asked(self, step: int) -> int:
-        """The step to go on from after `step` steps, as far as photographs lent have a say in it:
-        see `trial`."""
-        if not self.lent or self.stopped:
-            return step
-        if not self.trial:
-            self.trial = trial_at(step, self.schedule, often=self.patience_db > 0)
-            if self.trial:
-                keep_model(self.folder, step, self.model)
-            return step
-        begun = self.trial.begun
-        if step < self.trial.ends:
-            return step
-        came_to = tuple(self._db(row) for row in self.lent)
-        self.stepper.load(kept_model(self.folder, begun))
-        if not self.trial.dropout:
-            self.trial = replace(self.trial, plain_db=came_to)
-            return begun
-        self.answers.append(Answer(begun, len(self.stepper), self.trial.plain_db, came_to))
-        self.trial = None
-        self._pace.restart()
-        if gives_too_little(self.answers, self.patience_db):
-            return self._gone_back(self.answers[-2].step)
-        return begun
-
-    def _gone_back(self, step: int) -> int:
-        """As it was after `step` steps, and from there on it grows no more."""
-        self.stopped = True
-        self.stepper.load(kept_model(self.folder, step))
-        self.schedule = self.schedule.grown(step)
-        said = [entry["step"] <= step for entry in self.history]
-        self.history = [h for h, kept in zip(self.history, said, strict=True) if kept]
-        self.times = [t for t, kept in zip(self.times, said, strict=True) if kept]
-        return step
-
     def _db(self, row: int) -> float:
         """PSNR of a photograph, as the model is."""
         level = self.train[row].levels[-1]
@@ -334,13 +250,13 @@ class Trainer:
         return psnr(image, np.asarray(asked, np.float32) / (255 if level.plain else 1))
 
     def _adapt(self, step: int) -> None:
-        clears = self.schedule.passes(step + 1, CLEARINGS)
+        clears = self.schedule.passes(step + 1, FLOATER_REMOVALS)
         grows = self.schedule.densifies_after(step)
         if not (clears or grows):
             return
         model = self.model
         if clears:
-            model = model.take(~self._open_air.holds(model.means))
+            model = model.take(~self._free_space.holds(model.means))
         if grows:
             model = self._grown(model, step)
         if self.smooth:
@@ -351,7 +267,7 @@ class Trainer:
         model = self._strategy.prune(model, self.schedule.prunes_giants(step))
         budget = min(self.schedule.budget(step, self.cap), self.cap)  # which may have been lowered
         model = self._strategy.grow(model, budget, self.schedule.rng(step))
-        return model.take(morton.order_of(model.means))
+        return model.take(morton.morton_order_of(model.means))
 
     def _tick(self, step: int, loss: float) -> None:
         numbers: dict[str, float | int | str] = {
@@ -360,8 +276,7 @@ class Trainer:
         }
         if self.history and "psnr_db" in self.history[-1]:
             numbers["held_out_psnr_db"] = round(self.history[-1]["psnr_db"], 2)
-        label = "training: asking photographs that were lent" if self.trial else "training"
-        self.report.progress(step, self.schedule.steps, label, **numbers)
+        self.report.progress(step, self.schedule.steps, "training", **numbers)
 
     def _record(self, step: int) -> None:
         began = self.clock.spent().seconds

@@ -1,85 +1,69 @@
-"""What the photographs that training lends are asked: whether splats shall sit steps out from where
-growth ends, and whether it shall have grown so far at all.
+"""What depends on how well a capture's other views are matched: dropout, and early stopping.
 
-Where few photographs are learnt by heart, sitting out is worth more than a decibel, and elsewhere
-it costs a third of one; and splats that are added explain the photographs trained on, not the
-scene. How lent photographs rise on the way tells neither: they waver by more than there is to know.
-So they are asked outright: from where it stands, training settles as at its end, in few steps,
-without and with splats sitting out, and looks at them; then all of that is forgotten. It is asked
-where growth ends; and in a long run, if somebody wants no more than pays, wherever growth has gone
-on for as long again. Where that gave none of them what was wished, training goes back to the model
-of the last time, and ends its growth there. One that gained is enough to go on: those lent lie
-between others, and gain far less than views from elsewhere.
+Dropout follows a fixed rule: captures with fewer than DROPOUT_BELOW training views are overfitted
+(their splats match the training views much better than views from elsewhere), so splats are dropped
+from every step once densification has ended. With more views dropout costs quality.
+
+Early stopping is used only if the user asks for it (--patience). Then a few training views are set
+aside as validation views while the model is densified, and densification ends at the first
+evaluation point at which no validation view has improved by the given PSNR over its best so far.
+Afterwards the validation views are trained on like all others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from statistics import fmean
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
-from stages.training.schedule import GROWTH_ENDS, Schedule
+from stages.training.schedule import Schedule
 
-MOST_STEPS = 200  # either way
-LASTS = 1 / 15  # of the run at most, either way
-EARLIEST = 1500  # steps: fewer are cheap, and say little of what more would give
-TIMES = 4  # at most, each at twice the steps of the one before
-# From DOUBT_DB on, that is in doubt, splats sit out: to do so where it is not wanted costs 0.3 dB,
-# and to miss it 2 dB. From SURE_DB on it is by heart, and `prune` may take what only these
-# photographs show.
-DOUBT_DB, SURE_DB = -0.05, 0.05
+DROPOUT_BELOW = 15  # training views
+MAX_VALIDATION_VIEWS = 4  # more of them would be missed more than their advice is worth
+MIN_VIEWS_FOR_VALIDATION = 8  # of fewer training views each is missed more than its advice is worth
+EVALUATIONS = 10  # evenly spaced over the run
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One under way, from step `begun` to step `ends`. plain_db: what each of the lent photographs
-    came to without anything sitting out; () while that way is still being gone."""
-
-    begun: int
-    ends: int
-    plain_db: tuple[float, ...] = ()
-
-    @property
-    def dropout(self) -> bool:
-        """Whether splats sit out on the way that is being gone."""
-        return bool(self.plain_db)
+def uses_dropout(views: int) -> bool:
+    """Whether a run with this many training views overfits them, and so uses dropout."""
+    return views < DROPOUT_BELOW
 
 
-@dataclass(frozen=True)
-class Answer:
-    """What each of the lent photographs would have come to had training ended from `step` on, with
-    `splats`: without and with splats sitting out."""
-
-    step: int
-    splats: int
-    plain_db: tuple[float, ...]
-    sitting_out_db: tuple[float, ...]
-
-    @property
-    def gain_db(self) -> float:
-        """What sitting out gives, on the average."""
-        return fmean(self.sitting_out_db) - fmean(self.plain_db)
-
-    @property
-    def best_db(self) -> tuple[float, ...]:
-        return max(self.plain_db, self.sitting_out_db, key=fmean)
-
-    def gained_db(self, before: Answer) -> float:
-        """By the photograph that gained most since then."""
-        return max(now - then for now, then in zip(self.best_db, before.best_db, strict=True))
+def validation_rows(views: int) -> tuple[int, ...]:
+    """Which of `views` training views are set aside for early stopping: the fifth of every eight,
+    which lies between the held-out views, or fewer where that would be more than
+    MAX_VALIDATION_VIEWS; none of fewer than MIN_VIEWS_FOR_VALIDATION."""
+    if views < MIN_VIEWS_FOR_VALIDATION:
+        return ()
+    return tuple(range(4, views, max(8, -(-views // MAX_VALIDATION_VIEWS))))
 
 
-def trial_at(step: int, schedule: Schedule, often: bool) -> Trial | None:
-    """The one that begins after `step` steps, if any. often: not only where growth ends."""
-    before, now = schedule.share(step - 1), schedule.share(step)
-    shares = [GROWTH_ENDS / 2**k for k in range(TIMES if often else 1)]
-    due = [share for share in shares if before < share <= now]
-    ends = step + max(1, min(MOST_STEPS, round(LASTS * schedule.steps)))
-    if not due or ends >= schedule.steps or (due[0] < GROWTH_ENDS and step < EARLIEST):
-        return None
-    return Trial(step, ends)
+@dataclass
+class EarlyStopping:
+    """Decides when densification ends.
 
+    Args:
+        patience_db: the improvement of PSNR that at least one validation view must show.
+        rows: of the validation views among the training views; () never stops.
+        best_db: the best PSNR of each so far; [] before the first evaluation.
+        stopped_at: number of steps after which densification was stopped; 0 if it was not.
+    """
 
-def gives_too_little(answers: Sequence[Answer], patience_db: float) -> bool:
-    """Whether growing on since the answer before the last gave none of them patience_db."""
-    return len(answers) > 1 and answers[-1].gained_db(answers[-2]) < patience_db
+    patience_db: float
+    rows: tuple[int, ...]
+    best_db: list[float] = field(default_factory=list)
+    stopped_at: int = 0
+
+    def next_schedule(
+        self, schedule: Schedule, step: int, psnr_of: Callable[[int], float]
+    ) -> Schedule:
+        """The schedule to follow after `step` steps. psnr_of(row): PSNR of a training view now."""
+        due = schedule.densifying(step) and schedule.passes(step, EVALUATIONS)
+        if not self.rows or not due:
+            return schedule
+        now = [psnr_of(row) for row in self.rows]
+        before = self.best_db or [float("-inf")] * len(now)
+        self.best_db = list(map(max, now, before))
+        if any(a >= b + self.patience_db for a, b in zip(now, before, strict=True)):
+            return schedule
+        self.stopped_at = step
+        return schedule.without_densification(step)

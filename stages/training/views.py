@@ -31,6 +31,19 @@ class Level:
     outside: str = ""
     light: Light | None = None
 
+    @classmethod
+    def from_pixels(
+        cls,
+        camera: Camera,
+        pixels: NDArray[np.uint8],
+        mask: NDArray[np.uint8] | None = None,
+        outside: str = "",
+        light: Light | None = None,
+    ) -> Level:
+        """Of pixels [H, W, 3]."""
+        planar = np.ascontiguousarray(pixels.transpose(2, 0, 1))
+        return cls(camera, planar, channel_means(planar), mask, outside, light)
+
     @property
     def plain(self) -> bool:
         """Whether its pixels are what a drawing is compared with, as they are."""
@@ -96,9 +109,8 @@ def load_views(
             for _, scale in RESOLUTIONS:
                 camera = view.camera.fitted(max(16, round(train_side * scale)))
                 photograph = load_evaluation_view(folder, view, camera)
-                planar = np.ascontiguousarray(photograph.pixels.transpose(2, 0, 1))
-                means = channel_means(planar)
                 masked = photograph.mask, view.outside
-                levels.add(Level(camera, planar, means, *masked, view.light if light else None))
+                kept_light = view.light if light else None
+                levels.add(Level.from_pixels(camera, photograph.pixels, *masked, kept_light))
             loaded.append(TrainingView(view.name, levels))
     return loaded

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.stage import Draw
+from stages.base.stage import DrawView
 from stages.scene import Camera
 
 LARGEST_SHARE = 0.2  # of the training thread's time that goes into frames
@@ -77,7 +77,7 @@ class LiveFrames:
         """Whether a viewer was there in the last `WATCHED_FOR_S`."""
         return self._clock() - self._last_seen < WATCHED_FOR_S
 
-    def offer(self, draw: Draw, step: int) -> None:
+    def offer(self, draw: DrawView, step: int) -> None:
         """Draw the requested frame, if there is one and `LARGEST_SHARE` allows it."""
         if self._requests.empty() or self._clock() < self._not_before:
             return
@@ -86,7 +86,7 @@ class LiveFrames:
             request.frame = self._draw(draw, request.camera, step)
             request.answered.set()
 
-    def offer_last(self, draw: Draw, step: int) -> None:
+    def offer_last(self, draw: DrawView, step: int) -> None:
         """Training has ended: draw one more frame for the viewer, which is kept."""
         if self._camera is not None and self.is_watched():
             self._last = self._draw(draw, self._camera, step)
@@ -98,7 +98,7 @@ class LiveFrames:
         while not self._requests.empty():
             self._requests.get_nowait().answered.set()
 
-    def _draw(self, draw: Draw, camera: Camera, step: int) -> Frame | None:
+    def _draw(self, draw: DrawView, camera: Camera, step: int) -> Frame | None:
         start = self._clock()
         try:
             pixels = draw(camera)

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from stages.base.stage import Numbers
 from stages.formats.page import document
-from stages.formats.page.shots import Shot
+from stages.formats.page.cameras import PageCamera
 from stages.scene import Camera, View
-from stages.scene.framing import depth_of_interest
+from stages.scene.framing import median_depth
 from stages.viewer.live_frames import Frame, LiveFrames
 from stages.viewer.server import Item, Response
 from stages.viewer.site import with_photographs
@@ -49,7 +49,7 @@ class LivePage:
         self,
         title: str,
         views: Sequence[View],
-        shots: Sequence[Shot],
+        shots: Sequence[PageCamera],
         points: NDArray[np.floating],
         photos: Path | None = None,
     ) -> None:
@@ -122,7 +122,7 @@ def _rigid(text: str) -> NDArray[np.float64]:
     return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
 
-def _plain(shot: Shot, points: NDArray[np.floating]) -> dict[str, Any]:
+def _plain(shot: PageCamera, points: NDArray[np.floating]) -> dict[str, Any]:
     """A shot as the page reads it. `depth`: the distance to the point that the page orbits."""
     camera: Camera = shot.camera
     return {
@@ -131,7 +131,7 @@ def _plain(shot: Shot, points: NDArray[np.floating]) -> dict[str, Any]:
         "held_out": shot.held_out,
         **{name: getattr(camera, name) for name in ("width", "height", "fx")},
         "place": camera.world_to_camera[:3].ravel().tolist(),
-        "depth": depth_of_interest(camera, points),
+        "depth": median_depth(camera, points),
     }
 
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from stages.base.stage import Draw, Numbers, Stage
+from stages.base.stage import DrawView, Numbers, Stage
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Listener, Pipeline
 
@@ -41,13 +41,15 @@ class LiveTraining(Listener):
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         if stage.name != _STAGE:
             return
-        from stages.formats.page.shots import shots_of
+        from stages.formats.page.cameras import page_cameras
         from stages.viewer.live_page import LivePage
         from stages.viewer.server import LocalServer
 
         sfm, seeds = self._pipeline.load("sfm"), self._pipeline.load("seed")
         title = self._pipeline.run_folder.absolute().name
-        self._page = LivePage(title, sfm.views, shots_of(sfm.views, seeds), seeds.means, sfm.folder)
+        self._page = LivePage(
+            title, sfm.views, page_cameras(sfm.views, seeds), seeds.means, sfm.folder
+        )
         try:
             self._server = LocalServer(self._page.items)
         except OSError as error:  # training goes on without the page
@@ -61,7 +63,7 @@ class LiveTraining(Listener):
             self._progress = (done, total)
             self._page.progressed(label, done, total, numbers)
 
-    def drawable(self, stage: Stage, draw: Draw) -> None:
+    def drawable(self, stage: Stage, draw: DrawView) -> None:
         if self._page is None:
             return
         done, total = self._progress

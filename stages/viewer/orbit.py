@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene import Camera, Splats, look_at
-from stages.scene.framing import depth_of_interest
+from stages.scene.framing import median_depth
 
 _STEEPEST_DEG = 80.0  # seen from straight above, left and right lose their meaning
 _INSIDE = 0.9  # of an arc: at its very ends a single photograph looks
@@ -64,7 +64,7 @@ def focus(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.float64]:
         point = np.linalg.solve(normal, np.einsum("vij,vj->i", across, centres))
         if np.mean(np.einsum("vi,vi->v", point - centres, ahead) > 0) > 0.5:
             return np.asarray(point)
-    depths = [depth_of_interest(camera, splats.means) for camera in cameras]
+    depths = [median_depth(camera, splats.means) for camera in cameras]
     return np.asarray(np.median(centres + np.array(depths)[:, None] * ahead, axis=0))
 
 

@@ -57,10 +57,10 @@ def camera_of_view(splats: Splats, views: Sequence[View], name: str | None) -> C
 
     Raises SplatError "render-camera".
     """
-    from stages.scene.framing import in_front_of
+    from stages.scene.framing import front_camera
 
     if name is None:
-        return views[0].camera if views else in_front_of(splats)
+        return views[0].camera if views else front_camera(splats)
     for candidates in (
         [view.camera for view in views if view.name == name],
         [view.camera for view in views if view.name.rpartition("/")[2] == name],
@@ -102,10 +102,10 @@ def path_cameras(
 
 
 def _orbit(cameras: list[Camera], splats: Splats, duration: Duration) -> CameraPath:
-    from stages.scene.framing import in_front_of
+    from stages.scene.framing import front_camera
     from stages.viewer import orbit
 
-    cameras = cameras or [in_front_of(splats)]
+    cameras = cameras or [front_camera(splats)]
     half = orbit.arc_seen(cameras, splats)[1]
     notes: tuple[str, ...] = ()
     if half < math.pi:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from stages.formats import format_of, streamed_sog
 from stages.formats.page import document
-from stages.formats.page.shots import Shot, shots_of
+from stages.formats.page.cameras import PageCamera, page_cameras
 from stages.scene import Splats, View
 from stages.viewer.server import Item
 
@@ -32,11 +32,11 @@ def site(
 
     Raises SplatError.
     """
-    shots, items = with_photographs(shots_of(views, splats), views, photos)
+    shots, items = with_photographs(page_cameras(views, splats), views, photos)
     streams = format_of(content).streamed
     files = streamed_sog.parts_of(content) if streams else {"scene.ply": content}
     items |= {f"/{name}": Item(file, "application/octet-stream") for name, file in files.items()}
-    levels = streamed_sog.widths(content, splats) if streams else []
+    levels = streamed_sog.splat_widths(content, splats) if streams else []
     scene = document.scene_data(
         *(title, splats, shots),
         units=units,
@@ -50,8 +50,8 @@ def site(
 
 
 def with_photographs(
-    shots: Sequence[Shot], views: Sequence[View], photos: Path | None
-) -> tuple[list[Shot], dict[str, Item]]:
+    shots: Sequence[PageCamera], views: Sequence[View], photos: Path | None
+) -> tuple[list[PageCamera], dict[str, Item]]:
     """(the shots with the addresses of their photographs, the items by address)."""
     images = {view.name: view.image for view in views}
     found, items = [], {}

@@ -1,17 +1,12 @@
-"""What was killed half-way does not stay for ever."""
+"""Incomplete files of processes that ended are removed."""
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from stages.base.atomic import clear_left, partial_prefix
-
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="only there is it known what runs")
+from stages.base.atomic import partial_prefix, remove_abandoned_files
 
 
 def ended() -> str:
@@ -31,9 +26,9 @@ def test_what_a_killed_process_left_goes_and_what_lives_stays(tmp_path: Path) ->
     stays = {"a.ply", ".partial-a.ply", f"{partial_prefix()}b.ply", elsewhere}
     for name in stays:
         (tmp_path / name).touch()
-    clear_left(tmp_path)
+    remove_abandoned_files(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == stays
 
 
 def test_a_folder_that_is_not_there_is_no_error_of_its_own(tmp_path: Path) -> None:
-    clear_left(tmp_path / "none")
+    remove_abandoned_files(tmp_path / "none")

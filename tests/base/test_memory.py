@@ -7,12 +7,13 @@ import sys
 
 import pytest
 
-from stages.base.memory import PeakMemory, resident_mib
+from stages.base.memory import PeakMemory, available_mib, resident_mib
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells it exactly")
+exact = pytest.mark.skipif(sys.platform != "linux", reason="sampled where it cannot be reset")
 HOLD_MIB = 120
 
 
+@exact
 def test_peak_counts_memory_given_back_before_the_end() -> None:
     before = resident_mib()
     with PeakMemory() as memory:
@@ -32,6 +33,7 @@ print(first.peak_mib, second.peak_mib)
 """
 
 
+@exact
 def test_peak_of_one_stretch_is_not_inherited_by_the_next() -> None:
     """In a process of its own: what other tests in this one have freed comes and goes."""
     run = [sys.executable, "-c", _TWO_STRETCHES]
@@ -46,3 +48,10 @@ def test_peak_counts_child_processes() -> None:
     with PeakMemory(interval_s=0.02) as memory:
         subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
     assert memory.peak_mib > before + 0.9 * HOLD_MIB
+
+
+def test_free_memory_is_known_and_of_a_process_that_ended_there_is_none() -> None:
+    assert available_mib() > 100
+    with subprocess.Popen([sys.executable, "-c", ""]) as child:
+        child.wait()
+    assert resident_mib(child.pid) == 0.0

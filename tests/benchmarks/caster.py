@@ -1,6 +1,7 @@
-"""The rooms' ray caster (`tests.structure.room_captures.picture`) compiled: a thousand
-photographs of a
-hall of boxes in minutes instead of an hour."""
+"""A compiled ray caster for `tests.structure.room_captures.picture`.
+
+It draws a thousand pictures of a hall of boxes in minutes instead of an hour.
+"""
 
 from __future__ import annotations
 

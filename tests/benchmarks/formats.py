@@ -20,8 +20,8 @@ from rich.table import Table
 
 from stages import formats
 from stages.base.memory import PeakMemory, resident_mib
+from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.proof.independent_readers import read_back
 from stages.scene import Splats, load_splats, save_splats
 from tests import processes
 from tests.benchmarks.scenes import random_scene, view

@@ -49,7 +49,7 @@ SCENES = tuple(
 TOY = ((12, (32, 24)),)
 H100_BYTES_A_SECOND = 3.35e12  # what the floor is of, whatever the device
 COLUMNS = ("draw_ms", "back_ms", "both_ms", "step_ms", "frames_a_second", "floor_ms", "floor_share")
-# Of a step, by docs/gpu.md: what a splat, a (splat, tile) and a pixel move.
+# Of a step, by docs/experiments/gpu.md: what a splat, a (splat, tile) and a pixel move.
 STEP_BYTES = (3437, 328, 326)
 SETTINGS = RasterSettings(near=1e-5)
 ON = "cuda" if torch.cuda.is_available() else "cpu"

@@ -24,8 +24,8 @@ import numpy as np
 
 from stages import formats
 from stages.formats.ply_header import binary_rows, read_header
+from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.proof.independent_readers import read_back
 from tests import processes
 from tests.benchmarks import tiled
 from tests.benchmarks.timing import machine

@@ -17,10 +17,10 @@ import numpy as np
 
 from stages import formats
 from stages.editing import levels
-from stages.measure.evaluation import capped_psnr_db
-from stages.raster.draw import renderer, settings_of
+from stages.measure.image_metrics import capped_psnr_db
+from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at
-from stages.scene.framing import around
+from stages.scene.framing import orbit_cameras
 
 FINER = 4
 _SMALLEST_PX, _LARGEST_PX = 64, 500
@@ -31,7 +31,7 @@ def cameras(full: Splats, level: Splats) -> Iterator[Camera]:
     middle = np.median(full.means, axis=0).astype(np.float64)
     reach = float(np.percentile(np.linalg.norm(full.means - middle, axis=1), 90))
     size = 2 * float(np.median(np.exp(level.log_scales.max(axis=1))))
-    for camera in around(full, 3, 0.5):
+    for camera in orbit_cameras(full, 3, 0.5):
         focal = camera.fx
         away = (camera.centre - middle) / np.linalg.norm(camera.centre - middle) * size * focal
         wide = 4 * focal * reach / (size * focal)
@@ -51,11 +51,11 @@ def main(path: Path, fewest: int = 2000) -> None:
     """fewest: no level follows one of so many; by default there are more than an asset has."""
     levels._FEWEST = fewest
     full = formats.read(path)
-    plain = settings_of(full)
+    plain = raster_settings_of(full)
     smooth = replace(plain, antialias=True)
     print("| splats | full | as sharp: full, level | without antialiasing: full, level |")
     print("|--:|--:|--:|--:|")
-    for level in levels.levels_of(full)[1:]:
+    for level in levels.coarser_levels(full):
         rows = []
         for camera in cameras(full, level):
             truth = truth_of(full, camera, smooth)

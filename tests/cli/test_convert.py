@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from splatcli.app import app
 from stages import formats
 from stages.base import scratch
+from stages.surface.table import MESHES
 from tests.cli.help_text import help_of
 from tests.formats.truth import many_splats
 
@@ -101,6 +102,13 @@ def test_unknown_endings_name_the_known_ones(tmp_path: Path, source: str, target
     assert not (tmp_path / target).exists()
 
 
+def test_the_folder_of_the_target_is_made(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(3))
+    target = tmp_path / "new" / "deep" / "a.spz"
+    converted(tmp_path / "a.ply", target)
+    assert len(formats.read(target)) == 3
+
+
 def test_a_missing_or_damaged_file_leaves_nothing_behind(tmp_path: Path) -> None:
     converted(tmp_path / "none.spz", tmp_path / "b.ply", code=3)
     (tmp_path / "a.spz").write_bytes(b"\x1f\x8bnonsense")
@@ -114,7 +122,7 @@ def test_help_names_every_ending() -> None:
         assert f".{name}" in text
 
 
-@pytest.mark.parametrize("ending", formats.MESHES)
+@pytest.mark.parametrize("ending", MESHES)
 def test_a_mesh_is_made_from_a_run_and_converted_neither_to_nor_from(
     tmp_path: Path, ending: str
 ) -> None:

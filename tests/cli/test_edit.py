@@ -15,8 +15,8 @@ from splatcli.app import app
 from splatcli.commands import edit as command
 from stages import formats
 from stages.base import scratch
-from stages.editing.scene import Edited
-from stages.editing.syntax import OPERATIONS, ParsedOperation, as_text, parse_file
+from stages.editing.scene import EditedScene
+from stages.editing.syntax import OPERATIONS, ParsedOperation, format_operations, parse_file
 from stages.scene import Splats, View, look_at
 from tests import scenes
 from tests.cli.help_text import help_of
@@ -138,7 +138,7 @@ def test_where_cameras_are_known_what_is_written_is_proven(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     camera = scenes.camera(matrix=look_at(np.array([0.0, -1.0, -9.0]), np.zeros(3)))
-    known = Edited(result_of(source), views=(View("a", "", camera),))
+    known = EditedScene(result_of(source), views=(View("a", "", camera),))
     monkeypatch.setattr(command, "_load_scene", lambda path: known)
     _, err = edited(source, tmp_path / "b.ply", "--scale", "2", "--rotate", "x:30")
     assert "read back and drawn again" in err
@@ -171,7 +171,7 @@ def test_operations_written_to_a_file_are_read_back(tmp_path: Path) -> None:
         ParsedOperation("drop-floaters"),
         ParsedOperation("move", "-1,0,0"),
     ]
-    (tmp_path / "ops").write_text(as_text(chain))
+    (tmp_path / "ops").write_text(format_operations(chain))
     assert parse_file(tmp_path / "ops") == chain
 
 
@@ -220,7 +220,7 @@ def test_a_target_is_wanted_and_a_known_ending(source: Path, tmp_path: Path) -> 
     _, err = edited(source, code=2)
     assert "edit-no-target" in err
     edited(source, tmp_path / "b.obj", code=2)
-    edited(source, tmp_path / "none" / "b.ply", code=6)
+    edited(source, source / "b.ply", code=6)  # a file is no folder
 
 
 def test_splats_that_no_viewer_can_draw_are_left_out_first(source: Path, tmp_path: Path) -> None:

@@ -1,10 +1,9 @@
-"""Help: quick, with examples, and true to the README."""
+"""Help: quick, and with examples."""
 
 from __future__ import annotations
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -135,38 +134,6 @@ def test_shell_completion_knows_commands_and_choices(
     monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
     result = CliRunner().invoke(app, [], prog_name="splat")
     assert result.stdout.split() == completed
-
-
-def readme_commands() -> list[list[str]]:
-    """Every line of a README code block, or inline code, that calls `splat`."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = []
-    for block in re.findall(r"```(?:bash|sh|console)\n(.*?)```", text, re.S):
-        for line in block.splitlines():
-            for command in line.removeprefix("$ ").split("#")[0].split("&&"):
-                if command.strip().startswith("splat "):
-                    found.append(shlex.split(command))
-    for inline in re.findall(r"`(splat [^`]+)`", text):
-        found.append(shlex.split(inline))
-    return found
-
-
-@pytest.mark.parametrize("words", readme_commands(), ids=" ".join)
-def test_readme_command_exists(words: list[str]) -> None:
-    command = next((w for w in words[1:] if not w.startswith("-")), None)
-    if command is None:
-        assert words == ["splat", "--help"]
-        return
-    assert command in COMMANDS
-    text = help_of(command)
-    for word in words[2:]:
-        if word.startswith("--"):
-            assert re.search(rf"{re.escape(word.split('=')[0])}\b", text), word
-
-
-def test_readme_names_every_command() -> None:
-    named = {word for words in readme_commands() for word in words[1:]}
-    assert set(COMMANDS) <= named
 
 
 def test_version_is_the_distributions(splat) -> None:

@@ -53,10 +53,10 @@ def test_label_that_names_each_photograph_is_one_phase(clock, lines) -> None:
 def test_another_phase_speaks_at_once(clock, lines) -> None:
     listener = progress.Lines()
     listener.started(STAGE, 2, "has not run yet", False)
-    for label in ("finding features", "placing photographs"):
+    for label in ("finding features", "registering photographs"):
         for done in range(25):
             listener.progressed(STAGE, label, done, 24, {"photographs": done})
-    assert lines[1:] == ["  finding features: 0/24", "  placing photographs: 0/24"]
+    assert lines[1:] == ["  finding features: 0/24", "  registering photographs: 0/24"]
 
 
 def test_slow_units_are_seconds_each(clock, lines) -> None:

@@ -26,7 +26,7 @@ KILLS = int(os.environ.get("SPLAT_TEST_KILLS", "3"))
 SEED = int(os.environ.get("SPLAT_TEST_SEED", "4"))
 SMALL = (
     *("--preset", "preview", "--train-side", "128", "--steps", "200", "--max-splats", "3000"),
-    *("--tune-steps", "0", "--format", "ply"),
+    *("--finetune-steps", "0", "--format", "ply"),
 )
 
 

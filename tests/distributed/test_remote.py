@@ -228,7 +228,7 @@ def test_urls_give_the_same_bytes_as_folders(tmp_path: Path) -> None:
         shutil.copy(photo, tmp_path / "captures" / "front")
     small = (
         *("--preset", "preview", "--train-side", "96", "--steps", "60", "--max-splats", "1500"),
-        *("--tune-steps", "0", "--format", "ply"),
+        *("--finetune-steps", "0", "--format", "ply"),
     )
     url = tmp_path.as_uri()
     for words in (

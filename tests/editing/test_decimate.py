@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.editing.decimate import Appraisal, decimated
-from stages.editing.moments import Moments, merged
-from stages.measure.evaluation import capped_psnr_db
+from stages.editing.decimate import RemovalCosts, decimate
+from stages.editing.moments import Moments, merge
+from stages.measure.image_metrics import capped_psnr_db
 from stages.raster.definition import ALPHA_MAX
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, look_at
@@ -29,7 +29,7 @@ def moments(splats: Splats) -> Moments:
 def test_a_pair_keeps_its_mass_its_mean_and_its_covariance() -> None:
     pair = scenes.splats([[0, 0, 0], [5, 0, 0]], [[0.1, 0.2, 0.3], [0.3, 0.3, 0.1]], [0.2, 0.4])
     a, b = moments(pair.take(slice(1))), moments(pair.take(slice(1, 2)))
-    found, share = merged(a, b)
+    found, share = merge(a, b)
     weights = np.array([share[0], 1 - share[0]])
     draws = np.random.default_rng(0).normal(size=(2, 200_000, 3))
     points = [draws[i] * np.exp(pair.log_scales[i]) + pair.means[i] for i in (0, 1)]
@@ -45,7 +45,7 @@ def test_a_pair_keeps_its_mass_its_mean_and_its_covariance() -> None:
 
 def test_two_equal_splats_on_one_place_cover_less_than_twice_as_much() -> None:
     one = moments(scenes.splats([[0, 0, 0]], 0.1, 0.3))
-    found, share = merged(one, one)
+    found, share = merge(one, one)
     assert share[0] == 0.5
     np.testing.assert_allclose(found.covariances, one.covariances)
     # 1 - (1 - g)^2 of a Gaussian g of height p has the mass 2 p - p p / 2
@@ -54,7 +54,7 @@ def test_two_equal_splats_on_one_place_cover_less_than_twice_as_much() -> None:
 
 def test_mass_that_no_opacity_can_hold_makes_a_splat_larger() -> None:
     pair = moments(scenes.splats([[0, 0, 0], [0.25, 0, 0]], 0.1, 0.95))
-    found, _ = merged(pair.take(slice(1)), pair.take(slice(1, 2)))
+    found, _ = merge(pair.take(slice(1)), pair.take(slice(1, 2)))
     assert found.opacities[0] == ALPHA_MAX
     assert found.masses[0] > 1.7 * pair.masses[0]
 
@@ -71,20 +71,20 @@ def test_shapes_come_back_from_their_covariances() -> None:
 
 @pytest.mark.parametrize("count", [1, 7, 250, 999, 1000, 5000])
 def test_there_are_as_many_as_were_asked_for(count: int) -> None:
-    found = decimated(wall(1000), count)
+    found = decimate(wall(1000), count)
     assert len(found) == min(count, 1000)
     assert all(np.isfinite(array).all() for array in found.arrays)
 
 
 def test_splats_that_are_all_the_same_become_fewer_too() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
-    assert len(decimated(scenes.splats(grid), 100)) == 100
-    assert len(decimated(scenes.splats(np.zeros((500, 3))), 3)) == 3
+    assert len(decimate(scenes.splats(grid), 100)) == 100
+    assert len(decimate(scenes.splats(np.zeros((500, 3))), 3)) == 3
 
 
 def test_from_afar_a_tenth_of_the_splats_shows_the_same() -> None:
     full = wall(4000)
-    few = decimated(full, 400)
+    few = decimate(full, 400)
     camera = from_afar(20)
     picture = render(full, camera).image
     assert picture.max() > 0.3
@@ -97,7 +97,7 @@ def test_colours_that_differ_are_merged_last() -> None:
     r = np.random.default_rng(1)
     means = r.uniform(-1, 1, (600, 3))
     rgb = np.where(means[:, :1] > 0, (1.0, 0, 0), (0, 0, 1.0))
-    found = decimated(scenes.splats(means, 0.05, 0.5, rgb), 60)
+    found = decimate(scenes.splats(means, 0.05, 0.5, rgb), 60)
     colours = 0.5 + 0.28209479 * found.sh[:, 0]
     pure = np.minimum(np.abs(colours - (1, 0, 0)).max(1), np.abs(colours - (0, 0, 1)).max(1))
     assert (pure < 1e-3).mean() > 0.9
@@ -109,13 +109,13 @@ def test_what_is_worth_nothing_goes_and_what_must_stay_is_not_left_out() -> None
     nothing[::8] = True
     seen: list[int] = []
 
-    def appraise(now: Splats) -> Appraisal:
+    def removal_costs(now: Splats) -> RemovalCosts:
         seen.append(len(now))
         worthless = np.isclose(now.sh_degrees, 1)
-        return Appraisal(np.ones(len(now)), np.where(worthless, -1.0, np.inf))
+        return RemovalCosts(np.ones(len(now)), np.where(worthless, -1.0, np.inf))
 
     marked = replace(splats, sh_degrees=nothing.astype(np.uint8))
-    found = decimated(marked, 380, 0.02, appraise)
+    found = decimate(marked, 380, 0.02, removal_costs)
     assert len(found) == 380
     assert seen[0] == 400
     # with nothing else to leave out and merging at a price, the worthless went

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.base.errors import SplatError
-from stages.editing.expression import NAMES, parsed
+from stages.editing.expression import VARIABLES, parse_expression
 from tests import scenes
 
 SPLATS = scenes.splats(
@@ -34,7 +34,7 @@ SPLATS = scenes.splats(
     ],
 )
 def test_a_condition_says_which_splats_stay(text: str, wanted: list[bool]) -> None:
-    assert parsed(text).holds(SPLATS).tolist() == wanted
+    assert parse_expression(text).evaluate(SPLATS).tolist() == wanted
 
 
 @pytest.mark.parametrize(
@@ -68,11 +68,11 @@ def test_a_condition_says_which_splats_stay(text: str, wanted: list[bool]) -> No
 )
 def test_anything_else_is_refused_with_the_names_that_there_are(text: str) -> None:
     with pytest.raises(SplatError) as refused:
-        parsed(text)
+        parse_expression(text)
     assert refused.value.code == "edit-keep"
-    assert all(name in refused.value.wanted for name in NAMES)
+    assert all(name in refused.value.wanted for name in VARIABLES)
 
 
 def test_a_value_that_is_no_number_is_not_kept() -> None:
     broken = scenes.splats([[np.nan, 0, 0], [1, 0, 0]])
-    assert parsed("x < 5").holds(broken).tolist() == [False, True]
+    assert parse_expression("x < 5").evaluate(broken).tolist() == [False, True]

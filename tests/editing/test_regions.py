@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from stages.base.errors import SplatError
-from stages.editing.regions import parsed
+from stages.editing.regions import parse_region
 from tests import scenes
 
 MEANS = np.random.default_rng(3).uniform(-2, 2, (500, 3))
@@ -19,10 +19,10 @@ CORNERS = [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 
 
 def test_a_box_and_a_ball() -> None:
-    box = parsed("box:-1,-1,-1,1,1.5,2").holds(SPLATS)
+    box = parse_region("box:-1,-1,-1,1,1.5,2").contains(SPLATS)
     means = SPLATS.means
     assert (box == ((means >= -1) & (means <= [1, 1.5, 2])).all(1)).all()
-    ball = parsed("sphere:0.5,0,0,1.2").holds(SPLATS)
+    ball = parse_region("sphere:0.5,0,0,1.2").contains(SPLATS)
     assert (ball == (np.linalg.norm(means - [0.5, 0, 0], axis=1) <= 1.2)).all()
     assert 0 < ball.sum() < 500
 
@@ -31,15 +31,15 @@ def test_a_hull_of_the_corners_of_a_box_is_the_box(tmp_path: Path) -> None:
     (tmp_path / "points.json").write_text(json.dumps(CORNERS))
     mesh = trimesh.Trimesh(CORNERS, trimesh.creation.box((2, 2, 2)).faces, process=False)
     mesh.export(tmp_path / "points.ply")
-    wanted = parsed("box:-1,-1,-1,1,1,1").holds(SPLATS)
+    wanted = parse_region("box:-1,-1,-1,1,1,1").contains(SPLATS)
     for name in ("points.json", "points.ply"):
-        assert (parsed(f"hull:{tmp_path / name}").holds(SPLATS) == wanted).all()
+        assert (parse_region(f"hull:{tmp_path / name}").contains(SPLATS) == wanted).all()
 
 
 def test_a_lasso_is_what_lies_before_the_camera_and_within_its_corners() -> None:
     """By hand: a camera at z = -1 that looks along z, 100 pixels to the unit; an L of corners."""
     view = "100,0,0,0,0,100,0,0,0,0,1,1"
-    found = parsed(f"lasso:{view},0,0,100,0,100,50,50,50,50,100,0,100").holds(SPLATS)
+    found = parse_region(f"lasso:{view},0,0,100,0,100,50,50,50,50,100,0,100").contains(SPLATS)
     x, y, z = SPLATS.means.astype(np.float64).T
     u, v = 100 * x / (z + 1), 100 * y / (z + 1)
     whole = (z > -1) & (u > 0) & (v > 0) & (u < 100) & (v < 100)
@@ -57,7 +57,7 @@ def test_a_lasso_is_what_lies_before_the_camera_and_within_its_corners() -> None
 )
 def test_what_names_no_part_of_space_is_refused(text: str) -> None:
     with pytest.raises(SplatError) as refused:
-        parsed(text)
+        parse_region(text)
     assert refused.value.code == "edit-region"
 
 
@@ -79,6 +79,6 @@ def test_points_that_are_no_hull_are_refused(
     if content is not None:
         (tmp_path / name).write_text(content)
     with pytest.raises(SplatError) as refused:
-        parsed(f"hull:{tmp_path / name}")
+        parse_region(f"hull:{tmp_path / name}")
     assert refused.value.code == "edit-hull-unreadable"
     assert name in refused.value.given

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.editing.operations import done, prepared
-from stages.editing.scene import Edited
+from stages.editing.operations import apply_operations, prepare_operations
+from stages.editing.scene import EditedScene
 from stages.editing.syntax import ParsedOperation
 from stages.measure.evaluation import EvaluationView
 from stages.raster.draw import render
@@ -36,19 +36,19 @@ def cameras(count: int = 6) -> list[Camera]:
     return [Camera(96, 80, 90, 90, 48, 40, pose) for pose in poses]
 
 
-def scene(splats: Splats) -> Edited:
+def scene(splats: Splats) -> EditedScene:
     """Photographs are drawings of the splats."""
     photographs, views = [], []
     for number, camera in enumerate(cameras()):
         pixels = np.rint(255 * np.clip(render(splats, camera).image, 0, 1)).astype(np.uint8)
         photographs.append(EvaluationView(str(number), camera, pixels))
         views.append(View(str(number), "", camera))
-    return Edited(splats, "metres", photographs, photographs[:2], tuple(views))
+    return EditedScene(splats, "metres", photographs, photographs[:2], tuple(views))
 
 
-def after(start: Edited, *words: str) -> Edited:
-    typed = [ParsedOperation(*word.split(maxsplit=1)) for word in words]
-    *_, last = done(start, prepared(typed, Path("scene.ply")))
+def after(start: EditedScene, *words: str) -> EditedScene:
+    parsed = [ParsedOperation(*word.split(maxsplit=1)) for word in words]
+    *_, last = apply_operations(start, prepare_operations(parsed, Path("scene.ply")))
     return last.scene
 
 
@@ -66,7 +66,7 @@ def test_a_scene_that_is_moved_as_a_whole_costs_nothing(words: tuple[str, ...]) 
     moved = after(start, *words)
     assert moved.psnr_db() == pytest.approx(start.psnr_db(), abs=0.3)
     assert (moved.psnr_db() or 0) > 45
-    view = moved.views_there()[1].camera
+    view = moved.placed_views()[1].camera
     drawn = render(moved.splats, view).image
     np.testing.assert_allclose(drawn, render(start.splats, cameras()[1]).image, atol=0.01)
 
@@ -76,10 +76,10 @@ def test_photographs_say_what_may_go() -> None:
     start = scene(replace(solid, opacity_logits=solid.opacity_logits + 3))
     half = f"decimate {len(start.splats) // 2}"
     guided = after(start, half)
-    blind = after(replace(start, photographs=(), judges=()), half)
+    blind = after(replace(start, training_views=(), held_out_views=()), half)
     assert len(guided.splats) == len(blind.splats) == 750
     assert blind.psnr_db() is None
-    judged = replace(blind, judges=start.judges)
+    judged = replace(blind, held_out_views=start.held_out_views)
     assert (guided.psnr_db() or 0) > (judged.psnr_db() or 99) + 1
 
 

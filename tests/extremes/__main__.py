@@ -1,6 +1,6 @@
 """Measure every row of the extremes table and print it.
 
-python -m tests.extremes [--write docs/extremes.md]
+python -m tests.extremes [--write docs/experiments/extremes.md]
 """
 
 from __future__ import annotations

@@ -12,7 +12,8 @@ import numpy as np
 
 from stages import formats
 from stages.formats import usd_read
-from stages.proof.independent_readers import FileContent, read_back
+from stages.proof.checks import read_back
+from stages.proof.content import FileContent
 from stages.raster.definition import RasterSettings, Rendering
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, look_at

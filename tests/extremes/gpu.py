@@ -4,8 +4,8 @@ python -m tests.extremes.gpu [--row 3 --row 4] [--float32]
 
 A row takes the interpreter seconds or minutes, so what was measured is kept in gpu.json beside
 this file, and the table's column "gpu" is made of that: with a GPU at hand run this, then
-`python -m tests.extremes --write docs/extremes.md`. --float32: with footprints in float32, kept
-apart; what that costs is in docs/gpu.md.
+`python -m tests.extremes --write docs/experiments/extremes.md`. --float32: with footprints in
+float32, kept apart; what that costs is in docs/experiments/gpu.md.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import pytest
 from tests.extremes.gpu import kept, on_gpu
 from tests.extremes.table import ROWS, listing, promises
 
-LISTING = Path(__file__).parents[2] / "docs" / "extremes.md"
+LISTING = Path(__file__).parents[2] / "docs" / "experiments" / "extremes.md"
 
 
 def test_there_is_one_row_for_each_number_of_the_table() -> None:

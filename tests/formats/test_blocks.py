@@ -9,8 +9,8 @@ import pytest
 
 from stages import formats
 from stages.base import blocks
+from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.proof.independent_readers import read_back
 from tests.formats.truth import many_splats
 
 QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]
@@ -20,7 +20,7 @@ QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]
 def test_reading_and_writing_are_told(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     told: list[tuple[int, int]] = []
-    with blocks.watched(lambda done, total: told.append((done, total))):
+    with blocks.progress_reported_to(lambda done, total: told.append((done, total))):
         formats.write(path, many_splats(40))
         if suffix not in ("glb", "gltf", "quantised.glb"):
             assert (40, 40) in told

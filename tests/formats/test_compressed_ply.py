@@ -71,7 +71,7 @@ def test_values_come_back_within_half_a_step(tmp_path: Path, degree: int) -> Non
     splats = many_splats(700).with_sh_degree(degree)
     formats.write(tmp_path / "a.compressed.ply", splats, units="metres")
     back = formats.read(tmp_path / "a.compressed.ply")
-    wanted = splats.take(morton.order(splats))
+    wanted = splats.take(morton.morton_order(splats))
     np.testing.assert_array_equal(back.origin, splats.origin)
     for start in range(0, 700, 256):
         rows = slice(start, start + 256)
@@ -96,7 +96,7 @@ def test_one_splat_far_away_spoils_one_chunk_only(tmp_path: Path) -> None:
     splats.means[77] = 1e9
     splats.log_scales[78] = -87
     formats.write(tmp_path / "a.compressed.ply", splats)
-    wanted = splats.take(morton.order(splats))
+    wanted = splats.take(morton.morton_order(splats))
     errors = np.abs(formats.read(tmp_path / "a.compressed.ply").means - wanted.means).max(axis=1)
     assert (errors > 0.01).sum() < 256
 
@@ -106,7 +106,7 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.compressed.ply", splats) == 0
     back = formats.read(tmp_path / "a.compressed.ply")
-    wanted = splats.take(morton.order(splats))
+    wanted = splats.take(morton.morton_order(splats))
     limit = compressed_ply.LOG_SCALE_LIMIT
     np.testing.assert_allclose(
         back.log_scales, np.clip(wanted.log_scales, -limit, limit), atol=0.02

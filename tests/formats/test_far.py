@@ -10,7 +10,7 @@ import pytest
 from stages import formats
 from stages.formats import usd_read
 from stages.formats.ply import property_names
-from stages.scene.far import recentred
+from stages.scene.recentring import recentred
 from tests.formats.files import edited_glb, ply_bytes
 from tests.formats.truth import many_splats, red_splat
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.formats import gltf_quantised
-from stages.proof.independent_readers import read_back
+from stages.proof.checks import read_back
 from tests.formats.files import glb_parts
 from tests.formats.truth import MEAN, QUATERNION, many_splats, red_splat
 

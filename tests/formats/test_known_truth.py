@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stages import formats
-from stages.proof.independent_readers import read_back
+from stages.proof.checks import read_back
 from tests.formats.files import glb_parts
 from tests.formats.truth import (
     C0,

@@ -9,7 +9,7 @@ import pytest
 
 from stages import formats
 from stages.formats import FORMATS
-from stages.formats.axes import least_turned
+from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_for_sog, splats_to_write
 from stages.scene import QuantisedSplats, Splats, morton
 from stages.scene.rotations import matrices_of
@@ -28,7 +28,7 @@ def test_a_file_holds_what_was_rounded_and_is_smaller(tmp_path) -> None:
         sizes.append(path.stat().st_size)
     assert sizes[1] < 0.8 * sizes[0]
     read = formats.read(tmp_path / "b.sog")
-    wanted = rounded.take(morton.order(rounded))
+    wanted = rounded.take(morton.morton_order(rounded))
     np.testing.assert_allclose(read.means, wanted.means, atol=2e-4)
     np.testing.assert_allclose(read.log_scales, wanted.log_scales, atol=1e-5)
     np.testing.assert_allclose(read.sh, wanted.sh, atol=1e-5)
@@ -53,18 +53,18 @@ def test_a_palette_of_few_rows_is_written_as_it_was_chosen(tmp_path) -> None:
     formats.write(tmp_path / "a.sog", rounded)
     read = formats.read(tmp_path / "a.sog").sh[:, 1:].reshape(len(rounded), -1)
     assert len(np.unique(read, axis=0)) <= 64
-    wanted = kinds[morton.order(rounded)]
+    wanted = kinds[morton.morton_order(rounded)]
     assert np.abs(read - wanted).max() < 0.02 * np.ptp(wanted)
 
 
 def test_axes_named_anew_are_the_same_ellipsoids_turned_less() -> None:
     splats = many_splats(3000)
-    found = least_turned(splats)
+    found = smallest_rotations(splats)
     for one, other in zip(covariances(splats), covariances(found), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * np.abs(one).max())
     assert found.quaternions[:, 0].min() > 0.85  # 63 degrees: no cube is farther from itself
     assert splats.quaternions[:, 0].min() < 0.1
-    again = least_turned(found)
+    again = smallest_rotations(found)
     np.testing.assert_allclose(again.quaternions, found.quaternions, atol=1e-6)
 
 

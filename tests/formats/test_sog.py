@@ -81,7 +81,7 @@ def test_every_pixel_is_that_of_the_specification(tmp_path: Path) -> None:
 def test_values_come_back_as_near_as_the_format_allows(tmp_path: Path, degree: int) -> None:
     splats = many_splats(600).with_sh_degree(degree)
     formats.write(tmp_path / "a.sog", splats)
-    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.order(splats))
+    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.morton_order(splats))
     np.testing.assert_array_equal(back.origin, splats.origin)
     bent, back_bent = (np.sign(m) * np.log1p(np.abs(m)) for m in (wanted.means, back.means))
     assert np.abs(back_bent - bent).max() <= 0.5 * np.ptp(bent, axis=0).max() / 65535 + 1e-6
@@ -102,12 +102,12 @@ def test_a_palette_smaller_than_the_scene_stays_close_to_it() -> None:
     kinds = rng.normal(0, 0.3, (50, 24)).astype(np.float32)
     vectors = kinds[rng.integers(0, 50, 8000)] + rng.normal(0, 0.01, (8000, 24)).astype("f4")
     vectors[:2000] = 0
-    palette, labels = codebook.of_vectors(vectors, 1024)
+    palette, labels = codebook.vector_palette(vectors, 1024)
     assert len(palette) <= 1024
     np.testing.assert_array_equal(palette[labels[:2000]], 0)
     spread = np.sqrt(np.mean((palette[labels[2000:]] - vectors[2000:]) ** 2))
     assert spread < 0.02  # of 0.3
-    again = codebook.of_vectors(vectors, 1024)
+    again = codebook.vector_palette(vectors, 1024)
     np.testing.assert_array_equal(again[1], labels)
 
 
@@ -115,19 +115,19 @@ def test_a_palette_of_few_vectors_is_exact() -> None:
     rng = np.random.default_rng(3)
     vectors = rng.normal(size=(64, 9)).astype(np.float32)[rng.integers(0, 64, 5000)]
     vectors[:100] = 0
-    palette, labels = codebook.of_vectors(vectors, 65)
+    palette, labels = codebook.vector_palette(vectors, 65)
     np.testing.assert_array_equal(palette[labels], vectors)
     assert len(palette) == 65
-    assert len(codebook.of_vectors(vectors, 64)[0]) <= 64
+    assert len(codebook.vector_palette(vectors, 64)[0]) <= 64
 
 
 def test_a_codebook_of_few_numbers_is_exact_and_of_many_is_close() -> None:
     few = np.array([3.0, -1.0, 3.0, 0.25])
-    book = codebook.of_numbers(few)
+    book = codebook.scalar_codebook(few)
     np.testing.assert_array_equal(book[codebook.nearest(book, few)], few)
     many = np.random.default_rng(1).normal(0, 1, 20_000)
     many[0] = 400  # one far away takes an entry, not the precision of all
-    book = codebook.of_numbers(many)
+    book = codebook.scalar_codebook(many)
     errors = np.abs(book[codebook.nearest(book, many)] - many)
     assert errors.max() < 0.5
     assert np.sqrt(np.mean(errors**2)) < 0.02
@@ -137,7 +137,7 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
     splats = extreme_splats(1)
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.sog", splats) == 0
-    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.order(splats))
+    back, wanted = formats.read(tmp_path / "a.sog"), splats.take(morton.morton_order(splats))
     np.testing.assert_allclose(back.log_scales, np.clip(wanted.log_scales, -20, 20), atol=1e-5)
     np.testing.assert_allclose(back.opacities, wanted.opacities, atol=1e-6)
 

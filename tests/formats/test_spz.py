@@ -14,7 +14,7 @@ import pytest
 from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import spz_read
-from stages.proof.independent_readers import read_back
+from stages.proof.checks import read_back
 from stages.proof.prover import Prover, cameras_for
 from stages.scene import Splats
 from tests.formats.files import angles

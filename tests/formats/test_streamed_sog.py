@@ -18,10 +18,10 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.editing import levels
 from stages.formats import sog, streamed_sog
-from stages.formats.rows import drawable
-from stages.measure.evaluation import capped_psnr_db
-from stages.proof import independent_readers
-from stages.raster.draw import renderer, settings_of
+from stages.formats.values import drawable_rows
+from stages.measure.image_metrics import capped_psnr_db
+from stages.proof.checks import read_back
+from stages.raster.draw import raster_settings_of, renderer
 from stages.scene import Camera, Splats, look_at
 from tests.editing.walls import wall
 from tests.formats.truth import many_splats
@@ -37,7 +37,7 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def asset(tmp_path: Path) -> Path:
-    formats.write(tmp_path / "a" / "lod-meta.json", many_splats(2000), units="metres")
+    levels.write(tmp_path / "a" / "lod-meta.json", many_splats(2000), units="metres")
     return tmp_path / "a" / "lod-meta.json"
 
 
@@ -64,8 +64,8 @@ def test_the_finest_level_comes_back_in_the_order_that_is_told(asset: Path) -> N
     np.testing.assert_allclose(found.opacities, wanted.opacities, atol=0.003)
 
 
-def test_a_second_reader_finds_the_same(asset: Path) -> None:
-    first, second = formats.read(asset), independent_readers.read_back(asset).splats
+def test_an_independent_reader_finds_the_same(asset: Path) -> None:
+    first, second = formats.read(asset), read_back(asset).splats
     np.testing.assert_allclose(second.means, first.means, atol=1e-5)
     np.testing.assert_allclose(second.sh, first.sh, atol=1e-6)
 
@@ -100,7 +100,7 @@ def test_a_leaf_bounds_what_is_in_it(asset: Path) -> None:
 def test_units_and_origin_are_told(tmp_path: Path) -> None:
     far = replace(many_splats(50), origin=np.array([1e6, 2.0, 3.0]))
     path = tmp_path / "lod-meta.json"
-    formats.write(path, far, units="metres")
+    levels.write(path, far, units="metres")
     np.testing.assert_array_equal(formats.read(path).origin, far.origin)
     assert formats.units_of(path) == "metres"
 
@@ -108,14 +108,14 @@ def test_units_and_origin_are_told(tmp_path: Path) -> None:
 def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path: Path) -> None:
     splats = many_splats(50)
     splats.means[3] = np.nan
-    assert drawable(splats).sum() == 49
-    assert formats.write(tmp_path / "lod-meta.json", splats) == 1
+    assert drawable_rows(splats).sum() == 49
+    assert levels.write(tmp_path / "lod-meta.json", splats) == 1
     assert len(formats.read(tmp_path / "lod-meta.json")) == 49
 
 
 def test_an_asset_takes_the_place_of_an_earlier_one(asset: Path) -> None:
     (asset.parent / "notes.txt").write_text("mine")
-    formats.write(asset, many_splats(100))
+    levels.write(asset, many_splats(100))
     assert len(formats.read(asset)) == 100
     names = {path.name for path in asset.parent.iterdir()}
     assert names == {"lod-meta.json", "lod-meta.html", "0_0", "notes.txt"}
@@ -124,7 +124,7 @@ def test_an_asset_takes_the_place_of_an_earlier_one(asset: Path) -> None:
 
 
 def test_no_splats_at_all_are_an_asset_too(tmp_path: Path) -> None:
-    formats.write(tmp_path / "lod-meta.json", many_splats(5).take(slice(0)))
+    levels.write(tmp_path / "lod-meta.json", many_splats(5).take(slice(0)))
     assert len(formats.read(tmp_path / "lod-meta.json")) == 0
 
 
@@ -212,9 +212,9 @@ def at_one_pixel(level: Splats, focal: float = 400.0) -> float:
 
 def test_a_level_looks_like_the_scene_where_its_splats_are_a_pixel() -> None:
     full = wall(8000)
-    every = levels.levels_of(full)
+    every = [full, *levels.coarser_levels(full)]
     assert [len(level) for level in every] == [8000, 2000, 500, 125]
-    settings = replace(settings_of(full), antialias=True)
+    settings = replace(raster_settings_of(full), antialias=True)
     for level in every[1:]:
         camera = camera_at(at_one_pixel(level))
         picture = renderer(full, settings)(camera).image

@@ -1,9 +1,8 @@
-"""The table of formats says what is true of the files, and README's table is made of it."""
+"""The table of formats says what is true of the files, and nothing else."""
 
 from __future__ import annotations
 
 import inspect
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -12,43 +11,29 @@ import pytest
 from stages import formats
 from stages.base.errors import Family, SplatError
 from stages.base.lazy import load_object
-from stages.formats import FORMATS, MESHES, TABLE, Format
-from stages.proof.byte_breakdown import byte_breakdown_of
+from stages.formats import BY_ENDING, FORMATS, Format
+from stages.proof.checks import CHECKS, byte_breakdown_of
+from stages.surface.table import MESHES, MeshFormat
 from tests.formats.files import read
 from tests.formats.truth import many_splats
 
-README = Path(__file__).parents[2] / "README.md"
-PLACES = ("writer", "reader", "second_reader", "anatomy", "order", "validator")
+PLACES = ("writer", "reader", "independent_reader", "order", "quantiser")
+ROWS: list[Format | MeshFormat] = [*BY_ENDING.values(), *MESHES.values()]
 
 
-def readme_lines() -> list[str]:
-    """The lines of README's table, formats that say the same of themselves on one."""
-    lines = []
-    for (opens_in, keeps, y_up), rows in itertools.groupby(
-        TABLE, lambda row: (row.opens_in, row.keeps, row.y_up)
-    ):
-        names = ", ".join(f"`{row.ending}`" for row in rows)
-        lines.append(f"| {names} | {opens_in} | {keeps}{'; y up' if y_up else ''} |")
-    return lines
-
-
-def test_readmes_table_is_made_of_the_rows() -> None:
-    lines = README.read_text(encoding="utf-8").splitlines()
-    start = lines.index("| `--format` | opens in | keeps |") + 2
-    found = list(itertools.takewhile(str.strip, lines[start:]))
-    assert found == readme_lines(), "README's table should be:\n" + "\n".join(readme_lines())
-
-
-@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.ending)
-def test_every_function_that_a_row_names_is_there(row: Format) -> None:
-    for place in filter(None, (getattr(row, name) for name in PLACES)):
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.ending)
+def test_every_function_that_a_row_names_exists(row: Format | MeshFormat) -> None:
+    for place in filter(None, (getattr(row, name, "") for name in PLACES)):
         assert callable(load_object(place)), place
-    assert bool(row.anatomy) != row.is_mesh
+
+
+def test_every_format_has_its_checks() -> None:
+    assert list(CHECKS) == list(BY_ENDING)
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
 def test_a_writer_takes_views_where_its_row_says_so(row: Format) -> None:
-    assert ("views" in inspect.signature(load_object(row.writer)).parameters) == row.wants_views
+    assert ("views" in inspect.signature(load_object(row.writer)).parameters) == row.takes_views
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from stages.photos.cut_out import AUTO, Masked
 from stages.photos.decode import Decoded
 from stages.photos.exif import Exif
+from stages.photos.masking import AUTO, MaskedPhoto
 from tests.fuzz.layer import Layer
 
 WIDTH, HEIGHT = 48, 32
@@ -27,7 +27,7 @@ def _content() -> bytes:
 def _read(path: Path) -> int:
     pixels = np.full((HEIGHT, WIDTH, 3), 99, np.uint8)
     photograph = Decoded(pixels, (WIDTH, HEIGHT), Exif())
-    found = Masked.of(photograph, "a.jpg", path, False, AUTO)
+    found = MaskedPhoto.of(photograph, "a.jpg", path, False, AUTO)
     assert found.mask is not None
     assert found.mask.shape == (HEIGHT, WIDTH)
     assert found.mask.dtype == np.uint8

@@ -1,4 +1,4 @@
-"""Surfaces, and cameras on rings around them, of which it is known what they leave out."""
+"""Surfaces and rings of cameras around them, whose gaps are known."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def without(splats: Splats, row: int, degree: int, added: np.ndarray) -> Splats:
     """One splat cut to a degree, its colour moved."""
     degrees, shift = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     degrees[row], shift[row] = degree, added
-    return Removal(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).of(splats)
+    return Removal(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).apply(splats)
 
 
 def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) -> None:
@@ -73,7 +73,7 @@ def test_worth_goes_on_from_what_other_photographs_told(tmp_path) -> None:
         "truncated_picture_change",
     ):
         np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-9)
-    assert (found.photographs == whole.photographs).all()
+    assert (found.view_counts == whole.view_counts).all()
     assert found.sse == pytest.approx(whole.sse)
     assert (found.scene_depth == whole.scene_depth).all()
     assert (found.psnr_db == whole.psnr_db[4:]).all()

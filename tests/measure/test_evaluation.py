@@ -11,17 +11,15 @@ from PIL import Image
 
 from stages.measure import evaluation
 from stages.measure.evaluation import (
-    IDENTICAL_DB,
     LARGEST_SUBSET,
     EvaluationView,
-    capped_psnr_db,
     evaluate,
     evaluation_subset,
     image_renderer,
     load_evaluation_views,
 )
-from stages.measure.image_metrics import flip
-from stages.raster.draw import settings_of
+from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db, flip
+from stages.raster.draw import raster_settings_of
 from stages.scene import (
     IGNORE,
     TRANSPARENT,
@@ -81,7 +79,7 @@ def test_a_file_without_cameras_gets_a_near_plane_of_its_own_size(scene: SmallSc
     for factor in (1e-4, 1.0, 1e4):
         alone = replace(in_units(scene, factor)[0], draw_settings=DrawSettings())
         extent = float(np.ptp(alone.means, axis=0).max())
-        assert 1e-4 * extent < settings_of(alone).near < 0.02 * extent
+        assert 1e-4 * extent < raster_settings_of(alone).near < 0.02 * extent
 
 
 def test_photographs_are_judged_at_the_size_that_was_trained(scene: SmallScene) -> None:
@@ -96,7 +94,7 @@ def test_photographs_are_judged_at_the_size_that_was_trained(scene: SmallScene) 
 def test_the_near_plane_of_the_look_decides_what_is_drawn() -> None:
     before_the_lens = splats([[0.0, 0.0, 0.5]], rgb=(1.0, 0.0, 0.0))
     both = join(before_the_lens, splats([[0.0, 0.0, 5.0]], rgb=(0.0, 1.0, 0.0)))
-    assert settings_of(replace(both, draw_settings=DrawSettings(near=1.0))).near == 1.0
+    assert raster_settings_of(replace(both, draw_settings=DrawSettings(near=1.0))).near == 1.0
 
 
 def test_figures_stay_finite() -> None:
@@ -150,7 +148,7 @@ def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScen
     (photograph, *_) = load_evaluation_views(folder, views, draw_settings)
     assert draw_settings.background == 1.0
     assert photograph.pixels[:, 36:].min() == 255
-    assert settings_of(replace(scene.splats, draw_settings=draw_settings)).background == (
+    assert raster_settings_of(replace(scene.splats, draw_settings=draw_settings)).background == (
         1.0,
         1.0,
         1.0,

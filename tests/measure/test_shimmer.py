@@ -1,4 +1,4 @@
-"""Pictures that glide, and pictures that do not."""
+"""Shimmer of pictures with and without aliasing, and the extreme framings."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def drawing(splats: Splats, antialias: bool = False):
     return lambda camera: draw(camera).image
 
 
-def test_what_is_larger_than_pixels_does_not_shimmer_and_what_is_finer_does() -> None:
+def test_detail_larger_than_pixels_does_not_shimmer_and_finer_detail_does() -> None:
     smooth = shimmer(drawing(sheet(8, 6)), CAMERA, DEPTH)[1]
     fine = shimmer(drawing(sheet(0.7, 0.05)), CAMERA, DEPTH)[1]
     assert smooth < 0.5
@@ -53,7 +53,7 @@ def test_what_is_larger_than_pixels_does_not_shimmer_and_what_is_finer_does() ->
     assert shimmer(drawing(sheet(0.7, 0.05), antialias=True), CAMERA, DEPTH)[1] < fine / 2
 
 
-def test_an_even_slope_does_not_shimmer_however_steep() -> None:
+def test_a_linear_ramp_does_not_shimmer_however_steep() -> None:
     def draw(camera: Camera) -> np.ndarray:
         shift = camera.world_to_camera[0, 3] * camera.fx / DEPTH
         return np.repeat(((np.arange(64) + shift) / 100 + 0.1)[None, :, None], 3, axis=2)
@@ -61,7 +61,7 @@ def test_an_even_slope_does_not_shimmer_however_steep() -> None:
     assert shimmer(draw, CAMERA, DEPTH)[1] == pytest.approx(0, abs=1e-9)
 
 
-def test_framings_keep_what_matters_in_the_middle() -> None:
+def test_framings_keep_the_subject_in_the_middle() -> None:
     target = np.array([[0.0, 0.0, DEPTH]])
     for moved, depth in (
         (from_distance(CAMERA, 4, DEPTH), 4 * DEPTH),
@@ -75,7 +75,7 @@ def test_framings_keep_what_matters_in_the_middle() -> None:
     assert sideways(CAMERA, 2, DEPTH).project(target)[0][0] == pytest.approx([30, 24])
 
 
-def test_a_large_picture_is_not_made_larger_than_anybody_waits_for() -> None:
+def test_the_size_of_a_large_picture_is_limited() -> None:
     assert at_resolution(replace(CAMERA, width=6400), 4).width == 6400
     assert at_resolution(replace(CAMERA, width=1600), 4).width == 2560
     assert at_resolution(CAMERA, 0.25).width == 16
@@ -90,15 +90,15 @@ def test_fine_splats_thicken_in_small_pictures_and_not_in_pictures_scaled_down()
     assert small < scaled - 10
 
 
-def test_what_is_not_judged_does_not_judge_small_pictures_either() -> None:
+def test_invalid_pixels_do_not_count_in_small_pictures_either() -> None:
     draw = drawing(sheet(8, 6))
     pixels = (np.clip(draw(CAMERA), 0, 1) * 255 + 0.5).astype(np.uint8)
-    cut_off = np.zeros((48, 64), bool)
-    cut_off[:9] = True
+    saturated = np.zeros((48, 64), bool)
+    saturated[:9] = True
     pixels[:9] = 255
-    whole, kept = (
-        small_psnr_db(draw, [EvaluationView("a", CAMERA, pixels, cut_off=c)])
-        for c in (None, cut_off)
+    whole, valid = (
+        small_psnr_db(draw, [EvaluationView("a", CAMERA, pixels, saturated=c)])
+        for c in (None, saturated)
     )
     assert whole[1] < 20
-    assert kept[1] > 45
+    assert valid[1] > 45

@@ -25,7 +25,7 @@ def test_rows_in_their_own_order_are_themselves() -> None:
     np.testing.assert_array_equal(matched_rows(splats, splats, ()), np.arange(N))
 
 
-@pytest.mark.parametrize("order", [morton.order, splat32.order])
+@pytest.mark.parametrize("order", [morton.morton_order, splat32.order])
 def test_a_known_order_is_found(order: object) -> None:
     splats = many_splats(N)
     rows = order(splats)  # type: ignore[operator]
@@ -35,7 +35,7 @@ def test_a_known_order_is_found(order: object) -> None:
 def test_an_unknown_order_is_found() -> None:
     splats = many_splats(N)
     file, rows = shuffled(splats)
-    np.testing.assert_array_equal(matched_rows(splats, file, [morton.order(splats)]), rows)
+    np.testing.assert_array_equal(matched_rows(splats, file, [morton.morton_order(splats)]), rows)
 
 
 def test_an_unknown_order_is_found_though_all_positions_moved_a_little() -> None:

@@ -14,7 +14,7 @@ from stages import formats
 from stages.formats import splat32
 from stages.proof import prover as proving
 from stages.proof import usd_validators
-from stages.proof.independent_readers import read_back
+from stages.proof.checks import read_back
 from stages.proof.prover import Proof, Prover, cameras_for
 from stages.scene import Splats
 from tests.small_scene import SmallScene, small_scene
@@ -115,10 +115,10 @@ def test_the_order_of_the_rows_does_not_matter(
     [
         (mirrored, "positions are wrong: its x, y, z look like -x, y, z"),
         (turned_about_x, "positions are wrong: its x, y, z look like x, -y, -z"),
-        (moved, "positions are wrong: all lie 7"),
+        (moved, "positions are wrong: all are moved by 7"),
         (shrunk, "the scene is 0.1 times as large"),
         (rolled, "rotations are wrong: they look like x, y, z, w taken for w, x, y, z"),
-        (interleaved, "colours are wrong: the coefficients look like red, green, blue in turn"),
+        (interleaved, "colours are wrong: the coefficients look like coefficient-major"),
     ],
     ids=lambda value: value.__name__ if callable(value) else "",
 )
@@ -145,7 +145,7 @@ def test_bytes_of_f_rest_in_the_wrong_order_are_seen(
         data["vertex"][name] = column
     data.write(tmp_path / "a.ply")
     proof = prover.prove(tmp_path / "a.ply")
-    assert "red, green, blue in turn, taken for all reds first" in proof.fault
+    assert "coefficient-major (RGB together), read as channel-major" in proof.fault
     assert proof.figures["verify_db"] < 45
 
 
@@ -258,7 +258,7 @@ def test_the_usd_librarys_own_validators_have_nothing_to_say(
     scene: SmallScene, tmp_path: Path, name: str
 ) -> None:
     formats.write(tmp_path / f"a.{name}", scene.splats)
-    assert usd_validators.complaints(tmp_path / f"a.{name}") == []
+    assert usd_validators.errors_in(tmp_path / f"a.{name}") == []
 
 
 @pytest.mark.parametrize(

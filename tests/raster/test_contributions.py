@@ -8,12 +8,12 @@ import torch
 
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import (
-    CHANGE,
     CONTRIBUTIONS,
-    LARGEST,
-    PULL,
-    SQUARES,
+    ERROR_CHANGE,
+    LARGEST_WEIGHT,
+    SQUARED_WEIGHT,
     WEIGHT,
+    WEIGHTED_RESIDUAL,
     RasterSettings,
     splat_arrays,
 )
@@ -61,14 +61,14 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_splat(backend, s
     wanted = np.array([squared_error(scene.take(rows != i), picture, where) - now for i in rows])
     assert (wanted < 0).any()
     assert (wanted > 0).any()
-    assert relative(measured(backend, scene, picture, where)[:, CHANGE], wanted) < 1e-3
+    assert relative(measured(backend, scene, picture, where)[:, ERROR_CHANGE], wanted) < 1e-3
 
 
 @pytest.mark.parametrize("backend", LIGHT_BACKENDS)
 def test_against_its_own_picture_no_splat_is_better_gone(backend):
     scene, where = faint_cloud(1), camera(40, 30)
     forward = rasteriser_of(backend).forward(splat_arrays(scene), where, SETTINGS)
-    change = measured(backend, scene, forward.image[:3].copy(), where)[:, CHANGE]
+    change = measured(backend, scene, forward.image[:3].copy(), where)[:, ERROR_CHANGE]
     assert (change >= 0).all()
 
 
@@ -92,10 +92,10 @@ def test_weights_are_those_of_the_definition(backend, opaque):
     wanted = np.zeros((len(scene), 6))
     wanted[projected.index.numpy()] = torch.stack(columns, 1).numpy()
     found = measured(backend, scene, photograph(), where)
-    np.testing.assert_allclose(found[:, LARGEST], wanted[:, 1], atol=5e-3)
+    np.testing.assert_allclose(found[:, LARGEST_WEIGHT], wanted[:, 1], atol=5e-3)
     assert relative(found[:, WEIGHT], wanted[:, 0]) < 1e-3
-    assert relative(found[:, SQUARES], wanted[:, 2]) < 1e-3
-    assert relative(found[:, PULL:], wanted[:, 3:]) < 1e-3
+    assert relative(found[:, SQUARED_WEIGHT], wanted[:, 2]) < 1e-3
+    assert relative(found[:, WEIGHTED_RESIDUAL:], wanted[:, 3:]) < 1e-3
 
 
 @pytest.mark.parametrize("backend", LIGHT_BACKENDS)

@@ -238,7 +238,7 @@ def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
 
 
 def test_memory_that_runs_out_names_the_cap_that_would_fit():
-    with pytest.raises(SplatError) as told, device.failures_told(1_000_000):
+    with pytest.raises(SplatError) as told, device.gpu_errors_explained(1_000_000):
         raise torch.OutOfMemoryError("CUDA out of memory")
     assert told.value.code == "raster-gpu-memory"
     assert "--max-splats 500000" in told.value.hint
@@ -250,8 +250,11 @@ def test_memory_that_runs_out_names_the_cap_that_would_fit():
 
 def test_a_gpu_that_is_busy_is_named():
     said = "CUDA error: all CUDA-capable devices are busy or unavailable"
-    with pytest.raises(SplatError, match="busy or unavailable") as told, device.failures_told(1):
+    with (
+        pytest.raises(SplatError, match="busy or unavailable") as told,
+        device.gpu_errors_explained(1),
+    ):
         raise RuntimeError(said)
     assert told.value.code == "raster-gpu-failed"
-    with pytest.raises(RuntimeError, match="shape"), device.failures_told(1):
+    with pytest.raises(RuntimeError, match="shape"), device.gpu_errors_explained(1):
         raise RuntimeError("shape")

@@ -71,14 +71,14 @@ def test_every_gradient_through_the_filter_agrees(antialias):
 def test_the_definition_of_the_filter_has_the_gradient_of_its_finite_differences():
     import torch
 
-    from stages.raster.reference import Parameters, parameters_of, smooth
+    from stages.raster.reference import Parameters, apply_smoothing, parameters_of
 
     p = parameters_of(cloud(20))
     widths = torch.tensor(widths_for(cloud(20)), dtype=torch.float64)
 
     def total(log_scales):
         moved = Parameters(p.means, p.quaternions, log_scales, p.opacity_logits, p.sh)
-        scales, kept = smooth(moved, widths)
+        scales, kept = apply_smoothing(moved, widths)
         return (scales.log().sum(1) * torch.arange(1, 21) + 7 * kept).sum()
 
     total(p.log_scales).backward()

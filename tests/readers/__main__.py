@@ -17,10 +17,10 @@ import numpy as np
 from PIL import Image
 
 from stages import formats, quantise, sfm
-from stages.formats.rows import kept_rows
+from stages.formats.values import drop_undrawable
 from stages.measure.image_metrics import psnr
+from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.proof.independent_readers import read_back
 from stages.raster.draw import render
 from stages.scene import Camera, Splats, View, look_at, split_held_out
 from tests.packages import UnavailableError, installed
@@ -62,7 +62,7 @@ def main() -> None:
 def _source(path: Path) -> tuple[Splats, tuple[View, ...]]:
     """The splats that could be drawn, and up to two views to compare pictures from."""
     if not path.is_dir():
-        splats, _ = kept_rows(formats.read(path))
+        splats, _ = drop_undrawable(formats.read(path))
         middle = np.median(splats.means, axis=0)
         reach = 2.5 * float(np.median(np.abs(splats.means - middle)))
         eye = middle + reach * np.array([0.6, -0.5, -1.0])
@@ -70,7 +70,7 @@ def _source(path: Path) -> tuple[Splats, tuple[View, ...]]:
         camera = Camera(*SIZE, SIDE_PX * 1.1, SIDE_PX * 1.1, SIDE_PX / 2, SIDE_PX / 2, matrix)
         return replace(splats, origin=np.zeros(3)), (View("side", "", camera),)
     reconstruction = sfm.STAGE.load(path / "2-sfm")
-    splats, _ = kept_rows(quantise.STAGE.load(path / "6-quantise").splats)
+    splats, _ = drop_undrawable(quantise.STAGE.load(path / "6-quantise").splats)
     training, held = split_held_out(reconstruction.views)
     chosen = held or training
     views = [chosen[0], chosen[len(chosen) // 2]][: len(chosen)]

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.proof.independent_readers import read_back
+from stages.proof.checks import read_back
 from stages.scene import Camera
 from tests.viewer.browser import Browser
 

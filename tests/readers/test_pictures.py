@@ -10,7 +10,7 @@ import pytest
 
 from stages import formats
 from stages.editing import levels
-from stages.formats.rows import degrees_in_use
+from stages.formats.values import sh_degrees_used
 from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.scene import Splats
@@ -36,7 +36,7 @@ def scene() -> Splats:
     sh = splats.sh.copy()
     sh[:, 1:] *= 0.4
     sh[:, 0] *= 0.8
-    return replace(splats, sh=sh, sh_degrees=degrees_in_use(sh))
+    return replace(splats, sh=sh, sh_degrees=sh_degrees_used(sh))
 
 
 @pytest.mark.parametrize("name", ENGINES)
@@ -67,7 +67,7 @@ def test_playcanvas_draws_levels_of_detail_from_three_distances(
     splats = scene()
     monkeypatch.setattr(levels, "_FEWEST", len(splats) // 3)
     path = tmp_path / "lod-meta.json"
-    formats.write(path, splats)
+    levels.write(path, splats)
     assert (tmp_path / "1_0").is_dir()
     with served(packages, tmp_path) as address:
         engine = Engine(browser, address, "playcanvas")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from stages import formats
+from stages.proof.checks import read_back
 from stages.proof.compare import differences
-from stages.proof.independent_readers import read_back
 from tests.formats.truth import many_splats
 from tests.packages import UnavailableError
 from tests.readers.values import READERS, Reader
@@ -32,7 +32,7 @@ def test_other_readers_find_what_was_written(
     tmp_path: Path, reader: Reader, suffix: str, degree: int
 ) -> None:
     splats = replace(many_splats().with_sh_degree(degree), origin=np.zeros(3))
-    path = tmp_path / formats.BY_ENDING[suffix].name("a")
+    path = tmp_path / formats.BY_ENDING[suffix].file_name("a")
     formats.write(path, splats)
     try:
         content = reader.read(path)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.formats import format_of
+from stages.proof.checks import read_back
 from stages.proof.content import Y_DOWN, Y_UP, FileContent, logits, splats_of
-from stages.proof.independent_readers import read_back
 from tests.packages import UnavailableError, installed, node
 
 HERE = Path(__file__).parent

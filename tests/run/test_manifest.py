@@ -1,4 +1,4 @@
-"""What is written down, and that it is not believed once it was changed."""
+"""Manifests survive JSON, and every later change to them is detected."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from stages.base.errors import SplatError
 from stages.run.digests import FileRecord, combined_digest, differences, record_files
-from stages.run.manifest import plain, read_sealed, write_sealed
+from stages.run.manifest import SCHEMA, plain, read_sealed, write_sealed
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -50,7 +50,7 @@ def test_plain_takes_what_stages_report() -> None:
 def test_sealed_file_reads_back_and_every_changed_byte_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
     write_sealed(path, {"a": [1, "zwölf", None], "b": {"c": 0.1}})
-    assert read_sealed(path) == {"schema": 1, "a": [1, "zwölf", None], "b": {"c": 0.1}}
+    assert read_sealed(path) == {"schema": SCHEMA, "a": [1, "zwölf", None], "b": {"c": 0.1}}
     whole = path.read_bytes()
     for i in range(len(whole)):
         broken = bytearray(whole)

@@ -18,8 +18,9 @@ import pytest
 
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.memory import resident_mib
-from stages.run.lock import locked
-from stages.run.manifest import Manifest
+from stages.run import manifest
+from stages.run.lock import HOLDER, locked
+from stages.run.manifest import SCHEMA, Manifest
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.runfile import RunFile
 from tests.run.fakes import CopySettings, CountSettings, fake_stages, photographs
@@ -312,7 +313,9 @@ def test_manifest_edited_by_hand_is_refused(finished: Pipeline, run_folder: Path
     assert ran(finished) == ["count"]
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"schema": "one"}', '{"schema": 1}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "null", '{"schema": "one"}', f'{{"schema": {SCHEMA}}}']
+)
 def test_damaged_manifest_is_refused(finished: Pipeline, run_folder: Path, text: str) -> None:
     (run_folder / "1-copy" / "manifest.json").write_text(text)
     with pytest.raises(SplatError) as caught:
@@ -327,6 +330,32 @@ def test_newer_schema_is_refused(finished: Pipeline, run_folder: Path, name: str
     with pytest.raises(SplatError) as caught:
         finished.run()
     assert caught.value.code == "run-folder-newer"
+
+
+def test_a_run_folder_of_an_older_schema_is_refused_and_left_as_it_is(
+    photos: Path, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(manifest, "SCHEMA", SCHEMA - 1)
+        Pipeline(run_folder, photos, fake_stages()).run()
+    (run_folder / ".lock").unlink()
+    (run_folder / ".2-count.partial").mkdir()
+
+    def state() -> dict[str, tuple[int, bytes]]:
+        paths = (run_folder, *run_folder.rglob("*"))
+        return {
+            str(p): (p.stat().st_mtime_ns, p.read_bytes() if p.is_file() else b"") for p in paths
+        }
+
+    before = state()
+    older = Pipeline(run_folder, photos, fake_stages())
+    for use in (older.run, older.status, older.plan, lambda: older.manifest("copy")):
+        with pytest.raises(SplatError, match="older version") as caught:
+            use()
+        assert caught.value.code == "run-folder-older"
+        assert int(caught.value.family) == 5
+        assert "--out" in caught.value.hint
+    assert state() == before
 
 
 def test_later_stage_alone_names_the_command_to_run_first(photos: Path, run_folder: Path) -> None:
@@ -349,12 +378,12 @@ def test_second_process_is_refused_and_named(finished: Pipeline, run_folder: Pat
 def test_lock_of_a_killed_process_does_not_count(finished: Pipeline, run_folder: Path) -> None:
     code = (
         "import os, sys, pathlib, signal\n"
-        "from stages.run.lock import locked\n"
+        "from stages.run.lock import HOLDER, locked\n"
         "with locked(pathlib.Path(sys.argv[1])):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", code, str(run_folder)], check=False, timeout=30)
-    assert (run_folder / ".lock").read_text().strip().isdigit()
+    assert (run_folder / HOLDER).read_text().strip().isdigit()
     assert finished.busy() is None
     assert ran(finished) == []
 
@@ -583,16 +612,20 @@ def test_crash_while_replacing_leaves_one_whole_result(
     assert isinstance(Manifest.read(final), Manifest)
 
 
-def test_seconds_and_memory_of_all_attempts_are_added_up(photos: Path, run_folder: Path) -> None:
+def test_seconds_cpu_seconds_and_memory_of_all_attempts_are_added_up(
+    photos: Path, run_folder: Path
+) -> None:
     pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
     with pytest.raises(Interrupted):
         pipeline.run()
     usage = run_folder / ".2-count.partial" / "usage.json"
-    usage.write_text(json.dumps({"seconds": 100.0, "peak_memory_mib": 9e6}))
+    before = {"seconds": 100.0, "cpu_seconds": 300.0, "peak_memory_mib": 9e6}
+    usage.write_text(json.dumps(before))
     begun = time.monotonic()
     pipeline.run()
     counted = pipeline.manifest("count")
     assert counted is not None
     assert 100.0 < counted.seconds <= 100.0 + time.monotonic() - begun
+    assert 300.0 <= counted.cpu_seconds < 400.0
     assert counted.peak_memory_mib == 9e6
     assert set(counted.outputs) == {"count.txt"}

@@ -33,7 +33,7 @@ def test_the_rim_belongs_to_the_picture_on_the_left_and_above_only() -> None:
 def test_neighbours_are_together_in_the_order_of_morton_whatever_strays() -> None:
     means = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
     means[7], means[8, 1] = 1e9, np.nan
-    order = morton.order_of(means)
+    order = morton.morton_order_of(means)
     assert sorted(order.tolist()) == list(range(2000))
     kept = means[order[~np.isin(order, (7, 8))]]
     steps = np.linalg.norm(np.diff(kept, axis=0), axis=1)

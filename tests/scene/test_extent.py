@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.scene import Camera, Reconstruction, View, scene_extent, seen_extent
+from stages.scene import Camera, Reconstruction, View, scene_extent, training_extent
 
 
 def held_still(apart, points):
@@ -27,15 +27,15 @@ def wall(distance):
 
 @pytest.mark.parametrize("apart", [1e-4, 0.01, 0.1])
 def test_cameras_close_together_see_as_large_a_scene_as_it_is_far_away(apart):
-    assert seen_extent(held_still(apart, wall(7.0))) == pytest.approx(7.0)
+    assert training_extent(held_still(apart, wall(7.0))) == pytest.approx(7.0)
 
 
 def test_a_walk_longer_than_what_it_sees_is_its_own_measure():
     walked = held_still(10.0, wall(2.0))
-    assert seen_extent(walked) == scene_extent(walked.views) > 10
+    assert training_extent(walked) == scene_extent(walked.views) > 10
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), -wall(3.0)])
 def test_without_points_in_any_picture_the_cameras_tell(points):
     bare = held_still(0.5, points)
-    assert seen_extent(bare) == scene_extent(bare.views)
+    assert training_extent(bare) == scene_extent(bare.views)

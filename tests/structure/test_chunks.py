@@ -61,15 +61,15 @@ def in_shares(job: Job, executor: Hands) -> None:
     jobs.work(job)
     left = 1
     while left:
-        jobs.work(replace(job, step="choosing"))
+        jobs.work(replace(job, step="pair selection"))
         left = chunks.match_pairs_in_chunks(job, executor, lambda: None)
     jobs.work(replace(job, step="matching"))
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunks, "PHOTOGRAPHS", 6)
-    monkeypatch.setattr(chunks, "PAIRS", 20)
+    monkeypatch.setattr(chunks, "PHOTOGRAPHS_PER_CHUNK", 6)
+    monkeypatch.setattr(chunks, "PAIRS_PER_CHUNK", 20)
 
 
 def test_shares_find_what_one_process_finds(whole: Job, tmp_path: Path) -> None:
@@ -95,10 +95,10 @@ def test_every_pair_and_known_matches_are_shared_too(whole: Job, tmp_path: Path)
     plain, shared = tmp_path / "plain.db", tmp_path / "shared.db"
     for path in (plain, shared):
         sqlite.copy(Path(whole.database), path)
-        sqlite.forget_geometries(path)
+        sqlite.delete_geometries(path)
     wanted = replace(whole, step="matching", matching="exhaustive", drop_stationary=True)
     jobs.work(replace(wanted, database=str(plain)))
-    job = replace(wanted, database=str(shared), step="choosing")
+    job = replace(wanted, database=str(shared), step="pair selection")
     jobs.work(job)
     assert chunks.match_pairs_in_chunks(job, Hands(), lambda: None) == 36
     jobs.work(job)

@@ -43,7 +43,7 @@ def test_half_written_photographs_and_pairs_are_forgotten(tmp_path: Path) -> Non
 def test_a_copy_holds_the_same_and_can_be_reset_alone(tmp_path: Path) -> None:
     path = make(tmp_path / "a.db")
     sqlite.copy(path, tmp_path / "b.db")
-    sqlite.forget_geometries(tmp_path / "b.db")
+    sqlite.delete_geometries(tmp_path / "b.db")
     assert sqlite.verified_pairs(tmp_path / "b.db") == []
     assert len(sqlite.verified_pairs(path)) == 2
 

@@ -32,8 +32,8 @@ BANANA = ModelStatistics(
     distortion=0.0098,
     focal_over_prior=1.04,
     pairs_checked=40,
-    link_points=500,
-    link_views=3,
+    cut_points=500,
+    cut_views=3,
 )
 PLUSH = replace(
     BANANA,
@@ -46,13 +46,13 @@ PLUSH = replace(
 DRONE = replace(BANANA, median_triangulation_angle_deg=5.0, baseline_over_depth=0.4)
 
 
-def codes(figures: ModelStatistics) -> list[str]:
-    return [failure.code for failure in check_model(figures)]
+def codes(statistics: ModelStatistics) -> list[str]:
+    return [failure.code for failure in check_model(statistics)]
 
 
-@pytest.mark.parametrize("figures", [BANANA, PLUSH, DRONE], ids=["banana", "plush", "drone"])
-def test_good_captures_pass(figures: ModelStatistics) -> None:
-    assert codes(figures) == []
+@pytest.mark.parametrize("statistics", [BANANA, PLUSH, DRONE], ids=["banana", "plush", "drone"])
+def test_good_captures_pass(statistics: ModelStatistics) -> None:
+    assert codes(statistics) == []
 
 
 @pytest.mark.parametrize(
@@ -102,15 +102,15 @@ def test_good_captures_pass(figures: ModelStatistics) -> None:
         ),
         # an object turned over half-way: 36 of 193 pairs, everything else plausible
         (
-            {"pairs_checked": 193, "pairs_contradicting": 36, "contradicting": ("a", "b")},
+            {"pairs_checked": 193, "pairs_inconsistent": 36, "inconsistent_pair": ("a", "b")},
             "sfm-contradictions",
         ),
         # the same poster on opposite walls: walls put into one, but not by those between them
-        ({"turn_of_other_deg": 175.0}, "sfm-contradictions"),
+        ({"rotation_to_other_deg": 175.0}, "sfm-contradictions"),
         # two halves that one pair links, put beside each other by the global mapper
-        ({"mapper": "global", "link_points": 1, "link_views": 8}, "sfm-weak-link"),
-        ({"mapper": "global", "link_points": 60, "link_views": 8}, "sfm-weak-link"),
-        ({"link_points": 20, "link_views": 8}, "sfm-weak-link"),
+        ({"mapper": "global", "cut_points": 1, "cut_views": 8}, "sfm-weak-link"),
+        ({"mapper": "global", "cut_points": 60, "cut_views": 8}, "sfm-weak-link"),
+        ({"cut_points": 20, "cut_views": 8}, "sfm-weak-link"),
         ({"mean_reprojection_error_px": 2.6}, "sfm-high-error"),
         ({"mean_reprojection_error_px": float("nan")}, "sfm-high-error"),
         ({"mean_track_length": 2.1}, "sfm-short-tracks"),
@@ -127,17 +127,17 @@ def test_one_photograph_of_sixteen_may_be_left_out_but_not_four() -> None:
 
 
 def test_a_few_contradicting_pairs_are_chance() -> None:
-    assert codes(replace(BANANA, pairs_checked=8, pairs_contradicting=2)) == []
-    assert codes(replace(PLUSH, pairs_checked=1200, pairs_contradicting=60)) == []
+    assert codes(replace(BANANA, pairs_checked=8, pairs_inconsistent=2)) == []
+    assert codes(replace(PLUSH, pairs_checked=1200, pairs_inconsistent=60)) == []
 
 
 def test_what_is_too_little_to_refuse_is_said() -> None:
     assert borderline_failures(PLUSH) == []
-    few = replace(PLUSH, pairs_checked=100, pairs_contradicting=5, contradicting=("a", "b"))
+    few = replace(PLUSH, pairs_checked=100, pairs_inconsistent=5, inconsistent_pair=("a", "b"))
     assert codes(few) == []
     assert [failure.code for failure in borderline_failures(few)] == ["sfm-contradictions"]
     assert "a and b" in borderline_failures(few)[0].given
-    loose = replace(PLUSH, link_points=60, link_views=12)
+    loose = replace(PLUSH, cut_points=60, cut_views=12)
     assert codes(loose) == []
     assert [failure.code for failure in borderline_failures(loose)] == ["sfm-weak-link"]
 

@@ -83,7 +83,7 @@ def test_a_photograph_is_brought_back_to_what_the_median_one_shows(
     where = Camera(30, 20, 30.0, 30.0, 15.0, 10.0, np.eye(4))
     as_taken = np.rint(seen(truth * 2.0 ** np.array(light)) * 255).astype(np.uint8)
     even = EvaluationView("a", where, as_taken).in_median_light(light)
-    kept = even.kept
+    kept = even.valid
     assert kept is not None
     assert kept.mean() > 0.3
     assert np.abs(even.image - seen(truth))[kept].max() < 0.012

@@ -77,7 +77,7 @@ def test_markers_of_a_stated_size_make_the_world_metric(tmp_path: Path) -> None:
     assert metric is not None
     assert metric.metres == pytest.approx(0.05 / SIDE, rel=0.005)
     assert report.metrics["markers"] == 3
-    assert "markers of 0.05 m" in report.metrics["metres_from"]
+    assert "markers of 0.05 m" in report.metrics["scale_source"]
 
 
 def test_markers_that_are_not_there_are_an_error(tmp_path: Path) -> None:

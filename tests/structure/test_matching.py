@@ -67,7 +67,7 @@ def test_three_threads_find_what_one_finds(
 def test_what_was_found_before_is_kept_and_the_missing_added(
     features: Job, whole: tuple[Rows, Rows], tmp_path: Path
 ) -> None:
-    job = matching(features, tmp_path, "chosen")
+    job = matching(features, tmp_path, "selected")
     jobs.work(job)
     chosen = found(job, "two_view_geometries")
     assert len(chosen) >= PHOTOGRAPHS - 1
@@ -101,7 +101,7 @@ def test_matches_without_a_geometry_are_verified_and_not_matched_again(
 
 
 def test_photographs_without_features_match_nothing(features: Job, tmp_path: Path) -> None:
-    job = matching(features, tmp_path, "chosen")
+    job = matching(features, tmp_path, "selected")
     with closing(sqlite3.connect(job.database)) as connection:
         for table in ("keypoints", "descriptors"):
             connection.execute(f"UPDATE {table} SET rows = 0, data = '' WHERE image_id = 4")

@@ -64,7 +64,7 @@ def test_a_distance_between_two_photographs_makes_the_world_metric() -> None:
     assert metric is not None
     moved = centres(metric.poses(poses))
     assert np.linalg.norm(moved[2] - moved[9]) == pytest.approx(3.5)
-    assert "3.5 m apart" in report.metrics["metres_from"]
+    assert "3.5 m apart" in report.metrics["scale_source"]
 
 
 def test_points_move_with_the_cameras() -> None:
@@ -118,7 +118,7 @@ def test_gps_that_does_not_fit_is_refused() -> None:
     capture = capture_of(on_earth(rng.normal(0, 4, (12, 2))))
     metric, report = found(capture, cameras())
     assert metric is None
-    assert report.metrics["metres_from"] == "nothing"
+    assert report.metrics["scale_source"] == "nothing"
     assert report.metrics["with_gps"] == 12
 
 

@@ -38,7 +38,7 @@ def test_pairs_grow_with_photographs_and_not_with_their_square() -> None:
     alike = np.full((400, 400), 50, np.int32)
     assert len(pairs.initial_pairs(alike)) <= 400 * (pairs.BEST + 1)
     nothing_linked = pairs.linking_pairs(alike, [], {})
-    assert len(nothing_linked) <= 400 * pairs.MOST_TO_CLOSE_GAPS
+    assert len(nothing_linked) <= 400 * pairs.MOST_LINKING_PAIRS
 
 
 def test_neighbours_are_compared_even_if_nothing_looks_alike() -> None:
@@ -65,7 +65,7 @@ def test_of_too_many_those_that_look_most_alike_are_compared() -> None:
     alike[3, 70] = alike[70, 3] = 9
     more = pairs.linking_pairs(alike, [], {})
     assert (3, 70) in more
-    assert len(more) == 100 * pairs.MOST_TO_CLOSE_GAPS
+    assert len(more) == 100 * pairs.MOST_LINKING_PAIRS
 
 
 def test_where_all_hang_together_nothing_is_added() -> None:

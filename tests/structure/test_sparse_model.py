@@ -37,25 +37,25 @@ def test_points_behind_a_camera_have_infinite_error() -> None:
 def test_figures_of_a_half_circle() -> None:
     model = orbit_model(views=7, points=200)
     result = MappingResult(model, (model.names,), timed_out=False)
-    figures = model_statistics(result, 8, "incremental")
-    assert (figures.photographs, figures.registered, figures.points) == (8, 7, 200)
-    assert figures.mean_track_length == 7
+    statistics = model_statistics(result, 8, "incremental")
+    assert (statistics.photographs, statistics.registered, statistics.points) == (8, 7, 200)
+    assert statistics.mean_track_length == 7
     # Opposite ends, 4 away and 1 up: 2 atan(4) = 152 degrees in the middle, less around it.
-    assert figures.median_triangulation_angle_deg == pytest.approx(152.0, abs=6)
-    assert figures.focal_over_prior == pytest.approx(1.05)
-    assert figures.distortion == -0.05
-    assert figures.weak_photographs == 0
-    assert (figures.pairs_checked, figures.pairs_contradicting) == (6, 0)
-    assert (figures.link_points, figures.link_views) == (200, 3)
+    assert statistics.median_triangulation_angle_deg == pytest.approx(152.0, abs=6)
+    assert statistics.focal_over_prior == pytest.approx(1.05)
+    assert statistics.distortion == -0.05
+    assert statistics.weak_photographs == 0
+    assert (statistics.pairs_checked, statistics.pairs_inconsistent) == (6, 0)
+    assert (statistics.cut_points, statistics.cut_views) == (200, 3)
 
 
 def test_pairs_that_the_model_contradicts_are_counted_and_one_is_named() -> None:
     model = orbit_model(views=6, points=40)
     fits = np.array([0.9, 0.5, 0.1, 1.0, 0.0])
-    result = MappingResult(replace(model, pair_fits=fits), (model.names,), timed_out=False)
-    figures = model_statistics(result, 6, "incremental")
-    assert figures.pairs_contradicting == 2
-    assert figures.contradicting == ("02.jpg", "03.jpg")
+    result = MappingResult(replace(model, pair_inlier_ratios=fits), (model.names,), timed_out=False)
+    statistics = model_statistics(result, 6, "incremental")
+    assert statistics.pairs_inconsistent == 2
+    assert statistics.inconsistent_pair == ("02.jpg", "03.jpg")
 
 
 def test_cameras_in_one_place_have_no_baseline_and_no_angle() -> None:
@@ -65,10 +65,10 @@ def test_cameras_in_one_place_have_no_baseline_and_no_angle() -> None:
     poses[:, :3, 3] = -np.einsum("vij,j->vi", poses[:, :3, :3], centre)
     still = replace(model, world_to_camera=poses)
     assert triangulation_angles(still, np.arange(40)).max() < 1e-5
-    figures = model_statistics(
+    statistics = model_statistics(
         MappingResult(still, (model.names,), timed_out=False), 6, "incremental"
     )
-    assert figures.baseline_over_depth < 1e-9
+    assert statistics.baseline_over_depth < 1e-9
 
 
 def test_views_with_hardly_any_points_go_and_the_rest_stays_consistent() -> None:

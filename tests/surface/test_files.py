@@ -15,9 +15,9 @@ from pygltflib import GLTF2
 from stages import formats
 from stages.base.errors import SplatError
 from stages.base.lazy import load_object
-from stages.formats import MESHES
 from stages.surface.files import fault_of
 from stages.surface.mesh import Mesh
+from stages.surface.table import MESHES
 
 
 def tent() -> Mesh:
@@ -30,7 +30,7 @@ def tent() -> Mesh:
 
 
 def write(path: Path, mesh: Mesh, units: str = "metres") -> str:
-    """Write by the table; what the second reader has to say of it."""
+    """Write by the table; what the independent reader has to say of it."""
     row = MESHES[path.name.removeprefix("a.")]
     load_object(row.writer)(path, mesh, units)
     return fault_of(path, row, mesh)

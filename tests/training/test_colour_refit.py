@@ -34,7 +34,7 @@ def pictures_of(model: Model) -> list[Level]:
     return found
 
 
-def recoloured(model: Model, levels: list[Level]) -> Model:
+def refitted(model: Model, levels: list[Level]) -> Model:
     return ColourRefit(CpuRasteriser(), SETTINGS, lambda: levels, NO_WIDTHS).of(model)
 
 
@@ -52,7 +52,7 @@ def paler(model: Model) -> Model:
 
 def test_one_step_takes_out_most_of_what_colours_alone_got_wrong(truth):
     levels = pictures_of(truth)
-    before, after = paler(truth), recoloured(paler(truth), levels)
+    before, after = paler(truth), refitted(paler(truth), levels)
     assert squared_error(after, levels) < 0.25 * squared_error(before, levels)
 
 
@@ -60,13 +60,13 @@ def test_again_and_again_it_never_gets_worse(truth):
     levels, model = pictures_of(truth), paler(truth)
     errors = [squared_error(model, levels)]
     for _ in range(4):
-        model = recoloured(model, levels)
+        model = refitted(model, levels)
         errors.append(squared_error(model, levels))
     assert errors == sorted(errors, reverse=True)
 
 
 def test_nothing_but_colours_moves(truth):
-    after = recoloured(paler(truth), pictures_of(truth))
+    after = refitted(paler(truth), pictures_of(truth))
     for name, array in vars(truth).items():
         assert (name == "sh") != np.array_equal(getattr(after, name), array)
 
@@ -75,7 +75,7 @@ def test_bands_above_a_splats_own_degree_stay_empty(truth):
     levels, flat = pictures_of(truth), paler(truth)
     flat.sh_degrees[:] = 0
     flat.sh[:, 1:] = 0.0
-    assert not recoloured(flat, levels).sh[:, 1:].any()
+    assert not refitted(flat, levels).sh[:, 1:].any()
 
 
 def test_what_is_masked_asks_for_nothing(truth):
@@ -83,8 +83,8 @@ def test_what_is_masked_asks_for_nothing(truth):
         replace(level, mask=np.zeros((30, 40), np.uint8), outside=IGNORE)
         for level in pictures_of(truth)
     ]
-    np.testing.assert_array_equal(recoloured(paler(truth), levels).sh, paler(truth).sh)
+    np.testing.assert_array_equal(refitted(paler(truth), levels).sh, paler(truth).sh)
 
 
 def test_no_photograph_leaves_colours_as_they_are(truth):
-    np.testing.assert_array_equal(recoloured(truth, []).sh, truth.sh)
+    np.testing.assert_array_equal(refitted(truth, []).sh, truth.sh)

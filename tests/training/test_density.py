@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from stages.scene import logit
-from stages.training.density import BYTES_PER_SPLAT, AdaptiveDensity, splat_cap
+from stages.training.cap import BYTES_PER_SPLAT, splat_cap
+from stages.training.density import AdaptiveDensity
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
 
@@ -55,8 +56,8 @@ def test_faint_giant_and_broken_splats_go():
     m.opacity_logits[0] = logit(0.004)
     m.log_scales[1] = np.log(0.11 * EXTENT)
     m.means[2, 1] = np.nan
-    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, settled=True)) == 7
-    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, settled=False)) == 8
+    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, remove_giants=True)) == 7
+    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, remove_giants=False)) == 8
 
 
 @pytest.mark.parametrize("room", [0, 1, 3])

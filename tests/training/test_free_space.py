@@ -10,7 +10,7 @@ from stages.scene import DrawSettings, look_at
 from stages.training.free_space import ENOUGH, WITNESSES, known_free_space
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
-from stages.training.trainer import CLEARINGS, Trainer
+from stages.training.trainer import FLOATER_REMOVALS, Trainer
 from tests.scenes import camera, splats
 from tests.training.pictures import view_of
 
@@ -108,7 +108,7 @@ class Clouds:
 
 
 @pytest.mark.parametrize("steps", [1, 60, 403])
-def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, steps):
+def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, monkeypatch, steps):
     start = wall()
     pictures = np.full((48, 64, 3), 0.5, np.float32)
     views = [view_of(f"{k}", pictures, one) for k, one in enumerate(cameras(3))]
@@ -116,9 +116,10 @@ def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, steps):
     made = Trainer(
         *(schedule, views, [], DrawSettings(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
     )
-    made._strategy = Clouds()
+    clouds = Clouds()
+    monkeypatch.setattr(made, "_strategy", clouds)
     model = made.run(start)
-    assert made._strategy.made == sum(schedule.densifies_after(step) for step in range(steps))
+    assert clouds.made == sum(schedule.densifies_after(step) for step in range(steps))
     assert len(model) == len(start)
     assert (model.means[:, 2] > 0.5 * FAR).all()
 
@@ -126,6 +127,6 @@ def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, steps):
 def test_it_is_looked_for_a_few_times_in_a_run_and_at_its_end():
     for steps in (7, 3000, 30_000):
         schedule = Schedule(steps=steps, extent=1.0, sh_degree=0, n_start=1, seed=0)
-        asked = [step for step in range(steps) if schedule.passes(step + 1, CLEARINGS)]
-        assert len(asked) == min(steps, CLEARINGS)
+        asked = [step for step in range(steps) if schedule.passes(step + 1, FLOATER_REMOVALS)]
+        assert len(asked) == min(steps, FLOATER_REMOVALS)
         assert asked[-1] == steps - 1

@@ -137,7 +137,7 @@ def test_a_photograph_that_is_read_anew_is_sent_once(monkeypatch):
     made, seen = stepper(), level()
     made.step(seen, SETTINGS, RATES, smooth=False)
     sent = []
-    monkeypatch.setattr(gpu_step, "resident", lambda *given: sent.append(given))
+    monkeypatch.setattr(gpu_step, "gpu_target_of", lambda *given: sent.append(given))
     made.step(replace(seen, pixels=seen.pixels.copy()), SETTINGS, RATES, smooth=False)
     assert not sent
 

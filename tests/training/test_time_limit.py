@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.training.schedule import GROWTH_ENDS, RESOLUTIONS, SETTLE_TO, Schedule
+from stages.training.schedule import DENSIFICATION_END, RESOLUTIONS, SETTLE_TO, Schedule
 from stages.training.time_limit import TimeLimit
 
 
@@ -47,15 +47,6 @@ def test_steps_that_take_a_second_each_still_end_in_time():
     assert 30 < took < 66
 
 
-def test_steps_that_do_not_count_are_not_taken_for_a_slow_machine():
-    pace = TimeLimit(100.0)
-    assert pace.steps(10, 1.0) is None
-    assert pace.steps(110, 11.0) == 110 + 890  # a tenth of a second each
-    pace.restart()  # ten seconds went into what did not count
-    assert pace.steps(110, 21.0) is None
-    assert pace.steps(210, 31.0) == 210 + 690
-
-
 def test_a_plan_that_is_never_changed_is_the_share_of_steps():
     plan = schedule(400)
     assert [plan.share(step) for step in (0, 100, 400)] == [0.0, 0.25, 1.0]
@@ -78,10 +69,10 @@ def test_pictures_are_whole_to_the_very_end_of_any_plan():
     assert {plan.level(step) for step in range(990, 1001)} == {len(RESOLUTIONS) - 1}
 
 
-def test_a_run_that_grows_no_more_is_as_long_as_if_that_had_been_the_plan():
-    plan = schedule(3000).grown(600)
-    assert plan.share(600) == GROWTH_ENDS
-    assert plan.steps == round(600 / GROWTH_ENDS)
+def test_a_run_whose_densification_ended_is_as_long_as_if_that_had_been_the_plan():
+    plan = schedule(3000).without_densification(600)
+    assert plan.share(600) == DENSIFICATION_END
+    assert plan.steps == round(600 / DENSIFICATION_END)
     assert not any(plan.densifies_after(step) for step in range(600, plan.steps))
     late = schedule(3000)
-    assert late.grown(2500) is late
+    assert late.without_densification(2500) is late

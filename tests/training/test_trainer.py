@@ -26,7 +26,8 @@ from stages.training.density import AdaptiveDensity
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from stages.training.schedule import Schedule
-from stages.training.trainer import EVALUATIONS, Trainer
+from stages.training.trainer import Trainer
+from stages.training.validation import EVALUATIONS
 from stages.training.views import Level, TrainingView, load_views
 from tests.scenes import camera, cloud, splats
 from tests.small_scene import small_scene
@@ -228,7 +229,7 @@ def test_looking_on_does_not_change_what_is_trained(tmp_path):
         drawn.append(draw(where))
         assert drawn[-1].shape == (height, width, 3)
 
-    report.onlooker = keep
+    report.preview = keep
     watched, start = small_problem(tmp_path, "watched", report, steps=150)
     found = watched.run(start)
     assert len(drawn) == 150
@@ -243,7 +244,7 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     t, start = small_problem(tmp_path, "seen", report, steps=40)
     where = camera(48, 36)
     seen = []
-    report.onlooker = lambda draw: seen.append(draw(where))
+    report.preview = lambda draw: seen.append(draw(where))
     trained = finished(t.run(start), 1, start, t.draw_settings)
     settings = t.settings(t.schedule.sh_degree)
     image = render(trained, where, settings, backend="reference").image
@@ -311,9 +312,9 @@ def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
 
 def test_nothing_at_all_can_be_taken_grown_and_pruned():
     empty = new_model(*splat_arrays(grid(2).take(np.zeros(4, bool))))
-    strategy = AdaptiveDensity(1.0, photographs=8)
+    strategy = AdaptiveDensity(1.0, views=8)
     assert len(strategy.grow(empty, 100, np.random.default_rng(0))) == 0
-    assert len(strategy.prune(empty, settled=True)) == 0
+    assert len(strategy.prune(empty, remove_giants=True)) == 0
     assert len(empty.take(np.zeros(0, bool))) == 0
 
 
@@ -415,7 +416,7 @@ def test_a_cap_that_was_asked_for_is_told_as_that(tmp_path):
 def test_no_more_is_modelled_than_the_photographs_tell(tmp_path, monkeypatch):
     """60 x 40 pixels of three numbers each; a splat of degree 1 has 23, one of degree 3 has 59."""
     small = camera(width=60, height=40)
-    monkeypatch.setattr(cap, "FEWEST", 10)
+    monkeypatch.setattr(cap, "MIN_CAP", 10)
     assert cap.splats_determined([small] * 5, 1) == 5 * 60 * 40 * 3 // 23
     assert cap.splats_determined([small] * 5, 3) == 5 * 60 * 40 * 3 // 59
     monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.training.density import THRESHOLD, AdaptiveDensity, Within
+from stages.training.density import GRADIENT_THRESHOLD, AdaptiveDensity, BoundedDensity
 from stages.training.optimiser import Model, new_model
 
 
@@ -22,11 +22,11 @@ def model() -> Model:
         np.zeros(n, np.float32),
         np.zeros((n, 1, 3), np.float32),
     )
-    found.gradient_sum[:], found.gradient_count[:] = 10 * THRESHOLD, 1
+    found.gradient_sum[:], found.gradient_count[:] = 10 * GRADIENT_THRESHOLD, 1
     return found
 
 
-BLOCK = Within(AdaptiveDensity(extent=1.0, photographs=8), (0.0, -9.0, 9.0, 9.0))
+BLOCK = BoundedDensity(AdaptiveDensity(extent=1.0, views=8), (0.0, -9.0, 9.0, 9.0))
 
 
 def test_a_block_grows_in_its_own_rectangle_alone(model) -> None:

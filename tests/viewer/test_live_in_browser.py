@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.formats.page.shots import shots_of
+from stages.formats.page.cameras import page_cameras
 from stages.measure.image_metrics import psnr
 from stages.raster.draw import render
 from stages.run.pipeline import Pipeline
 from stages.scene import Camera, Splats
-from stages.scene.framing import depth_of_interest
+from stages.scene.framing import median_depth
 from stages.viewer.live_page import LivePage
 from stages.viewer.server import LocalServer
 from tests import processes, sample
@@ -64,7 +64,7 @@ def worker(tmp_path: Path) -> Iterator[Worker]:
         picture = ours(coloured_scene(), view.camera)
         Image.fromarray(np.uint8(picture * 255)).save(tmp_path / view.image)
     splats = coloured_scene()
-    page = LivePage("test", views(), shots_of(views(), splats), splats.means, tmp_path)
+    page = LivePage("test", views(), page_cameras(views(), splats), splats.means, tmp_path)
     working = Worker(page)
     server = LocalServer(page.items)
     serving = threading.Thread(target=server.serve_forever)
@@ -143,7 +143,7 @@ def test_dragging_turns_the_scene_with_the_hand(browser: Browser, worker: Any) -
     bare(browser, worker.address)
     _, before = shown(browser)
     camera = views()[0].camera
-    depth = depth_of_interest(camera, coloured_scene().means)
+    depth = median_depth(camera, coloured_scene().means)
     pivot = camera.centre + depth * camera.forward
     near = pivot - 0.2 * depth * camera.forward
     mouse(browser, (150, 120), (165, 125), (190, 140))
@@ -163,7 +163,7 @@ def test_right_dragging_takes_the_scene_along_and_the_wheel_comes_closer(
     bare(browser, worker.address)
     _, before = shown(browser)
     camera = views()[0].camera
-    pivot = camera.centre + depth_of_interest(camera, coloured_scene().means) * camera.forward
+    pivot = camera.centre + median_depth(camera, coloured_scene().means) * camera.forward
     mouse(browser, (150, 120), (170, 110), button="right")
     _, matrix = shown(browser)
     travelled = seen_at(matrix, camera, pivot) - seen_at(before, camera, pivot)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.formats.page.shots import Shot, shots_of
+from stages.formats.page.cameras import PageCamera, page_cameras
 from stages.scene import Camera
 from stages.viewer.live_page import SIDES, LivePage
 from stages.viewer.server import LocalServer
@@ -26,7 +26,7 @@ from tests import scenes
 from tests.viewer.asking import ask
 from tests.viewer.pages import HOSTILE, Elements, views
 
-SHOTS = shots_of(views(), scenes.cloud(20))
+SHOTS = page_cameras(views(), scenes.cloud(20))
 
 
 def place_of(camera: Camera) -> str:
@@ -184,7 +184,7 @@ def test_time_left_counts_from_where_training_was_resumed() -> None:
 
 
 def test_the_page_fetches_nothing_from_elsewhere_and_names_cannot_break_out() -> None:
-    page = LivePage(HOSTILE, (), [Shot(HOSTILE, scenes.camera())], scenes.cloud(3).means)
+    page = LivePage(HOSTILE, (), [PageCamera(HOSTILE, scenes.camera())], scenes.cloud(3).means)
     text = page.items["/"].content.decode()  # type: ignore[union-attr]
     elements = Elements(text)
     assert elements.scene()["shots"][0]["name"] == HOSTILE

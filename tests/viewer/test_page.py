@@ -13,8 +13,8 @@ import pytest
 from stages import formats
 from stages.formats import html
 from stages.formats.page import document
-from stages.formats.page.shots import Shot, as_plain, shots_of
-from stages.proof.independent_readers import read_back
+from stages.formats.page.cameras import PageCamera, as_plain, page_cameras
+from stages.proof.checks import read_back
 from stages.scene import Camera, Splats, look_at
 from stages.viewer.site import site
 from tests import scenes
@@ -92,7 +92,7 @@ def test_a_damaged_page_is_refused(
 
 def test_names_cannot_break_out_of_the_page() -> None:
     splats = scenes.cloud(3)
-    shots = [Shot(HOSTILE, scenes.camera())]
+    shots = [PageCamera(HOSTILE, scenes.camera())]
     text = document.head(document.scene_data(HOSTILE, splats, shots, units="arbitrary", source=""))
     elements = Elements(text)
     assert elements.scene()["shots"][0]["name"] == HOSTILE
@@ -101,13 +101,13 @@ def test_names_cannot_break_out_of_the_page() -> None:
 
 
 def test_every_eighth_camera_by_name_is_marked_as_held_out() -> None:
-    shots = shots_of(tuple(reversed(views(10))), scenes.cloud(3))
+    shots = page_cameras(tuple(reversed(views(10))), scenes.cloud(3))
     assert [shot.name for shot in shots] == [f"{i}.jpg" for i in range(10)]
     assert [shot.name for shot in shots if shot.held_out] == ["0.jpg", "8.jpg"]
 
 
 def test_splats_without_a_capture_are_seen_from_in_front() -> None:
-    (shot,) = shots_of((), scenes.cloud(20))
+    (shot,) = page_cameras((), scenes.cloud(20))
     plain = as_plain(shot, scenes.cloud(20).means)
     assert shot.camera.centre[2] < np.median(scenes.cloud(20).means[:, 2])
     assert np.isfinite(plain["position"] + plain["target"] + plain["rotation"]).all()
@@ -125,7 +125,7 @@ def test_a_camera_in_the_viewers_world_looks_the_same_way(
 ) -> None:
     """By hand: the viewer's world is ours turned about z; its camera is x right, y up, z back."""
     camera = scenes.camera(matrix=look_at(np.array(eye), np.zeros(3), np.array(up)))
-    plain = as_plain(Shot("a", camera), np.zeros((1, 3)))
+    plain = as_plain(PageCamera("a", camera), np.zeros((1, 3)))
     right, down, forward = camera.world_to_camera[:3, :3]
 
     def turned(v: np.ndarray) -> np.ndarray:
@@ -161,4 +161,4 @@ def test_photographs_are_served_by_number_and_only_from_their_folder(tmp_path: P
 
 def test_a_camera_that_sees_nothing_still_has_something_to_turn_around() -> None:
     away = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, look_at(np.zeros(3), np.array([0, 0, -1.0])))
-    assert np.isfinite(as_plain(Shot("a", away), scenes.cloud(9).means)["target"]).all()
+    assert np.isfinite(as_plain(PageCamera("a", away), scenes.cloud(9).means)["target"]).all()

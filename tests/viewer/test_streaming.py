@@ -56,7 +56,7 @@ def asset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def address(asset: Path) -> Iterator[str]:
     """Of a page that `splat view` serves; beside it the asset's own page, as any server would."""
     splats = formats.read(asset)
-    seen = views(streamed_sog.widths(asset, splats))
+    seen = views(streamed_sog.splat_widths(asset, splats))
     page = asset.with_suffix(".html")
     own = {f"/{page.name}": Item(page, "text/html; charset=utf-8")}
     server = LocalServer(site("test", splats, asset, seen) | own)
@@ -72,7 +72,7 @@ def test_three_distances_are_drawn_from_three_levels(
     browser: Browser, address: str, asset: Path
 ) -> None:
     splats = formats.read(asset)
-    widths = streamed_sog.widths(asset, splats)
+    widths = streamed_sog.splat_widths(asset, splats)
     assert len(widths) == 3
     browser.open(address + "?bare&webgl&camera=2")
     browser.run("window.splatReady")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.formats.page.shots import Shot, as_plain
+from stages.formats.page.cameras import PageCamera, as_plain
 from stages.scene import Splats
 
 CHUNK_START = '<script type="text/plain" class="splats">'
@@ -32,7 +32,7 @@ _POLICY = (
 def scene_data(
     title: str,
     splats: Splats,
-    shots: Sequence[Shot],
+    shots: Sequence[PageCamera],
     *,
     units: str,
     source: str,

@@ -1,1 +1,1 @@
-"""What a minute, a megabyte and a splat are worth in one scene, measured on its own photographs."""
+"""The trade-off report of one run, and the comparison of two."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,85 +10,84 @@ import numpy as np
 
 from stages.base.atomic import replacing
 from stages.measure.evaluation import image_renderer
-from stages.measure.tradeoff import pages, thin_words, words
-from stages.measure.tradeoff.measuring import Material
+from stages.measure.image_metrics import psnr_text
+from stages.measure.tradeoff import html, summary
+from stages.measure.tradeoff.curves import OperatingPoint, Tradeoff
+from stages.measure.tradeoff.measurement import TradeoffInputs
 from stages.measure.tradeoff.plots import write_plots
-from stages.measure.tradeoff.points import Point, Trade
 
+ERROR_GAIN = 4.0  # of the picture of errors, so that small ones can be seen
 _COLUMNS = (
-    *("curve", "label", "splats", "bytes", "wall_seconds", "cpu_seconds", "frame_seconds"),
+    *("curve", "label", "splats", "bytes", "wall_seconds", "cpu_seconds", "draw_seconds"),
     *("psnr_db", "change_db", "change_low_db", "change_high_db"),
 )
 _SECTIONS = {
-    "time": ("Time", words.about_time),
-    "formats": ("Bytes", words.about_formats),
-    "splats": ("Splats", words.about_splats),
-    "drawing": ("Drawing", words.about_drawing),
-    "coverage": ("Coverage", thin_words.about_coverage),
-    "framing": ("Framing", thin_words.about_framing),
-    "photographs": ("Photographs", words.about_photographs),
+    "time": ("Time", summary.about_time),
+    "formats": ("Bytes", summary.about_formats),
+    "splats": ("Splats", summary.about_splats),
+    "drawing": ("Drawing", summary.about_drawing),
+    "coverage": ("Coverage", summary.about_coverage),
+    "framing": ("Framing", summary.about_framing),
+    "photographs": ("Photographs", summary.about_photographs),
 }
 
 
-def sentences(trade: Trade) -> dict[str, list[str]]:
-    """What the report says, by section."""
-    return {title: say(trade) for title, say in _SECTIONS.values()}
+def summarise(tradeoff: Tradeoff) -> dict[str, list[str]]:
+    """The text of the report: title of each section, and its lines."""
+    return {title: about(tradeoff) for title, about in _SECTIONS.values()}
 
 
-def write_report(folder: Path, name: str, trade: Trade, material: Material) -> list[Path]:
-    """Everything into `folder`, which is there; name: the run's. The files. Raises SplatError."""
-    plots = {path.stem: path for path in write_plots(folder, trade)}
+def write_report(folder: Path, name: str, tradeoff: Tradeoff, inputs: TradeoffInputs) -> list[Path]:
+    """Write everything into `folder`, which exists, and return the files. name: the run's. Raises
+    SplatError."""
+    plots = {path.stem: path for path in write_plots(folder, tradeoff)}
     table = folder / "tradeoff.csv"
-    with replacing(table) as temporary:
-        temporary.write_text(_table(trade), encoding="utf-8")
-    parts = [
-        pages.paragraphs(
-            [
-                f"Quality is PSNR of {len(trade.scores)} photographs that training never saw, "
-                f"drawn {trade.side_px} pixels large. Intervals (95 %) are of the difference to "
-                "this run's splats, photograph by photograph: they speak of other photographs of "
-                "this scene, not of another run's luck."
-            ]
-        )
-    ]
-    for stem, (title, say) in _SECTIONS.items():
-        parts += [pages.heading(title), pages.paragraphs(say(trade))]
+    with replacing(table) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        writer.writerows(_rows(tradeoff))
+    introduction = (
+        f"Quality is the PSNR of {len(tradeoff.scores)} held-out views, which training never saw, "
+        f"drawn {tradeoff.side_px} pixels large. Intervals (95 %) are of the difference to this "
+        "run's splats, view by view: they are about other views of this scene, not about another "
+        "run with another seed."
+    )
+    parts = [html.paragraphs([introduction])]
+    for stem, (title, about) in _SECTIONS.items():
+        parts += [html.heading(title), html.paragraphs(about(tradeoff))]
         if stem in plots:
-            parts.append(pages.png(plots[stem], f"Plot: {title}"))
+            parts.append(html.png(plots[stem], f"Plot: {title}"))
         if stem == "formats":
-            parts.append(_formats_table(trade))
+            parts.append(_formats_table(tradeoff))
         if stem == "framing":
-            parts.append(_framings(trade))
-    parts += [_photographs_table(trade), _worst(trade, material)]
+            parts.append(_framings(tradeoff))
+    parts += [_photographs_table(tradeoff), _worst(tradeoff, inputs)]
     report = folder / "report.html"
-    pages.write_page(report, f"The trade of {name}", parts)
+    html.write_page(report, f"Trade-off report: {name}", parts)
     return [report, table, *plots.values()]
 
 
-def _table(trade: Trade) -> str:
-    held = io.StringIO()
-    writer = csv.writer(held, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for m in trade.moments:
-        row = (m.splats, "", f"{m.seconds:.2f}", f"{m.cpu_seconds:.2f}", "", f"{m.psnr_db:.4f}")
-        writer.writerow(("time", f"step {m.step}", *row, "", "", ""))
-    for curve, points in (("format", trade.formats), ("splats", trade.counts)):
-        writer.writerows(_row(curve, point) for point in points)
-    for score in trade.scores:
-        figure = f"{score.psnr_db:.4f}"
-        writer.writerow(("photograph", score.name, *[""] * 5, figure, "", "", ""))
-    return held.getvalue()
+def _rows(tradeoff: Tradeoff) -> Iterator[tuple[str, ...]]:
+    for h in tradeoff.history:
+        times = f"{h.seconds:.2f}", f"{h.cpu_seconds:.2f}"
+        row = (str(h.splats), "", *times, "", f"{h.psnr_db:.4f}")
+        yield ("time", f"step {h.step}", *row, "", "", "")
+    for curve, points in (("format", tradeoff.formats), ("splats", tradeoff.pruned)):
+        for point in points:
+            yield (curve, *_row(point))
+    for score in tradeoff.scores:
+        yield ("photograph", score.name, *[""] * 5, f"{score.psnr_db:.4f}", "", "", "")
 
 
-def _row(curve: str, point: Point) -> Iterator[str]:
-    yield from (curve, point.label, str(point.splats))
+def _row(point: OperatingPoint) -> Iterator[str]:
+    yield from (point.label, str(point.splats))
     yield "" if point.size_bytes is None else str(point.size_bytes)
-    yield from ("", "", "" if point.frame_s is None else f"{point.frame_s:.5f}")
+    yield from ("", "", "" if point.draw_seconds is None else f"{point.draw_seconds:.5f}")
     change = point.change
     yield from (f"{x:.4f}" for x in (point.psnr_db, change.mean, change.low, change.high))
 
 
-def _formats_table(trade: Trade) -> str:
+def _formats_table(tradeoff: Tradeoff) -> str:
     rows = [
         (
             point.label,
@@ -97,37 +95,38 @@ def _formats_table(trade: Trade) -> str:
             f"{point.psnr_db:.2f} dB",
             f"{point.change.mean:+.3f} dB",
         )
-        for point in trade.formats
+        for point in tradeoff.formats
     ]
-    return pages.table(("format", "size", "held-out PSNR", "change"), rows)
+    return html.table(("format", "size", "held-out PSNR", "change"), rows)
 
 
-def _photographs_table(trade: Trade) -> str:
+def _photographs_table(tradeoff: Tradeoff) -> str:
     rows = [
-        (f"{number}  {score.name}", f"{score.psnr_db:.2f} dB", f"{score.ssim:.3f}")
-        for number, score in enumerate(trade.scores, 1)
+        (f"{number}  {score.name}", psnr_text(score.psnr_db), f"{score.ssim:.3f}")
+        for number, score in enumerate(tradeoff.scores, 1)
     ]
-    return pages.table(("photograph", "PSNR", "SSIM"), rows)
+    return html.table(("photograph", "PSNR", "SSIM"), rows)
 
 
-def _framings(trade: Trade) -> str:
-    """The scene from elsewhere, three pictures a row."""
+def _framings(tradeoff: Tradeoff) -> str:
+    """Three pictures a row."""
     shown = [
         (f"{framing.label}: shimmer {framing.shimmer:.1f} of 255", framing.image)
-        for framing in trade.thin.framings
+        for framing in tradeoff.framings
     ]
-    return "".join(pages.pictures(shown[i : i + 3]) for i in range(0, len(shown), 3))
+    return "".join(html.pictures(shown[i : i + 3]) for i in range(0, len(shown), 3))
 
 
-def _worst(trade: Trade, material: Material) -> str:
-    """The worst photograph, what is drawn of it, and what lies between."""
-    photograph = next(p for p in material.held_out if p.name == trade.worst.name)
-    drawn = image_renderer(material.splats, material.backend)(photograph.camera)
-    drawn, truth = np.clip(drawn, 0.0, 1.0), photograph.image
-    return pages.pictures(
+def _worst(tradeoff: Tradeoff, inputs: TradeoffInputs) -> str:
+    """The worst photograph, the drawing of it, and the error."""
+    view = next(view for view in inputs.held_out if view.name == tradeoff.worst.name)
+    drawn = image_renderer(inputs.splats, inputs.backend)(view.camera)
+    drawn, truth = np.clip(drawn, 0.0, 1.0), view.image
+    error = np.clip(np.abs(drawn - truth) * ERROR_GAIN, 0.0, 1.0)
+    return html.pictures(
         (
-            (f"{photograph.name}: the photograph", truth),
-            (f"drawn, {trade.worst.psnr_db:.2f} dB", drawn),
-            (f"error x {pages.ERROR_GAIN:g}", pages.error_of(drawn, truth)),
+            (f"{view.name}: the photograph", truth),
+            (f"drawn, {tradeoff.worst.psnr_db:.2f} dB", drawn),
+            (f"error x {ERROR_GAIN:g}", error),
         )
     )

@@ -25,12 +25,12 @@ from stages.raster.cpu.tile import (
 from stages.raster.definition import (
     ALPHA_MAX,
     ALPHA_MIN,
-    CHANGE,
     CONTRIBUTIONS,
-    LARGEST,
-    PULL,
-    SQUARES,
+    ERROR_CHANGE,
+    LARGEST_WEIGHT,
+    SQUARED_WEIGHT,
     WEIGHT,
+    WEIGHTED_RESIDUAL,
 )
 from stages.raster.kernels.simd import (
     bits16,
@@ -147,18 +147,18 @@ def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, s
             shift = behind * ratio - painted
             change = vfma(shift, shift + two * vload(work, RESIDUAL + plane), change)
             vstore(work, BEHIND + plane, behind + painted)
-    out[slot, CHANGE], out[slot, WEIGHT], out[slot, SQUARES] = (
+    out[slot, ERROR_CHANGE], out[slot, WEIGHT], out[slot, SQUARED_WEIGHT] = (
         vsum(change),
         vsum(total),
         vsum(squares),
     )
-    out[slot, PULL], out[slot, PULL + 1] = vsum(pull_r), vsum(pull_g)
-    out[slot, PULL + 2] = vsum(pull_b)
+    out[slot, WEIGHTED_RESIDUAL], out[slot, WEIGHTED_RESIDUAL + 1] = vsum(pull_r), vsum(pull_g)
+    out[slot, WEIGHTED_RESIDUAL + 2] = vsum(pull_b)
     vstore(lanes, 0, largest)
     top = lanes[0]
     for lane in range(1, 16):
         top = max(top, lanes[lane])
-    out[slot, LARGEST] = top
+    out[slot, LARGEST_WEIGHT] = top
 
 
 @kernel
@@ -172,7 +172,7 @@ def gather_contributions(raw, places, out):
         for slot in range(first, first + places[place, COUNT]):
             for column in range(CONTRIBUTIONS):
                 value = np.float64(raw[slot, column])
-                if column == LARGEST:
+                if column == LARGEST_WEIGHT:
                     out[place, column] = max(out[place, column], value)
                 else:
                     out[place, column] += value

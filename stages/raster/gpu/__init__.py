@@ -1,1 +1,1 @@
-"""The GPU backend: Triton kernels, as `definition.Rasteriser` wants them. See docs/gpu.md."""
+"""The GPU backend: Triton kernels, as `definition.Rasteriser` wants them. See docs/guide/gpu.md."""

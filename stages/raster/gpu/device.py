@@ -19,9 +19,9 @@ from stages.base.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.raster.definition import MemoryFull
 
-INSTALL = "docs/gpu.md says which build of torch brings what is missing."
+INSTALL = "docs/guide/gpu.md says which build of torch brings what is missing."
 _OLDEST = (7, 0)  # compute capability that Triton compiles for
-BYTES_A_SPLAT = 1500  # of training, with degree 3 and 4 tiles a splat: docs/gpu.md
+BYTES_A_SPLAT = 1500  # of training, with degree 3 and 4 tiles a splat: docs/experiments/gpu.md
 _NVIDIA, _AMD = Path("/proc/driver/nvidia/version"), Path("/dev/kfd")  # there with their drivers
 _COMPILERS = ("cc", "gcc", "clang")
 
@@ -123,7 +123,7 @@ def built() -> str:
 
 
 @contextmanager
-def failures_told(splats: int) -> Iterator[None]:
+def gpu_errors_explained(splats: int) -> Iterator[None]:
     """What a device refuses while it works on so many splats, as SplatError."""
     import torch
 

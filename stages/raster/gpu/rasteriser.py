@@ -14,7 +14,7 @@ from torch import Tensor
 from stages.raster.camera_row import camera_row
 from stages.raster.definition import (
     CONTRIBUTIONS,
-    LARGEST,
+    LARGEST_WEIGHT,
     NO_SMOOTHING,
     SH,
     Arrays,
@@ -23,7 +23,7 @@ from stages.raster.definition import (
     gradient_columns,
 )
 from stages.raster.gpu import blend, gradients, lists, project
-from stages.raster.gpu.device import failures_told, interpreted, require
+from stages.raster.gpu.device import gpu_errors_explained, interpreted, require
 from stages.scene import Camera
 
 VISIBLE, CULLED = 1, 2  # as `project_kernel` says them
@@ -118,7 +118,7 @@ class GpuRasteriser:
         depths: bool = False,
     ) -> Forward:
         """See `definition.Rasteriser`."""
-        with failures_told(len(arrays[0])):
+        with gpu_errors_explained(len(arrays[0])):
             scene, view = self.scene(arrays, smoothing), self.view(camera, settings)
             drawn = self.draw(scene, view, depths)
             status, image = drawn.status.cpu().numpy(), drawn.image.cpu().numpy()
@@ -154,11 +154,11 @@ class GpuRasteriser:
         self._over_tiles(blend.contribution_kernel, forward.view, drawn, planes, raw)
         sums = self._summed(raw, made, tl.float64)
         found = sums.cpu().numpy()[forward.visible]
-        entries = raw[:, LARGEST].cpu().numpy()
+        entries = raw[:, LARGEST_WEIGHT].cpu().numpy()
         firsts, counts = (t.cpu().numpy()[forward.visible] for t in (made.firsts, made.counts))
         for place in range(len(found)):
             own = entries[firsts[place] : firsts[place] + counts[place]]
-            found[place, LARGEST] = own.max(initial=0.0)
+            found[place, LARGEST_WEIGHT] = own.max(initial=0.0)
         return found
 
     def scene(self, arrays: Arrays, smoothing: NDArray[np.float32] = NO_SMOOTHING) -> Scene:

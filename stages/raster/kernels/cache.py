@@ -1,8 +1,8 @@
-"""Where compiled kernels are kept: a folder for exactly these sources, compiler and processor.
+"""Where compiled kernels are kept: one folder for each set of sources, compiler and processor.
 
-Numba notices a changed kernel file, but not a changed file that it imports from; a folder per
-digest of all of them cannot serve a stale kernel, and works where the package is read-only.
-Folders of other versions are removed, less the newest few and those that a running process holds.
+Numba notices a changed kernel file, but not a change in a file that it imports. A folder named by
+the digest of all of them cannot serve a stale kernel, and works where the package is read-only.
+Folders of other versions are removed, except the most recent and those that a running process uses.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ import tempfile
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO
 
-KEPT = 3  # folders of compiled kernels: one for each version or machine that is in turn
+from filelock import FileLock
+
+KEPT = 3  # folders of compiled kernels, the one in use included
+PACKAGES = ("raster", "structure", "surface", "training")  # those with kernels
 _VARIABLE = "NUMBA_CACHE_DIR"
-_ROOMS = ("kernels", "raster", "training", "surface", "seeding", "structure")
-_IN_USE = "in-use"  # locked, as long as its process lives, by each that compiles into the folder
-_held: list[IO[str]] = []
+_WAIT_S = 60.0  # for another process that is removing old folders
+_IN_USE = "in-use-{}"  # a lock for each process that uses a folder, held until the process ends
+_held: list[FileLock] = []
 
 
 def folder() -> Path:
@@ -35,15 +37,15 @@ def are_compiled(kernel: str = "*") -> bool:
 
 
 def others() -> list[Path]:
-    """Folders of other versions and machines beside this process's, the one used last first."""
+    """Folders of other versions and machines beside this process's, most recently used first."""
     found = [path for path in folder().parent.glob("kernels-*") if path != folder()]
-    with suppress(OSError):  # what another process removes meanwhile
+    with suppress(OSError):  # another process may be removing one
         found.sort(key=_last_use, reverse=True)
     return found
 
 
 def size_bytes(kernels: Path) -> int:
-    """Of everything in a folder of kernels."""
+    """Size of all files in a folder of kernels."""
     return sum(path.stat().st_size for path in kernels.rglob("*") if path.is_file())
 
 
@@ -57,17 +59,13 @@ def prepare() -> None:
     name = f"kernels-{_digest()}"
     root = _root()
     try:
-        _hold(root / name)
+        _use(root, name)
     except OSError:  # a home folder may be read-only, and Numba stops where it cannot write
         root = Path(tempfile.gettempdir()) / f"splat-{_user()}"
         root.mkdir(mode=0o700, exist_ok=True)
         if _owner(root) != _user():  # compiled kernels are code: only our own may be run
             root = Path(tempfile.mkdtemp(prefix="splat-"))
-        _hold(root / name)
-    os.environ[_VARIABLE] = str(root / name)
-    for path in others()[KEPT - 1 :]:
-        with suppress(OSError):
-            _remove(path)
+        _use(root, name)
 
 
 def _digest() -> str:
@@ -77,8 +75,8 @@ def _digest() -> str:
     features = llvm.get_host_cpu_features().flatten()
     digest = hashlib.sha256("\n".join((sys.version, processor, features)).encode())
     digest.update((version("numba") + version("llvmlite")).encode())
-    stages = Path(__file__).resolve().parent.parent
-    for source in sorted(path for room in _ROOMS for path in (stages / room).rglob("*.py")):
+    stages = Path(__file__).resolve().parents[2]
+    for source in sorted(path for name in PACKAGES for path in (stages / name).rglob("*.py")):
         digest.update(source.relative_to(stages).as_posix().encode() + source.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -96,40 +94,41 @@ def _owner(path: Path) -> int:
     return path.stat().st_uid  # 0 under Windows, whose temporary folder is the user's own
 
 
-def _hold(path: Path) -> None:
-    """Make a folder of kernels, note the time, and keep it from being removed. Raises OSError."""
-    for _ in range(2):  # another process may be removing this very folder
-        path.mkdir(parents=True, exist_ok=True)
-        file = (path / _IN_USE).open("w")
-        file.write("kept while its process lives\n")
-        file.flush()
-        with suppress(OSError):  # not every disk of a network knows locks: then none is removed
-            _lock(file, shared=True)
-        if (path / _IN_USE).exists():
-            break
-    _held.append(file)
+def _use(root: Path, name: str) -> None:
+    """Make the folder of kernels `name` under `root`, mark it as in use by this process, and remove
+    old ones. Raises OSError, also if another process does not finish this (Timeout)."""
+    root.mkdir(parents=True, exist_ok=True)
+    with FileLock(root / "lock", timeout=_WAIT_S):  # nobody marks a folder that is being removed
+        (root / name).mkdir(exist_ok=True)
+        mark = root / name / _IN_USE.format(os.getpid())
+        lock = FileLock(mark)
+        lock.acquire(timeout=0)
+        os.utime(mark)
+        _held.append(lock)
+        os.environ[_VARIABLE] = str(root / name)
+        _clear_marks(root / name, sparing=mark)
+        for path in others()[KEPT - 1 :]:
+            with suppress(OSError):
+                _clear_marks(path)
+                shutil.rmtree(path)
 
 
 def _last_use(path: Path) -> float:
-    note = path / _IN_USE
-    return (note if note.exists() else path).stat().st_mtime
+    """When a process last began to use a folder of kernels."""
+    marks = path.glob(_IN_USE.format("*"))
+    return max((mark.stat().st_mtime for mark in marks), default=path.stat().st_mtime)
 
 
-def _remove(path: Path) -> None:
-    """Remove one folder of kernels. Raises OSError if a process holds it."""
-    with (path / _IN_USE).open("a") as file:
-        _lock(file, shared=False)
-        if sys.platform != "win32":
-            shutil.rmtree(path)
-            return
-    (path / _IN_USE).unlink()  # Windows refuses while anyone has it open
-    shutil.rmtree(path)
-
-
-def _lock(file: IO[str], shared: bool) -> None:
-    """Shared locks wait; one for itself is refused (OSError) while any other is held."""
-    if sys.platform == "win32":
-        return
-    import fcntl
-
-    fcntl.flock(file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX | fcntl.LOCK_NB)
+def _clear_marks(path: Path, sparing: Path | None = None) -> None:
+    """Remove the marks of processes that have ended. Raises OSError (Timeout) at the first mark of
+    one that still runs, unless `sparing` is given."""
+    for mark in path.glob(_IN_USE.format("*")):
+        if mark == sparing:
+            continue
+        try:
+            with FileLock(mark, timeout=0):
+                pass
+            mark.unlink(missing_ok=True)
+        except OSError:
+            if sparing is None:
+                raise

@@ -8,9 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+from filelock import FileLock
+
 from stages.raster.kernels import cache
 
-ROOT = Path(__file__).parent.parent.parent
+ROOT = Path(__file__).resolve().parents[3]
 SHOW = "import os; print(os.environ['NUMBA_CACHE_DIR'])"
 
 
@@ -73,35 +75,47 @@ def test_old_folders_go_less_the_newest_few_and_those_in_use(tmp_path: Path) -> 
         folder = root / f"kernels-{age}"
         folder.mkdir(parents=True)
         (folder / "x.nbi").write_text("kernel")
-        (folder / "in-use").write_text("")
-        os.utime(folder / "in-use", (1e9 - age, 1e9 - age))
-    with (root / "kernels-5" / "in-use").open() as held:
-        cache._lock(held, shared=True)
+        (folder / "in-use-1").write_text("")
+        os.utime(folder / "in-use-1", (1e9 - age, 1e9 - age))
+    held = root / "kernels-5" / "in-use-2"
+    with FileLock(held):
+        os.utime(held, (1e9 - 9, 1e9 - 9))
         own = python(f"import stages.raster.kernels; {SHOW}", tmp_path)
     kept = {"kernels-0", "kernels-1", "kernels-5", Path(own).name}
-    assert {path.name for path in root.iterdir()} == kept
+    assert {path.name for path in root.glob("kernels-*")} == kept
     assert len(kept) == cache.KEPT + 1  # the one in use
 
 
-def test_only_this_room_imports_numba() -> None:
+def test_a_killed_process_does_not_keep_its_folder(tmp_path: Path) -> None:
+    code = f"import os, signal, stages.raster.kernels; {SHOW}; os.kill(os.getpid(), signal.SIGKILL)"
+    env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    env["XDG_CACHE_HOME"] = str(tmp_path / "cache")
+    subprocess.run([sys.executable, "-c", code], env=env, check=False, timeout=60)
+    (dead,) = (tmp_path / "cache" / "splat").glob("kernels-*/in-use-*")
+    own = Path(python(f"import stages.raster.kernels; {SHOW}", tmp_path))
+    assert own == dead.parent
+    assert not dead.exists()
+
+
+def test_only_this_package_imports_numba() -> None:
     """So that it never loads before its folder is set."""
     pattern = re.compile(r"^\s*(?:import|from) (?:numba|llvmlite)", re.M)
-    rooms = {
+    packages = {
         path.parent.name
         for path in (ROOT / "stages").rglob("*.py")
         if pattern.search(path.read_text("utf-8"))
     }
-    assert rooms == {"kernels"}
+    assert packages == {"kernels"}
 
 
-def test_a_change_in_any_room_with_kernels_makes_another_folder() -> None:
+def test_a_change_in_any_package_with_kernels_makes_another_folder() -> None:
     stages = ROOT / "stages"
     with_kernels = {
         path.relative_to(stages).parts[0]
         for path in stages.rglob("*.py")
         if "@kernel" in path.read_text("utf-8")
     }
-    assert with_kernels <= set(cache._ROOMS)
+    assert with_kernels == set(cache.PACKAGES)
 
 
 def test_what_is_compiled_is_known_kernel_by_kernel(tmp_path, monkeypatch) -> None:

@@ -1,0 +1,26 @@
+"""The `--format` option, which two stages share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import field
+from typing import Any
+
+from stages.formats.table import FORMATS
+from stages.surface.table import MESHES
+
+DEFAULT_FORMATS = ("ply", "splat", "glb", "usdz")
+ALL_MESHES = "mesh"  # a value of `--format`: every format of meshes
+CHOICES = (*FORMATS, ALL_MESHES, *MESHES)
+
+
+def rounding_formats(names: Iterable[str]) -> tuple[str, ...]:
+    """Those of the formats whose rounding needs fine-tuning, in the order of the table."""
+    chosen = set(names)
+    return tuple(n for n, row in FORMATS.items() if n in chosen and row.needs_finetuning)
+
+
+def formats_setting(default: tuple[str, ...], **metadata: Any) -> Any:
+    """The `formats` field of a stage's settings."""
+    help = "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply"
+    return field(default=default, metadata={"help": help, "choices": CHOICES, **metadata})

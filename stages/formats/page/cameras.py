@@ -1,0 +1,65 @@
+"""Our cameras, as the page takes them.
+
+The viewer turns content by 180 degrees about z, so that y down becomes y up; cameras are turned
+with it. Its own camera has x right, y up and looks along -z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Camera, Splats, View, split_held_out
+from stages.scene.framing import front_camera, median_depth
+from stages.scene.rotations import quaternions_of
+
+_VIEWER_FROM_WORLD = np.diag([-1.0, -1.0, 1.0])
+_CAMERA_FROM_VIEWERS = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class PageCamera:
+    """A place to look from. photo: the address of its photograph; "" without one. held_out:
+    whether training never saw it."""
+
+    name: str
+    camera: Camera
+    photo: str = ""
+    held_out: bool = False
+
+
+def page_cameras(views: Sequence[View], splats: Splats) -> tuple[PageCamera, ...]:
+    """The capture's cameras by name, without photographs; or one in front of the splats."""
+    if not views:
+        return (PageCamera("in front", front_camera(splats)),)
+    held = {view.name for view in split_held_out(tuple(views))[1]}
+    ordered = sorted(views, key=lambda view: view.name)
+    return tuple(PageCamera(view.name, view.camera, held_out=view.name in held) for view in ordered)
+
+
+def as_plain(shot: PageCamera, means: NDArray[np.floating]) -> dict[str, Any]:
+    """A shot as plain data. means [N, 3]: what it looks at, for the distance to turn around.
+
+    position, target: the viewer's world. rotation: x, y, z, w, from the viewer's camera to its
+    world. Lengths in pixels as in `Camera`.
+    """
+    camera = shot.camera
+    depth = median_depth(camera, means)
+    rotation = _VIEWER_FROM_WORLD @ camera.world_to_camera[:3, :3].T @ _CAMERA_FROM_VIEWERS
+    return {
+        "name": shot.name,
+        "photo": shot.photo,
+        "held_out": shot.held_out,
+        **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "position": _plain(_VIEWER_FROM_WORLD @ camera.centre),
+        "target": _plain(_VIEWER_FROM_WORLD @ (camera.centre + depth * camera.forward)),
+        "rotation": _plain(quaternions_of(rotation)[[1, 2, 3, 0]]),
+    }
+
+
+def _plain(values: NDArray[np.floating]) -> list[float]:
+    return [round(float(value), 9) for value in values]

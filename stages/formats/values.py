@@ -1,0 +1,216 @@
+"""Which splats a file can hold, and the change between our values and linear ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base import scratch
+from stages.base.bad_files import BadFileError
+from stages.base.blocks import blocks, reported_blocks
+from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
+from stages.scene import Splats
+
+LOG_SCALE_MIN = -87.0  # below it a scale is no normal float32 any more
+# What linear 0 and 1 become: alpha is drawn between 1/255 and 0.99, so neither can be told from
+# the exact value.
+LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
+_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
+
+_keeps_damage: ContextVar[bool] = ContextVar("keeps_damage", default=False)
+
+
+@contextmanager
+def nonfinite_allowed() -> Iterator[None]:
+    """Inside, readers hand out values that are not finite instead of refusing the file: for who
+    wants to know what is in it."""
+    token = _keeps_damage.set(True)
+    try:
+        yield
+    finally:
+        _keeps_damage.reset(token)
+
+
+def allows_nonfinite() -> bool:
+    return _keeps_damage.get()
+
+
+def drawable_rows(splats: Splats) -> NDArray[np.bool_]:
+    """[N] true where every value is finite, the scales can be squared in float32 and the
+    quaternion has a direction: the rule of our rasteriser. The others no viewer can draw."""
+    good = np.empty(len(splats), bool)
+    for rows in blocks(len(splats)):
+        good[rows] = _drawable(splats.take(rows))
+    return good
+
+
+def _drawable(splats: Splats) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore", over="ignore"):
+        good = np.isfinite(splats.means).all(axis=1)
+        good &= np.abs(splats.means).max(axis=1, initial=0.0) <= np.finfo(np.float32).max
+        good &= np.isfinite(splats.log_scales).all(axis=1)
+        good &= splats.log_scales.max(axis=1, initial=-np.inf) <= LOG_SCALE_MAX
+        good &= np.isfinite(splats.opacity_logits)
+        good &= np.isfinite(splats.sh).all(axis=(1, 2))
+        good &= np.abs(splats.sh).max(axis=(1, 2), initial=0.0) <= np.finfo(np.float32).max
+        largest = np.abs(splats.quaternions.astype(np.float64)).max(axis=1, initial=0.0)
+        good &= np.isfinite(largest) & (largest >= QUATERNION_MIN)
+    return np.asarray(good, bool)
+
+
+def drop_undrawable(splats: Splats) -> tuple[Splats, int]:
+    """(the drawable splats, how many were dropped)."""
+    kept = select_rows(splats, drawable_rows(splats))
+    return kept, len(splats) - len(kept)
+
+
+def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
+    """The rows where `keep` [N] is true, in their order."""
+    if keep.all():
+        return splats
+    count = int(keep.sum())
+    arrays: dict[str, Any] = {}
+    for name in _FIELDS:
+        values = getattr(splats, name)
+        arrays[name] = scratch.empty((count, *values.shape[1:]), values.dtype)
+    start = 0
+    for rows in reported_blocks(len(splats)):
+        mask = keep[rows]
+        there = slice(start, start + int(mask.sum()))
+        for name in _FIELDS:
+            arrays[name][there] = getattr(splats, name)[rows][mask]
+        start = there.stop
+    return replace(splats, **arrays)
+
+
+def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
+    """[N, 4] w, x, y, z of length 1; the norm is taken in float64, where 1e-20 squared is
+    not 0."""
+    unit = np.empty((len(quaternions), 4), np.float32)
+    for rows in blocks(len(quaternions)):
+        exact = quaternions[rows].astype(np.float64)
+        unit[rows] = exact / np.linalg.norm(exact, axis=1, keepdims=True)
+    return unit
+
+
+def linear_scales(splats: Splats) -> NDArray[np.float32]:
+    """[N, 3] standard deviations; never below the least normal float32, so that a logarithm
+    gives the scale back."""
+    scales = np.empty((len(splats), 3), np.float32)
+    for rows in blocks(len(splats)):
+        exact = np.maximum(splats.log_scales[rows].astype(np.float64), LOG_SCALE_MIN)
+        scales[rows] = np.exp(exact)
+    return scales
+
+
+def linear_opacities(splats: Splats) -> NDArray[np.float32]:
+    """[N] in [0, 1]."""
+    with np.errstate(over="ignore"):
+        return (1.0 / (1.0 + np.exp(-splats.opacity_logits.astype(np.float64)))).astype(np.float32)
+
+
+def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
+    """[N] the inverse of `linear_opacities`. Raises BadFileError for values outside [0, 1]."""
+    logits = np.empty(len(opacities), np.float32)
+    for rows in blocks(len(opacities)):
+        p = opacities[rows].astype(np.float64)
+        if not ((p >= 0) & (p <= 1)).all() and not allows_nonfinite():
+            raise BadFileError("opacities lie outside 0..1")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logits[rows] = np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX)
+    return logits
+
+
+def log_scales_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
+    """[N, 3] the inverse of `linear_scales`, of scales enlarged by `factor`; 0 (a flat splat)
+    becomes the least scale that a float32 keeps. Raises BadFileError for negative scales."""
+    logs = np.empty(scales.shape, np.float32)
+    for rows in blocks(len(scales)):
+        exact = scales[rows].astype(np.float64) * factor
+        if not (exact >= 0).all() and not allows_nonfinite():
+            raise BadFileError("scales are negative or not numbers")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs[rows] = np.maximum(np.log(exact), LOG_SCALE_MIN)
+    return logs
+
+
+def allocate(count: int, degree: int) -> Splats:
+    """`count` splats for a reader to fill, float32; what they hold is not defined."""
+    return Splats(
+        means=scratch.empty((count, 3)),
+        quaternions=scratch.empty((count, 4)),
+        log_scales=scratch.empty((count, 3)),
+        opacity_logits=scratch.empty((count,)),
+        sh=scratch.empty((count, (degree + 1) ** 2, 3)),
+        sh_degrees=np.zeros(count, np.uint8),
+    )
+
+
+def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """[N] the highest degree with a coefficient that is not 0, of `sh` [N, (L + 1)^2, 3]."""
+    degrees = np.zeros(len(sh), np.uint8)
+    for rows in blocks(len(sh)):
+        for degree in range(1, round(sh.shape[1] ** 0.5)):
+            band = sh[rows, degree * degree : (degree + 1) ** 2]
+            degrees[rows][(band != 0).any(axis=(1, 2))] = degree
+    return degrees
+
+
+def check_finite(splats: Splats) -> Splats:
+    """What a reader hands out: infinite opacity and scale logarithms made finite in their place
+    (files hold them for opaque and for flat splats), and the degree of each splat found.
+
+    Raises BadFileError if any other value is not finite: such a file is damaged, and silence would
+    move or lose splats.
+    """
+    for rows in blocks(len(splats)):
+        logits, logs = splats.opacity_logits[rows], splats.log_scales[rows]
+        flat, opaque = np.isneginf(logs), np.isinf(logits)
+        logs[flat] = LOG_SCALE_MIN
+        logits[opaque] = np.clip(logits[opaque], LOGIT_MIN, LOGIT_MAX)
+        np.clip(logits, -1e30, 1e30, out=logits)
+    clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
+        bad = count_nonfinite(getattr(clean, name))
+        if bad and not allows_nonfinite():
+            raise BadFileError(f"{bad} values of {name} are not finite numbers")
+    return clean
+
+
+def count_nonfinite(values: NDArray[np.floating]) -> int:
+    """How many of `values` are NaN or infinite."""
+    return sum(
+        int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)) if values.size
+    )
+
+
+def concatenate(parts: Sequence[Splats]) -> Splats:
+    """All rows of `parts`, at the highest SH degree among them, with the origin 0."""
+    if len(parts) == 1:
+        return replace(parts[0], origin=np.zeros(3))
+    if not parts:
+        return allocate(0, 0)
+    count, width = sum(map(len, parts)), max(part.sh.shape[1] for part in parts)
+    arrays: dict[str, Any] = {}
+    for name in _FIELDS:
+        values = getattr(parts[0], name)
+        shape = (width, 3) if name == "sh" else values.shape[1:]
+        arrays[name] = scratch.empty((count, *shape), values.dtype)
+    start = 0
+    for part in parts:
+        for rows in reported_blocks(len(part)):
+            for name in _FIELDS:
+                values = getattr(part, name)[rows]
+                out = arrays[name][start + rows.start : start + rows.stop]
+                if name == "sh":
+                    out[:, values.shape[1] :] = 0
+                    out = out[:, : values.shape[1]]
+                out[...] = values
+        start += len(part)
+    return Splats(**arrays)

@@ -1,0 +1,171 @@
+"""Two runs of the same photographs, compared view by view: `report.html` and `compare.csv`."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stages.base.atomic import replacing
+from stages.base.errors import Family, SplatError
+from stages.base.text import counted
+from stages.measure.bootstrap import Difference, paired_difference
+from stages.measure.evaluation import (
+    EvaluationView,
+    Score,
+    evaluate,
+    image_renderer,
+    load_evaluation_views,
+)
+from stages.measure.tradeoff import html
+from stages.measure.tradeoff.curves import mean_db, psnr_change
+from stages.scene import Reconstruction, Splats, View, split_held_out
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One of the two runs. facts: further lines of the report, text by name."""
+
+    name: str
+    splats: Splats
+    reconstruction: Reconstruction
+    backend: str
+    facts: dict[str, str]
+
+    @property
+    def held_out(self) -> dict[str, View]:
+        """The held-out views of this run by name."""
+        return {view.name: view for view in split_held_out(self.reconstruction.views)[1]}
+
+    def side_px(self, name: str) -> int:
+        """Longer side of the held-out view `name`, as this run draws it."""
+        camera = self.splats.draw_settings.camera(self.held_out[name].camera)
+        return max(camera.width, camera.height)
+
+    def views(self, names: Sequence[str], side_px: int) -> tuple[EvaluationView, ...]:
+        """The held-out views `names` with this run's cameras. Raises SplatError."""
+        held_out, settings = self.held_out, replace(self.splats.draw_settings, side=side_px)
+        chosen = [held_out[name] for name in names]
+        return tuple(load_evaluation_views(self.reconstruction.folder, chosen, settings))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two candidates on the same held-out views.
+
+    Args:
+        candidates: the first and the second.
+        views: of each, in the same order.
+        scores: of each, in that order.
+        psnr, ssim: of the second less the first.
+        side_px: longer side of every picture.
+    """
+
+    candidates: tuple[Candidate, Candidate]
+    views: tuple[tuple[EvaluationView, ...], tuple[EvaluationView, ...]]
+    scores: tuple[tuple[Score, ...], tuple[Score, ...]]
+    psnr: Difference
+    ssim: Difference
+    side_px: int
+
+
+def compare_runs(first: Candidate, second: Candidate) -> Comparison:
+    """Evaluate both on the views that both hold out, at the smaller size of the two, each with its
+    own run's camera. Raises SplatError (compare-nothing-in-common)."""
+    names = sorted(first.held_out.keys() & second.held_out.keys())
+    if not names:
+        raise SplatError(
+            "compare-nothing-in-common",
+            given=f"No photograph is held out of both {first.name} and {second.name}.",
+            wanted="Photographs that neither run was trained on, to compare them by.",
+            hint="Make both runs of the same photographs, four or more.",
+            family=Family.USAGE,
+        )
+    both = (first, second)
+    side_px = min(one.side_px(name) for one in both for name in names)
+    views = (first.views(names, side_px), second.views(names, side_px))
+    a, b = (
+        tuple(evaluate(image_renderer(one.splats, one.backend), seen))
+        for one, seen in zip(both, views, strict=True)
+    )
+    ssim = np.array([two.ssim - one.ssim for one, two in zip(a, b, strict=True)])
+    return Comparison(both, views, (a, b), psnr_change(b, a), paired_difference(ssim), side_px)
+
+
+def verdict_lines(comparison: Comparison) -> list[str]:
+    """Whether the second candidate is better, and how sure that is."""
+    change, (a, b) = comparison.psnr, comparison.candidates
+    interval, ssim = (
+        f"95 %: {d.low:+.{digits}f} to {d.high:+.{digits}f}" if d.views > 1 else "one view"
+        for d, digits in ((change, 2), (comparison.ssim, 4))
+    )
+    return [
+        f"{b.name} against {a.name}: {change.mean:+.2f} dB ({interval}): {change.verdict}.",
+        f"SSIM: {comparison.ssim.mean:+.4f} ({ssim}): {comparison.ssim.verdict}.",
+        f"Measured on {counted(change.views, 'held-out view')}, {comparison.side_px} pixels large. "
+        "Each is one run: the interval does not say whether the same settings would be better with "
+        "another seed.",
+    ]
+
+
+def fact_rows(comparison: Comparison) -> list[tuple[str, str, str]]:
+    """(name, of the first, of the second)."""
+    first, second = (candidate.facts for candidate in comparison.candidates)
+    means = [mean_db(scores) for scores in comparison.scores]
+    rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in first | second]
+    return [("held-out PSNR", f"{means[0]:.2f} dB", f"{means[1]:.2f} dB"), *rows]
+
+
+def distinct_name(folder: Path, other: Path) -> str:
+    """A run folder's own name, with its parent's where the other folder has the same."""
+    here, there = folder.absolute(), other.absolute()
+    return here.name if here.name != there.name else f"{here.parent.name}/{here.name}"
+
+
+def write_comparison(folder: Path, comparison: Comparison) -> list[Path]:
+    """Write the report and the table into `folder`, which exists. Raises SplatError."""
+    a, b = (candidate.name for candidate in comparison.candidates)
+    pairs = list(zip(*comparison.scores, strict=True))
+    table = folder / "compare.csv"
+    with replacing(table) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        names = ("first_psnr_db", "second_psnr_db", "first_ssim", "second_ssim")
+        writer.writerow(("photograph", *names))
+        for one, two in pairs:
+            figures = (one.psnr_db, two.psnr_db, one.ssim, two.ssim)
+            writer.writerow((one.name, *(f"{x:.5f}" for x in figures)))
+    report = folder / "report.html"
+    rows = [
+        (
+            one.name,
+            *(f"{score.psnr_db:.2f} dB" for score in (one, two)),
+            f"{two.psnr_db - one.psnr_db:+.2f} dB",
+        )
+        for one, two in pairs
+    ]
+    parts = [
+        html.paragraphs(verdict_lines(comparison)),
+        html.heading("The runs"),
+        html.table(("", a, b), fact_rows(comparison)),
+        html.heading("Photograph by photograph"),
+        html.table(("photograph", f"{a}, PSNR", f"{b}, PSNR", "change"), rows),
+        html.heading("Side by side"),
+        *_pictures(comparison),
+    ]
+    html.write_page(report, f"{a} and {b}", parts)
+    return [report, table]
+
+
+def _pictures(comparison: Comparison) -> list[str]:
+    draw = [image_renderer(one.splats, one.backend) for one in comparison.candidates]
+    rows = []
+    for i, seen in enumerate(zip(*comparison.views, strict=True)):
+        shown = [(f"{seen[0].name}: the photograph", seen[0].image)]
+        for k, candidate in enumerate(comparison.candidates):
+            caption = f"{candidate.name}, {comparison.scores[k][i].psnr_db:.2f} dB"
+            shown.append((caption, draw[k](seen[k].camera)))
+        rows.append(html.pictures(shown))
+    return rows

@@ -1,0 +1,170 @@
+"""What masks and transparency leave of a photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from stages.base.errors import SplatError
+from stages.photos.decode import FORMATS, MAX_MEGAPIXELS, UPRIGHT, Decoded
+from stages.photos.masks import FOLDER
+from stages.scene import IGNORE, TRANSPARENT, Photo
+from stages.scene.capture import PHOTOS_FOLDER
+
+AUTO = "auto"
+SAME_SHAPE = 0.03  # sides in another proportion than that: a mask of something else
+LEAST_SHARE = 1e-3  # of a photograph; with less inside, nothing is left of it
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class MaskedPhoto:
+    """A photograph and what of it counts. decoded: over black where nothing is. mask [H, W], 0 is
+    outside, and outside: as in `scene.Photo`; None where everything counts. scaled: whether a mask
+    file had another size. share: of the photograph that is inside."""
+
+    decoded: Decoded
+    mask: NDArray[np.uint8] | None = None
+    outside: str = ""
+    scaled: bool = False
+    share: float = 1.0
+
+    @classmethod
+    def of(
+        cls, decoded: Decoded, name: str, file: Path | None, invert: bool, means: str
+    ) -> MaskedPhoto:
+        """From the photograph's alpha and the mask in `file`, white inside (or black: invert).
+
+        means: IGNORE, TRANSPARENT, or AUTO: what the file masks is ignored, what alpha does is
+        empty. Raises SplatError "mask-unfit", which names the photograph.
+        """
+        if file is None and decoded.alpha is None:
+            return cls(decoded)
+        mask, scaled = decoded.alpha, False
+        if file is not None:
+            kept, scaled = _read(file, name, invert, decoded)
+            solid = np.uint8(255) if mask is None else mask
+            mask = np.where(kept, solid, np.uint8(0))
+        assert mask is not None
+        outside = means if means != AUTO else TRANSPARENT if file is None else IGNORE
+        if outside == TRANSPARENT and file is not None:
+            black = np.where(mask[..., None] > 0, decoded.pixels, np.uint8(0))
+            decoded = replace(decoded, pixels=black, as_it_was=None)
+        return cls(decoded, mask, outside, scaled, float(np.mean(mask > 127)))
+
+    def file(self, image: str) -> str:
+        """Where the mask of the normalised picture `image` goes; "" without one."""
+        return f"{FOLDER}/{image.removeprefix(PHOTOS_FOLDER)}.png" if self.outside else ""
+
+
+def check_shares(photos: Sequence[Photo], shares: Sequence[float], files: bool) -> None:
+    """shares: of each photograph that is inside its mask. files: whether masks came as files.
+
+    Raises SplatError "mask-empty" where a mask leaves nothing, "mask-full" where no mask of a
+    capture masks anything.
+    """
+    empty = [p.name for p, share in zip(photos, shares, strict=True) if share < LEAST_SHARE]
+    if empty:
+        raise SplatError(
+            "mask-empty",
+            given=f"Masks leave nothing of {_listed(empty)}.",
+            wanted="White where a photograph counts, black elsewhere.",
+            hint="Take these photographs away; if black is where they count, add --invert-masks.",
+        )
+    masked = [share for photo, share in zip(photos, shares, strict=True) if photo.mask]
+    if files and masked and min(masked) == 1.0:
+        names = [photo.name for photo in photos if photo.mask]
+        raise SplatError(
+            "mask-full",
+            given=f"Masks take nothing away from any photograph: {_listed(names)}.",
+            wanted="White where a photograph counts, black elsewhere.",
+            hint="Check the masks, or take them away.",
+        )
+
+
+def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArray[np.bool_], bool]:
+    """([H, W] what the mask keeps, whether it had another size than the photograph's file).
+
+    A mask that lies as the file does is turned with it. Raises SplatError "mask-unfit".
+    """
+    image, stored = _opened(path, name), decoded.stored
+    turn = UPRIGHT.get(decoded.exif.orientation)
+    upright = (stored[1], stored[0]) if turn in _QUARTERS else stored
+    if (
+        turn is not None
+        and turn in _QUARTERS
+        and _alike(image.size, stored)
+        and not _alike(image.size, upright)
+    ):
+        image = image.transpose(turn)
+    if not _alike(image.size, upright):
+        sizes = f"{image.width} x {image.height}, the photograph {upright[0]} x {upright[1]}"
+        raise _unfit(path, name, f"it is {sizes}")
+    values = _values(image)
+    kept = values > 0.5 * max(float(values.max()), 1.0)
+    if invert:
+        kept = ~kept
+    height, width = decoded.pixels.shape[:2]
+    resized = cv2.resize(
+        kept.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST_EXACT
+    )
+    return np.asarray(resized > 0), image.size != upright
+
+
+_QUARTERS = (
+    Image.Transpose.TRANSPOSE,
+    Image.Transpose.ROTATE_270,
+    Image.Transpose.TRANSVERSE,
+    Image.Transpose.ROTATE_90,
+)
+
+
+def _opened(path: Path, name: str) -> Image.Image:
+    readable = [kind for kind in FORMATS if kind in Image.OPEN]
+    try:
+        with Image.open(path, formats=readable) as image:
+            if image.width * image.height <= MAX_MEGAPIXELS * 1_000_000:
+                image.load()
+                return image.copy()
+    except Exception as error:  # decoders raise whatever the damage leads to
+        denied = isinstance(error, PermissionError)
+        why = "it may not be read" if denied else "it is damaged, or no picture"
+        raise _unfit(path, name, why) from error
+    raise _unfit(path, name, f"it has more than {MAX_MEGAPIXELS} megapixels")
+
+
+def _values(image: Image.Image) -> NDArray[np.float32]:
+    """[H, W] brightness; of a picture that is one colour all over, its alpha if it has one."""
+    if image.mode in ("P", "PA") or "transparency" in image.info:
+        image = image.convert("RGBA")
+    if image.mode in ("RGBA", "LA"):
+        alpha = np.asarray(image.getchannel("A"), np.float32)
+        colour = np.asarray(image.convert("RGBA").convert("L"), np.float32)
+        return alpha if np.ptp(colour) == 0 else np.minimum(colour, alpha)
+    grey = image if image.mode in ("1", "L") or image.mode[0] in "IF" else image.convert("L")
+    return np.asarray(grey, np.float32)
+
+
+def _alike(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
+    """Whether both have the same proportions, to a few hundredths."""
+    return abs(size[0] * wanted[1] / (size[1] * wanted[0]) - 1.0) < SAME_SHAPE
+
+
+def _unfit(path: Path, name: str, why: str) -> SplatError:
+    return SplatError(
+        "mask-unfit",
+        given=f"{path}, the mask of {name}, cannot be used: {why}.",
+        wanted="A grey picture with its photograph's proportions, white where that counts.",
+        hint="Masks of another capture? Name their folder with --masks, or take them away.",
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + rest

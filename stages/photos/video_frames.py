@@ -1,0 +1,117 @@
+"""Photographs out of a video: it is read once to measure its frames and once to keep the chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from stages.base.errors import Interrupted
+from stages.base.stage import Report
+from stages.base.text import counted
+from stages.photos.decode import Decoded
+from stages.photos.exif import Exif
+from stages.photos.find import Source
+from stages.photos.frame_selection import (
+    BLURRED_BELOW,
+    MEASURED_SIDE_PX,
+    MOST,
+    STEP,
+    WIDEST_GAP,
+    Chosen,
+    Seen,
+    Watcher,
+    choose,
+)
+from stages.photos.video import Video
+
+
+def photographs(
+    source: Source, wanted: int, max_side: int, report: Report
+) -> Iterator[tuple[str, Decoded]]:
+    """(name within the video, picture) of the chosen frames, at most `wanted`; 0: as the motion
+    asks. Which and why goes into the report's metric "videos".
+
+    Raises Unusable for a file without pictures that decode, and Interrupted.
+    """
+    video = Video(source.path)
+    seen, colours = _measured(video, source.name, report)
+    chosen = choose(seen, wanted)
+    facts = _facts(source.name, video, seen, chosen, colours)
+    report.metric("videos", [*report.metrics.get("videos", []), facts])
+    _tell(source.name, video, seen, chosen, colours, wanted == 0, report)
+    numbers = {one.number for one in chosen}
+    for frame in video.frames():
+        if frame.number in numbers:
+            _tick(report, frame.number, len(seen), f"taking frames of {source.name}")
+            yield f"{frame.number:06d}.jpg", Decoded(frame.srgb(max_side), frame.size, Exif())
+        if frame.number >= chosen[-1].number:
+            return
+
+
+def _measured(video: Video, name: str, report: Report) -> tuple[list[Seen], str]:
+    """(every frame, how its colours come to sRGB)."""
+    watcher, seen, colours = Watcher(), [], ""
+    total = video.about_frames()
+    for frame in video.frames():
+        _tick(report, frame.number, max(total, frame.number + 1), f"looking through {name}")
+        colours = frame.colours.words
+        seen.append(watcher.see(frame.grey(MEASURED_SIDE_PX), frame.seconds))
+    return seen, colours
+
+
+def _tick(report: Report, done: int, total: int, label: str) -> None:
+    if report.stop_requested.is_set():
+        raise Interrupted(f"stopped at frame {done} of about {total}")
+    report.progress(done, total, label)
+
+
+def _facts(
+    name: str, video: Video, seen: list[Seen], chosen: list[Chosen], colours: str
+) -> dict[str, Any]:
+    """For the manifest: which frames and why."""
+    return {
+        "name": name,
+        "frames": len(seen),
+        "seconds": round(seen[-1].seconds, 3),
+        "damaged_packets": video.damaged,
+        "missing_seconds": round(video.missing_s, 1),
+        "colours": colours,
+        "chosen_by": f"the sharpest in each stretch of equal motion; a frame is blurred below "
+        f"{BLURRED_BELOW} of its neighbours' sharpness, and taken only where the picture would "
+        f"move by more than {WIDEST_GAP} of its longer side without it",
+        "chosen": [vars(one) for one in chosen],
+    }
+
+
+def _tell(
+    name: str,
+    video: Video,
+    seen: list[Seen],
+    chosen: list[Chosen],
+    colours: str,
+    automatic: bool,
+    report: Report,
+) -> None:
+    if video.missing_s or video.damaged:
+        lost = f", {video.missing_s:.0f} s at its end are missing" if video.missing_s else ""
+        report.warn(
+            "ingest-video-damaged",
+            f"{name} is damaged{lost}: {counted(len(seen), 'frame')} could be read, as far as "
+            f"{seen[-1].seconds:.1f} s. Copy it from the camera again.",
+        )
+    if "BT.2100" in colours:
+        report.warn("ingest-video-hdr", f"{name} is of high dynamic range: {colours}.")
+    blurred = [one for one in chosen if one.sharpness < BLURRED_BELOW]
+    if blurred:
+        at = ", ".join(f"{one.seconds:.1f} s" for one in blurred[:8])
+        report.warn(
+            "ingest-video-blurred",
+            f"{name} has no sharp frame near {at}. Move more slowly, with more light.",
+        )
+    moved = sum(one.moved for one in chosen)
+    if automatic and moved > 2 * STEP * MOST:
+        report.warn(
+            "ingest-video-long",
+            f"{name} moves so far that its {len(chosen)} frames are {moved / len(chosen):.2f} of a "
+            "picture apart. --frames takes more.",
+        )

@@ -1,0 +1,45 @@
+"""The turn between our y-down world and y-up formats: 180 degrees about x.
+
+(x, y, z) becomes (x, -y, -z). It is its own inverse, and costs no precision: every value changes
+its sign or nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from stages.scene import Splats
+
+FLIP = np.array([1.0, -1.0, -1.0])
+
+# Each real spherical harmonic is a polynomial in the direction; its sign under y -> -y, z -> -z,
+# in the order m = -l..l (Kerbl et al. 2023, and KHR_gaussian_splatting appendix A):
+# 1 | y z x | xy yz 2zz-xx-yy xz xx-yy |
+# y(3xx-yy) xyz y(4zz-xx-yy) z(2zz-3xx-3yy) x(4zz-xx-yy) z(xx-yy) x(xx-3yy)
+SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+
+# Rotating by q after a half turn h gives h q. We store h q h* instead: the factor h* turns the
+# ellipsoid by 180 degrees about one of its own axes, which it does not notice, and an unrotated
+# splat stays unrotated.
+_QUATERNION_SIGNS = np.array([1, 1, -1, -1], np.float32)
+
+
+def flipped(splats: Splats, *, reuse: bool = False) -> Splats:
+    """The splats in the other frame (y down to y up, and back).
+
+    reuse: into the arrays that they come in, for a caller who needs those no more.
+    """
+    signs = {
+        "means": FLIP.astype(splats.means.dtype),
+        "quaternions": _QUATERNION_SIGNS,
+        "sh": SH_SIGNS[: splats.sh.shape[1], None],
+    }
+    arrays = {}
+    for name, sign in signs.items():
+        values = getattr(splats, name)
+        with np.errstate(invalid="ignore"):  # a damaged file's NaN; `checked` refuses it
+            arrays[name] = np.multiply(values, sign, out=values if reuse else None)
+    # + 0.0: an origin of -0 would be written as such
+    return replace(splats, **arrays, origin=splats.origin * FLIP + 0.0)

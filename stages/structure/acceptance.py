@@ -1,0 +1,114 @@
+"""Which model of the attempts is used; the error if there is none, and the warnings if there is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from stages.base.errors import Family, SplatError
+from stages.base.stage import Report
+from stages.scene import Capture
+from stages.structure.fallbacks import Attempt, best_attempt
+from stages.structure.gates import Thresholds, borderline_failures
+from stages.structure.sparse_model import SparseModel
+
+_FEWEST_PARTIAL_POINTS = 50
+_MOST_NAMES = 12  # photographs that a message names
+
+
+def accepted_model(attempts: list[Attempt], capture: Capture, allow_partial: bool) -> SparseModel:
+    """The model of the best attempt. Raises SplatError if it failed a gate, unless `allow_partial`
+    and the model has enough photographs and points."""
+    best = best_attempt(attempts)
+    model = best.result.model if best.result is not None else None
+    if model is not None and len(model.names) >= Thresholds().fewest_views:
+        enough = len(model.points) >= _FEWEST_PARTIAL_POINTS
+        if best.passed or (enough and allow_partial):
+            return model
+    worst = best.failures[0]
+    groups = best.result.groups if best.result is not None else ()
+    code, given = worst.code, worst.given
+    if code == "sfm-too-few-registered" and len(groups) > 1:
+        code = "sfm-separate-groups"
+        names = {photo.image: photo.name for photo in capture.photos}
+        described = "; ".join(
+            f"{len(group)} ({_listed(sorted(names[image] for image in group), 3)})"
+            for group in groups[:4]
+        )
+        given += f" The largest models are of: {described}."
+    raise SplatError(
+        code, given=given, wanted=worst.wanted, hint=worst.hint, family=Family.RECONSTRUCTION
+    )
+
+
+def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -> None:
+    """Warnings about the model of the best attempt."""
+    best = best_attempt(attempts)
+    assert best.result is not None
+    assert best.result.model is not None
+    registered = set(best.result.model.names)
+    missing = [photo.name for photo in capture.photos if photo.image not in registered]
+    if missing:
+        report.warn(
+            "sfm-photographs-left-out",
+            f"{len(missing)} of {len(capture.photos)} photographs could not be registered and "
+            f"{'is' if len(missing) == 1 else 'are'} not used: {_listed(missing)}. More overlap "
+            "with the others would help.",
+        )
+    if len(best.result.groups) > 1:
+        sizes = ", ".join(str(len(group)) for group in best.result.groups)
+        report.warn(
+            "sfm-several-models",
+            f"The photographs were registered in separate models of {sizes}; the largest is used.",
+        )
+    if best.passed and best is not attempts[0]:
+        report.warn(
+            "sfm-second-try",
+            f"The standard configuration failed ({attempts[0].failures[0].given}) but another one "
+            f"passed: {best.configuration.name}. Check the result with care.",
+        )
+    failed = {failure.code for failure in best.failures}
+    for failure in borderline_failures(best.statistics):
+        if failure.code not in failed:
+            report.warn(failure.code, f"{failure.given} {failure.wanted} {failure.hint}")
+    for failure in best.failures:
+        report.warn(
+            failure.code, f"Accepted because of --allow-partial: {failure.given} {failure.wanted}"
+        )
+
+
+def report_metrics(best: Attempt, model: SparseModel, report: Report) -> None:
+    """The metrics of the attempt that is used, and of its `model`."""
+    statistics = best.statistics
+    report.metric("mean_track_length", round(statistics.mean_track_length, 3))
+    report.metric(
+        "median_triangulation_angle_deg", round(statistics.median_triangulation_angle_deg, 2)
+    )
+    report.metric("baseline_over_depth", round(statistics.baseline_over_depth, 4))
+    report.metric("keypoints_median", best.keypoints_median)
+    report.metric("focal_px", [round(float(f), 2) for f in model.camera_params[:, 0]])
+    report.metric("distortion", [round(float(k), 5) for k in model.camera_params[:, 3]])
+    report.metric("configuration", best.configuration.name)
+    report.metric("pairs_matched", best.pairs_matched)
+    report.metric("pairs_verified", best.pairs_verified)
+
+
+def attempt_metrics(attempt: Attempt) -> dict[str, Any]:
+    """One attempt as JSON values."""
+    statistics = {
+        name: round(value, 4) if isinstance(value, float) else value
+        for name, value in asdict(attempt.statistics).items()
+    }
+    return {
+        "configuration": attempt.configuration.name,
+        "passed": attempt.passed,
+        "failures": [failure.code for failure in attempt.failures],
+        "keypoints_median": attempt.keypoints_median,
+        **statistics,
+    }
+
+
+def _listed(names: Sequence[str], most: int = _MOST_NAMES) -> str:
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + rest

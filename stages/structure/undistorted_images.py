@@ -1,0 +1,130 @@
+"""Undistorted pictures and masks of a reconstruction, as files."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stages.base.atomic import replacing
+from stages.base.errors import Interrupted, SplatError
+from stages.base.stage import Report
+from stages.scene import TRANSPARENT, Camera, Photo
+from stages.structure.undistortion import (
+    AnyLens,
+    remap_tables,
+    undistorted_camera,
+    visible_share,
+)
+
+IMAGES = "colmap/images"
+MASKS = "colmap/masks"
+_JPEG = (
+    *(cv2.IMWRITE_JPEG_QUALITY, 97),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+)
+
+_Tables = tuple[np.ndarray, np.ndarray]
+
+
+def mask_file(photo: Photo) -> str:
+    """Path of a photograph's undistorted mask in the reconstruction; "" without one."""
+    return f"{MASKS}/{photo.picture}.png" if photo.mask else ""
+
+
+def write_undistorted_images(
+    photos: Sequence[Photo],
+    cameras: Sequence[Camera],
+    lenses: Sequence[AnyLens],
+    source: Path,
+    folder: Path,
+    report: Report,
+) -> tuple[list[Camera], float]:
+    """Write undistorted pictures and masks. A photograph without distortion is copied unchanged.
+
+    Args:
+        photos: V photographs.
+        cameras, lenses: [V] of the photographs as they were taken.
+        source: the folder of the capture.
+        folder: the folder of the reconstruction.
+        report: receives progress.
+
+    Returns:
+        The pinhole cameras [V] and the mean share of the photographs that their pictures show.
+
+    Raises Interrupted, and SplatError "sfm-photo-unreadable".
+    """
+    pinholes, shares = [], []
+    known: dict[tuple[object, ...], tuple[Camera, float]] = {}
+    tables: dict[tuple[object, ...], _Tables] = {}  # of the last camera: they are large
+    for done, (photo, camera, lens) in enumerate(zip(photos, cameras, lenses, strict=True)):
+        if report.stop_requested.is_set():
+            raise Interrupted
+        report.progress(done, len(photos), "undistorting", photographs=done)
+        key = (lens, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        if key not in known:
+            pinhole = undistorted_camera(camera, lens)
+            known[key] = pinhole, visible_share(camera, lens, pinhole)
+        pinhole, share = known[key]
+        pinholes.append(replace(pinhole, world_to_camera=camera.world_to_camera))
+        shares.append(share)
+        if lens.bends and key not in tables:
+            tables = {key: remap_tables(camera, lens, pinhole)}
+        _write_picture(photo, source, folder, tables[key] if lens.bends else None)
+        _write_mask(photo, source, folder, tables[key] if lens.bends else None)
+    report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
+    return pinholes, float(np.mean(shares))
+
+
+def _write_picture(photo: Photo, source: Path, folder: Path, tables: _Tables | None) -> None:
+    image = _read(source / photo.image)
+    target = folder / IMAGES / photo.picture
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if tables is None:
+        with replacing(target) as partial:
+            shutil.copyfile(source / photo.image, partial)
+    else:
+        _encode(target, cv2.remap(image, *tables, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _write_mask(photo: Photo, source: Path, folder: Path, tables: _Tables | None) -> None:
+    if not photo.mask:
+        return
+    mask = _read(source / photo.mask)[..., 0]
+    if tables is not None:
+        soft = cv2.INTER_LINEAR if photo.outside == TRANSPARENT else cv2.INTER_NEAREST
+        mask = cv2.remap(mask, *tables, interpolation=soft, borderMode=cv2.BORDER_REPLICATE)
+    target = folder / mask_file(photo)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _encode(target, mask)
+
+
+def _read(path: Path) -> np.ndarray:
+    try:
+        data = np.fromfile(path, np.uint8)  # cv2.imread fails on some paths under Windows
+    except OSError:
+        data = np.empty(0, np.uint8)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if data.size else None
+    if image is None:
+        raise SplatError(
+            "sfm-photo-unreadable",
+            given=f"{path} cannot be read any more.",
+            wanted="The pictures that ingest wrote must stay as they are.",
+            hint="Run `splat ingest` again.",
+        )
+    return image
+
+
+def _encode(path: Path, image: np.ndarray) -> None:
+    """As PNG or JPEG, by the suffix: lossless photographs stay lossless."""
+    if path.suffix.lower() == ".png":
+        encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1]
+    else:
+        encoded = cv2.imencode(".jpg", image, _JPEG)[1]
+    with replacing(path) as partial:
+        encoded.tofile(partial)

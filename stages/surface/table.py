@@ -1,0 +1,36 @@
+"""The table of mesh formats: one row for each. Reading it imports nothing.
+
+To add a format, write `write(path, mesh, units)` in a module here and an independent reader in
+`files`, name both in a row of `MESHES`, and extend the pattern of mesh names in
+`stages.formats.table`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MeshFormat:
+    """One mesh format. Functions are named as "module:function", imported at their first use.
+
+    Attributes:
+        ending: what a file's name ends in, without the dot; also the value of `--format`.
+        writer: (path, mesh, units) -> None.
+        independent_reader: (path) -> (vertices [V, 3], faces [F, 3]) in the world's axes. It shares
+            no code with the writer and may raise anything.
+        y_up: whether the file's axes are y up, turned 180 degrees about x from ours.
+        opens_in, keeps: two cells of README's table.
+    """
+
+    ending: str
+    writer: str
+    independent_reader: str
+    y_up: bool = False
+    opens_in: str = "game engines, mesh tools"
+    keeps: str = "no splats: triangles to collide with, see below"
+
+
+_GLB = MeshFormat("mesh.glb", "stages.surface.gltf:write", "stages.surface.files:read_glb", True)
+_PLY = MeshFormat("mesh.ply", "stages.surface.ply:write", "stages.surface.files:read_ply")
+MESHES = {row.ending: row for row in (_GLB, _PLY)}

@@ -1,0 +1,203 @@
+"""Tables of the documentation that are made from the code's registries.
+
+python -m tests.docs_tables writes them between `<!-- begin: NAME -->` and `<!-- end -->` of each
+page; tests/test_docs.py fails when a page is stale.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import itertools
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages import STAGE_NAMES, load_stage
+from stages.base.settings import settings_of
+from tests.layers import LAYERS, STAGE_FILES
+
+if TYPE_CHECKING:
+    from stages.formats.table import Format
+    from stages.surface.table import MeshFormat
+
+ROOT = Path(__file__).parent.parent
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+_BLOCK = re.compile(r"(<!-- begin: ([\w-]+) -->\n).*?(<!-- end -->)", re.S)
+
+Rows = Sequence[tuple[str, ...]]
+
+
+def _table(head: tuple[str, ...], rows: Rows) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _first_sentence(path: Path) -> str:
+    """The first paragraph of a module's docstring."""
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return " ".join(text.split("\n\n")[0].split()).replace("|", r"\|")
+
+
+def _path_of(module: str) -> Path:
+    found = ROOT.joinpath(*module.split("."))
+    return found / "__init__.py" if found.is_dir() else found.with_suffix(".py")
+
+
+def layers() -> str:
+    rows: list[tuple[str, ...]] = []
+    for number, packages in enumerate(LAYERS):
+        for package in packages:
+            if package == "stages":
+                continue
+            stage = package.removeprefix("stages.") in STAGE_FILES
+            path = _path_of(package)
+            name = f"{package.replace('.', '/')}{'.py' if path.name != '__init__.py' else '/'}"
+            title = "one stage: " if stage else ""
+            rows.append((str(number), f"`{name}`", title + _first_sentence(path)))
+    return _table(("layer", "package", "contents"), rows)
+
+
+def modules(package: str) -> str:
+    folder = ROOT / package
+    found = sorted(folder.glob("*.py"))
+    rows = [(f"`{p.name}`", _first_sentence(p)) for p in found if p.name != "__init__.py"]
+    return _table((f"module of `{package}/`", "contents"), rows)
+
+
+def stages() -> str:
+    rows: list[tuple[str, ...]] = []
+    for number, name in enumerate(STAGE_NAMES, 1):
+        stage = load_stage(name)
+        rows.append(
+            (
+                f"`{number}-{name}`",
+                f"`stages/{name}.py`",
+                ", ".join(stage.reads) or "the photographs",
+                str(stage.version),
+                ", ".join(f"`{setting.flag}`" for setting in settings_of(stage.settings_type)),
+            )
+        )
+    return _table(("folder", "module", "reads", "version", "options"), rows)
+
+
+def _formats() -> list[Format | MeshFormat]:
+    from stages.formats.table import TABLE
+    from stages.surface.table import MESHES
+
+    return [*TABLE, *MESHES.values()]
+
+
+def formats() -> str:
+    rows: list[tuple[str, ...]] = []
+    same = itertools.groupby(_formats(), lambda row: (row.opens_in, row.keeps, row.y_up))
+    for (opens_in, keeps, y_up), group in same:
+        names = ", ".join(f"`{row.ending}`" for row in group)
+        rows.append((names, opens_in, f"{keeps}{'; y up' if y_up else ''}"))
+    return _table(("`--format`", "opens in", "keeps"), rows)
+
+
+def format_modules() -> str:
+    rows: list[tuple[str, ...]] = []
+    for row in _formats():
+        places = (row.writer, getattr(row, "reader", ""))
+        cells = (f"`{place.replace(':', '` `')}`" if place else "none" for place in places)
+        rows.append((f"`{row.ending}`", *cells))
+    return _table(("format", "writer", "reader"), rows)
+
+
+def cameras() -> str:
+    from stages.cameras.table import CAMERA_FILES
+
+    rows: list[tuple[str, ...]] = []
+    for row in CAMERA_FILES:
+        module = importlib.import_module(f"stages.cameras.{row.module}")
+        points = "yes" if hasattr(module, "read_points") else "no"
+        rows.append((row.what, points, f"`stages/cameras/{row.module}.py`"))
+    return _table(("file", "sparse points", "read by"), rows)
+
+
+def backends() -> str:
+    from stages.raster.backends import BACKENDS
+
+    rows: list[tuple[str, ...]] = [("`auto`", "the fastest that runs here", "")]
+    for backend in BACKENDS:
+        devices = ", ".join(f"`{device}`" for device in backend.devices)
+        rows.append((f"`{backend.name}`", backend.summary, devices))
+    return _table(("`--backend`", "is", "`--device`"), rows)
+
+
+def presets() -> str:
+    from stages.train import PRESETS
+
+    rows: list[tuple[str, ...]] = []
+    for name, preset in PRESETS.items():
+        cap = f"{preset.max_splats:,}" if preset.max_splats else "by memory and photographs"
+        size = f"{preset.train_side} px"
+        rows.append((f"`{name}`", f"{preset.steps:,}", size, str(preset.sh_degree), cap))
+    return _table(("`--preset`", "steps", "size", "SH degree", "splats, at most"), rows)
+
+
+def operations() -> str:
+    from stages.editing.syntax import OPERATIONS
+
+    rows: list[tuple[str, ...]] = []
+    for word in OPERATIONS.values():
+        takes = word.takes.replace("|", r"\|")
+        rows.append((f"`--{word.name} {takes}".rstrip() + "`", word.help))
+    return _table(("operation", "effect"), rows)
+
+
+def commands() -> str:
+    from typer.main import get_command
+
+    from splatcli.app import app
+
+    rows: list[tuple[str, ...]] = []
+    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
+        text = " ".join((command.help or "").split("\n\n")[0].split())
+        own = ROOT / "splatcli" / "commands" / f"{name}.py"
+        rows.append((f"`splat {name}`", text, f"`{own.relative_to(ROOT)}`" if own.exists() else ""))
+    return _table(("command", "does", "module besides `splatcli/app.py`"), rows)
+
+
+def errors() -> str:
+    from stages.base.errors import Family
+
+    return _table(
+        ("exit status", "family"),
+        [(str(int(family)), f"`{family.name}`") for family in Family],
+    )
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "layers": layers,
+    "stages": stages,
+    "formats": formats,
+    "format-modules": format_modules,
+    "cameras": cameras,
+    "backends": backends,
+    "presets": presets,
+    "operations": operations,
+    "commands": commands,
+    "errors": errors,
+    "modules-splatcli": lambda: modules("splatcli"),
+}
+
+
+def renewed(text: str) -> str:
+    """A page with its tables as the code has them now."""
+    return _BLOCK.sub(lambda found: found[1] + TABLES[found[2]]() + found[3], text)
+
+
+def main() -> None:
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        if renewed(text) != text:
+            page.write_text(renewed(text), encoding="utf-8")
+            print(f"{page.relative_to(ROOT)} is written anew")
+
+
+if __name__ == "__main__":
+    main()

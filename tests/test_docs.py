@@ -1,0 +1,154 @@
+"""The documentation is true: tables, codes, paths and links, and every command in it exists."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+
+from splatcli.app import app
+from stages import STAGE_NAMES
+from stages.base.distribution import VERSION
+from tests.docs_commands import bash_lines, inline_commands, splat_commands
+from tests.docs_tables import PAGES, ROOT, renewed
+
+COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
+GUIDE = (ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md")))
+README_LINES = 200
+# Files of users and of run folders, which the code does not hold.
+WRITTEN = {"manifest.json", "transforms.json", "reconstruction.json"}
+_CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
+# Strings of the source that look like codes and are something else.
+_NO_CODES = {
+    *("drop-floaters", "max-mb"),  # operations of `splat edit`
+    *("utf-8", "utf-8-sig", "no-store", "same-origin"),  # encodings, headers
+    "keep-damage",  # an argument of the USD reader's process
+    *("in-use", "peak-memory"),  # parts of file names
+    *("no-rotation", "too-large"),  # flags of `splat info`
+}
+
+
+def page_id(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("words", splat_commands(), ids=" ".join)
+def test_command_of_the_documentation_parses(words: list[str]) -> None:
+    """By the real command line with all its options; nothing is run."""
+    command: Any = COMMANDS[words[1]]
+    command.make_context(words[1], list(words[2:]))
+
+
+@pytest.mark.parametrize("words", inline_commands(), ids=" ".join)
+def test_command_in_the_text_has_its_options(words: list[str]) -> None:
+    if words[1].startswith("-"):
+        assert words[1:] in (["--help"], ["--version"])
+        return
+    if words[1].isupper():  # a placeholder
+        return
+    known = {option for found in COMMANDS[words[1]].params for option in found.opts}
+    known |= {option for found in COMMANDS[words[1]].params for option in found.secondary_opts}
+    options = {word.split("=")[0] for word in words[2:] if word.startswith("--")}
+    assert options <= known | {"--help"}
+
+
+def test_other_commands_of_the_documentation_are_known() -> None:
+    """Blocks hold splat, pip, pytest and the tools of this repository, and nothing else."""
+    known = ("splat", "pip", "pytest", "python", "ruff", "mypy", "pre-commit", "mkdocs", ".")
+    for page in (*GUIDE, ROOT / "CONTRIBUTING.md"):
+        for line in bash_lines(page):
+            assert line.split()[0] in known, f"{page_id(page)}: {line}"
+
+
+def test_guide_names_every_command() -> None:
+    assert {words[1] for words in splat_commands()} >= COMMANDS.keys()
+
+
+def test_readme_is_short_and_has_both_commands() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= README_LINES
+    run = "splat process sample_captures/still_life/images --preset preview --out run"
+    assert f"pip install . && {run}" in text
+    assert 'pip install ".[test]" && pytest' in text
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_generated_tables_are_those_of_the_code(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert renewed(text) == text, "stale: run python -m tests.docs_tables"
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=page_id)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        if not target.startswith(("http://", "https://")):
+            assert (page.parent / target).exists(), target
+
+
+def source_of(path: Path) -> str:
+    """Text of a module, or of all modules of a package."""
+    files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    return "\n".join(file.read_text(encoding="utf-8") for file in files)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_paths_and_names_of_the_code_exist(page: Path) -> None:
+    """`stages/x.py` and `stages/x.py` `Name`; experiments name modules by path only."""
+    text = page.read_text(encoding="utf-8")
+    for path, _, name in re.findall(r"`((?:stages|splatcli|tests)/[\w./]*)`( `(\w+)`)?", text):
+        assert (ROOT / path).exists(), path
+        if name:
+            assert re.search(rf"\b{name}\b", source_of(ROOT / path)), f"{path} has no {name}"
+    names = {
+        path.name for top in ("stages", "splatcli", "tests") for path in (ROOT / top).rglob("*")
+    }
+    for name in re.findall(r"`(\w+\.(?:py|cpp|json))`", text):
+        assert name in names | WRITTEN, name
+    for module in re.findall(r"python -m ((?:stages|tests)[\w.]*)", text):
+        found = ROOT.joinpath(*module.split("."))
+        assert found.with_suffix(".py").exists() or (found / "__main__.py").exists(), module
+
+
+@functools.cache
+def codes_of_source() -> frozenset[str]:
+    """Codes of errors and warnings: kebab-case strings, and f-strings with upper-case fields."""
+    found = set()
+    for top in ("stages", "splatcli"):
+        for path in (ROOT / top).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                text = node.value if isinstance(node, ast.Constant) else None
+                if isinstance(text, str) and _CODE.fullmatch(text):
+                    found.add(text)
+    return frozenset(found - _NO_CODES)
+
+
+def test_troubleshooting_has_every_code_and_no_other() -> None:
+    text = (ROOT / "docs" / "guide" / "troubleshooting.md").read_text(encoding="utf-8")
+    codes = re.findall(r"^\| `([\w-]+)` \|", text, re.M)
+    assert len(codes) == len(set(codes))
+    written = {code for code in codes if code.islower()}
+    assert written - codes_of_source() == set(), "documented, and not in the source"
+    assert codes_of_source() - written == set(), "in the source, and not documented"
+
+
+def test_architecture_names_every_stage_and_its_folder() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    for number, name in enumerate(STAGE_NAMES, 1):
+        assert f"`{number}-{name}`" in text
+
+
+def test_glossary_is_sorted_and_has_one_sentence_a_term() -> None:
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    terms = re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", text, re.M)[2:]
+    assert [term.lower() for term, _ in terms] == sorted(term.lower() for term, _ in terms)
+    assert not [term for term, meaning in terms if ". " in meaning]
+
+
+def test_changelog_begins_with_this_version() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert text.split("## ", 1)[1].startswith(VERSION)

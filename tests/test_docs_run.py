@@ -1,0 +1,81 @@
+"""Commands and code of the documentation, really run on a small finished run."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests import sample
+from tests.docs_commands import splat_commands
+from tests.docs_tables import ROOT
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+# Without photographs of one's own, a browser or many minutes.
+RUN = ("status", "info", "render", "export", "convert", "edit", "verify", "cameras")
+README = [words for words in splat_commands([ROOT / "README.md"]) if words[1] in RUN]
+GUIDE = (
+    "splat quantise run --sog-loss-db 0.1",
+    "splat prune run --rounds 0",
+    "splat export run --format mesh --mesh-triangles 50000",
+    "splat edit run scene/lod-meta.json",
+    "splat cameras run transforms.json",
+    "splat tradeoff run",
+    "splat render --path transforms.json --out frames",
+)
+
+
+def test_readme_has_commands_to_run() -> None:
+    assert len(README) >= 7
+
+
+def test_commands_of_readme_and_guide_run(sample_run: Path, tmp_path: Path) -> None:
+    """In one folder, one after the other, as a reader does them."""
+    folder = sample.copied(sample_run, tmp_path)
+    in_guide = splat_commands(sorted((ROOT / "docs" / "guide").glob("*.md")))
+    chosen = [line.split() for line in GUIDE]
+    assert all(words in in_guide for words in chosen)
+    for words in [*README, *chosen]:
+        done = sample.splat(*words[1:], folder=folder)
+        assert done.returncode == 0, f"{words}\n{done.stdout[-1000:]}{done.stderr[-2000:]}"
+
+
+def test_files_of_a_run_are_those_of_the_architecture_page(sample_run: Path) -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = text.split("### A run folder", 1)[1].split("## ", 1)[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    named = set()
+    for row in rows:
+        folder = ""
+        for name in re.findall(r"`([^`]+)`", row):
+            folder = name.rpartition("/")[0] if re.match(r"\d-\w+/[\w.]", name) else folder
+            named.add(
+                name.rstrip("/") if "/" in name.rstrip("/") else f"{folder}/{name}".strip("/")
+            )
+    named = {name.rstrip("/") for name in named}
+    found = {path.relative_to(sample_run / "run") for path in (sample_run / "run").glob("?-*/*")}
+    for path in sorted(found):
+        known = path.name == "manifest.json" or path.name.startswith("scene.")
+        assert known or path.as_posix() in named, f"{path} is not on the page"
+    for name in named - {"blocks", "N-STAGE/manifest.json", "7-export/scene.*"}:
+        assert (sample_run / "run" / name).exists(), f"{name} is not in a run folder"
+
+
+def test_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer and smaller steps than it says."""
+    page = (ROOT / "docs" / "guide" / "python.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    small = 'preset="preview", max_side=320, train_side=120, steps=200, max_splats=3000'
+    assert 'preset="preview"' in code
+    shutil.copytree(sample.PHOTOS, tmp_path / "photos")
+    monkeypatch.chdir(tmp_path)
+    made: dict[str, object] = {}
+    exec(code.replace('preset="preview"', f'{small}, formats=("ply",)'), made)
+    scene = made["scene"]
+    assert (tmp_path / "view.png").stat().st_size > 1000
+    assert len(scene.splats) > 100  # type: ignore[attr-defined]
+    assert [file.format for file in scene.assets.files] == ["ply"]  # type: ignore[attr-defined]
+    assert scene.metrics["train"]["psnr_db"] > 15  # type: ignore[attr-defined]

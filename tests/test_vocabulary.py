@@ -1,0 +1,119 @@
+"""Words that were given up for the field's own do not come back: stages, splatcli, docs, README.
+
+A row names the words, what to write instead, and where they mean nothing else. Parts of identifiers
+count: `lent_photographs` holds "lent".
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+CODE = ("stages", "splatcli")
+EVERYWHERE = (*CODE, "docs", "README.md")
+TRAINING = ("stages/training", "stages/train.py", "stages/capacity", "stages/prune.py")
+DISTRIBUTED = ("stages/structure", "stages/distributed")
+SUFFIXES = (".py", ".md", ".js", ".html", ".css")
+
+
+@dataclass(frozen=True)
+class Word:
+    """pattern: a regular expression; parts of snake_case and CamelCase names are words too.
+    instead: what to write. reason: of an exception. exact: the pattern as it is, case included.
+    """
+
+    pattern: str
+    instead: str
+    where: tuple[str, ...] = EVERYWHERE
+    reason: str = ""
+    exact: bool = False
+
+
+WORDS = (
+    Word("judg(e|es|ed|ing|ement)", "held-out (test) views; evaluation, evaluate"),
+    Word("lent|lends?", "validation views"),
+    Word("by[ _-]heart", "overfitting, overfitted"),
+    Word("(sits?|sat|sitting)[ _]out|resting", "dropout, dropped"),
+    Word("open[ _]air", "floaters, free space"),
+    Word("(?<!RANSAC )trials?", "validation probe", reason="RANSAC has trials"),
+    Word("answers?|answered", "result of the validation probe", TRAINING, "a server may answer"),
+    Word("doubts?|doubtful", "a threshold with a name, a warning"),
+    Word("way (back|there)", "backward pass, forward pass"),
+    Word("forwards|backwards", "forward pass, backward pass"),
+    Word("pull(s|ed|ing)?(?! request)", "gradient"),
+    Word("strides?", "step size, learning rate", (*TRAINING, "docs"), "arrays elsewhere have them"),
+    Word("how far", "step size, progress, distance", TRAINING),
+    Word("(?<!loss_)bands?", "SH coefficients, SH degree", reason="loss_bands: rows of a picture"),
+    Word("passed[ _]on", "generalisation ratio"),
+    Word("hands", "executor; a verb: sends, gives"),
+    Word("(?<!each )shares(?! no code)", "chunks", (*DISTRIBUTED, "docs")),
+    Word("placing", "registration"),
+    Word("makers?", "provenance, backends"),
+    Word("told(?! apart)", "reported, given, known", reason="`compare` tells two runs apart"),
+    Word("asked", "requested, given; or what is done"),
+    Word(r"\bLook(?= *[(\[,|)])|\blook_of\b|\.look\b", "DrawSettings", CODE, exact=True),
+    Word("first look", "preselection of pairs"),
+    Word("settl(e|es|ed|ing)", "learning-rate decay; colour refit; robust bundle adjustment"),
+    Word("prices?", "pruning strength, Lagrange multiplier, cost in bits"),
+    Word("pays? (for )?(its|their|his) way", "contribution"),
+    Word("worth", "contribution; or the figure itself"),
+    Word("ground floor|house|floors", "layer, architecture"),
+    Word("rooms|(this|that|every|a) room", "package", CODE, "docs speak of photographed rooms"),
+    Word(r"(base|editing|capacity|structure|tradeoff)[./](thin_)?words", "text, syntax, summary"),
+    Word("rungs?|climb(s|ed|ing)?|ladder", "fallback, attempt"),
+    Word(r"(class |: |\[|-> )Photograph\b", "the view types of `scene`", CODE, exact=True),
+    Word("onlookers?", "live preview"),
+    Word("wish(es|ed)?", "request, option"),
+    Word(r"\b_?Wanted\b(?!:)", "Options", CODE, exact=True),
+    Word(r"(Tell|Say) = |: (Tell|Say)\b", "progress callback", CODE, exact=True),
+    Word("anatom(y|ies)", "byte breakdown"),
+    Word(r"distributed[./]far|FarRun", "remote", CODE),
+    Word(r"class Place\b", "Location", CODE, exact=True),
+    Word("witness(es)?", "visibility constraints"),
+    Word("(?<!fine)(?<!fine-)tun(ed|er|ing)", "fine-tuned, fine-tuning"),
+    Word("fitted", "fine-tuned", (*TRAINING, "stages/export.py", "stages/quantise.py")),
+    Word(r"\b(Aim|Shrinking|class Cut|Outcome)\b", "Targets, Pruner, Removal", CODE, exact=True),
+    Word("census|curiosit(y|ies)", "statistics"),
+    Word("chains? of operations", "operations"),
+    Word(r"\bTyped\b", "ParsedOperation", CODE, exact=True),
+    Word("frugal", "memory-limited training step"),
+    Word(r"capture is thin|thin_words|tradeoff[./]thin", "poorly covered"),
+)
+
+
+@functools.cache
+def texts() -> dict[str, str]:
+    """Text by path of all files that are checked, vendored ones left out."""
+    files = [ROOT / "README.md"]
+    for top in (*CODE, "docs"):
+        files += sorted((ROOT / top).rglob("*"))
+    return {
+        path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+        for path in files
+        if path.suffix in SUFFIXES and "vendor" not in path.parts
+    }
+
+
+def found(word: Word) -> list[str]:
+    """ "path:line: text" of each line that holds the word."""
+    word_start = "(?:(?<![A-Za-z])|(?<=[a-z])(?=[A-Z]))"
+    pattern = word.pattern if word.exact else f"{word_start}(?i:{word.pattern})(?![a-z])"
+    hits = []
+    for path, text in texts().items():
+        if any(path == top or path.startswith(top + "/") for top in word.where):
+            for number, line in enumerate(text.splitlines(), 1):
+                if re.search(pattern, line):
+                    hits.append(f"{path}:{number}: {line.strip()[:100]}")
+    return hits
+
+
+@pytest.mark.parametrize("word", WORDS, ids=lambda word: word.pattern)
+def test_word_was_given_up(word: Word) -> None:
+    hits = found(word)
+    shown = "\n".join(hits[:30])
+    assert not hits, f"write instead: {word.instead} ({len(hits)} lines)\n{shown}"
