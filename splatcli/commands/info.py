@@ -107,7 +107,7 @@ def _by_precision(memory: MemoryUse) -> dict[str, int]:
 def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
     """Frames a second from some of the photographs' cameras, at the size of the training; from
     cameras around the splats if there are no photographs."""
-    from stages.measure.speed import seconds_per_frame
+    from stages.measure.evaluation import seconds_per_frame
 
     from stages.scene.framing import orbit_cameras
 
