@@ -1,4 +1,4 @@
-"""Reconstruction -> Splats: a robust start for training from the sparse points.
+"""Reconstruction -> Splats: initial splats from the sparse points, without outliers.
 
 Follows the reference trainer (Kerbl et al., 3D Gaussian Splatting, 2023, section 5.1): one round
 splat a point, as large as the mean distance to its three nearest neighbours, opacity 0.1.
@@ -23,37 +23,39 @@ if TYPE_CHECKING:
 OPACITY = 0.1
 NEIGHBOURS = 3
 _FEWEST_SPLATS = 50
-_FAR = 8.0  # x the radius that holds nine tenths of the points, or of the cameras
-_FAR_WEAK = 4.0  # the same for points that only two photographs see
+_FAR = 8.0  # x the radius that contains nine tenths of the points, or of the cameras
+_FAR_WEAK = 4.0  # the same for points with only two observations
 _HIGH_ERROR = 4.0  # x the median reprojection error
-_AT_A_CAMERA = 0.05  # of the typical distance from a point to its nearest camera
-_FLOOR = 0.1  # of the median scale: duplicates have no distance between them
-_CEILING = 0.05  # of the distance to the nearest camera: 3 degrees to either side
+_AT_A_CAMERA = 0.05  # x the median distance from a point to its nearest camera
+_SMALLEST_SCALE = 0.1  # x the median scale: duplicates are at distance 0
+_LARGEST_SCALE = 0.05  # x the distance to the nearest camera: 3 degrees to either side
 
 
 @dataclass(frozen=True)
 class SeedSettings:
-    """Settings of the start."""
+    """Settings of the initial splats."""
 
     keep_outliers: bool = field(
         default=False,
-        metadata={"help": "Also start splats at points that look misplaced or far away."},
+        metadata={"help": "Keep points that look misplaced or are far away."},
     )
     fill: bool = field(
         default=True,
-        metadata={"help": "Also start splats where photographs show a surface without points."},
+        metadata={"help": "Add splats where photographs show surfaces without points."},
     )
 
 
 def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report: Report) -> Splats:
-    """Splats of degree 0 from inputs["sfm"], written to `folder`.
+    """Splats of SH degree 0 from inputs["sfm"], written to `folder`.
 
-    Raises SplatError "seed-too-few-points" if fewer than 50 points are worth starting from.
+    Raises SplatError "seed-too-few-points" if fewer than 50 points are usable.
     """
     import numpy as np
 
-    from stages.scene import Splats, draw_settings_of, logit, rgb_to_dc
+    from stages.scene import Splats, draw_settings_of, logit, rgb_to_dc, split_held_out
     from stages.scene.storage import save_splats
+    from stages.structure.seeding.empty_cells import fill_cells
+    from stages.structure.seeding.plane_sweep import plane_sweep_points
 
     reconstruction: Reconstruction = inputs["sfm"]
     finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
@@ -61,20 +63,29 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     reasons: dict[str, NDArray[np.bool_]] = {"not_finite": ~finite}
     if not settings.keep_outliers and finite.any():
         reasons |= _outliers(reconstruction, finite)
-        for left_out in reasons.values():
-            keep &= ~left_out
-    _report_counts(reasons, len(reconstruction.points), report)
+        for outliers in reasons.values():
+            keep &= ~outliers
+    _report_outliers(reasons, len(reconstruction.points), report)
     points = reconstruction.points[keep]
     if len(points) < _FEWEST_SPLATS:
         raise _too_few(len(points), len(reconstruction.points))
     colours = reconstruction.colours[keep].astype(np.float64) / 255.0
+    training, _ = split_held_out(reconstruction.views)  # held-out views give no points or colours
     if settings.fill:
-        points, colours = _with_agreed(reconstruction, points, colours, report)
+        more, more_colours = plane_sweep_points(reconstruction.folder, training, points)
+        report.metric("plane_sweep_points", len(more))
+        points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
     scales, clamped = _scales(points, reconstruction)
     report.metric("median_scale", float(np.median(scales)))
     report.metric("scales_clamped", clamped)
     if settings.fill:
-        points, colours, scales = _filled(reconstruction, points, colours, scales, report)
+        cameras = tuple(view.camera for view in reconstruction.views)
+        more, more_colours, more_scales = fill_cells(
+            reconstruction.folder, training, points, cameras
+        )
+        report.metric("filled_cells", len(more))
+        points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
+        scales = np.concatenate([scales, more_scales])
     report.progress(1, 1, "seeding", splats=len(points))
     splats = Splats(
         means=points.astype(np.float32),
@@ -91,48 +102,6 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     return splats
 
 
-def _with_agreed(
-    reconstruction: Reconstruction,
-    points: NDArray[np.float64],
-    colours: NDArray[np.float64],
-    report: Report,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """With the points that `sweep` finds. Held-out photographs lend none: they are the judges."""
-    import numpy as np
-
-    from stages.scene import split_held_out
-    from stages.structure.seeding.plane_sweep import plane_sweep_points
-
-    training, _ = split_held_out(reconstruction.views)
-    more, more_colours = plane_sweep_points(reconstruction.folder, training, points)
-    report.metric("plane_sweep_points", len(more))
-    return np.concatenate([points, more]), np.concatenate([colours, more_colours])
-
-
-def _filled(
-    reconstruction: Reconstruction,
-    points: NDArray[np.float64],
-    colours: NDArray[np.float64],
-    scales: NDArray[np.float64],
-    report: Report,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """With what `coverage` adds. Held-out photographs lend no colours: they are the judges."""
-    import numpy as np
-
-    from stages.scene import split_held_out
-    from stages.structure.seeding.empty_cells import fill_cells
-
-    training, _ = split_held_out(reconstruction.views)
-    cameras = tuple(view.camera for view in reconstruction.views)
-    more, more_colours, more_scales = fill_cells(reconstruction.folder, training, points, cameras)
-    report.metric("filled_cells", len(more))
-    return (
-        np.concatenate([points, more]),
-        np.concatenate([colours, more_colours]),
-        np.concatenate([scales, more_scales]),
-    )
-
-
 def load(folder: Path) -> Splats:
     """The splats of a finished folder."""
     from stages.scene.storage import load_splats
@@ -143,7 +112,7 @@ def load(folder: Path) -> Splats:
 def _outliers(
     reconstruction: Reconstruction, finite: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.bool_]]:
-    """[P] masks of points not to start from, by reason."""
+    """Masks [P] of outliers, by reason."""
     import numpy as np
 
     from stages.structure.seeding.neighbours import nearest_distance
@@ -153,7 +122,7 @@ def _outliers(
     centres = _camera_centres(reconstruction)
     middle = np.median(points[finite], axis=0)
     distances = np.linalg.norm(points - middle, axis=1)
-    # Cameras count too, so that a background is judged by the size of the whole capture.
+    # Cameras count, too: a far background is normal for a capture of that size.
     reach = float(np.percentile(distances[finite], 90))
     if len(centres):
         reach = max(reach, float(np.percentile(np.linalg.norm(centres - middle, axis=1), 90)))
@@ -170,10 +139,10 @@ def _outliers(
 def _scales(
     points: NDArray[np.float64], reconstruction: Reconstruction
 ) -> tuple[NDArray[np.float64], int]:
-    """([N] standard deviations in world units, how many were brought within bounds).
+    """([N] standard deviations in world units, how many were clamped).
 
-    The floor keeps duplicates from vanishing; the ceiling, an angle as seen from the nearest
-    camera, keeps lonely points from covering the pictures.
+    The lower bound keeps duplicates from vanishing. The upper bound, an angle seen from the nearest
+    camera, keeps isolated points from covering the pictures.
     """
     import numpy as np
 
@@ -183,11 +152,11 @@ def _scales(
     positive = raw[raw > 0]
     if not len(positive):
         raise _too_few(1, len(points))
-    floor = _FLOOR * float(np.median(positive))
-    ceiling = np.maximum(
-        floor, _CEILING * nearest_distance(points, _camera_centres(reconstruction))
+    smallest = _SMALLEST_SCALE * float(np.median(positive))
+    largest = np.maximum(
+        smallest, _LARGEST_SCALE * nearest_distance(points, _camera_centres(reconstruction))
     )
-    scales = np.clip(raw, floor, ceiling)
+    scales = np.clip(raw, smallest, largest)
     return scales, int(np.sum(scales != raw))
 
 
@@ -197,7 +166,7 @@ def _camera_centres(reconstruction: Reconstruction) -> NDArray[np.float64]:
     return np.array([view.camera.centre for view in reconstruction.views]).reshape(-1, 3)
 
 
-def _report_counts(reasons: dict[str, NDArray[np.bool_]], points: int, report: Report) -> None:
+def _report_outliers(reasons: dict[str, NDArray[np.bool_]], points: int, report: Report) -> None:
     import numpy as np
 
     counts = {reason: int(mask.sum()) for reason, mask in reasons.items()}
@@ -208,8 +177,8 @@ def _report_counts(reasons: dict[str, NDArray[np.bool_]], points: int, report: R
     if total > 0.2 * points:
         report.warn(
             "seed-many-outliers",
-            f"{total} of {points} points look misplaced and were left out. Look at the result "
-            "with care; photographs with more overlap give a cleaner start.",
+            f"{total} of {points} points look misplaced and were left out. Check the result with "
+            "care; photographs with more overlap give fewer outliers.",
         )
 
 
@@ -218,7 +187,7 @@ def _too_few(usable: int, points: int) -> SplatError:
         "seed-too-few-points",
         given=f"Only {usable} of {points} reconstructed points can be used.",
         wanted=f"At least {_FEWEST_SPLATS} distinct points to start from.",
-        hint="Take more photographs with more overlap of a scene with texture, and begin again.",
+        hint="Take more photographs with more overlap of a scene with texture, and start again.",
         family=Family.RECONSTRUCTION,
     )
 

@@ -114,6 +114,17 @@ def test_paths_and_names_of_the_code_exist(page: Path) -> None:
         assert found.with_suffix(".py").exists() or (found / "__main__.py").exists(), module
 
 
+@pytest.mark.parametrize("page", GUIDE, ids=page_id)
+def test_keys_and_metrics_that_the_guide_names_exist(page: Path) -> None:
+    """`psnr_as_taken_db` and the like: words in code style with an underscore."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    code = source_of(ROOT / "stages") + source_of(ROOT / "splatcli")
+    for inline in re.findall(r"`([^`]+)`", text):
+        for name in re.findall(r"(?<![\w./-])[a-z]+_\w+(?!\.)\b", inline):
+            known = name in ("a_mask", "poses_bounds", "transforms_train", "sample_captures")
+            assert known or re.search(rf"\b{name}\b", code), name
+
+
 @functools.cache
 def codes_of_source() -> frozenset[str]:
     """Codes of errors and warnings: kebab-case strings, and f-strings with upper-case fields."""

@@ -58,7 +58,7 @@ def test_given_cameras_are_kept_and_points_are_triangulated(tmp_path: Path) -> N
     np.testing.assert_allclose(have @ np.linalg.inv(back), wanted, atol=1e-6)
     assert found.levelled
     assert len(found.points) > 100
-    assert report.metrics["points_source"] == "matches"
+    assert report.metrics["points_source"] == "triangulation"
     assert report.metrics["epipolar_inlier_ratio"] > 0.9
     assert report.metrics["mean_reprojection_error_px"] < 1.0
     views = sfm.load(tmp_path / "sfm").views
@@ -105,7 +105,7 @@ def test_a_file_that_knows_north_gives_the_world_its_directions(tmp_path: Path) 
 
 
 def split_file(path: Path) -> list[str]:
-    """transforms.json of six photographs: four to train on, one to judge; their names."""
+    """transforms.json of six photographs: four for training, one held out; their names."""
     frames = []
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     names = list(POSES)[:6]
@@ -177,7 +177,7 @@ def test_opengl_axes_are_refused_by_their_name(tmp_path: Path) -> None:
     with pytest.raises(SplatError) as caught:
         reconstructed(tmp_path / "sfm", cameras)
     assert caught.value.code == "cameras-do-not-fit"
-    assert "y and z of each camera are turned round" in caught.value.hint
+    assert "y and z of each camera are negated" in caught.value.hint
 
 
 def test_a_splits_test_photographs_judge_and_lend_no_points(tmp_path: Path) -> None:

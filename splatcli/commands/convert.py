@@ -80,7 +80,7 @@ def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     from stages.proof.prover import Prover, cameras_for
 
     cameras = cameras_for(splats, results.views_of(results.run_around(source)))
-    proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)
+    proof = Prover.of(splats, cameras, source_format=format_of(source).ending).prove(target)
     if proof.fault:
         raise _failed(target, proof.fault)
     return proof.figures

@@ -31,14 +31,14 @@ _ONLY_ITSELF = (
 class _Original:
     """What files are compared with.
 
-    name: for messages. came_as: the format that it was read from. itself: whether it is the file
+    name: for messages. source_format: the format that it was read from. itself: whether it is the file
     to verify. backend: of the rendering. quantised: of a run.
     """
 
     splats: Splats
     views: tuple[View, ...]
     name: str
-    came_as: str = ""
+    source_format: str = ""
     itself: bool = False
     backend: str = "auto"
     quantised: QuantisedSplats | None = None
@@ -96,7 +96,7 @@ def verify(
         if original is None or prover is None:
             original = _original(file, against, read)
             cameras = cameras_for(original.splats, original.views)
-            prover = Prover.of(original.splats, cameras, original.backend, original.came_as)
+            prover = Prover.of(original.splats, cameras, original.backend, original.source_format)
         del read
         for splats in original.candidates(file):
             proof = replace(prover, splats=splats).prove(file, exact=original.itself)
@@ -144,8 +144,8 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
         raise runfolder.missing(against)
     run = Pipeline(against) if against is not None else results.run_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
-        came_as = formats.format_of(file).ending
-        return _Original(drop_undrawable(read)[0], (), _ITSELF, came_as, itself=True)
+        source_format = formats.format_of(file).ending
+        return _Original(drop_undrawable(read)[0], (), _ITSELF, source_format, itself=True)
     views = run.load("sfm").views
     quantised = run.load("quantise")
     splats = drop_undrawable(quantised.splats)[0]

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from threading import Lock
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,15 +100,7 @@ class Features:
         self._lock = Lock()
         self._connection = _open_read_only(database, immutable, check_same_thread=False)
 
-    def __enter__(self) -> Features:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         self._connection.close()
 
     def descriptors(self, position: int) -> NDArray[np.uint8]:

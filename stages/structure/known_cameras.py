@@ -29,6 +29,7 @@ from stages.structure.levelling import levelling_rotation, up_direction
 from stages.structure.match_cameras import PosedPhoto, match_cameras
 from stages.structure.metric_scale import KnownScale, find_metric_scale
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_step
+from stages.structure.sparse_model import camera_centres
 from stages.structure.undistorted_images import IMAGES, mask_file, write_undistorted_images
 
 NEIGHBOURS = 10
@@ -93,9 +94,9 @@ def reconstruct(
     cloud, observations = find_points(
         from_file, triangulated, training, photos, cameras, folder, seed, report
     )
-    if found.ground.metres and not known_scale.stated:
+    if found.ground.metres and not known_scale.metres_per_unit:
         known_scale = replace(
-            known_scale, stated=found.ground.metres, stated_by=found.ground.said_by
+            known_scale, metres_per_unit=found.ground.metres, source=found.ground.said_by
         )
     return _finish(
         posed, cameras, cloud, observations, folder, report, known_scale, capture, found.ground.axes
@@ -163,7 +164,7 @@ def neighbours(poses: NDArray[np.float64]) -> NDArray[np.int32]:
     first, second = np.triu_indices(count, 1)
     if count > EXHAUSTIVE_UP_TO:
         rotations = poses[:, :3, :3]
-        centres = -np.einsum("vij,vi->vj", rotations, poses[:, :3, 3])
+        centres = camera_centres(poses)
         distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
         angle = np.arccos(np.clip(rotations[:, 2] @ rotations[:, 2].T, -1.0, 1.0))
         cost = distance / max(float(np.median(distance)), 1e-300) + angle

@@ -17,6 +17,7 @@ from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
 from stages.structure.job import Job, known_cameras_path
 from stages.structure.mapping import observations
 from stages.structure.matching import match_pairs
+from stages.structure.sparse_model import camera_centres
 
 # Factor on COLMAP's error thresholds of triangulation, for each round of refinement: with the usual
 # thresholds, rough poses give no points to begin with.
@@ -112,16 +113,12 @@ def _refined(job: Job, known: Mapping[str, Any], scratch: Path) -> NDArray[np.fl
         poses = given.copy()
         for number in sorted(model.reg_image_ids()):
             poses[number - 1, :3] = model.images[number].cam_from_world().matrix()
-    scale, turn, shift = similarity(_centres(poses), _centres(given))
+    scale, turn, shift = similarity(camera_centres(poses), camera_centres(given))
     rotations = poses[:, :3, :3] @ turn.T
-    centres = scale * _centres(poses) @ turn.T + shift
+    centres = scale * camera_centres(poses) @ turn.T + shift
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centres)
     return poses
-
-
-def _centres(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(-np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3]))
 
 
 def _triangulated(

@@ -1,4 +1,4 @@
-"""Turns and shifts a sparse model so that up is -Y and the subject lies at the origin."""
+"""Rotates and translates a sparse model so that up is -Y and the subject is at the origin."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 from stages.structure.sparse_model import SparseModel, point_errors
 
-_ROLL_TOLERANCE_DEG = 12.0  # how crooked people hold a camera
+_ROLL_TOLERANCE_DEG = 12.0  # by how much hand-held cameras roll
 _AGREEING_SHARE = 0.7
-_PRIOR_WEIGHT = 0.002  # decides only where the cameras' x axes are nearly parallel
-_ROUNDS = 20
+_PRIOR_WEIGHT = 0.002  # matters only if the cameras' x axes are nearly parallel
+_ITERATIONS = 20
 
 
 def up_direction(rotations: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """[3] unit up vector of the world in which `rotations` [V, 3, 3] (world to camera) are given.
 
-    People tilt cameras up and down but hold the horizon level: then every camera's x axis is
-    horizontal, and up is the direction that is most nearly perpendicular to all of them, however
-    far the cameras look down. Photographs held crooked or upright are outvoted (iteratively
-    reweighted least squares, Cauchy weights). Returns None if the cameras do not agree.
+    People pitch cameras but do not roll them: then every camera's x axis is horizontal, and up is
+    the direction most nearly perpendicular to all of them, at any pitch. Photographs that were
+    rolled or in portrait format are outliers (iteratively reweighted least squares, Cauchy
+    weights). Returns None if the cameras do not agree.
     """
     right, down, forward = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     mean_up = -down.mean(axis=0)
@@ -29,23 +29,23 @@ def up_direction(rotations: NDArray[np.float64]) -> NDArray[np.float64] | None:
     tolerance = np.sin(np.radians(_ROLL_TOLERANCE_DEG))
     weights = np.ones(len(rotations))
     up = np.zeros(3)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         scatter = np.einsum("v,vi,vj->ij", weights / weights.sum(), right, right) + prior
         up = np.linalg.eigh(scatter)[1][:, 0]
         weights = 1.0 / (1.0 + ((right @ up) / (0.5 * tolerance)) ** 2)
     agreeing = np.abs(right @ up) < tolerance
     if agreeing.mean() < _AGREEING_SHARE:
         return None
-    # Which of the two directions: where the tops of the pictures point, or, where cameras look
-    # straight down or up and tops say nothing, away from what they look at.
+    # The sign: towards the tops of the pictures, or, if all cameras look straight up or down,
+    # against the viewing direction.
     tops = float(np.mean(-down[agreeing] @ up))
     sign = tops if abs(tops) > 0.1 else -float(np.mean(forward[agreeing] @ up))
     return up if sign >= 0 else -up
 
 
 def subject_centre(model: SparseModel) -> NDArray[np.float64]:
-    """[3] median of the well-constrained points: those seen by 3 photographs or more with less
-    than the median error, each counted once for every photograph that sees it."""
+    """[3] median of the well-constrained points: those with at least 3 observations and at most the
+    median error, weighted by their number of observations."""
     tracks, errors = model.tracks, point_errors(model)
     good = (tracks >= 3) & (errors <= np.median(errors))
     if good.sum() < 10:
@@ -56,8 +56,8 @@ def subject_centre(model: SparseModel) -> NDArray[np.float64]:
 def level_and_recentre(model: SparseModel) -> tuple[SparseModel, bool]:
     """(the model in the new world, whether it was levelled).
 
-    The new world has the subject's centre at the origin and, where levelled, up = -Y, with the
-    first photograph looking along +Z as far as its heading goes. Float64 throughout.
+    The new world has the subject's centre at the origin. If levelled, up is -Y, and the horizontal
+    viewing direction of the first photograph is +Z. Float64 throughout.
     """
     centre = subject_centre(model)
     rotations = model.world_to_camera[:, :3, :3]
@@ -73,8 +73,8 @@ def level_and_recentre(model: SparseModel) -> tuple[SparseModel, bool]:
 def levelling_rotation(
     up: NDArray[np.float64], heading: NDArray[np.float64], right: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[3, 3] new from old: -Y is `up`, +Z the horizontal part of `heading` (of the direction that
-    goes with `right` where the heading is vertical)."""
+    """[3, 3] new from old: -Y is `up`, +Z the horizontal part of `heading`; if `heading` is
+    vertical, +Z follows from `right`."""
     down = -up
     ahead = heading - (heading @ down) * down
     if np.linalg.norm(ahead) < 0.1:

@@ -1,8 +1,6 @@
-"""How much lighter or darker, and in which tint, each photograph was taken: from the spots that
-several photographs show.
+"""Exposure and white balance of each photograph, from points that several photographs show.
 
-What light means to sRGB values is said in `scene.light`: exposure and white balance add to the
-logarithm of a value and 0.055.
+Exposure and white balance add to the logarithm of an sRGB value plus 0.055 (`scene.light`).
 """
 
 from __future__ import annotations
@@ -24,23 +22,26 @@ from stages.scene import Reconstruction
 from stages.scene.light import OFFSET, POWER, spread_ev
 from stages.structure.finish import SPARSE
 
-SMALLER = 4  # times: sides of the pictures that are looked at; averages out their noise
-DARKEST, LIGHTEST = 0.06, 0.94  # sRGB values between which light can be told
-HOLD = 1e-6  # of the best-known view: holds each towards 0, where nothing else does
-ALIKE = 0.5  # of the spread: by more, halves of the spots do not tell the same light
-LEAST = 30  # spots of a photograph to tell its light by
-HALVES = 5  # all spots; the greyer and the more tinted; the darker and the lighter
-TURNS = 8  # of weighing spots that do not agree (they shine, or are hidden) ever less
+DOWNSCALE = 4  # of the pictures' sides; averages out their noise
+DARKEST, LIGHTEST = 0.06, 0.94  # sRGB values that are used
+REGULARISATION = 1e-6  # x the largest diagonal element; draws unconstrained views towards 0
+LARGEST_DISAGREEMENT = 0.5  # between halves of the points, in spreads of the light
+FEWEST_POINTS = 30  # of a photograph
+SUBSETS = 5  # all points; the greyer and the more saturated half; the darker and the lighter half
+ITERATIONS = 8  # of reweighted least squares
 
 
 def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction:
-    """The reconstruction with `View.light`, from the COLMAP model that lies in its folder; as it is
-    where its spots tell different things: then a surface shines, and the light did not change."""
+    """The reconstruction with `View.light`, measured at the points of its COLMAP model.
+
+    It is returned unchanged if halves of the points disagree: then surfaces shine, and neither
+    exposure nor white balance changed.
+    """
     model = read_model(reconstruction.folder / SPARSE)[1]
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
     observed = model.observed_points, model.observing_views, model.observed_px
-    steps, total = itertools.count(1), len(pictures) + HALVES * 3
-    found, differ = measure_light(
+    steps, total = itertools.count(1), len(pictures) + SUBSETS * 3
+    found, disagreement = measure_light(
         pictures, *observed, tick=lambda: report.progress(next(steps), total, "measuring light")
     )
     lights = [
@@ -49,8 +50,8 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
     ]
     spread = spread_ev(lights)
     report.metric("light_spread_ev", round(spread, 4))
-    report.metric("light_disagreement_ev", round(differ, 4))
-    if differ > ALIKE * spread:
+    report.metric("light_disagreement_ev", round(disagreement, 4))
+    if disagreement > LARGEST_DISAGREEMENT * spread:
         return reconstruction
     views = (replace(v, light=light) for v, light in zip(reconstruction.views, lights, strict=True))
     return replace(reconstruction, views=tuple(views))
@@ -63,41 +64,46 @@ def measure_light(
     px: NDArray[np.float64],
     tick: Callable[[], None] = lambda: None,
 ) -> tuple[NDArray[np.float64], float]:
-    """([V, 3] EV by which each photograph is lighter than the median one, for red, green and blue;
-    by how many EV, root mean square, halves of the spots differ in that: the greyer and the more
-    tinted, the darker and the lighter).
+    """(light [V, 3], disagreement): by how many EV each photograph is lighter than the median one
+    in red, green and blue, NaN for a view with too few usable points; and the RMS difference in EV
+    between halves of the points: the greyer and the more saturated, the darker and the lighter.
 
-    pictures [V]: files. points, views [O], px [O, 2]: where each view sees which spot, in pixels of
-    its picture. NaN for a view with too few usable spots. tick: called after each picture, and
-    after each channel of each of `HALVES`.
+    Args:
+        pictures: [V] files.
+        points, views, px: [O], [O], [O, 2] observations, in pixels of the picture.
+        tick: called after each picture, and after each channel of each of `SUBSETS`.
     """
-    spots = _values(pictures, views, px, tick)
-    usable = ((spots > DARKEST) & (spots < LIGHTEST)).all(axis=1)
+    values = _values(pictures, views, px, tick)
+    usable = ((values > DARKEST) & (values < LIGHTEST)).all(axis=1)
     counts = np.bincount(views[usable], minlength=len(pictures))
-    usable &= counts[views] >= LEAST
-    points, views, spots = points[usable], views[usable], spots[usable]
+    usable &= counts[views] >= FEWEST_POINTS
+    points, views, values = points[usable], views[usable], values[usable]
     if not len(points):
         return np.full((len(pictures), 3), np.nan), 0.0
-    ev = POWER * np.log2(spots.astype(np.float64) + OFFSET)
-    tint = (spots.max(axis=1) - spots.min(axis=1)) / spots.max(axis=1)
-    halves = [np.ones(len(points), np.bool_)]
-    for kind in (tint, spots.mean(axis=1)):
-        _, spot = np.unique(points, return_inverse=True)
-        of_spot = (np.bincount(spot, kind) / np.bincount(spot))[spot]
-        halves += [of_spot < np.median(of_spot), of_spot >= np.median(of_spot)]
-    light, *told = (_even(points[h], views[h], ev[h], len(pictures), tick) for h in halves)
-    differ = np.array([told[0] - told[1], told[2] - told[3]])
-    return light, float(np.sqrt(np.nanmean(differ**2))) if np.isfinite(differ).any() else 0.0
+    ev = POWER * np.log2(values.astype(np.float64) + OFFSET)
+    saturation = (values.max(axis=1) - values.min(axis=1)) / values.max(axis=1)
+    subsets = [np.ones(len(points), np.bool_)]
+    for kind in (saturation, values.mean(axis=1)):
+        _, point = np.unique(points, return_inverse=True)
+        mean = (np.bincount(point, kind) / np.bincount(point))[point]
+        subsets += [mean < np.median(mean), mean >= np.median(mean)]
+    light, grey, saturated, dark, bright = (
+        _centred_offsets(points[s], views[s], ev[s], len(pictures), tick) for s in subsets
+    )
+    difference = np.array([grey - saturated, dark - bright])
+    if not np.isfinite(difference).any():
+        return light, 0.0
+    return light, float(np.sqrt(np.nanmean(difference**2)))
 
 
-def _even(
+def _centred_offsets(
     points: NDArray[np.int32],
     views: NDArray[np.int32],
     ev: NDArray[np.float64],
     count: int,
     tick: Callable[[], None],
 ) -> NDArray[np.float64]:
-    """[count, 3] of each view, its channels' medians 0; NaN for views without spots."""
+    """[count, 3] `_offsets` of each channel, with median 0; NaN for views without points."""
     found = np.empty((count, 3))
     for channel in range(3):
         found[:, channel] = _offsets(points, views, ev[:, channel], count)
@@ -112,7 +118,7 @@ def _values(
     px: NDArray[np.float64],
     tick: Callable[[], None],
 ) -> NDArray[np.float32]:
-    """[O, 3] sRGB values at each spot, 0 to 1; NaN beyond a picture."""
+    """[O, 3] sRGB values of each observation, 0 to 1; NaN outside the picture."""
     found = np.full((len(views), 3), np.nan, np.float32)
     for number, path in enumerate(pictures):
         tick()
@@ -120,7 +126,7 @@ def _values(
         picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is None or not len(mine):
             continue
-        height, width = (max(1, side // SMALLER) for side in picture.shape[:2])
+        height, width = (max(1, side // DOWNSCALE) for side in picture.shape[:2])
         small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
         scale = np.array([width / picture.shape[1], height / picture.shape[0]])
         x, y = np.nan_to_num(px[mine] * scale - 0.5, nan=-1.0).astype(np.float32).T
@@ -133,21 +139,25 @@ def _values(
 def _offsets(
     points: NDArray[np.int32], views: NDArray[np.int32], ev: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """[count] what to take from each view's values so that they agree best spot by spot; robust."""
-    _, spot = np.unique(points, return_inverse=True)
+    """[count] offset of each view such that values minus offsets agree best at each point.
+
+    Iteratively reweighted least squares (Cauchy weights) in offsets; the values of points are
+    eliminated (Schur complement). Outliers are points that shine or are hidden.
+    """
+    _, point = np.unique(points, return_inverse=True)
     weight, offsets = np.ones(len(ev)), np.zeros(count)
-    for _ in range(TURNS):
-        table = csr_array((weight, (spot, views)), shape=(int(spot.max()) + 1, count))
+    for _ in range(ITERATIONS):
+        table = csr_array((weight, (point, views)), shape=(int(point.max()) + 1, count))
         total = np.asarray(table.sum(axis=1)).ravel()
-        mean = np.bincount(spot, weight * ev) / total
+        mean = np.bincount(point, weight * ev) / total
         normal = np.diag(np.bincount(views, weight, count)) - np.asarray(
             (table.T @ (table / total[:, None])).todense()
         )
-        right = np.bincount(views, weight * (ev - mean[spot]), count)
-        normal[np.diag_indices(count)] += HOLD * normal.diagonal().max()
+        right = np.bincount(views, weight * (ev - mean[point]), count)
+        normal[np.diag_indices(count)] += REGULARISATION * normal.diagonal().max()
         offsets = np.linalg.solve(normal, right)
-        left = ev - offsets[views]
-        left -= (np.bincount(spot, weight * left) / total)[spot]
-        noise = max(1.4826 * float(np.median(np.abs(left))), 1e-6)
-        weight = 1.0 / (1.0 + (left / (2.0 * noise)) ** 2)
+        residual = ev - offsets[views]
+        residual -= (np.bincount(point, weight * residual) / total)[point]
+        noise = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+        weight = 1.0 / (1.0 + (residual / (2.0 * noise)) ** 2)
     return offsets

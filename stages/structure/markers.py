@@ -1,4 +1,4 @@
-"""Printed ArUco markers in the photographs, alone or on a ChArUco board: how long a side is."""
+"""Printed ArUco markers in the photographs, alone or on a ChArUco board: lengths of their sides."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _DICTIONARIES = tuple(
         *("DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11"),
     )
 )
-_TRIED = 12  # pictures that say which dictionary the markers are of
-_NARROWEST_DEG = 2.0  # between the rays to a corner; below, its depth is a guess
-_WORST_OF_SIDE = 0.004  # of the picture's longer side, that a corner may lie off its place
+_SAMPLED = 12  # pictures in which each dictionary is tried
+_NARROWEST_DEG = 2.0  # triangulation angle; below, depth is too inaccurate
+_LARGEST_ERROR = 0.004  # reprojection error of a corner, in longer sides of the picture
 
 Seen = list[tuple[int, NDArray[np.float64]]]  # (camera, corners [4, 2] in pixels)
 
 
 def marker_sides(pictures: Sequence[Path], cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """[S] lengths in world units of the sides of all markers that two pictures or more show; empty
-    where there is none. cameras: pinholes, of `pictures`."""
-    spread = np.linspace(0, len(pictures) - 1, min(_TRIED, len(pictures))).round().astype(int)
+    """[S] lengths in world units of the sides of all markers in two or more pictures, which may be
+    none. cameras: the pinhole cameras of `pictures`."""
+    spread = np.linspace(0, len(pictures) - 1, min(_SAMPLED, len(pictures))).round().astype(int)
     detectors = [_detector(number) for number in _DICTIONARIES]
     counts = [sum(len(_detected(detector, pictures[i])) for i in spread) for detector in detectors]
     best = detectors[int(np.argmax(counts))]
@@ -39,10 +39,10 @@ def marker_sides(pictures: Sequence[Path], cameras: Sequence[Camera]) -> NDArray
         for number, picture in enumerate(pictures):
             for marker, corners in _detected(best, picture).items():
                 seen[marker].append((number, corners))
-    placed = [_placed(places, cameras) for places in seen.values()]
+    triangulated = [_triangulated(places, cameras) for places in seen.values()]
     sides = [
         np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
-        for corners in placed
+        for corners in triangulated
         if corners is not None
     ]
     return np.concatenate(sides) if sides else np.zeros(0)
@@ -55,7 +55,7 @@ def _detector(dictionary: int) -> Any:
 
 
 def _detected(detector: Any, picture: Path) -> dict[int, NDArray[np.float64]]:
-    """Corners [4, 2] by marker, in our pixels; a number that is there twice does not count."""
+    """Corners [4, 2] in pixels by marker id; ids that occur twice are left out."""
     data = np.fromfile(picture, np.uint8)
     grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     if grey is None:
@@ -63,14 +63,15 @@ def _detected(detector: Any, picture: Path) -> dict[int, NDArray[np.float64]]:
     corners, numbers, _ = detector.detectMarkers(grey)
     flat = [] if numbers is None else np.ravel(numbers).tolist()
     return {
-        number: np.asarray(found, np.float64).reshape(4, 2) + 0.5  # OpenCV's centres are whole
+        number: np.asarray(found, np.float64).reshape(4, 2)
+        + 0.5  # OpenCV has pixel centres at whole numbers
         for number, found in zip(flat, corners, strict=True)
         if flat.count(number) == 1
     }
 
 
-def _placed(places: Seen, cameras: Sequence[Camera]) -> NDArray[np.float64] | None:
-    """[4, 3] of a marker's corners in the world, or None where rays do not fix them."""
+def _triangulated(places: Seen, cameras: Sequence[Camera]) -> NDArray[np.float64] | None:
+    """[4, 3] a marker's corners in the world, triangulated; None if that is too inaccurate."""
     if len(places) < 2:
         return None
     chosen = [cameras[i] for i, _ in places]
@@ -80,14 +81,14 @@ def _placed(places: Seen, cameras: Sequence[Camera]) -> NDArray[np.float64] | No
     cosines = np.einsum("aci,bci->abc", rays, rays).min(axis=2)
     if np.degrees(np.arccos(np.clip(cosines.min(), -1.0, 1.0))) < _NARROWEST_DEG:
         return None
-    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # [V, 4, 3, 3]
-    total = across.sum(axis=0)
-    wanted = np.einsum("vcij,vj->ci", across, centres)
+    perpendicular = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # [V, 4, 3, 3]
+    total = perpendicular.sum(axis=0)
+    wanted = np.einsum("vcij,vj->ci", perpendicular, centres)
     corners = np.linalg.solve(total, wanted[..., None])[..., 0]
     for camera, at in zip(chosen, seen, strict=True):
         local = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         pixels = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        worst = _WORST_OF_SIDE * max(camera.width, camera.height)
+        worst = _LARGEST_ERROR * max(camera.width, camera.height)
         if (local[:, 2] <= 0).any() or np.abs(pixels - at).max() > worst:
             return None
     return corners

@@ -1,4 +1,4 @@
-"""Which photograph a camera of a file belongs to: by name, as far as other programs keep names."""
+"""Assigns the cameras of a file to photographs by name, as far as other programs keep names."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import Lens
-from stages.photos.find import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
+from stages.photos.sources import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
 from stages.scene import Camera, Capture, Photo, View
 
-_NAMED = 6
+_MOST_NAMES = 6  # in a message
 _SUFFIXES = LOSSY | LOSSLESS | RAW | OTHER_PICTURES
-_FEWEST = 3
+_FEWEST = 3  # photographs
 _SHAPE_TOLERANCE = 0.01
-_PARTIAL = "--allow-partial goes on with those that have both."
+_PARTIAL = "--allow-partial goes on with those that match."
 
 
 @dataclass(frozen=True)
 class PosedPhoto:
-    """A photograph, its camera in the photograph's own pixels, its lens, and its role."""
+    """A photograph, its camera in pixels of the photograph, its lens and its role."""
 
     photo: Photo
     camera: Camera
@@ -38,9 +38,16 @@ def match_cameras(
 ) -> list[PosedPhoto]:
     """The photographs that have a camera, in the capture's order.
 
-    split: whether the file's own train and test photographs are kept, and all others left out.
-    Raises SplatError, also for those that lack their counterpart unless `allow_partial`; a split
-    that leaves photographs out (a benchmark's maps of depth beside them) is no reason.
+    Args:
+        found: the cameras.
+        capture: the photographs.
+        split: keep the file's train and test photographs with these roles, and leave out others.
+        allow_partial: leave out cameras without photograph and photographs without camera.
+        report: receives a warning about these.
+
+    Raises SplatError, without `allow_partial` also if a camera has no photograph or a photograph no
+    camera. With `split`, a photograph that the split leaves out (a benchmark's depth map, for
+    example) needs no camera.
     """
     if split and not {view.role for view in found.views} >= {"train", "test"}:
         raise _no_split()
@@ -54,13 +61,13 @@ def match_cameras(
     for number, position in sorted(matches.items(), key=lambda match: match[1]):
         view, photo = views[number], capture.photos[position]
         lens = found.lenses[wanted[number]]
-        posed.append(PosedPhoto(photo, _fitted(view, photo), lens, view.role if split else ""))
+        posed.append(PosedPhoto(photo, _scaled(view, photo), lens, view.role if split else ""))
     return posed
 
 
 def _matched(views: Sequence[View], photos: Sequence[Photo]) -> tuple[dict[int, int], list[str]]:
-    """(photograph by view, names of views without one). A name agrees from its end on: the more
-    folders of it are equal the better, and its suffix may be another or missing."""
+    """(photograph by view, names of views without one). Names are compared from the end: the more
+    folders are equal the better; suffixes may differ or be missing."""
     by_stem: dict[str, list[int]] = defaultdict(list)
     for position, photo in enumerate(photos):
         for name in {photo.name, photo.picture}:
@@ -85,7 +92,7 @@ def _matched(views: Sequence[View], photos: Sequence[Photo]) -> tuple[dict[int, 
 
 
 def _parts(name: str) -> list[str]:
-    """The name without its suffix, then its folders from the innermost on, folded."""
+    """The name without its suffix, then its folders, innermost first; case-folded."""
     plain = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
     path = PurePosixPath(plain)
     stem = path.stem if path.suffix in _SUFFIXES else path.name
@@ -97,7 +104,7 @@ def _suffix(name: str) -> str:
 
 
 def _agreement(name: str, photo: Photo) -> tuple[int, bool, bool]:
-    """The larger the better: folders in common, whether the suffix is the same, too."""
+    """How well names agree, larger is better: (folders in common, same suffix, no more folders)."""
     mine, theirs = _parts(name)[1:], _parts(photo.name)[1:]
     common = 0
     for a, b in zip(mine, theirs, strict=False):
@@ -107,8 +114,8 @@ def _agreement(name: str, photo: Photo) -> tuple[int, bool, bool]:
     return common, _suffix(name) == _suffix(photo.name), len(theirs) == common
 
 
-def _fitted(view: View, photo: Photo) -> Camera:
-    """The camera on the photograph's own pixels: ingest may have made it smaller."""
+def _scaled(view: View, photo: Photo) -> Camera:
+    """The camera in pixels of the photograph, which ingest may have made smaller."""
     camera = view.camera
     shape = camera.width * photo.height / (camera.height * photo.width)
     rounding = 1.0 / min(photo.width, photo.height)
@@ -119,74 +126,74 @@ def _fitted(view: View, photo: Photo) -> Camera:
         "cameras-other-shape",
         given=f"The camera of {photo.name} is for pictures of {camera.width} x {camera.height}, "
         f"the photograph has {photo.width} x {photo.height}.",
-        wanted="Cameras of these photographs, in their shape.",
-        hint="The photograph's EXIF turns it upright and the camera is for it lying: turn the "
-        "pixels themselves, and find the cameras again."
+        wanted="Cameras of these photographs, with the same aspect ratio.",
+        hint="The photograph is rotated by its EXIF orientation, and the camera is for the pixels "
+        "before that: rotate the pixels themselves, and estimate the cameras again."
         if swapped
-        else "Name the photographs that the cameras were found from, not cropped.",
+        else "Give the photographs that the cameras were estimated from, uncropped.",
     )
 
 
 def _check_missing(
     missing: list[str], without: list[str], matched: int, allow_partial: bool, report: Report
 ) -> None:
-    told = []
+    problems = []
     if missing:
-        told.append(
+        problems.append(
             f"{counted(len(missing), 'camera')} of the file "
             f"{'names' if len(missing) == 1 else 'name'} photographs that are not there "
             f"({_listed(missing)})"
         )
     if without:
         has = "has" if len(without) == 1 else "have"
-        told.append(
+        problems.append(
             f"{counted(len(without), 'photograph')} {has} no camera in the file "
             f"({_listed(without)})"
         )
-    if not told:
+    if not problems:
         return
-    given = "; ".join(told) + "."
+    given = "; ".join(problems) + "."
     code = "cameras-without-photographs" if missing else "cameras-missing"
     if matched < _FEWEST or not allow_partial:
         raise SplatError(
             code,
             given=given if matched else f"No photograph has a camera in the file: {given}",
-            wanted="A camera for every photograph, and a photograph for every camera, by name.",
-            hint="Name the photographs' folder that the file speaks of. " + _PARTIAL,
+            wanted="A camera for every photograph and a photograph for every camera, by name.",
+            hint="Give the folder of the photographs that the file names. " + _PARTIAL,
         )
-    report.warn(code, f"{given} What has no counterpart is left out.")
+    report.warn(code, f"{given} These are left out.")
 
 
 def _listed(names: list[str]) -> str:
-    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(name[:80] for name in names[:_NAMED]) + rest
+    rest = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(name[:80] for name in names[:_MOST_NAMES]) + rest
 
 
 def _ambiguous(name: str, photos: list[str]) -> SplatError:
     return SplatError(
         "cameras-ambiguous",
         given=f"The camera of {name[:80]} may belong to any of {_listed(photos)}.",
-        wanted="Names that tell the photographs apart.",
-        hint="Name the folder of photographs that holds only one of them.",
+        wanted="Names that identify one photograph each.",
+        hint="Give a folder of photographs with only one of them.",
     )
 
 
 def _twice(first: str, second: str, photo: str) -> SplatError:
     return SplatError(
         "cameras-of-one-name",
-        given=f"Two cameras of the file, {first[:80]} and {second[:80]}, are those of {photo}.",
+        given=f"Two cameras of the file, {first[:80]} and {second[:80]}, belong to {photo}.",
         wanted="One camera for each photograph.",
-        hint="Remove the one that is not meant.",
+        hint="Remove one of them from the file.",
     )
 
 
 def _no_split() -> SplatError:
     return SplatError(
         "cameras-without-split",
-        given="--split was asked for, and the cameras' file does not say which photographs are "
-        "for training and which for testing.",
+        given="--split is given, but the camera file does not say which photographs are for "
+        "training and which for testing.",
         wanted="transforms_train.json and transforms_test.json, or a file with train_filenames "
         "and test_filenames.",
-        hint="Leave --split away: then one photograph in eight is held out.",
+        hint="Leave --split away; then every eighth photograph is held out.",
         family=Family.USAGE,
     )

@@ -6,7 +6,7 @@ import functools
 import json
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,7 @@ def select_pairs(job: Job) -> None:
     sqlite.merge_chunks(database, sorted(chunks_path(job).glob("*.db")))
     inliers = sqlite.inliers_of_pairs(database)
     missing: list[Pair] = []
-    with sqlite.Features(database) as stored:
+    with closing(sqlite.Features(database)) as stored:
         features = _IndexedFeatures(job, stored)
         features.vocabulary()  # built once, and not in each chunk
         for wanted in _rounds(job, features, inliers):
@@ -86,7 +86,7 @@ def _matcher(job: Job, source: str, immutable: bool = False) -> Iterator[_Matche
     reader is closed before the writer, because the last to close a database tidies it up."""
     with (
         pycolmap.Database.open(job.database) as database,
-        sqlite.Features(Path(source), immutable) as stored,
+        closing(sqlite.Features(Path(source), immutable)) as stored,
     ):
         yield _Matcher(job, database, stored)
 

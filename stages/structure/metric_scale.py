@@ -1,4 +1,4 @@
-"""How large the world is, and where north: from what is known of it, or from GPS."""
+"""Metric scale and north of a reconstruction, from a known length or from GPS."""
 
 from __future__ import annotations
 
@@ -17,23 +17,28 @@ from stages.structure.markers import marker_sides
 
 _FEWEST_GPS = 5
 _AGREEING_SHARE = 0.6  # of the photographs with GPS
-_WORST_RESIDUAL = 0.15  # of how far the cameras spread: beyond, GPS says nothing about the scene
-_WORST_SPREAD = 0.05  # of the sides of markers, which are all of one size
-_PAIRS = 2000  # tried, at most
+_WORST_RESIDUAL = 0.15  # of the spread of the cameras; beyond, GPS is too inaccurate
+_WORST_SPREAD = 0.05  # median relative deviation of the sides of markers, all of one size
+_HYPOTHESES = 2000  # of the robust fit, at most
 # WGS 84: half axis in metres, eccentricity squared
 _AXIS, _ECCENTRICITY2 = 6_378_137.0, 6.69437999014e-3
 
 
 @dataclass(frozen=True)
 class KnownScale:
-    """What is said of the size. distance: two photographs' names and how far apart they are,
-    metres; or nothing. marker: side of the printed markers, metres; 0 for none. stated: metres of
-    one unit of a world that came with its cameras, 0 where nobody says; stated_by: who does."""
+    """What is known of the scale.
+
+    Args:
+        distance: names of two photographs and the distance of their cameras in metres; or ().
+        marker: side of the printed markers in metres; 0 for none.
+        metres_per_unit: of known cameras; 0 if unknown.
+        source: what states metres_per_unit.
+    """
 
     distance: Sequence[str] = ()
     marker: float = 0.0
-    stated: float = 0.0
-    stated_by: str = ""
+    metres_per_unit: float = 0.0
+    source: str = ""
 
 
 UNKNOWN_SCALE = KnownScale()
@@ -41,8 +46,8 @@ UNKNOWN_SCALE = KnownScale()
 
 @dataclass(frozen=True)
 class MetricScale:
-    """metres: of one unit of the world. heading: rotation about the vertical, radians, after which
-    +Z is north and +X east; 0 where that is not known. source: in words."""
+    """metres: per unit of the world. heading: rotation about the vertical in radians after which +Z
+    is north and +X east; 0 if unknown. source: a description for the manifest."""
 
     metres: float
     heading: float
@@ -50,19 +55,19 @@ class MetricScale:
 
     @property
     def turn(self) -> NDArray[np.float64]:
-        """[3, 3] new world from old, without its scale; about y, which points down."""
+        """[3, 3] rotation from the old to the new world, about y, which points down."""
         c, s = math.cos(self.heading), math.sin(self.heading)
         return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
     def poses(self, world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[V, 4, 4] of the same cameras in the new world."""
+        """[V, 4, 4] the poses in the new world."""
         moved = np.array(world_to_camera)
         moved[:, :3, :3] = moved[:, :3, :3] @ self.turn.T
         moved[:, :3, 3] *= self.metres
         return moved
 
     def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[P, 3] in the new world."""
+        """[P, 3] the points in the new world."""
         return np.asarray(self.metres * points @ self.turn.T)
 
 
@@ -75,9 +80,16 @@ def find_metric_scale(
     levelled: bool,
     report: Report,
 ) -> MetricScale | None:
-    """What is known of the size of the world of `cameras`, pinholes, of the capture's photographs
-    `names`, whose undistorted `pictures` lie on disk. Where the user says nothing, the cameras'
-    file may, or GPS. None where nothing says.
+    """The metric scale: by a distance or marker of the user, else by the camera file, else by GPS.
+    None if none of these is known.
+
+    Args:
+        known: what the user or the camera file states.
+        capture: the photographs.
+        names, cameras, pictures: [V] names of the registered photographs, their pinhole cameras,
+            and the files of their undistorted pictures.
+        levelled: whether up is -Y.
+        report: receives metrics.
 
     Raises SplatError for a distance or a marker that cannot be used.
     """
@@ -86,8 +98,8 @@ def find_metric_scale(
         metric: MetricScale | None = _from_distance(known.distance, capture, names, centres)
     elif known.marker:
         metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
-    elif known.stated:
-        metric = MetricScale(known.stated, 0.0, known.stated_by)
+    elif known.metres_per_unit:
+        metric = MetricScale(known.metres_per_unit, 0.0, known.source)
     else:
         photos = {photo.name: photo for photo in capture.photos}
         metric = _from_gps([photos[name] for name in names], centres, levelled, report)
@@ -96,41 +108,41 @@ def find_metric_scale(
     return metric
 
 
-def check_distance(asked: Sequence[str], capture: Capture) -> float:
-    """The metres of what was asked. Raises SplatError where it cannot be of this capture."""
-    *ends, said = asked
+def check_distance(distance: Sequence[str], capture: Capture) -> float:
+    """The metres of a `KnownScale.distance`. Raises SplatError if it cannot be of this capture."""
+    *ends, text = distance
     try:
-        metres = float(said)
+        metres = float(text)
     except ValueError:
         metres = math.nan
     if not (math.isfinite(metres) and metres > 0):
-        raise _unusable(f"{said} is no distance in metres")
+        raise _unusable(f"{text} is not a distance in metres")
     for name in ends:
         if name not in {photo.name for photo in capture.photos}:
-            raise _unusable(f"{name} is no photograph of the capture")
+            raise _unusable(f"{name} is not a photograph of the capture")
     return metres
 
 
 def _from_distance(
-    asked: Sequence[str], capture: Capture, names: Sequence[str], centres: NDArray[np.float64]
+    distance: Sequence[str], capture: Capture, names: Sequence[str], centres: NDArray[np.float64]
 ) -> MetricScale:
-    metres = check_distance(asked, capture)
-    first, second, _ = asked
+    metres = check_distance(distance, capture)
+    first, second, _ = distance
     for name in (first, second):
         if name not in names:
-            raise _unusable(f"{name} could not be placed")
+            raise _unusable(f"{name} could not be registered")
     a, b = (centres[list(names).index(name)] for name in (first, second))
-    apart = float(np.linalg.norm(a - b))
+    units = float(np.linalg.norm(a - b))
     spread = float(np.linalg.norm(centres - np.median(centres, axis=0), axis=1).max())
-    if apart < 1e-3 * spread:
+    if units < 1e-3 * spread:
         raise _unusable(f"{first} and {second} were taken from the same place")
-    return MetricScale(metres / apart, 0.0, f"{first} and {second} are {metres:g} m apart")
+    return MetricScale(metres / units, 0.0, f"{first} and {second} are {metres:g} m apart")
 
 
 def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> MetricScale:
     report.metric("markers", len(sides) // 4)
     if not len(sides):
-        raise _no_marker("no ArUco marker was found in two photographs that see it from two sides")
+        raise _no_marker("no ArUco marker was found in two photographs from different directions")
     side = float(np.median(sides))
     spread = float(np.median(np.abs(sides / side - 1.0)))
     report.metric("marker_sides_spread", round(spread, 5))
@@ -142,13 +154,13 @@ def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> 
 def _from_gps(
     photos: Sequence[Photo], centres: NDArray[np.float64], levelled: bool, report: Report
 ) -> MetricScale | None:
-    """From horizontal positions alone: heights by GPS are worse than the photographs' level."""
+    """By horizontal positions alone: GPS heights are less accurate than levelling by cameras."""
     rows = [i for i, photo in enumerate(photos) if photo.gps is not None]
     report.metric("with_gps", len(rows))
     if not levelled or len(rows) < _FEWEST_GPS:
         return None
     earth = east_north([photos[i].gps or (0.0, 0.0) for i in rows])
-    here = centres[rows, 0] + 1j * centres[rows, 2]  # x and z: east and north, once turned
+    here = centres[rows, 0] + 1j * centres[rows, 2]  # x and z become east and north
     there = earth[:, 0] + 1j * earth[:, 1]
     factor, inliers, residual = fit_similarity_2d(here, there)
     spread = float(np.sqrt(np.mean(np.abs(there - there.mean()) ** 2)))
@@ -158,7 +170,7 @@ def _from_gps(
     agreed = inliers.sum() >= max(_FEWEST_GPS, _AGREEING_SHARE * len(rows))
     if not agreed or residual > _WORST_RESIDUAL * spread or abs(factor) == 0:
         return None
-    # (x + iz) e^(i angle) turns x to z; `turn` has the opposite sign for its angle.
+    # (x + iz) e^(i angle) rotates x towards z; `turn` rotates the other way.
     return MetricScale(
         float(abs(factor)),
         -float(np.angle(factor)),
@@ -169,11 +181,13 @@ def _from_gps(
 def fit_similarity_2d(
     here: NDArray[np.complex128], there: NDArray[np.complex128]
 ) -> tuple[complex, NDArray[np.bool_], float]:
-    """(factor, who agrees [N], their RMS distance) of the similarity that takes most of `here` [N]
-    to `there` [N] in the plane: the best of those through two, refined (least median, Rousseeuw
-    1984)."""
+    """Robust fit of a similarity of the plane that maps `here` [N] to `there` [N].
+
+    Least median of squares over hypotheses from two points each (Rousseeuw 1984), then least
+    squares over inliers. Returns (complex factor, inliers [N], RMS residual of the inliers).
+    """
     first, second = np.triu_indices(len(here), 1)
-    chosen = np.linspace(0, len(first) - 1, min(len(first), _PAIRS)).astype(int)
+    chosen = np.linspace(0, len(first) - 1, min(len(first), _HYPOTHESES)).astype(int)
     best, least = 0j, math.inf
     for i, j in zip(first[chosen], second[chosen], strict=True):
         if abs(here[j] - here[i]) == 0:
@@ -196,9 +210,11 @@ def east_north(places: Sequence[tuple[float, float]]) -> NDArray[np.float64]:
     longitude = np.unwrap(degrees[:, 1], period=360.0)  # across the 180th meridian
     latitude = np.radians(degrees[:, 0])
     middle = float(np.median(latitude))
-    bend = 1.0 - _ECCENTRICITY2 * math.sin(middle) ** 2
-    north = _AXIS * (1.0 - _ECCENTRICITY2) / bend**1.5 * (latitude - middle)
-    east = _AXIS / math.sqrt(bend) * np.cos(middle) * np.radians(longitude - np.median(longitude))
+    curvature = 1.0 - _ECCENTRICITY2 * math.sin(middle) ** 2
+    north = _AXIS * (1.0 - _ECCENTRICITY2) / curvature**1.5 * (latitude - middle)
+    east = (
+        _AXIS / math.sqrt(curvature) * np.cos(middle) * np.radians(longitude - np.median(longitude))
+    )
     return np.stack([east, north], axis=1)
 
 
@@ -208,7 +224,7 @@ def _no_marker(why: str) -> SplatError:
         given=f"--marker cannot be used: {why}.",
         wanted="Printed ArUco markers of one size, flat, sharp, with their white margin; alone or "
         "on a ChArUco board.",
-        hint="Leave --marker away, or say a distance with --scale instead.",
+        hint="Leave --marker away, or give a distance with --scale instead.",
         family=Family.RECONSTRUCTION,
     )
 
@@ -219,6 +235,6 @@ def _unusable(why: str) -> SplatError:
         given=f"--scale cannot be used: {why}.",
         wanted="Two photographs, as the capture names them, that were taken at different places, "
         "and the distance between their cameras in metres: --scale A.jpg B.jpg 0.85",
-        hint="Choose two that stand far apart: then a centimetre more or less matters little.",
+        hint="Choose two that are far apart: then an error of a centimetre matters little.",
         family=Family.USAGE,
     )

@@ -1,4 +1,4 @@
-"""COLMAP's database before the first feature: cameras and photographs (imports pycolmap)."""
+"""A new COLMAP database with cameras and photographs (imports pycolmap)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ import pycolmap
 from stages.structure import database as sqlite
 from stages.structure.job import CameraGuess, Job
 
-FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess where EXIF says nothing
+FOCAL_WITHOUT_PRIOR = 1.2  # x the longer side: COLMAP's guess without EXIF
 
 
 def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
-    """A database with the cameras and photographs, ids = position + 1. only: of the photographs at
-    these positions.
+    """Write a database with cameras and photographs, ids = position + 1; it appears at `path` when
+    it is complete. only: positions of the photographs to write, by default all.
 
-    Written by hand because COLMAP trusts EXIF focal lengths that a resize made wrong. Appears
-    under its name when complete.
+    COLMAP's own import would trust EXIF focal lengths that are wrong after resizing.
     """
     partial = path.with_name(path.name + ".partial")
     sqlite.delete(partial)

@@ -1,4 +1,4 @@
-"""A reconstruction on disk: reconstruction.json (views, in plain text) and .npy arrays."""
+"""A reconstruction on disk: reconstruction.json (views) and .npy arrays."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _ARRAYS = {"points": "<f8", "colours": "|u1", "errors_px": "<f8", "tracks": "<i4
 
 
 def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
-    """Write everything but the pictures; reconstruction.json comes last. Floats are written so
-    that they are read back exactly."""
+    """Write everything but the pictures; reconstruction.json is written last. Floats round-trip
+    exactly."""
     for name, dtype in _ARRAYS.items():
         array = np.ascontiguousarray(getattr(reconstruction, name), dtype)
         with replacing(folder / f"{name}.npy") as path, path.open("wb") as file:
@@ -36,7 +36,7 @@ def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
 
 
 def load_reconstruction(folder: Path) -> Reconstruction:
-    """What `save_reconstruction` wrote; pictures are not opened.
+    """Read what `save_reconstruction` wrote; pictures are not opened.
 
     Raises SplatError "reconstruction-damaged" if something is missing or inconsistent.
     """
@@ -68,7 +68,7 @@ def _load_array(folder: Path, name: str, dtype: str) -> Any:
     array = np.load(folder / f"{name}.npy", allow_pickle=False)
     width = () if name in ("errors_px", "tracks") else (3,)
     if array.dtype != np.dtype(dtype) or array.shape[1:] != width or not array.ndim:
-        raise ValueError(f"{name}.npy is laid out in another way")
+        raise ValueError(f"{name}.npy has another data type or shape")
     return array
 
 

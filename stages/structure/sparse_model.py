@@ -63,11 +63,7 @@ class SparseModel:
     @property
     def centres(self) -> NDArray[np.float64]:
         """[V, 3] camera positions."""
-        rotations = self.world_to_camera[:, :3, :3]
-        found: NDArray[np.float64] = -np.einsum(
-            "vij,vi->vj", rotations, self.world_to_camera[:, :3, 3]
-        )
-        return found
+        return camera_centres(self.world_to_camera)
 
     @property
     def tracks(self) -> NDArray[np.int32]:
@@ -78,9 +74,16 @@ class SparseModel:
         return np.bincount(seen, minlength=len(self.points)).astype(np.int32)
 
 
+def camera_centres(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, 3] positions of cameras [V, 4, 4]."""
+    rotations, translations = world_to_camera[:, :3, :3], world_to_camera[:, :3, 3]
+    return np.asarray(-np.einsum("vij,vi->vj", rotations, translations))
+
+
 @dataclass(frozen=True)
 class MappingResult:
-    """model: the largest, or None. groups: names in each model found, largest first."""
+    """model: the largest, or None. groups: names in each model found, largest first. timed_out:
+    whether the mapper ran out of time."""
 
     model: SparseModel | None
     groups: tuple[tuple[str, ...], ...]

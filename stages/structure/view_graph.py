@@ -1,4 +1,4 @@
-"""How firmly the photographs of a model hang together."""
+"""Connectivity of a model: its weakest cut in the graph of photographs that share points."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-_SMALLEST_PART = 0.1  # of the photographs; a few at the rim may hang loosely
+_SMALLEST_PART = 0.1  # of the photographs; a few outer ones may be weakly connected
 
 
 @dataclass(frozen=True)
 class Cut:
-    """What holds two parts of a model together: points seen from both; views: the smaller part."""
+    """A cut into two parts. points: observed in both; views: photographs of the smaller part."""
 
     points: int
     views: tuple[int, ...]
@@ -22,11 +22,15 @@ class Cut:
 def weakest_cut(
     points: NDArray[np.integer], views: NDArray[np.integer], photographs: int, fewest: int = 3
 ) -> Cut:
-    """The cut through the model that severs fewest points, neither part being small.
+    """The cut with the fewest points in common, among cuts along the second eigenvector of the
+    normalised Laplacian of the view graph (Fiedler 1973; Shi and Malik 2000).
 
-    points, views [O]: who sees what. Looked for where photographs are sorted by the second
-    eigenvector of their graph, along which parts come apart (Fiedler 1973; Shi and Malik 2000).
-    Where the model is too small to be cut: all points, and no views.
+    Args:
+        points, views: [O] observations.
+        photographs: of the model.
+        fewest: photographs of the smaller part, at least; and at least a tenth of all.
+
+    If the model is too small to be cut: all points, and no views.
     """
     count = int(points.max(initial=-1)) + 1
     smallest = max(fewest, round(_SMALLEST_PART * photographs))
@@ -40,19 +44,19 @@ def weakest_cut(
     first, last = np.full(count, photographs), np.full(count, -1)
     np.minimum.at(first, points, rank[views])
     np.maximum.at(last, points, rank[views])
-    seen = last >= 0
-    steps = np.bincount(first[seen], minlength=photographs).astype(np.int64)
-    steps -= np.bincount(last[seen], minlength=photographs)
-    severed = np.cumsum(steps)[smallest - 1 : photographs - smallest]
-    cut = smallest + int(severed.argmin())
+    observed = last >= 0
+    change = np.bincount(first[observed], minlength=photographs).astype(np.int64)
+    change -= np.bincount(last[observed], minlength=photographs)
+    shared_points = np.cumsum(change)[smallest - 1 : photographs - smallest]
+    cut = smallest + int(shared_points.argmin())
     part = order[:cut] if 2 * cut <= photographs else order[cut:]
-    return Cut(int(severed.min()), tuple(sorted(part.tolist())))
+    return Cut(int(shared_points.min()), tuple(sorted(part.tolist())))
 
 
 def _shared(
     points: NDArray[np.integer], views: NDArray[np.integer], photographs: int
 ) -> NDArray[np.float64]:
-    """[V, V] points that each two photographs both see."""
+    """[V, V] number of points that two photographs both observe."""
     shared = np.zeros((photographs, photographs))
     starts = np.flatnonzero(np.diff(points, prepend=-1, append=-1))
     for start, end in pairwise(starts.tolist()):

@@ -46,7 +46,7 @@ def test_the_scale_and_the_place_of_the_world_do_not_matter() -> None:
     ("mistake", "told"),
     [
         (lambda p: np.diag([1.0, -1, -1, 1]) @ p, "y and z"),
-        (np.linalg.inv, "camera to world where"),
+        (np.linalg.inv, "camera to world instead"),
         (lambda p: np.linalg.inv(np.diag([1.0, -1, -1, 1]) @ p), "OpenGL's camera to world"),
         (lambda p: np.roll(p, 1, axis=0), "after its own"),
         (lambda p: np.roll(p, -1, axis=0), "before its own"),
@@ -56,8 +56,8 @@ def test_the_scale_and_the_place_of_the_world_do_not_matter() -> None:
 def test_a_mistake_is_found_out(mistake, told: str) -> None:
     given = mistake(POSES)
     assert fits(given) < 0.3
-    shares = {name: fits(poses) for name, poses in likely_mistakes(given)}
-    (best,) = [name for name, share in shares.items() if share > 0.9]
+    ratios = {name: fits(poses) for name, poses in likely_mistakes(given)}
+    (best,) = [name for name, ratio in ratios.items() if ratio > 0.9]
     assert told in best
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from stages.measure.evaluation import EvaluationView
 from stages.scene import Camera
 from stages.scene.light import NOISE_EV, spread_ev
-from stages.structure.light import ALIKE, measure_light
+from stages.structure.light import LARGEST_DISAGREEMENT, measure_light
 
 SPOTS, VIEWS, CELL = 300, 6, 8
 COLUMNS = 20
@@ -58,7 +58,7 @@ def test_spots_of_all_kinds_tell_the_same_light_but_not_the_same_shine(tmp_path:
     found, differ = measure_light(*photographs(tmp_path, ev, hidden=0.0))
     assert differ < 0.2 * spread_ev([tuple(row) for row in found.tolist()])
     found, differ = measure_light(*photographs(tmp_path, 0 * ev, hidden=0.0, shiny=True))
-    assert differ > ALIKE * spread_ev([tuple(row) for row in found.tolist()])
+    assert differ > LARGEST_DISAGREEMENT * spread_ev([tuple(row) for row in found.tolist()])
 
 
 def test_even_light_is_within_a_cameras_noise(tmp_path: Path) -> None:

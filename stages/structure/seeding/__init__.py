@@ -1,1 +1,1 @@
-"""Where splats may start besides at the sparse points."""
+"""Initial splats besides those at the sparse points."""

@@ -1,19 +1,18 @@
-"""Splats to start from where structure from motion found no points.
+"""Initial splats where structure from motion found no points.
 
-Plain walls, carpets out of focus and the rim of a capture have no features, so a start from the
-sparse cloud alone leaves holes that training fills slowly or never. Here each photograph is cut
-into cells; a cell in which no point lands gets one, at the depth that its neighbours in that
-photograph suggest and in the photograph's own colour. Photographs are taken in turn, and what one
-has filled counts for the next, so that a few thousand points cover everything that was seen.
+Plain walls, blurred backgrounds and the borders of a capture have no features, so a start from the
+sparse points alone leaves holes that training fills slowly or never. Here each photograph is
+divided into cells. A cell without points gets one, at a depth interpolated from its neighbours in
+that photograph and in its own colour. Photographs are processed in order, and points added for one
+count for the next, so that a few thousand points cover everything that was seen.
 
-A guess too near is worse than none: training dresses it in what the one photograph shows behind
-it, and it hangs as a cloud before all cameras that look past it. So other photographs are asked
-(`witnesses`), and what they do not confirm goes as far back as the photograph sees at all: there it
-hides nothing, and leaves no hole for a cloud to grow into.
+A depth that is too small is worse than a hole: training fits the splat to what one photograph shows
+behind it, and it becomes a floater in front of other cameras. So other photographs must support the
+position (`visibility`). Without support it is moved to the far end of the photograph's depths,
+where it occludes nothing, and leaves no hole for floaters to grow into.
 
-Beyond its rim a photograph is continued a little in the colours of the rim, but only to where no
-photograph looks: what none shows is better guessed than left as a hole, and what one shows is not
-to be guessed.
+Beyond its borders a photograph is extrapolated a little in the colours of the border, but only to
+where no photograph looks.
 """
 
 from __future__ import annotations
@@ -30,23 +29,23 @@ from stages.structure.seeding.projection import cells, pixel_centres, unproject,
 from stages.structure.seeding.visibility import VisibilityConstraints
 
 CELLS = 32  # along the longer side of a photograph
-MARGIN = 0.25  # of the longer side: how far beyond its rim a photograph is continued
+MARGIN = 0.25  # of the longer side: how far a photograph is extrapolated beyond its borders
 PLANE_POINTS = 12
-PLANE_MISFIT = 0.04  # of the inverse depth, root mean square
-PLANE_REACH = 1.5  # how far beyond its points' depths a plane is continued
-CLEARANCE = 0.5
-SCALE = 0.5  # of a cell's size, seen at the point's depth
-SOLID = 250  # of 255: less of a cell holds what a mask takes away
-FARTHEST = 95  # percentile of the depths that a photograph sees
+PLANE_RESIDUAL = 0.04  # RMS, relative to the inverse depth
+PLANE_EXTENT = 1.5  # factor on the range of depths in which a plane is extrapolated
+CLEARANCE = 0.5  # x the near depth of a camera: no point is added within
+SCALE = 0.5  # of a cell's size at the depth of the point
+SOLID = 250  # of 255: least mean of the mask in a cell
+FAR_PERCENTILE = 95  # of the depths of a photograph's points
 
 
 @dataclass
 class _Filling:
-    """What is known (points [P, 3], and the clear space around each camera) and what was added."""
+    """Given points [P, 3] and the clearance around each camera, and the splats added so far."""
 
     points: NDArray[np.float64]
-    clear: list[tuple[NDArray[np.float64], float]]
-    places: list[NDArray[np.float64]] = field(default_factory=lambda: [np.zeros((0, 3))])
+    clearances: list[tuple[NDArray[np.float64], float]]
+    positions: list[NDArray[np.float64]] = field(default_factory=lambda: [np.zeros((0, 3))])
     colours: list[NDArray[np.float32]] = field(
         default_factory=lambda: [np.zeros((0, 3), np.float32)]
     )
@@ -61,18 +60,21 @@ def fill_cells(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
     """(points [M, 3], colours [M, 3] in 0..1, scales [M] in world units) to add to `points`.
 
-    folder: where the views' image paths start. cameras: all that were found, those of `views`
-    among them; the space before a camera is empty, and stays so.
+    Args:
+        folder: folder that the views' image paths are relative to.
+        views: training views.
+        points: [P, 3].
+        cameras: of all views; no point is added close to them.
     """
     filling = _Filling(points, [(c.centre, _clearance(c, points)) for c in cameras])
-    witnesses = VisibilityConstraints(views, points)
+    visibility = VisibilityConstraints(views, points)
     ordered = sorted(views, key=lambda v: v.name)
     for view in ordered:
-        _fill(filling, folder, view, 0, witnesses, ordered)
+        _fill(filling, folder, view, 0, visibility, ordered)
     for view in ordered:
-        _fill(filling, folder, view, round(MARGIN * CELLS), witnesses, ordered)
+        _fill(filling, folder, view, round(MARGIN * CELLS), visibility, ordered)
     return (
-        np.concatenate(filling.places),
+        np.concatenate(filling.positions),
         np.concatenate(filling.colours),
         np.concatenate(filling.scales),
     )
@@ -83,65 +85,66 @@ def _fill(
     folder: Path,
     view: View,
     margin: int,
-    witnesses: VisibilityConstraints,
+    visibility: VisibilityConstraints,
     views: list[View],
 ) -> None:
-    """Fill the empty cells of one photograph; with a margin, those beyond its rim."""
+    """Fill the empty cells of one photograph, also those in a margin (cells) beyond its borders."""
     small = view.camera.fitted(CELLS)
     camera = _widened(small, margin)
-    _, pixels, _ = visible_points(camera, np.concatenate([filling.points, *filling.places]))
-    measured = _thinned(*visible_points(camera, filling.points)[1:])
+    _, pixels, _ = visible_points(camera, np.concatenate([filling.points, *filling.positions]))
+    sampled = _one_per_quarter_cell(*visible_points(camera, filling.points)[1:])
     empty = _empty_cells(camera, pixels)
-    if len(measured[1]) < PLANE_POINTS or len(empty) == 0:
+    if len(sampled[1]) < PLANE_POINTS or len(empty) == 0:
         return
-    depth = _interpolated(empty, *measured)
+    depth = _interpolated(empty, *sampled)
     if margin:
-        free = ~_in_a_picture(unproject(camera, empty, depth), views)
+        free = ~_in_any_picture(unproject(camera, empty, depth), views)
     else:
-        depth, free = _believed(view, camera, empty, depth, measured[1], witnesses)
-    places = unproject(camera, empty, depth)
-    for centre, distance in filling.clear:
-        free &= np.linalg.norm(places - centre, axis=1) > distance
+        depth, free = _supported_depth(view, camera, empty, depth, sampled[1], visibility)
+    positions = unproject(camera, empty, depth)
+    for centre, distance in filling.clearances:
+        free &= np.linalg.norm(positions - centre, axis=1) > distance
     picture = load_image(folder / view.image, small.width, small.height)
     rows, columns = cells(empty - margin)
     at = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
     mask = mask_of(folder, view, small.width, small.height)
     if mask is not None:
         free &= mask[at] > SOLID
-    filling.places.append(places[free])
+    filling.positions.append(positions[free])
     filling.colours.append(picture[at][free])
     filling.scales.append(SCALE * depth[free] / camera.fx)
 
 
-def _believed(
+def _supported_depth(
     view: View,
     camera: Camera,
     at: NDArray[np.float64],
     depth: NDArray[np.float64],
-    measured: NDArray[np.float64],
-    witnesses: VisibilityConstraints,
+    depths: NDArray[np.float64],
+    visibility: VisibilityConstraints,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(depth [K], whether to fill [K]): what nothing confirms is moved back to where the
-    photograph's view ends, if no other contradicts that."""
-    places = unproject(camera, at, depth)
-    believed = witnesses.confirm(places, view.name) & witnesses.anchored(places)
-    end = float(np.percentile(measured, FARTHEST))
-    behind = np.where(believed, depth, np.maximum(depth, end))
-    _, before = witnesses.ask(unproject(camera, at, behind), view.name)
-    return behind, believed | ((before == 0) & (behind > depth))
+    """(depth [K], whether to fill [K]): positions without support are moved to the far end of the
+    photograph's `depths`, if no other photograph contradicts that."""
+    positions = unproject(camera, at, depth)
+    supported = visibility.supported(positions, view.name)
+    supported &= visibility.close_to_points(positions)
+    far = float(np.percentile(depths, FAR_PERCENTILE))
+    moved = np.where(supported, depth, np.maximum(depth, far))
+    _, occluding = visibility.count(unproject(camera, at, moved), view.name)
+    return moved, supported | ((occluding == 0) & (moved > depth))
 
 
-def _in_a_picture(places: NDArray[np.float64], views: list[View]) -> NDArray[np.bool_]:
-    """[K] whether some photograph looks there."""
-    shown = np.zeros(len(places), bool)
+def _in_any_picture(positions: NDArray[np.float64], views: list[View]) -> NDArray[np.bool_]:
+    """[K] whether a position projects into any photograph."""
+    shown = np.zeros(len(positions), bool)
     for view in views:
-        shown[visible_points(view.camera, places)[0]] = True
+        shown[visible_points(view.camera, positions)[0]] = True
     return shown
 
 
 def _clearance(camera: Camera, points: NDArray[np.float64]) -> float:
-    """How far around a camera nothing is to be guessed: half of the depth at which it begins to
-    see something (the fifth percentile: a few measured points are always misplaced)."""
+    """Distance around a camera without added points: half of the depth at which it begins to see
+    something (the fifth percentile of depths: a few points are always misplaced)."""
     _, _, depths = visible_points(camera, points)
     return CLEARANCE * float(np.percentile(depths, 5)) if len(depths) else 0.0
 
@@ -157,17 +160,17 @@ def _widened(camera: Camera, margin: int) -> Camera:
     )
 
 
-def _thinned(
+def _one_per_quarter_cell(
     pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """At most one point in each quarter of a cell: a depth wants no more, and 25,000 take long."""
+    """At most one point per quarter of a cell: enough for depths, and 25,000 points take long."""
     quarter = np.floor(2 * pixels).astype(np.int64)
     _, first = np.unique(quarter[:, 1] * 100_000 + quarter[:, 0], return_index=True)
     return pixels[first], depths[first]
 
 
 def _empty_cells(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[K, 2] centres of the cells (the camera's pixels) in which no point lands."""
+    """[K, 2] centres of the cells (the camera's pixels) without points."""
     hits = np.zeros((camera.height, camera.width), bool)
     hits[cells(pixels)] = True
     return pixel_centres(*np.nonzero(~hits))
@@ -176,12 +179,12 @@ def _empty_cells(camera: Camera, pixels: NDArray[np.float64]) -> NDArray[np.floa
 def _interpolated(
     at: NDArray[np.float64], pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[K] depth at each place, from the nearest measured points.
+    """[K] depth at each pixel `at`, from the nearest sparse points.
 
-    The inverse depth of a plane is affine in the picture: where the nearest points lie on a plane,
-    it is continued (a floor, a wall). Elsewhere the farthest of the nearest points to all four
-    sides is taken: what has no texture is more often behind than before, and a splat too far hides
-    nothing.
+    The inverse depth of a plane is affine in the picture: if the nearest points lie on a plane, it
+    is extrapolated (a floor, a wall). Otherwise the largest depth among the nearest points of the
+    four quadrants is used: surfaces without texture are more often behind than in front, and a
+    splat that is too far occludes nothing.
     """
     offset = pixels[None] - at[:, None]
     distance2 = (offset**2).sum(2)
@@ -195,9 +198,9 @@ def _interpolated(
     normal = np.einsum("kpi,kpj->kij", design * weights, design) + 1e-9 * np.eye(3)
     right = np.einsum("kpi,kp->ki", design * weights, inverse)
     plane = np.linalg.solve(normal, right[..., None])[..., 0]
-    misfit = np.einsum("kpi,ki->kp", design, plane) - inverse
-    flat = np.sqrt((misfit**2).mean(1)) < PLANE_MISFIT * inverse.mean(1)
-    low, high = inverse.min(1) / PLANE_REACH, inverse.max(1) * PLANE_REACH
+    residual = np.einsum("kpi,ki->kp", design, plane) - inverse
+    flat = np.sqrt((residual**2).mean(1)) < PLANE_RESIDUAL * inverse.mean(1)
+    low, high = inverse.min(1) / PLANE_EXTENT, inverse.max(1) * PLANE_EXTENT
     on_plane = 1.0 / np.clip(plane[:, 0], low, high)
     return np.where(flat, on_plane, _farthest_around(offset, distance2, depths))
 

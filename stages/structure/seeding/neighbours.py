@@ -11,8 +11,8 @@ from stages.raster.kernels.simd import kernel
 def mean_neighbour_distance(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """[N] mean distance of each point [N, 3] to its `count` nearest others.
 
-    Duplicates count as neighbours at distance 0. With fewer than `count` others the mean is over
-    those that there are; a single point gives infinity. Points must be finite.
+    Duplicates are neighbours at distance 0. With fewer than `count` others the mean is over all of
+    them; a single point gives infinity. Points must be finite.
     """
     count = min(count, len(points) - 1)
     if count < 1:
@@ -28,8 +28,8 @@ def mean_neighbour_distance(points: NDArray[np.float64], count: int) -> NDArray[
 
 @kernel
 def _sweep(points: NDArray[np.float64], axis: int, count: int) -> NDArray[np.float64]:
-    """Points sorted along `axis`: look outwards on both sides until the next candidate is farther
-    along that axis alone than the `count`th best so far."""
+    """For points sorted along `axis`: search outwards on both sides until the next candidate is
+    farther away along that axis alone than the `count`th nearest so far."""
     n = len(points)
     result = np.empty(n)
     best = np.empty(count)

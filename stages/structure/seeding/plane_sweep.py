@@ -1,11 +1,10 @@
-"""Points that photographs agree on where structure from motion found none.
+"""Points by multi-view stereo, where structure from motion found none.
 
-A plane sweep (Collins 1996, "A space-sweep approach to true multi-image matching"): a photograph's
-partners, a few that see the same things from the side, are drawn small as it would see them if all
-that they show lay on a plane before it, for many distances of that plane. Where neighbourhoods
-correlate best is a guess at the depth. A guess counts only where the guesses of other photographs
-say the same, and the measured points around it do not stand behind it: about one in 500 is then
-wrong.
+Plane sweep (Collins 1996, "A space-sweep approach to true multi-image matching"): the pictures of a
+few source views with a suitable triangulation angle are warped into a reference view by a plane at
+each of many depth hypotheses. The depth with the largest normalised cross-correlation (NCC) of
+neighbourhoods is the estimate. An estimate is used only if depth maps of other views agree and
+visibility constraints support it: about one in 500 is then wrong.
 """
 
 from __future__ import annotations
@@ -26,38 +25,39 @@ from stages.scene import Camera, View
 from stages.structure.seeding.projection import cells, pixel_centres, unproject, visible_points
 from stages.structure.seeding.visibility import VisibilityConstraints
 
-SIDE = 200  # pixels, longer side of the photographs compared
-PLANES = 64
+SIDE = 200  # pixels, longer side of the depth maps
+PLANES = 64  # depth hypotheses
 RADIUS = 3  # of the neighbourhood, pixels
-PARTNERS = 4
-BEST_ANGLE, ANGLE_SPREAD = 10.0, (4.0, 8.0)  # degrees between two photographs' rays; below, above
-FEWEST_SHARED = 20  # points
-SAMPLE = 1000  # points that tell which photographs go together
-MARGIN = (0.7, 1.6)  # how far before the nearest and behind the farthest point is searched
-FLAT = 2e-5  # variance of a neighbourhood: hundredths of the noise of a photograph's 8 bits
-AGREE = 0.015  # of a depth
-# (correlation, confirmations): fewer others will do where the likeness is closer
-CONFIRMED = ((0.6, 3), (0.8, 2))
+SOURCES = 4  # source views of each reference view
+# Triangulation angle in degrees: the best one, and the spread below and above it.
+BEST_ANGLE, ANGLE_SPREAD = 10.0, (4.0, 8.0)
+FEWEST_SHARED = 20  # sparse points seen by both views
+SAMPLE = 1000  # sparse points by which source views are selected
+DEPTH_MARGIN = (0.7, 1.6)  # factors on the nearest and farthest depth of sparse points
+FLAT = 2e-5  # variance of a neighbourhood without texture: hundredths of 8-bit noise
+DEPTH_TOLERANCE = 0.015  # relative
+# (NCC, depth maps that must agree): fewer suffice for a larger NCC
+AGREEMENT = ((0.6, 3), (0.8, 2))
 CELL = 2.0  # pixels: at most one point in each
-SOLID = 250  # of 255: less of a pixel holds what a mask takes away
-SAME_SURFACE = 0.05  # of a depth
+SOLID = 250  # of 255: least value of the mask
+SAME_SURFACE = 0.05  # relative depth difference
 
 
 @dataclass(frozen=True)
-class _Guess:
-    """depth, score [H, W]: of one photograph; score: correlation, -1 where there is no guess."""
+class _DepthMap:
+    """Of one reference view: depth [H, W], and NCC [H, W], -1 without an estimate."""
 
     camera: Camera
     depth: NDArray[np.float32]
-    score: NDArray[np.float32]
+    ncc: NDArray[np.float32]
 
 
 def plane_sweep_points(
     folder: Path, views: tuple[View, ...], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """(points [M, 3], colours [M, 3] in 0..1) to add to the measured `points` [P, 3].
+    """(points [M, 3], colours [M, 3] in 0..1) to add to the sparse `points` [P, 3].
 
-    folder: where the views' image paths start.
+    folder: folder that the image paths of `views` are relative to.
     """
     ordered = sorted(views, key=lambda view: view.name)
     cameras = [view.camera.fitted(SIDE) for view in ordered]
@@ -66,29 +66,30 @@ def plane_sweep_points(
         for view, camera in zip(ordered, cameras, strict=True)
     ]
     grey = [np.ascontiguousarray(picture.mean(2), np.float32) for picture in pictures]
-    partners = _partners(cameras, points)
+    sources = _source_views(cameras, points)
     with ThreadPoolExecutor(threads.count()) as pool:
-        sweep = functools.partial(_swept, cameras=cameras, grey=grey, points=points)
-        guesses = list(pool.map(sweep, range(len(cameras)), partners))
-    for view, guess in zip(ordered, guesses, strict=True):
-        mask = mask_of(folder, view, guess.camera.width, guess.camera.height)
+        sweep = functools.partial(_sweep, cameras=cameras, grey=grey, points=points)
+        depth_maps = list(pool.map(sweep, range(len(cameras)), sources))
+    for view, depth_map in zip(ordered, depth_maps, strict=True):
+        mask = mask_of(folder, view, depth_map.camera.width, depth_map.camera.height)
         if mask is not None:
-            guess.score[mask < SOLID] = -1
-    places, colours = [points], [np.zeros((0, 3), np.float32)]
-    for i, guess in enumerate(guesses):
-        others = [j for j in range(len(guesses)) if j in partners[i] or i in partners[j]]
-        sure = _confirmed(guess, [guesses[j] for j in others])
-        rows, columns = _thinned(guess, sure, np.concatenate(places))
+            depth_map.ncc[mask < SOLID] = -1
+    positions, colours = [points], [np.zeros((0, 3), np.float32)]
+    for i, depth_map in enumerate(depth_maps):
+        others = [j for j in range(len(depth_maps)) if j in sources[i] or i in sources[j]]
+        consistent = _consistent(depth_map, [depth_maps[j] for j in others])
+        rows, columns = _best_per_cell(depth_map, consistent, np.concatenate(positions))
         at = pixel_centres(rows, columns)
-        places.append(unproject(guess.camera, at, guess.depth[rows, columns].astype(np.float64)))
+        depths = depth_map.depth[rows, columns].astype(np.float64)
+        positions.append(unproject(depth_map.camera, at, depths))
         colours.append(pictures[i][rows, columns])
-    more = np.concatenate(places[1:] or [np.zeros((0, 3))])
-    believed = VisibilityConstraints(views, points).confirm(more)
-    return more[believed], np.concatenate(colours)[believed]
+    more = np.concatenate(positions[1:] or [np.zeros((0, 3))])
+    supported = VisibilityConstraints(views, points).supported(more)
+    return more[supported], np.concatenate(colours)[supported]
 
 
-def _partners(cameras: list[Camera], points: NDArray[np.float64]) -> list[list[int]]:
-    """For each photograph those that see much of the same, about ten degrees from the side."""
+def _source_views(cameras: list[Camera], points: NDArray[np.float64]) -> list[list[int]]:
+    """Source views of each view: those with many shared points at a good triangulation angle."""
     chosen = np.unique(
         np.linspace(0, len(points) - 1, min(SAMPLE, len(points))).round().astype(int)
     )
@@ -107,50 +108,50 @@ def _partners(cameras: list[Camera], points: NDArray[np.float64]) -> list[list[i
         both = visible[i] & visible
         score = np.where(both.sum(1) >= FEWEST_SHARED, (fitness * both).sum(1), 0.0)
         score[i] = 0.0
-        order = np.argsort(-score, kind="stable")[:PARTNERS]
+        order = np.argsort(-score, kind="stable")[:SOURCES]
         found.append([int(j) for j in order if score[j] > 0.02 * visible[i].sum()])
     return found
 
 
-def _swept(
+def _sweep(
     i: int,
-    partners: list[int],
+    sources: list[int],
     cameras: list[Camera],
     grey: list[NDArray[np.float32]],
     points: NDArray[np.float64],
-) -> _Guess:
-    """The best of PLANES planes at each pixel, as the two most alike of the partners see it."""
+) -> _DepthMap:
+    """The best depth hypothesis at each pixel, by the mean NCC of the two best source views."""
     camera = cameras[i]
     nothing = np.full((camera.height, camera.width), -1, np.float32)
     depths = visible_points(camera, points)[2]
-    if not partners or not len(depths):
-        return _Guess(camera, np.ones_like(nothing), nothing)
-    nearest, farthest = np.percentile(depths, (1, 99)) * MARGIN
+    if not sources or not len(depths):
+        return _DepthMap(camera, np.ones_like(nothing), nothing)
+    nearest, farthest = np.percentile(depths, (1, 99)) * DEPTH_MARGIN
     inverse = np.linspace(1 / farthest, 1 / nearest, PLANES)
     mean = _box(grey[i])
     variance = np.maximum(_box(grey[i] * grey[i]) - mean * mean, 0)
     scores = np.empty((PLANES, camera.height, camera.width), np.float32)
     for plane, inverse_depth in enumerate(inverse):
-        alike = []
-        for j in partners:
-            moved, missing = _moved(camera, cameras[j], grey[j], float(inverse_depth))
+        nccs = []
+        for j in sources:
+            moved, missing = _warped(camera, cameras[j], grey[j], float(inverse_depth))
             mean2 = _box(moved)
             variance2 = np.maximum(_box(moved * moved) - mean2 * mean2, 0)
             covariance = _box(grey[i] * moved) - mean * mean2
-            likeness = covariance / np.sqrt((variance + FLAT) * (variance2 + FLAT))
-            likeness[missing] = -1
-            alike.append(likeness)
-        scores[plane] = _mean_of_best_two(alike)
+            ncc = covariance / np.sqrt((variance + FLAT) * (variance2 + FLAT))
+            ncc[missing] = -1
+            nccs.append(ncc)
+        scores[plane] = _mean_of_best_two(nccs)
     best = scores.argmax(0)
     score = scores.max(0)
     score[(best == 0) | (best == PLANES - 1) | (variance < FLAT / 2)] = -1
     depth = 1 / (inverse[0] + _peak(scores, best) * (inverse[1] - inverse[0]))
-    return _Guess(camera, depth.astype(np.float32), score)
+    return _DepthMap(camera, depth.astype(np.float32), score)
 
 
-def _mean_of_best_two(alike: Sequence[NDArray[np.floating]]) -> NDArray[np.floating]:
-    """Pixel by pixel; a fifth of what sorting takes."""
-    best, *others = alike
+def _mean_of_best_two(values: Sequence[NDArray[np.floating]]) -> NDArray[np.floating]:
+    """Pixel by pixel; five times as fast as sorting."""
+    best, *others = values
     if not others:
         return best
     second = np.full_like(best, -np.inf)
@@ -165,10 +166,10 @@ def _box(picture: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.blur(picture, size, borderType=cv2.BORDER_REFLECT), np.float32)
 
 
-def _moved(
+def _warped(
     camera: Camera, other: Camera, picture: NDArray[np.float32], inverse_depth: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """(`other`'s picture as `camera` sees it if it all lay on the plane; where there is none)."""
+    """(`other`'s picture, warped into `camera` by a fronto-parallel plane; where it has none)."""
     rotation = other.world_to_camera[:3, :3] @ camera.world_to_camera[:3, :3].T
     shift = other.world_to_camera[:3, 3] - rotation @ camera.world_to_camera[:3, 3]
     plane = rotation + np.outer(shift, (0, 0, inverse_depth))
@@ -185,12 +186,12 @@ def _moved(
 
 
 def _intrinsics(camera: Camera) -> NDArray[np.float64]:
-    """[3, 3] for OpenCV, which has the centre of the first pixel at 0."""
+    """[3, 3] for OpenCV, which has pixel centres at whole numbers."""
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
 
 
 def _peak(scores: NDArray[np.float32], best: NDArray[np.intp]) -> NDArray[np.float64]:
-    """[H, W] the best plane between planes: the top of a parabola through three scores."""
+    """[H, W] sub-plane index of the best plane: the peak of a parabola through three scores."""
     middle = np.clip(best, 1, PLANES - 2)
     below, at, above = (
         np.take_along_axis(scores, (middle + k)[None], 0)[0].astype(np.float64) for k in (-1, 0, 1)
@@ -199,41 +200,41 @@ def _peak(scores: NDArray[np.float32], best: NDArray[np.intp]) -> NDArray[np.flo
     return np.asarray(middle + np.clip(0.5 * (below - above) / bend, -1, 1), np.float64)
 
 
-def _confirmed(guess: _Guess, others: list[_Guess]) -> NDArray[np.bool_]:
-    """[H, W] where enough of the others' guesses agree with this one's."""
-    height, width = guess.depth.shape
+def _consistent(depth_map: _DepthMap, others: list[_DepthMap]) -> NDArray[np.bool_]:
+    """[H, W] where enough of the other depth maps agree with this one."""
+    height, width = depth_map.depth.shape
     rows, columns = np.divmod(np.arange(height * width), width)
     at = pixel_centres(rows, columns)
-    places = unproject(guess.camera, at, guess.depth.ravel().astype(np.float64))
-    sure = np.zeros(height * width, bool)
-    for likeness, wanted in CONFIRMED:
+    positions = unproject(depth_map.camera, at, depth_map.depth.ravel().astype(np.float64))
+    consistent = np.zeros(height * width, bool)
+    for ncc, wanted in AGREEMENT:
         count = np.zeros(height * width, int)
         for other in others:
-            landed, pixels, depths = visible_points(other.camera, places)
+            landed, pixels, depths = visible_points(other.camera, positions)
             there = cells(pixels)
-            same = np.abs(other.depth[there] / depths - 1) < AGREE
-            count[landed] += same & (other.score[there] > likeness)
-        sure |= (count >= wanted) & (guess.score.ravel() > likeness)
-    return sure.reshape(height, width)
+            same = np.abs(other.depth[there] / depths - 1) < DEPTH_TOLERANCE
+            count[landed] += same & (other.ncc[there] > ncc)
+        consistent |= (count >= wanted) & (depth_map.ncc.ravel() > ncc)
+    return consistent.reshape(height, width)
 
 
-def _thinned(
-    guess: _Guess, sure: NDArray[np.bool_], points: NDArray[np.float64]
+def _best_per_cell(
+    depth_map: _DepthMap, consistent: NDArray[np.bool_], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(rows, columns) of the best sure pixel of each cell in which no point lies already; a point
-    far before or behind a sure surface lies on another."""
-    height, width = sure.shape
+    """(rows, columns) of the consistent pixel with the largest NCC in each cell without points.
+    Points far in front of or behind a consistent depth are on another surface and do not count."""
+    height, width = consistent.shape
     taken = np.zeros((int(height // CELL) + 1, int(width // CELL) + 1), bool)
-    _, pixels, depths = visible_points(guess.camera, points)
+    _, pixels, depths = visible_points(depth_map.camera, points)
     there = cells(pixels)
-    same = np.abs(depths / guess.depth[there] - 1) < SAME_SURFACE
-    rows, columns = cells(pixels[same | ~sure[there]], CELL)
+    same = np.abs(depths / depth_map.depth[there] - 1) < SAME_SURFACE
+    rows, columns = cells(pixels[same | ~consistent[there]], CELL)
     taken[rows, columns] = True
-    rows, columns = np.nonzero(sure)
+    rows, columns = np.nonzero(consistent)
     down, across = cells(pixel_centres(rows, columns), CELL)
     cell = down * taken.shape[1] + across
     free = ~taken.ravel()[cell]
     rows, columns, cell = rows[free], columns[free], cell[free]
-    order = np.lexsort((-guess.score[rows, columns], cell))
+    order = np.lexsort((-depth_map.ncc[rows, columns], cell))
     _, first = np.unique(cell[order], return_index=True)
     return rows[order][first], columns[order][first]

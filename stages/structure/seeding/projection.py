@@ -1,4 +1,4 @@
-"""From the world into the cells of a picture, and back."""
+"""Projection of points into the cells of a picture, and back."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stages.scene import Camera
 def visible_points(
     camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """(rows [K] of the points that land in the picture, their pixels [K, 2], depths [K])."""
+    """(indices [K] of the points that project into the picture, pixels [K, 2], depths [K])."""
     pixels, z = camera.project(points)
     rows = np.flatnonzero((z > 1e-6) & camera.shows(pixels))
     return rows, pixels[rows], z[rows]
@@ -20,7 +20,7 @@ def visible_points(
 def unproject(
     camera: Camera, pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[K, 3] the places at `depths` [K] that `pixels` [K, 2] show."""
+    """[K, 3] the points at `depths` [K] that project to `pixels` [K, 2]."""
     rays = np.stack(
         [
             (pixels[:, 0] - camera.cx) / camera.fx,
@@ -36,11 +36,11 @@ def unproject(
 def cells(
     pixels: NDArray[np.float64], size: float = 1.0
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(rows [K], columns [K]) of the cells of `size` pixels in which `pixels` [K, 2] lie."""
+    """(rows [K], columns [K]) of the cells of `size` pixels that contain `pixels` [K, 2]."""
     columns, rows = np.floor(pixels / size).astype(np.intp).T
     return rows, columns
 
 
 def pixel_centres(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
-    """[K, 2] the middle of each pixel."""
+    """[K, 2] the centre of each pixel."""
     return np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)

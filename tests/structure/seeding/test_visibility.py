@@ -23,7 +23,7 @@ def wall() -> np.ndarray:
 
 
 def asked(place: tuple[float, float, float], of: str) -> tuple[int, int]:
-    agree, before = VisibilityConstraints(views(), wall()).ask(np.array([place]), of)
+    agree, before = VisibilityConstraints(views(), wall()).count(np.array([place]), of)
     return int(agree[0]), int(before[0])
 
 
@@ -45,6 +45,6 @@ def test_a_photograph_is_no_witness_of_its_own() -> None:
 
 
 def test_without_points_nobody_knows_anything() -> None:
-    agree, before = VisibilityConstraints(views(), np.zeros((0, 3))).ask(wall(), "")
+    agree, before = VisibilityConstraints(views(), np.zeros((0, 3))).count(wall(), "")
     assert not agree.any()
     assert not before.any()
