@@ -31,8 +31,8 @@ _ONLY_ITSELF = (
 class _Original:
     """What files are compared with.
 
-    name: for messages. source_format: the format that it was read from. itself: whether it is the file
-    to verify. backend: of the rendering. quantised: of a run.
+    name: for messages. source_format: the format that it was read from. itself: whether it is the
+    file to verify. backend: of the rendering. quantised: of a run.
     """
 
     splats: Splats
