@@ -20,7 +20,7 @@ _HEADLINES = {
         *("features_seconds", "matching_seconds", "mapping_seconds"),
     ),
     "seed": ("splats",),
-    "train": ("splats", "psnr_db", "ssim", "made_by"),
+    "train": ("splats", "psnr_db", "ssim", "trained_by"),
     # Later stages measure at sizes of their own: their PSNR is no sequel of training's.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),

@@ -21,10 +21,14 @@ def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) ->
 
     Raises SplatError: stage-not-finished, run-half-anew, compare-other-photographs,
     compare-nothing-in-common, and what keeps files from being written."""
-    from stages.measure.tradeoff.pair_report import fact_rows, write_comparison
-
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.comparison import compare_runs, distinct_name, verdict_lines
+    from stages.measure.tradeoff.comparison import (
+        compare_runs,
+        distinct_name,
+        fact_rows,
+        verdict_lines,
+        write_comparison,
+    )
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [

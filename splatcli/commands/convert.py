@@ -25,9 +25,11 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     """
     from stages import formats
     from stages.base import scratch
+    from stages.base.atomic import make_folder
     from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
+    make_folder(target.parent)
     begun = time.monotonic()
     with _progress(quiet, as_json) as say, scratch.scratch_in(target.parent, spare=True):
         say(f"reading {source}")
@@ -71,7 +73,7 @@ def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
     from stages.proof.prover import Prover, cameras_for
 
     cameras = cameras_for(splats, views_around(source))
-    proof = Prover.of(splats, cameras, came_as=format_of(source).ending).prove(target)
+    proof = Prover.of(splats, cameras, source_format=format_of(source).ending).prove(target)
     if proof.fault:
         raise _failed(target, proof.fault)
     return proof.figures

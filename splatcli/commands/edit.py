@@ -100,9 +100,9 @@ def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
     from stages.proof.prover import Prover, cameras_for
 
     splats = drop_undrawable(scene.splats)[0]
-    came_as = format_of(source).ending if source.is_file() else ""
+    source_format = format_of(source).ending if source.is_file() else ""
     cameras = cameras_for(splats, scene.placed_views())
-    proof = Prover.of(splats, cameras, scene.backend, came_as).prove(target)
+    proof = Prover.of(splats, cameras, scene.backend, source_format).prove(target)
     if proof.fault:
         raise SplatError(
             "edit-verify-failed",

@@ -32,7 +32,7 @@ class _Original:
     splats: Splats
     views: tuple[View, ...]
     name: str
-    came_as: str = ""
+    source_format: str = ""
     itself: bool = False
     backend: str = "auto"
     quantised: QuantisedSplats | None = None
@@ -72,7 +72,7 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
         if original is None or prover is None:
             original = _original(file, against, read)
             cameras = cameras_for(original.splats, original.views)
-            prover = Prover.of(original.splats, cameras, original.backend, original.came_as)
+            prover = Prover.of(original.splats, cameras, original.backend, original.source_format)
         del read
         for held in original.held_in(file):
             proof = replace(prover, splats=held).prove(file, exact=original.itself)
@@ -121,8 +121,8 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
         raise runfolder.missing(against)
     run = Pipeline(against) if against is not None else sources.pipeline_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
-        came_as = formats.format_of(file).ending
-        return _Original(drop_undrawable(read)[0], (), _ITSELF, came_as, itself=True)
+        source_format = formats.format_of(file).ending
+        return _Original(drop_undrawable(read)[0], (), _ITSELF, source_format, itself=True)
     seen = run.load("sfm").views
     quantised = run.load("quantise")
     splats = drop_undrawable(quantised.splats)[0]

@@ -1,4 +1,4 @@
-"""How many bytes of a file are spent on what."""
+"""How many bytes of a splat file each attribute takes."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ class ByteBreakdown:
 
 def ply(path: Path) -> ByteBreakdown:
     with path.open("rb") as file:
-        return ByteBreakdown(_columns(read_header(file)))
+        return ByteBreakdown(_ply_columns(read_header(file)))
 
 
 def html(path: Path) -> ByteBreakdown:
-    """Of the .ply that is packed inside."""
+    """Of the .ply inside."""
     start = next(unzipped(path))  # some megabytes: longer than any header
-    return ByteBreakdown(_columns(read_header(io.BytesIO(start))), unpacked=True)
+    return ByteBreakdown(_ply_columns(read_header(io.BytesIO(start))), unpacked=True)
 
 
 def usd(path: Path) -> ByteBreakdown:
@@ -73,7 +73,7 @@ def usd(path: Path) -> ByteBreakdown:
     return ByteBreakdown({}, unknown=unknown)
 
 
-def _columns(header: Header) -> dict[str, int]:
+def _ply_columns(header: Header) -> dict[str, int]:
     parts: Counter[str] = Counter()
     for element in header.elements if header.encoding != "ascii" else ():
         for name, kind in element.properties:
@@ -125,16 +125,16 @@ def spz(path: Path) -> ByteBreakdown:
 
 def sog(path: Path) -> ByteBreakdown:
     with zipfile.ZipFile(path) as package:
-        return _of_pictures((m.filename, m.compress_size) for m in package.infolist())
+        return _sog_breakdown((m.filename, m.compress_size) for m in package.infolist())
 
 
 def streamed_sog(path: Path) -> ByteBreakdown:
     chunks = format_of(path).files(path)[1:]
-    return _of_pictures((file.name, file.stat().st_size) for file in chunks)
+    return _sog_breakdown((file.name, file.stat().st_size) for file in chunks)
 
 
-def _of_pictures(members: Iterable[tuple[str, int]]) -> ByteBreakdown:
-    """Of (name, bytes) of the files of a SOG."""
+def _sog_breakdown(members: Iterable[tuple[str, int]]) -> ByteBreakdown:
+    """By attribute, from (name, bytes) of the files of a SOG."""
     parts: Counter[str] = Counter()
     for name, size in members:
         stem = name.rpartition("/")[2].partition(".")[0].partition("_")[0]

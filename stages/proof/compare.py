@@ -1,4 +1,4 @@
-"""How far the values of a file lie from the splats that it was made from."""
+"""The differences between the values of a file and the splats that it was made from."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from stages.scene.flip import FLIP, flipped
 
 _BLOCK = 1 << 16  # rows compared at a time: copies stay small however large the file is
 
-# What one can begin to see, for naming the worst: a part of the scene's extent, natural
-# logarithms, degrees, and one step of 8 bits.
+# Errors that begin to be visible, to compare attributes: share of the scene's extent, natural
+# logarithm, degrees, and one step of 8 bits.
 _VISIBLE = {
     "position": 0.001,
     "log_scale": 0.02,
@@ -28,23 +28,27 @@ _VISIBLE = {
     "rotation": 1.0,
     "sh": 1 / 255 / SH_C0,
 }
-_ROUNDING = 0.01  # less than this part of it is not worth a name
-# Beyond it half of all splats are wrong, which no format does to them but a mistake does: a part
-# of the extent, natural logarithms, 0..1, degrees, 0..1.
+_ROUNDING = 0.01  # share of a visible error below which a difference is rounding
+# Medians above these show a mistake, as no format loses so much: share of the extent, natural
+# logarithm, 0..1, degrees, 0..1.
 _WRONG = {"position": 0.01, "log_scale": 0.5, "opacity": 0.1, "rotation": 10.0, "colour": 0.1}
-# Squared error of the view-dependent colours over their own squares: 1 where they are left out,
-# about 2 where they are others'.
+# Squared error of SH coefficients above degree 0, relative to their squares: 1 where they are
+# missing, about 2 where they are unrelated.
 _WRONG_SH = 1.1
-_LONG = 0.2  # a splat has a direction if its axes differ by this logarithm
+_ANISOTROPIC = 0.2  # a splat has an orientation if its log scales differ by this
 
 
 @dataclass(frozen=True)
 class Differences:
-    """largest: by attribute; positions in world units, scales in natural logarithms, opacities
-    in 0..1, rotations in degrees, SH as stored. worst: the attribute whose largest difference shows
-    most, "" if it is only rounding; worst_row: where in the file. wrong: what of most splats is
-    wrong.
-    rows [N]: for each row of the file the row of the original.
+    """Differences between a file and its original.
+
+    Attributes:
+        largest: by attribute; positions in world units, scales as natural logarithms, opacities in
+            0..1, rotations in degrees, SH as stored.
+        worst: the attribute with the most visible largest difference; "" if all are rounding.
+        worst_row: its row in the file.
+        wrong: attributes that are wrong for most splats.
+        rows: [N] for each row of the file the row of the original.
     """
 
     largest: dict[str, float]
@@ -57,7 +61,7 @@ class Differences:
 def differences(splats: Splats, content: FileContent, *names: str) -> Differences:
     """Compare a file with the `splats` that it should hold: as many, finite, in any order.
 
-    names: of the formats through which either went; some sort the rows or keep fewer bands.
+    names: the formats that either went through; some sort the rows or reduce the SH degree.
     """
     formats = [BY_ENDING[name] for name in names]
     file = content.splats
@@ -74,7 +78,7 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
         a = splats.take(rows[block]).with_sh_degree(degree)
         b = file.take(block).with_sh_degree(degree)
         a = flipped(a) if upright else a
-        for name, values in _block(a, b).items():
+        for name, values in _errors(a, b).items():
             if name not in errors:
                 errors[name] = scratch.empty((len(file),))
             errors[name][block] = values
@@ -84,7 +88,8 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
 
 
 def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows]:
-    """How a format may have sorted either side; made one by one, as the first often fits."""
+    """The orders in which the formats may have written either side; an iterator, because the first
+    often fits."""
     for row in formats:
         if row.order:
             order = load_object(row.order)
@@ -92,22 +97,21 @@ def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows
             yield np.argsort(order(file))
 
 
-def _block(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
+def _errors(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
     """By attribute, [N] the difference of each splat."""
-    both = a.sh[:, 0], b.sh[:, 0]
-    seen = [np.clip(0.5 + SH_C0 * dc.astype(np.float64), 0, 1) for dc in both]
+    colours = [np.clip(0.5 + SH_C0 * s.sh[:, 0].astype(np.float64), 0, 1) for s in (a, b)]
     return {
-        "position": _apart(a.means, b.means),
-        "log_scale": _apart(a.log_scales, b.log_scales),
-        "opacity": _apart(a.opacities[:, None], b.opacities[:, None]),
-        "rotation": rotations_apart(a.quaternions, b.quaternions),
-        "sh": _apart(a.sh.reshape(len(a), -1), b.sh.reshape(len(b), -1)),
-        "colour": np.abs(seen[0] - seen[1]).max(axis=1, initial=0.0),
-        "length": a.log_scales.max(axis=1) - a.log_scales.min(axis=1),
+        "position": _largest_difference(a.means, b.means),
+        "log_scale": _largest_difference(a.log_scales, b.log_scales),
+        "opacity": _largest_difference(a.opacities[:, None], b.opacities[:, None]),
+        "rotation": rotation_angles(a.quaternions, b.quaternions),
+        "sh": _largest_difference(a.sh.reshape(len(a), -1), b.sh.reshape(len(b), -1)),
+        "colour": np.abs(colours[0] - colours[1]).max(axis=1, initial=0.0),
+        "anisotropy": a.log_scales.max(axis=1) - a.log_scales.min(axis=1),
     }
 
 
-def _apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+def _largest_difference(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """[N] largest difference in each row of [N, K]."""
     found: NDArray[np.float64] = np.abs(a.astype(np.float64) - b.astype(np.float64)).max(
         axis=1, initial=0.0
@@ -115,9 +119,9 @@ def _apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float
     return found
 
 
-def rotations_apart(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[N] degrees between rotations [N, 4] of ellipsoids, which half turns about their own axes
-    leave as they are: of the four turns from a to b, the least."""
+def rotation_angles(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[N] degrees between the rotations a and b [N, 4] of ellipsoids. Half turns about the axes of
+    an ellipsoid do not change it, so the smallest of four rotations from a to b counts."""
     a, b = (q.astype(np.float64) for q in (a, b))
     a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
     real = (a * b).sum(axis=1, keepdims=True)
@@ -140,7 +144,7 @@ def _summary(
     row = int(errors[worst].argmax()) if shows else 0
     typical = {name: float(np.median(errors[name])) for name in _WRONG}
     typical["position"] /= extent
-    long = errors["length"] > _LONG
+    long = errors["anisotropy"] > _ANISOTROPIC
     typical["rotation"] = float(np.median(errors["rotation"][long])) if long.any() else 0.0
     wrong = [name for name in _WRONG if typical[name] > _WRONG[name]]
     if sums[0] > _WRONG_SH * max(sums[1], sums[2]):
@@ -149,7 +153,7 @@ def _summary(
 
 
 def _named(largest: dict[str, float]) -> dict[str, float]:
-    """With units in the names, three digits each."""
+    """With units in the names, rounded to three digits."""
     names = {"rotation": "max_rotation_error_degrees"}
     return {
         names.get(name, f"max_{name}_error"): float(f"{value:.3g}")

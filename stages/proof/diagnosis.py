@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from stages.proof.compare import Differences, rotations_apart
+from stages.proof.compare import Differences, rotation_angles
 from stages.proof.content import FileContent
 from stages.proof.matching import extent_of
 from stages.scene import Splats
@@ -101,7 +101,7 @@ def _quaternions(truth: Splats, file: Splats) -> str:
     return _first_below(
         _FITS_DEGREES,
         (
-            (words, float(np.median(rotations_apart(truth.quaternions, guess))))
+            (words, float(np.median(rotation_angles(truth.quaternions, guess))))
             for words, guess in tried
         ),
     )

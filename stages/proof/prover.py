@@ -1,8 +1,8 @@
 """Proof that a file holds the splats that it was made from.
 
-A parser that did not write it reads it back, the rasteriser draws it from cameras that training
-never saw, and every value is compared with the original's. Of very many splats those in the middle
-are drawn: drawing takes more memory than they do.
+An independent reader reads it back, the rasteriser draws it from held-out cameras, and every value
+is compared with the original. Of more than `_MAX_DRAWN` splats only the central ones are drawn,
+because drawing takes more memory than the splats themselves.
 """
 
 from __future__ import annotations
@@ -30,21 +30,24 @@ from stages.scene.framing import orbit_cameras
 
 _SIDE_PX = 480
 _CAMERAS = 3
-_MIDDLE = 0.5  # of the splats, to look at where no photographs tell: the rest is background
-_MOST_DRAWN = 1 << 22
-_LOSSLESS_DB = 45.0  # below it a file that should hold everything is wrong
-_LOSSY_DB = 30.0  # below it the loss is worth a warning
+_CENTRAL_SHARE = 0.5  # of the splats, to look at where no views are known
+_MAX_DRAWN = 1 << 22
+_MIN_LOSSLESS_DB = 45.0  # a file of a lossless format below this is wrong
+_WARN_LOSSY_DB = 30.0  # a file of a lossy format below this gets a warning
 
 
 @dataclass(frozen=True)
 class Proof:
-    """What was found about one file.
+    """The result for one file.
 
-    splats: how many it holds. figures: verify_db (PSNR between pictures of the original and of the
-    file, the worst camera), verify_mean_db, verify_cameras, and the largest errors of the values;
-    worst_attribute and worst_splat: whose largest error shows most, and its row in the file.
-    fault: why the file is wrong, "" if it is not; the figures are empty where nothing could be
-    compared. loss_db: what a lossy file lost if that is worth a warning, else None.
+    Attributes:
+        splats: the number of splats in the file.
+        figures: verify_db (the lowest PSNR of a camera between pictures of the original and of the
+            file), verify_mean_db, verify_cameras, the largest errors of the values, and
+            worst_attribute and worst_splat: the most visible error and its row in the file. Empty
+            where nothing could be compared.
+        fault: why the file is wrong; "" if it is not.
+        loss_db: the PSNR of a lossy file where it calls for a warning, else None.
     """
 
     splats: int
@@ -54,12 +57,14 @@ class Proof:
 
 
 def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...]:
-    """Three cameras to compare from: of held-out views spread over the capture, of other views
-    where none are held out, around the splats where there are none at all."""
+    """Three cameras to compare from: held-out views spread over the capture; training views where
+    none are held out; an orbit around the splats where there are no views."""
     training, held = split_held_out(tuple(views))
     chosen = held or training
     if not chosen:
-        return tuple(camera.fitted(_SIDE_PX) for camera in orbit_cameras(splats, _CAMERAS, _MIDDLE))
+        return tuple(
+            camera.fitted(_SIDE_PX) for camera in orbit_cameras(splats, _CAMERAS, _CENTRAL_SHARE)
+        )
     return tuple(view.camera.fitted(_SIDE_PX) for view in evenly_spaced(chosen, _CAMERAS))
 
 
@@ -67,9 +72,13 @@ def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...
 class Prover:
     """Compares files with one original, whose pictures are drawn once.
 
-    splats: the original, as `rows.kept_rows` leaves it. drawn: which of its rows are. came_as: the
-    format of the file that it was read from, "" if it was not; after a lossy one nothing can be
-    asked of float32.
+    Attributes:
+        splats: the original; all drawable.
+        drawn: the rows that are drawn.
+        cameras, pictures: the original drawn from each camera, [H, W, 3].
+        backend: the rasteriser.
+        source_format: the format of the file that the original was read from; "" if it was not
+            read from a file. After a lossy format, no format is expected to be lossless.
     """
 
     splats: Splats
@@ -77,7 +86,7 @@ class Prover:
     cameras: tuple[Camera, ...]
     pictures: tuple[NDArray[np.float32], ...]
     backend: str
-    came_as: str
+    source_format: str
 
     @classmethod
     def of(
@@ -85,38 +94,38 @@ class Prover:
         splats: Splats,
         cameras: tuple[Camera, ...],
         backend: str = AUTO,
-        came_as: str = "",
+        source_format: str = "",
     ) -> Prover:
-        drawn = _middle(splats)
+        drawn = _central_rows(splats)
         draw = renderer(splats.take(drawn), raster_settings_of(splats), backend)
         pictures = tuple(draw(camera).image for camera in cameras)
-        return cls(splats, drawn, cameras, pictures, backend, came_as)
+        return cls(splats, drawn, cameras, pictures, backend, source_format)
 
     def prove(self, path: Path, exact: bool = False) -> Proof:
-        """Read `path` with a second parser, draw it and compare. Nothing is raised for a file
-        that is wrong.
+        """Read `path` with an independent reader, draw it and compare. Nothing is raised for a
+        wrong file.
 
-        exact: whether even a format that keeps less than float32 has to give the same, because the
-        original was read from the file itself.
+        exact: whether a lossy format has to agree, too, because the original was read from this
+        file.
         """
         row = format_of(path)
         try:
             content = _drawable(checks.read_back(path))
             errors = checks.CHECKS[row.ending].validate(path)
-        except Exception as error:  # whatever another parser raises: the file is wrong
-            return Proof(0, {}, f"another reader refused it ({_words(error)})")
+        except Exception as error:  # whatever the reader raises: the file is wrong
+            return Proof(0, {}, f"another reader refused it ({_message(error)})")
         count = len(content.splats)
         if errors:
             return Proof(count, {}, f"its validator says: {errors[0]}")
         if count != len(self.splats):
             return Proof(count, {}, f"it holds {count} of {len(self.splats)} splats")
-        names = tuple(filter(None, (row.ending, self.came_as)))
+        names = tuple(filter(None, (row.ending, self.source_format)))
         lossy = not exact and any(BY_ENDING[name].loses for name in names)
         return self._compared(content, names, lossy)
 
     def _compared(self, content: FileContent, names: tuple[str, ...], lossy: bool) -> Proof:
         found = differences(self.splats, content, *names)
-        by_camera = self._decibels(content, found.rows)
+        by_camera = self._psnr_by_camera(content, found.rows)
         worst = min(by_camera, default=IDENTICAL_DB)
         figures = {
             "verify_db": round(worst, 2),
@@ -127,16 +136,16 @@ class Prover:
             "worst_splat": found.worst_row,
         }
         fault = diagnosis.explain(self.splats, content, found)
-        if not lossy and worst < _LOSSLESS_DB:
+        if not lossy and worst < _MIN_LOSSLESS_DB:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn
-        loss_db = worst if lossy and worst < _LOSSY_DB and not fault else None
+        loss_db = worst if lossy and worst < _WARN_LOSSY_DB and not fault else None
         return Proof(len(content.splats), figures, fault, loss_db)
 
-    def _decibels(self, content: FileContent, rows: Rows) -> list[float]:
-        """By camera; rows: see `Differences`. The camera is moved into the file's axes, not the
-        file's splats into ours: so the turn of positions, rotations and SH is checked by something
-        other than itself."""
+    def _psnr_by_camera(self, content: FileContent, rows: Rows) -> list[float]:
+        """PSNR by camera. rows: see `Differences`. The camera is moved into the axes of the file
+        instead of the splats into ours, so that the rotation of positions, quaternions and SH is
+        checked by other code than itself."""
         drawn = self.drawn if isinstance(self.drawn, slice) else self.drawn[rows]
         draw = renderer(content.splats.take(drawn), raster_settings_of(self.splats), self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
@@ -146,22 +155,22 @@ class Prover:
         ]
 
 
-def _middle(splats: Splats) -> NDArray[np.bool_] | slice:
-    """Rows that are drawn: all, or the `_MOST_DRAWN` nearest to the middle."""
-    if len(splats) <= _MOST_DRAWN:
+def _central_rows(splats: Splats) -> NDArray[np.bool_] | slice:
+    """The rows that are drawn: all, or the `_MAX_DRAWN` nearest to the median."""
+    if len(splats) <= _MAX_DRAWN:
         return slice(None)
     middle = [np.median(splats.means[:, axis]) for axis in range(3)]
     far = np.empty(len(splats), np.float32)
     for rows in blocks(len(splats)):
         far[rows] = np.linalg.norm(splats.means[rows] - middle, axis=1)
     drawn = np.zeros(len(splats), bool)
-    drawn[np.argpartition(far, _MOST_DRAWN)[:_MOST_DRAWN]] = True
+    drawn[np.argpartition(far, _MAX_DRAWN)[:_MAX_DRAWN]] = True
     return drawn
 
 
 def _drawable(content: FileContent) -> FileContent:
-    """Without what no viewer can draw. Infinite logarithms, of flat and of opaque splats, become
-    numbers, as the readers that are checked make them."""
+    """The drawable splats. Infinite logarithms of flat and opaque splats become finite, as in our
+    readers."""
     splats = content.splats
     if not (np.isfinite(splats.log_scales).all() and np.isfinite(splats.opacity_logits).all()):
         splats = replace(
@@ -178,5 +187,5 @@ def _drawable(content: FileContent) -> FileContent:
     return replace(content, splats=drop_undrawable(splats)[0])
 
 
-def _words(error: Exception) -> str:
+def _message(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,17 +1,17 @@
-"""What a set of splats is made of, and what in it will cause trouble in a viewer.
+"""Statistics of a set of splats, and the splats that cause trouble in viewers.
 
-What counts as trouble:
+Troublesome splats:
 - needle: the longest axis is more than 100 times the second. Its effective rank (Hyung et al. 2024,
   "Effective Rank Analysis and Regularization for Enhanced 3D Gaussian Splatting") is then 1.001 of
-  3: a line, which stands out from views that training did not have. A flat splat is no needle.
+  3: a line, which becomes visible from new views. A flat splat is no needle.
 - giant: the longest standard deviation is more than a tenth of the scene's extent, beyond which the
   reference trainer removes a splat (Kerbl et al. 2023).
 - outlier: the centre lies more than 5 times as far out as the box that holds the middle 98 % of the
   coordinates on each axis. A viewer that frames everything then shows the scene as a dot.
 - transparent: the opacity is below 1/255, so that it is never drawn.
-- no rotation: the quaternion is 0, or too short to tell; too large: the square of the size is more
-  than a float32 holds. Neither can be drawn.
-- duplicate: equal to another in everything but its view-dependent colour.
+- no rotation: the quaternion is 0 or too short to be normalised; too large: the squared scale
+  exceeds float32. Neither can be drawn.
+- duplicate: equal to another splat in everything but SH above degree 0.
 """
 
 from __future__ import annotations
@@ -36,12 +36,20 @@ _VALUES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 @dataclass(frozen=True)
 class Statistics:
-    """count: of splats. by_degree: how many use each SH degree. not_finite: by attribute, how many
-    splats hold NaN or infinity there; all that follows is of the others (`whole` of them).
+    """Statistics of splats. Lengths are in world units, relative to the origin of the splats.
 
-    low, high [3]: box of the centres; middle_low, middle_high: of 98 % of their coordinates on each
-    axis. extent: its diagonal. All in world units, relative to the splats' origin. median_scale:
-    standard deviation in world units. The rest counts splats, see above.
+    Attributes:
+        count: the number of splats.
+        by_degree: splats by the SH degree that they use.
+        not_finite: by attribute, splats with NaN or infinity. All that follows ignores them.
+        whole: the number of the other splats.
+        low, high: [3] box of the centres.
+        middle_low, middle_high: [3] box of the central 98 % of the coordinates on each axis.
+        median_centre: [3] median coordinates.
+        extent: diagonal of the middle box.
+        median_scale: median standard deviation.
+        median_opacity: in 0..1.
+        needles ... duplicates: numbers of troublesome splats, see above.
     """
 
     count: int
@@ -66,7 +74,7 @@ class Statistics:
 
 
 def statistics_of(splats: Splats) -> Statistics:
-    """Count everything. Values may be anything, NaN included."""
+    """The statistics of `splats`, whose values may be anything, NaN included."""
     degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
     by_degree = {int(d): int(n) for d, n in zip(degrees, counts, strict=True)}
     whole, not_finite = _finite(splats)
@@ -79,7 +87,7 @@ def statistics_of(splats: Splats) -> Statistics:
     for rows in blocks(len(splats)):
         block = splats.take(rows)
         keys[rows] = _fingerprints(block)
-        for name, marks in _marks(block.take(whole[rows]), box, extent).items():
+        for name, marks in _troubles(block.take(whole[rows]), box, extent).items():
             found[name] += int(np.count_nonzero(marks))
     keys = keys[whole]
     return Statistics(
@@ -123,10 +131,10 @@ def _box(means: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _marks(
+def _troubles(
     splats: Splats, box: dict[str, NDArray[np.float64]], extent: float
 ) -> dict[str, NDArray[np.bool_]]:
-    """[N] which splats are what; all values finite."""
+    """By kind of trouble: [N] which splats have it. All values must be finite."""
     logs = np.sort(splats.log_scales, axis=1)
     middle = (box["middle_low"] + box["middle_high"]) / 2
     half = (box["middle_high"] - box["middle_low"]) / 2
@@ -142,13 +150,13 @@ def _marks(
 
 
 def _fingerprints(splats: Splats) -> NDArray[np.uint64]:
-    """[N] equal for equal rows; that two of 10 million others meet has a chance of 3 in a
-    million."""
+    """[N] a 64-bit hash of each row; two different rows of 10 million collide with a probability of
+    3 in a million."""
     columns = (splats.means, splats.quaternions, splats.log_scales, splats.sh[:, 0])
     table = np.concatenate([*columns, splats.opacity_logits[:, None]], axis=1, dtype=np.float32)
     words = np.ascontiguousarray(table).view(np.uint32).astype(np.uint64)
     key = np.zeros(len(words), np.uint64)
-    for column in words.T:  # FNV-1a's prime, and a shift that brings high bits down
+    for column in words.T:  # the prime of FNV-1a, and a shift that mixes in the high bits
         key = (key ^ column) * np.uint64(0x100000001B3)
         key ^= key >> np.uint64(29)
         key *= np.uint64(0xBF58476D1CE4E5B9)

@@ -1,5 +1,5 @@
-"""A triangle mesh of the scene's surfaces: for engines that have to bump into something.
+"""The collision mesh: triangles of the scene's surfaces, for physics in game engines.
 
-Depth drawn from the splats -> a signed distance field -> marching cubes -> fewer triangles. It is
-a collision proxy: where things are, not how they look.
+Depth maps drawn from the splats -> truncated signed distance field -> marching cubes ->
+simplification.
 """

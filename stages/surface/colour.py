@@ -1,4 +1,4 @@
-"""What colour the cameras saw at each vertex."""
+"""Vertex colours of the mesh from the drawn views."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from stages.surface.depth_maps import DepthMap
 from stages.surface.mesh import Mesh
 
 
-def coloured(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
-    """Each vertex in the mean of what the pixels show that see it, by their votes.
+def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
+    """The mesh with colours: the weighted mean of the pixels that see each vertex.
 
-    tolerance: how far a pixel's depth may lie from the vertex, world units. What no pixel sees
-    takes the colour of the nearest vertex that one does.
+    tolerance: the largest distance in depth between a pixel and a vertex that it sees, world units.
+    A vertex that no pixel sees takes the colour of the nearest one that is seen.
     """
     from scipy.spatial import cKDTree
 
     if not len(mesh.vertices):
         return mesh
-    sums, votes = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
+    sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
     for found in maps:
         camera = found.camera
         pixels, z = camera.project(mesh.vertices.astype(np.float64))
@@ -29,14 +29,14 @@ def coloured(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
         agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
         seen = np.flatnonzero(inside)[agrees]
         rows, columns = rows[agrees], columns[agrees]
-        weight = found.vote[rows, columns].astype(np.float64)
+        weight = found.weight[rows, columns].astype(np.float64)
         sums[seen] += weight[:, None] * found.colour[rows, columns]
-        votes[seen] += weight
-    known = votes > 0
+        weights[seen] += weight
+    known = weights > 0
     if not known.any():
         return mesh
-    colours = np.zeros((len(votes), 3))
-    colours[known] = sums[known] / votes[known, None]
+    colours = np.zeros((len(weights), 3))
+    colours[known] = sums[known] / weights[known, None]
     _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])
     colours[~known] = colours[known][nearest]
     return replace(mesh, colours=np.rint(colours).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""How far points lie from a mesh."""
+"""Distances of points from a mesh."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ _CANDIDATES = 8  # triangles measured exactly for each point
 _POINTS_AT_ONCE = 1 << 16
 
 
-def distances(points: NDArray[np.floating], mesh: Mesh, spacing: float) -> NDArray[np.float64]:
-    """[P] from each point to the nearest triangle, world units; infinite if there is none.
+def distances_to_mesh(
+    points: NDArray[np.floating], mesh: Mesh, spacing: float
+) -> NDArray[np.float64]:
+    """[P] distance from each point [P, 3] to the nearest triangle, world units; infinite for an
+    empty mesh.
 
-    Exact distances to the triangles of the eight nearest samples of the surface, `spacing` apart at
-    most: never too small, and too large only where all eight miss the nearest triangle.
+    The distance is exact for the triangles of the eight nearest surface samples, which are at most
+    `spacing` apart. It is never too small, and too large only where all eight samples miss the
+    nearest triangle.
     """
     from scipy.spatial import cKDTree
 
@@ -39,8 +43,8 @@ def distances(points: NDArray[np.floating], mesh: Mesh, spacing: float) -> NDArr
 def _samples(
     corners: NDArray[np.float64], spacing: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """([S, 3] centres of the parts of each triangle, [S] which triangle); a triangle is cut into
-    n^2 alike ones, n so that no edge of a part is longer than `spacing`."""
+    """(samples [S, 3], the triangle of each [S]): each triangle is subdivided into n^2 similar ones
+    with edges of at most `spacing`, and their centres are the samples."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     cuts = np.clip(np.ceil(edges / spacing), 1, 64).astype(np.int64)
     points, owners = [], []
@@ -58,10 +62,8 @@ def _samples(
 
 
 def _to_triangles(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[M] distance of each point [M, 3] from its triangle [M, 3, 3].
-
-    The foot of the perpendicular if it falls inside, else the nearest point of an edge.
-    """
+    """[M] distance of each point [M, 3] from its triangle [M, 3, 3]: to the plane if the foot of
+    the perpendicular lies inside, else to the nearest edge."""
     a, b, c = corners.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     square = np.maximum((normal * normal).sum(axis=1), np.finfo(np.float64).tiny)

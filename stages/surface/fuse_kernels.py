@@ -1,4 +1,4 @@
-"""The inner loop of the fusion: every voxel asks every depth map how far the surface is."""
+"""The kernel of the fusion: each voxel reads its distance to the surface in each depth map."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def _row_in_view(camera, x, y, z, dx, dy, dz, count, near):
 
 
 @kernel
-def integrate(ticket, distance, weight, corner, voxel, truncation, near, cameras, depths, votes):
-    """Add the depth maps to the running means, slab by slab; a voxel takes them in their order.
+def integrate(ticket, distance, weight, corner, voxel, truncation, near, cameras, depths, weights):
+    """Add the depth maps to the running means, slab by slab, in their order in each voxel.
 
     distance [X, Y, Z]: mean signed distance as a share of the truncation, -1..1, positive before
-    the surface. weight [X, Y, Z]: sum of the votes. corner [3]: of the first voxel's centre.
-    cameras [V, CAMERA_ROW]. depths, votes: pixels of all pictures, one after the other.
+    the surface. weight [X, Y, Z]: sum of the weights. corner [3]: of the first voxel's centre.
+    cameras [V, CAMERA_ROW]. depths, weights: pixels of all pictures, one after the other.
     """
     nx, ny, nz = distance.shape
     while True:
@@ -65,10 +65,10 @@ def integrate(ticket, distance, weight, corner, voxel, truncation, near, cameras
                     column = min(max(int(fx * (x + k * dx) * inverse + cx), 0), width - 1)
                     row = min(max(int(fy * (y + k * dy) * inverse + cy), 0), height - 1)
                     pixel = start + row * width + column
-                    vote = votes[pixel]
+                    pixel_weight = weights[pixel]
                     ahead = depths[pixel] - depth_here
-                    if vote > 0.0 and ahead > -truncation:
+                    if pixel_weight > 0.0 and ahead > -truncation:
                         share = min(1.0, ahead / truncation)
-                        total = weight[i, j, k] + vote
-                        distance[i, j, k] += (share - distance[i, j, k]) * vote / total
+                        total = weight[i, j, k] + pixel_weight
+                        distance[i, j, k] += (share - distance[i, j, k]) * pixel_weight / total
                         weight[i, j, k] = total

@@ -1,4 +1,4 @@
-"""A mesh as .glb: triangles with normals and colours, y up. Specification: glTF 2.0, 3.7."""
+"""Writes a mesh as .glb: triangles with normals and colours, y up. Specification: glTF 2.0, 3.7."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ _TRIANGLES = 4
 
 
 def write(path: Path, mesh: Mesh, units: str) -> None:
-    """Positions stay relative to `mesh.origin`, which float32 could not hold; asset.extras says
-    it in the file's axes. glTF's unit is the metre: where `units` is "arbitrary", asset.extras
-    says so. Raises SplatError when the file cannot be written."""
+    """Write `mesh`. Positions stay relative to `mesh.origin`, which asset.extras holds in the axes
+    of the file. The unit of glTF is the metre; asset.extras says where it is "arbitrary".
+
+    Raises SplatError when the file cannot be written."""
     document: dict[str, Any] = {
         "asset": asset(units, mesh.origin * FLIP + 0.0, "collision proxy", note=NOTE),
         "scene": 0,
@@ -38,7 +39,7 @@ def write(path: Path, mesh: Mesh, units: str) -> None:
 def _attributes(mesh: Mesh) -> dict[str, NDArray[Any]]:
     """[V, ...] by name, each vertex a multiple of 4 bytes."""
     flip = FLIP.astype(np.float32)
-    # + 0: a zero that changed its sign would be another byte for the same place
+    # + 0 turns -0 into 0, so that equal positions are equal bytes
     linear = linear_light(mesh.colours / 255.0)
     colours = np.concatenate([linear, np.ones((len(linear), 1))], axis=1)
     return {

@@ -1,4 +1,4 @@
-"""Triangles with colours."""
+"""The mesh type: triangles with vertex colours."""
 
 from __future__ import annotations
 
@@ -12,8 +12,14 @@ NOTE = "collision proxy: where surfaces are, for physics; not made to be looked 
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices [V, 3] float32, in the world (y down) less `origin` [3] float64. faces [F, 3] int32,
-    counterclockwise seen from the side that cameras saw. colours [V, 3] uint8, sRGB."""
+    """A triangle mesh.
+
+    Attributes:
+        vertices: [V, 3] float32 in the world (y down), relative to `origin`.
+        faces: [F, 3] int32, counterclockwise seen from the cameras.
+        colours: [V, 3] uint8, sRGB.
+        origin: [3] float64.
+    """
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
@@ -22,7 +28,7 @@ class Mesh:
 
     @classmethod
     def of(cls, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> Mesh:
-        """Without colours yet; faces without area and vertices without faces are left out."""
+        """A grey mesh without degenerate faces and without vertices that no face uses."""
         vertices = np.ascontiguousarray(vertices, np.float32)
         corners = vertices[faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -36,7 +42,7 @@ class Mesh:
         return cls.of(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
 
     def normals(self) -> NDArray[np.float32]:
-        """[V, 3] unit: means of the faces around, weighted by their area."""
+        """[V, 3] unit normals: means over the adjacent faces, weighted by area."""
         a, b, c = (self.vertices[self.faces[:, i]].astype(np.float64) for i in range(3))
         across = np.cross(b - a, c - a)
         sums = np.zeros((len(self.vertices), 3))
@@ -45,14 +51,14 @@ class Mesh:
                 found = np.bincount(self.faces[:, i], across[:, axis], len(sums))
                 sums[:, axis] += found
         lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-        up = np.array([0.0, -1.0, 0.0])  # where the faces around a vertex cancel each other
+        up = np.array([0.0, -1.0, 0.0])  # where the adjacent faces cancel each other
         return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), up).astype(
             np.float32
         )
 
     @property
     def is_watertight(self) -> bool:
-        """Every edge belongs to two faces that run along it in opposite directions."""
+        """Whether every edge belongs to two faces with opposite directions."""
         if not len(self.faces):
             return False
         edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)

@@ -1,5 +1,5 @@
-"""A mesh as a binary .ply: vertices with normals and colours, triangles. World: y down, as in the
-splats' own .ply, so that both lie over each other."""
+"""Writes a mesh as a binary .ply: vertices with normals and colours, triangles. World: y down, as
+in the .ply of the splats, so that both coincide."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
 
 
 def write(path: Path, mesh: Mesh, units: str) -> None:
-    """Raises SplatError when the file cannot be written."""
+    """Write `mesh`. Raises SplatError when the file cannot be written."""
     vertices = np.zeros(len(mesh.vertices), _VERTEX)
     vertices["place"], vertices["normal"] = mesh.vertices, mesh.normals()
     vertices["colour"] = mesh.colours

@@ -31,6 +31,6 @@ class MeshFormat:
     keeps: str = "no splats: triangles to collide with, see below"
 
 
-_GLB = MeshFormat("mesh.glb", "stages.surface.gltf:write", "stages.surface.files:read_glb", True)
-_PLY = MeshFormat("mesh.ply", "stages.surface.ply:write", "stages.surface.files:read_ply")
+_GLB = MeshFormat("mesh.glb", "stages.surface.gltf:write", "stages.surface.checks:read_glb", True)
+_PLY = MeshFormat("mesh.ply", "stages.surface.ply:write", "stages.surface.checks:read_ply")
 MESHES = {row.ending: row for row in (_GLB, _PLY)}

@@ -212,7 +212,7 @@ def test_a_file_that_must_equal_itself_is_held_to_more(
     path = tmp_path / f"a.{name}"
     formats.write(path, scene.splats)
     back = formats.read(path)
-    prover = Prover.of(back, cameras_for(back), came_as=name)
+    prover = Prover.of(back, cameras_for(back), source_format=name)
     proof = prover.prove(path, exact=True)
     assert (proof.fault, proof.loss_db) == ("", None)
     assert proof.figures["verify_db"] > 80
@@ -229,7 +229,9 @@ def test_flat_and_opaque_splats_are_numbers_to_both_readers(
     records["rgba"][:9, 3] = 255
     (tmp_path / "a.splat").write_bytes(records.tobytes())
     back = formats.read(tmp_path / "a.splat")
-    proof = Prover.of(back, cameras_for(back), came_as="splat").prove(tmp_path / "a.splat", True)
+    proof = Prover.of(back, cameras_for(back), source_format="splat").prove(
+        tmp_path / "a.splat", True
+    )
     assert proof.fault == ""
     assert proof.splats == len(scene.splats)
     assert proof.figures["max_log_scale_error"] == 0
@@ -284,7 +286,7 @@ def test_what_the_usd_librarys_validators_find_is_a_fault(
 def test_of_very_many_splats_the_middle_is_drawn_and_all_are_compared(
     scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    monkeypatch.setattr(proving, "_MOST_DRAWN", len(scene.splats) // 2)
+    monkeypatch.setattr(proving, "_MAX_DRAWN", len(scene.splats) // 2)
     cameras = cameras_for(scene.splats, scene.reconstruction.views)
     some = Prover.of(scene.splats, cameras)
     right = written(some, tmp_path, name, scene.splats)

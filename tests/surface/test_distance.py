@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from stages.surface.distance import distances
+from stages.surface.distance import distances_to_mesh
 from stages.surface.mesh import Mesh
 
 
@@ -22,7 +22,9 @@ from stages.surface.mesh import Mesh
 )
 def test_distance_to_one_triangle(point: tuple[float, ...], wanted: float) -> None:
     triangle = Mesh.of(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))
-    assert distances(np.array([point]), triangle, 0.1)[0] == pytest.approx(wanted, abs=1e-12)
+    assert distances_to_mesh(np.array([point]), triangle, 0.1)[0] == pytest.approx(
+        wanted, abs=1e-12
+    )
 
 
 def test_distances_are_those_of_another_library() -> None:
@@ -32,8 +34,8 @@ def test_distances_are_those_of_another_library() -> None:
     points = rng.normal(0, 1.5, (200, 3))
     other = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     _, wanted, _ = trimesh.proximity.closest_point_naive(other, points)
-    np.testing.assert_allclose(distances(points, mesh, 0.05), wanted, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(distances_to_mesh(points, mesh, 0.05), wanted, rtol=1e-9, atol=1e-9)
 
 
 def test_nothing_is_infinitely_far() -> None:
-    assert np.isinf(distances(np.zeros((2, 3)), Mesh.empty(), 0.1)).all()
+    assert np.isinf(distances_to_mesh(np.zeros((2, 3)), Mesh.empty(), 0.1)).all()

@@ -12,7 +12,7 @@ from stages.base.stage import Report
 from stages.raster.kernels.pool import Pool
 from stages.scene import Reconstruction, Splats
 from stages.surface import fuse
-from stages.surface.make import MadeMesh, make
+from stages.surface.collision_mesh import CollisionMesh, make_collision_mesh
 from tests.surface.shapes import (
     CENTRE,
     all_around,
@@ -34,9 +34,9 @@ def _few_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(
     splats: Splats, reconstruction: Reconstruction, triangles: int = 100_000
-) -> tuple[MadeMesh, Report]:
+) -> tuple[CollisionMesh, Report]:
     report = Report()
-    return make(splats, reconstruction, triangles, "auto", report), report
+    return make_collision_mesh(splats, reconstruction, triangles, "auto", report), report
 
 
 def test_a_sphere_seen_from_all_sides_is_that_sphere() -> None:
@@ -77,10 +77,10 @@ def test_one_camera_gives_what_it_sees_and_no_shell_behind_it() -> None:
     assert (towards > 0).mean() > 0.95  # the rim is ragged
 
 
-def test_crumbs_in_the_air_are_left_out_and_counted() -> None:
+def test_small_components_are_removed_and_counted() -> None:
     above, beside = (ball(CENTRE + np.array(at), 0.08, (0, 0, 1), 40) for at in AIR)
     found, _ = made(joined(sphere(), above, beside), all_around())
-    assert found.figures["pieces_left_out"] >= 2
+    assert found.figures["removed_components"] >= 2
     assert np.linalg.norm(found.mesh.vertices - CENTRE, axis=1).max() < 1.2
 
 
@@ -107,7 +107,7 @@ def test_nothing_solid_is_an_empty_mesh_with_a_warning(what: str) -> None:
     assert [code for code, _ in report.warnings] == ["export-mesh-empty"]
 
 
-def test_points_far_from_the_mesh_are_told() -> None:
+def test_the_distance_of_sparse_points_is_reported() -> None:
     views = all_around()
     shifted = replace(views, points=CENTRE + 1.05 * directions(300))
     found, _ = made(sphere(), shifted)
@@ -121,12 +121,12 @@ def test_little_memory_means_larger_voxels_and_a_warning(monkeypatch: pytest.Mon
     monkeypatch.setattr(fuse, "available_mib", lambda: 1.0)
     found, report = made(sphere(), all_around())
     assert [code for code, _ in report.warnings] == ["export-mesh-coarse"]
-    assert fuse.voxels_that_fit() * 16 <= 2**20 / 4
+    assert fuse.voxel_budget() * 16 <= 2**20 / 4
     radii = np.linalg.norm(found.mesh.vertices - CENTRE, axis=1)
     assert np.abs(radii - 1).max() < 2 * MESH_VOXELS * found.figures["voxel"]
 
 
-def test_the_number_of_threads_does_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_threads_does_not_change_the_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     meshes = []
     for threads in (1, 3):
         pool = Pool(threads)
@@ -140,4 +140,4 @@ def test_ctrl_c_stops_between_cameras() -> None:
     report = Report()
     report.stop_requested.set()
     with pytest.raises(Interrupted):
-        make(sphere(), all_around(3), 1000, "auto", report)
+        make_collision_mesh(sphere(), all_around(3), 1000, "auto", report)

@@ -1,4 +1,4 @@
-"""Mesh files, compared with the mesh that they were made of by parsers that did not write them."""
+"""Check of mesh files with independent readers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ from stages.base.lazy import load_object
 from stages.surface.mesh import Mesh
 from stages.surface.table import MeshFormat
 
-_Y_UP = np.array([1.0, -1.0, -1.0])  # spelled out here: a wrong turn must not check itself
+# Not taken from the writer: its error must not check itself.
+_Y_UP = np.array([1.0, -1.0, -1.0])
+
+
+def write_checked(path: Path, row: MeshFormat, mesh: Mesh, units: str) -> str:
+    """Write the mesh; what is wrong with the file, see `fault_of`."""
+    load_object(row.writer)(path, mesh, units)
+    return fault_of(path, row, mesh)
 
 
 def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
@@ -20,7 +27,7 @@ def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
     nothing is."""
     try:
         vertices, faces = load_object(row.independent_reader)(path)
-    except Exception as error:  # whatever another parser raises: the file is wrong
+    except Exception as error:  # whatever the reader raises: the file is wrong
         return f"another reader refused it ({error})"
     if len(vertices) != len(mesh.vertices) or len(faces) != len(mesh.faces):
         return f"it holds {len(vertices)} vertices and {len(faces)} triangles"
@@ -40,7 +47,7 @@ def read_ply(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def read_glb(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """(vertices [V, 3], faces [F, 3]) by pygltflib, turned from y up to the world's axes."""
+    """(vertices [V, 3], faces [F, 3]) by pygltflib, rotated from y up to the world's axes."""
     from pygltflib import GLTF2
 
     document = GLTF2().load(str(path))

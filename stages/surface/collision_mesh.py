@@ -1,4 +1,4 @@
-"""Splats and their cameras -> a collision proxy, and how good it is."""
+"""Splats and their cameras -> the collision mesh and its quality figures."""
 
 from __future__ import annotations
 
@@ -14,41 +14,40 @@ from stages.raster.draw import raster_settings_of
 from stages.scene import Reconstruction, Splats, split_held_out
 from stages.surface import colour, depth_maps, extract, fuse
 from stages.surface.depth_maps import DepthMap
-from stages.surface.distance import distances
+from stages.surface.distance import distances_to_mesh
 from stages.surface.mesh import Mesh
 
-_WITHIN_VOXELS = 2.0  # how far a surface may lie from the mesh and count as covered
+_COVERED_VOXELS = 2.0  # largest distance of a covered surface from the mesh
 _SAMPLES = 200_000  # pixels that the covered share is measured on
-_POOR_SHARE = 0.7
+_LOW_COVERAGE = 0.7
 
 
 @dataclass(frozen=True)
-class MadeMesh:
-    """A mesh and its figures, JSON values. Lengths in world units.
+class CollisionMesh:
+    """A mesh and its figures, JSON values. Lengths are in world units.
 
-    triangles, vertices, watertight, voxel, pieces_left_out.
-    covered_share: of the pixels in which a training camera sees something solid, those whose
-    surface (median depth) lies within two voxels of the mesh; what lies outside the box counts as
-    not covered.
-    sparse_points_inside_share: of the sparse points, those inside the box that was fused. Of these:
-    sparse_median_distance, sparse_p90_distance to the nearest triangle, and the same as shares of
-    the box's diagonal. None where there are no such points.
+    triangles, vertices, watertight, voxel, removed_components.
+    covered_share: of the pixels with depth in the training cameras, the share whose surface (median
+    depth) lies within two voxels of the mesh. Surfaces outside the fused box are not covered.
+    sparse_points_inside_share: the share of sparse points inside the fused box. For these:
+    sparse_median_distance, sparse_p90_distance to the nearest triangle, and both relative to the
+    diagonal of the box; None where there are no such points.
     """
 
     mesh: Mesh
     figures: dict[str, Any]
 
 
-def make(
+def make_collision_mesh(
     splats: Splats, reconstruction: Reconstruction, triangles: int, backend: str, report: Report
-) -> MadeMesh:
-    """The mesh of what the training cameras see, of at most about `triangles` triangles.
+) -> CollisionMesh:
+    """The mesh of what the training cameras see, with at most about `triangles` triangles.
 
-    Equal inputs give an equal mesh, unless memory is so short that voxels have to be larger.
+    Equal inputs give an equal mesh, unless a lack of memory enlarges the voxels.
     Warnings: export-mesh-empty, export-mesh-coarse, export-mesh-gaps. Raises Interrupted.
     """
     training, _ = split_held_out(reconstruction.views)
-    cameras = depth_maps.chosen([view.camera for view in training])
+    cameras = depth_maps.select_cameras([view.camera for view in training])
     settings = raster_settings_of(splats)
 
     def tick(number: int) -> None:
@@ -56,24 +55,24 @@ def make(
             raise Interrupted(f"stopped after {number} of {len(cameras)} cameras")
         report.progress(number, len(cameras), "drawing depth")
 
-    maps = depth_maps.draw(splats, cameras, settings, backend, tick)
+    maps = depth_maps.draw_depth_maps(splats, cameras, settings, backend, tick)
     report.progress(len(cameras), len(cameras), "fusing depth")
-    region = fuse.seen_region(maps)
+    region = fuse.observed_box(maps)
     if region is None:
-        return _nothing(report)
-    voxels = fuse.voxels_that_fit()
+        return _empty_mesh(report)
+    voxels = fuse.voxel_budget()
     if voxels < fuse.VOXELS:
         report.warn(
             "export-mesh-coarse",
             f"Memory is short: the mesh was made of {voxels:,} voxels instead of "
             f"{fuse.VOXELS:,}. Close other programs and export again for a finer one.",
         )
-    volume = fuse.fuse(maps, fuse.empty_volume(*region, voxels), settings.near)
-    fine, crumbs = extract.without_crumbs(extract.surface_of(volume))
-    mesh = extract.simplified(fine, triangles)
+    volume = fuse.fuse_depth_maps(maps, fuse.empty_volume(*region, voxels), settings.near)
+    fine, removed = extract.remove_small_components(extract.extract_surface(volume))
+    mesh = extract.simplify(fine, triangles)
     if not len(mesh.faces):
-        return _nothing(report)
-    mesh = colour.coloured(mesh, maps, fuse.TRUNCATION * volume.voxel)
+        return _empty_mesh(report)
+    mesh = colour.colour_vertices(mesh, maps, fuse.TRUNCATION * volume.voxel)
     mesh = replace(mesh, origin=splats.origin)
     covered = _covered(mesh, maps, volume.voxel)
     figures = {
@@ -81,49 +80,49 @@ def make(
         "vertices": len(mesh.vertices),
         "watertight": mesh.is_watertight,
         "voxel": _rounded(volume.voxel),
-        "pieces_left_out": crumbs,
+        "removed_components": removed,
         "covered_share": covered,
-        **_from_sparse_points(mesh, reconstruction.points, volume),
+        **_sparse_point_figures(mesh, reconstruction.points, volume),
     }
     _warn_of_gaps(covered, report)
-    return MadeMesh(mesh, figures)
+    return CollisionMesh(mesh, figures)
 
 
-def _nothing(report: Report) -> MadeMesh:
+def _empty_mesh(report: Report) -> CollisionMesh:
     report.warn(
         "export-mesh-empty",
         "The mesh is empty: no training camera sees a solid surface. Look at the splats with "
         "`splat view`.",
     )
-    return MadeMesh(Mesh.empty(), {"triangles": 0, "vertices": 0, "covered_share": 0.0})
+    return CollisionMesh(Mesh.empty(), {"triangles": 0, "vertices": 0, "covered_share": 0.0})
 
 
 def _warn_of_gaps(covered: float, report: Report) -> None:
-    if covered < _POOR_SHARE:
+    if covered < _LOW_COVERAGE:
         report.warn(
             "export-mesh-gaps",
             f"The mesh covers only {covered:.0%} of what the training photographs show; the rest "
-            "lies far away, or the splats disagree about where it is.",
+            "is far away, or its depth differs between cameras.",
         )
 
 
 def _covered(mesh: Mesh, maps: list[DepthMap], voxel: float) -> float:
-    """See MadeMesh."""
+    """`covered_share` of CollisionMesh."""
     pixels = sum(int((found.depth > 0).sum()) for found in maps)
     step = max(1, pixels // _SAMPLES)
-    solid = [replace(found, vote=(found.depth > 0).astype(np.float32)) for found in maps]
+    solid = [replace(found, weight=(found.depth > 0).astype(np.float32)) for found in maps]
     places = np.concatenate([found.points(step) for found in solid])
-    near = distances(places, mesh, voxel) <= _WITHIN_VOXELS * voxel
+    near = distances_to_mesh(places, mesh, voxel) <= _COVERED_VOXELS * voxel
     return round(float(near.mean()), 4)
 
 
-def _from_sparse_points(
+def _sparse_point_figures(
     mesh: Mesh, points: NDArray[np.float64], volume: fuse.Volume
 ) -> dict[str, float | None]:
     inside = np.all((points >= volume.corner) & (points <= volume.far_corner), axis=1)
     share = float(inside.mean()) if len(points) else 0.0
     figures: dict[str, float | None] = {"sparse_points_inside_share": round(share, 4)}
-    found = distances(points[inside], mesh, volume.voxel)
+    found = distances_to_mesh(points[inside], mesh, volume.voxel)
     diagonal = float(np.linalg.norm(volume.far_corner - volume.corner))
     for name, percent in (("median", 50), ("p90", 90)):
         value = float(np.percentile(found, percent)) if len(found) else None
