@@ -78,8 +78,7 @@ def reconstruct(
     if len(posed) < 3:
         raise _too_few(len(posed))
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
-    photos = [one.photo for one in posed]
-    taken, lenses = [one.camera for one in posed], [one.lens for one in posed]
+    photos, taken, lenses = zip(*((p.photo, p.camera, p.lens) for p in posed), strict=True)
     cameras, share = write_undistorted_images(photos, taken, lenses, capture.folder, folder, report)
     _report_lost_area(1.0 - share, report)
     training = [i for i, one in enumerate(posed) if one.role != "test"]
@@ -275,12 +274,7 @@ def _finish(
     pictures = [folder / IMAGES / one.photo.picture for one in posed]
     scale = find_metric_scale(known_scale, capture, names, cameras, pictures, levelled, report)
     if scale is not None:
-        poses = np.array([camera.world_to_camera for camera in cameras])
-        points, poses = scale.points(points), scale.poses(poses)
-        cameras = [
-            replace(camera, world_to_camera=pose)
-            for camera, pose in zip(cameras, poses, strict=True)
-        ]
+        points, cameras = scale.points(points), scale.cameras(cameras)
         world_from_new[:3, :3] = world_from_new[:3, :3] @ scale.turn.T / scale.metres
     report.metric("file_from_world", world_from_new.tolist())
     return write_reconstruction(

@@ -58,7 +58,9 @@ def test_a_chunk_that_says_no_unit_is_arbitrary(
     assert (ground.metres, ground.axes) == (0.0, None)
 
 
-def referenced(folder: Path, latitude: float, gps: np.ndarray | None, dop: float = 5.0) -> Georeference:
+def referenced(
+    folder: Path, latitude: float, gps: np.ndarray | None, dop: float = 5.0
+) -> Georeference:
     """Of OpenSfM's reconstruction of cameras at EYES; gps [V, 3]: what each shot was told."""
     path = opensfm(folder)
     data: list[dict[str, Any]] = json.loads(path.read_text())

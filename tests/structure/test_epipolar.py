@@ -56,7 +56,7 @@ def test_the_scale_and_the_place_of_the_world_do_not_matter() -> None:
 def test_a_mistake_is_found_out(mistake, told: str) -> None:
     given = mistake(POSES)
     assert fits(given) < 0.3
-    ratios = {name: fits(poses) for name, poses in likely_mistakes(given)}
+    ratios = {name: fits(poses) for name, poses in likely_mistakes(given).items()}
     (best,) = [name for name, ratio in ratios.items() if ratio > 0.9]
     assert told in best
 

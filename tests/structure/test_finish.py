@@ -11,8 +11,8 @@ from PIL import Image
 
 from stages.base.stage import Report
 from stages.cameras.colmap import read_model
-from stages.photos.find import picture_names
 from stages.photos.load import load_mask
+from stages.photos.sources import picture_names
 from stages.scene import Capture, Photo
 from stages.structure.finish import finish
 from stages.structure.reconstruction_files import load_reconstruction, save_reconstruction
