@@ -93,12 +93,22 @@ def reconstruct(
     cloud, observations = find_points(
         from_file, triangulated, training, photos, cameras, folder, seed, report
     )
-    if found.ground.metres and not known_scale.metres_per_unit:
+    if found.georeference.metres_per_unit and not known_scale.metres_per_unit:
         known_scale = replace(
-            known_scale, metres_per_unit=found.ground.metres, source=found.ground.said_by
+            known_scale,
+            metres_per_unit=found.georeference.metres_per_unit,
+            source=found.georeference.source,
         )
     return _finish(
-        posed, cameras, cloud, observations, folder, report, known_scale, capture, found.ground.axes
+        posed,
+        cameras,
+        cloud,
+        observations,
+        folder,
+        report,
+        known_scale,
+        capture,
+        found.georeference.axes,
     )
 
 
@@ -263,7 +273,7 @@ def _finish(
     capture: Capture,
     axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
-    """Level, recentre and scale; write the COLMAP model. axes: as in `Ground`."""
+    """Level, recentre and scale; write the COLMAP model. axes: as in `Georeference`."""
     turn, levelled = _levelling(cameras, axes)
     middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
     world_from_new = np.eye(4)
