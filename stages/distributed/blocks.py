@@ -96,16 +96,16 @@ class _Scene:
         self.settings = replace(self.settings, light="on" if light else "off")
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
-        places, weights = partition.looked_at(replace(self.whole, views=training))
-        cells = partition.cut(places, weights, blocks)
+        places, weights = partition.weighted_points(replace(self.whole, views=training))
+        cells = partition.partition(places, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
-        member = block_views.members(
-            block_views.shares(coarse, cells, cameras, backend_of_settings(self.settings))
+        member = block_views.assign_views(
+            block_views.block_fractions(coarse, cells, cameras, backend_of_settings(self.settings))
         )
         folders = self._blocks(seeds, coarse, cells, member, partition.margin(places))
         parts = self._parts(folders, cells, member)
         draw_settings = draw_settings_of(self.whole.views, self.settings.train_side, light)
-        crossed = block_views.crossing(member)
+        crossed = block_views.crosses_blocks(member)
         crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
         teachers = [view for view in crossing if view in training]
         trained = self._joined(parts, cells, teachers, draw_settings)
