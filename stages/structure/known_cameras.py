@@ -98,7 +98,7 @@ def reconstruct(
             source=georeference.source,
         )
     axes = georeference.axes
-    return _finish(posed, cameras, cloud, observations, folder, report, known_scale, capture, axes)
+    return _finish(posed, cameras, cloud, observations, folder, report, known_scale, axes)
 
 
 def _report_lost_area(lost: float, report: Report) -> None:
@@ -259,7 +259,6 @@ def _finish(
     folder: Path,
     report: Report,
     known_scale: KnownScale,
-    capture: Capture,
     axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
     """Level, recentre and scale; write the COLMAP model. axes: as in `Georeference`."""
@@ -269,16 +268,16 @@ def _finish(
     world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
     cameras = [camera.moved(world_from_new) for camera in cameras]
     points = (cloud.points - middle) @ turn.T
-    names = [one.photo.name for one in posed]
-    pictures = [folder / IMAGES / one.photo.picture for one in posed]
-    scale = find_metric_scale(known_scale, capture, names, cameras, pictures, levelled, report)
+    photos = [one.photo for one in posed]
+    pictures = [folder / IMAGES / photo.picture for photo in photos]
+    scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
     if scale is not None:
         points, cameras = scale.points(points), scale.cameras(cameras)
         world_from_new[:3, :3] = world_from_new[:3, :3] @ scale.turn.T / scale.metres
     report.metric("file_from_world", world_from_new.tolist())
     return write_reconstruction(
         folder,
-        [one.photo for one in posed],
+        photos,
         cameras,
         replace(cloud, points=points),
         observations,
