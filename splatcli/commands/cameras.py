@@ -78,7 +78,7 @@ def _is_json(out: Path) -> bool:
 
 def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
     """The cameras, and the model with its points if it is one."""
-    from stages.cameras.colmap import read_model, recognised
+    from stages.cameras.colmap import locate, read_model
     from stages.cameras.table import read_cameras
 
     if runfolder.is_run_folder(source):
@@ -92,7 +92,7 @@ def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
                 family=Family.USAGE,
             )
         source = pipeline.stage_folder("sfm") / "colmap"
-    folder = recognised(source)
+    folder = locate(source)
     return (read_cameras(source), None) if folder is None else read_model(folder)
 
 

@@ -26,7 +26,7 @@ _ROUNDED = 1e-9  # of R^T R: more than float64 leaves
 
 
 @dataclass(frozen=True)
-class Ground:
+class Georeference:
     """What a file says of its world. metres: of one unit; 0 where it does not say. axes [3, 3]:
     rows point east, north and up in it; None likewise. said_by: in words."""
 
@@ -35,7 +35,7 @@ class Ground:
     said_by: str = ""
 
 
-UNSAID = Ground()
+NO_GEOREFERENCE = Georeference()
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class CameraFile:
     views: tuple[View, ...]
     folder: Path
     lenses: tuple[Lens, ...]
-    ground: Ground = UNSAID
+    ground: Georeference = NO_GEOREFERENCE
 
     @property
     def distorted(self) -> int:
         """How many views have a lens that distorts."""
-        return sum(lens.bends for lens in self.lenses)
+        return sum(lens.distorts for lens in self.lenses)
 
 
 @dataclass(frozen=True)

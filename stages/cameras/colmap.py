@@ -94,7 +94,7 @@ def _intrinsics(camera: Camera) -> tuple[int, int, float, float, float, float]:
     return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """Where the model lies: `path` itself, or inside as COLMAP and its users lay it out."""
     for folder in (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0"):
         if any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):

@@ -37,7 +37,7 @@ class Lens:
     skew: float = 0.0
 
     @property
-    def bends(self) -> bool:
+    def distorts(self) -> bool:
         """Whether it differs from a pinhole."""
         terms = (*self.radial, *self.below, *self.tangential, *self.prism, *self.own, self.skew)
         return "fisheye" in self.kind or any(terms)

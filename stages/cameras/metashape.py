@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
+    NO_GEOREFERENCE,
     ROTATION_TOLERANCE,
-    UNSAID,
     CameraFile,
-    Ground,
+    Georeference,
     content_of,
     make_views,
 )
@@ -67,23 +67,23 @@ def read(path: Path) -> CameraFile:
         return CameraFile(views, path.parent, tuple(lens for _, lens in mine), _ground(root))
 
 
-def _ground(root: Element) -> Ground:
+def _ground(root: Element) -> Georeference:
     """Of the only transform of a chunk or component; of several, none is everyone's."""
     every = [e for e in root.iter("transform") if e.find("scale") is not None]
     if len(every) != 1:
-        return UNSAID
+        return NO_GEOREFERENCE
     turn = _numbers(every[0], "rotation", 9).reshape(3, 3)
     shift, (scale,) = _numbers(every[0], "translation", 3), _numbers(every[0], "scale", 1)
     if scale <= 0 or np.abs(turn @ turn.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise BadFileError("the chunk's transform is no rotation and scale")
     if _EARTH[0] < np.linalg.norm(shift) < _EARTH[1]:
-        return Ground(float(scale), _east_north_up(shift) @ turn, _SAID_BY)
+        return Georeference(float(scale), _east_north_up(shift) @ turn, _SAID_BY)
     reference = (root.findtext(".//chunk/reference") or root.findtext("reference") or "").strip()
     unit = re.search(r'UNIT\["[^"]*",\s*([0-9.]+)', reference)
     changes = scale != 1.0 or shift.any() or (turn != np.eye(3)).any()
     if not (reference.startswith("LOCAL_CS") and unit and changes):
-        return UNSAID
-    return Ground(float(scale) * float(unit[1]), turn, _SAID_BY)
+        return NO_GEOREFERENCE
+    return Georeference(float(scale) * float(unit[1]), turn, _SAID_BY)
 
 
 def _numbers(transform: Element, name: str, count: int) -> NDArray[np.float64]:

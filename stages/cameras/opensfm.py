@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
-    UNSAID,
+    NO_GEOREFERENCE,
     CameraFile,
     FilePoints,
-    Ground,
+    Georeference,
     content_of,
     make_views,
 )
@@ -69,13 +69,13 @@ def read(path: Path) -> CameraFile:
         return CameraFile(views, path.parent / "images", lenses, _ground(data, views))
 
 
-def _ground(data: Mapping[str, Any], views: tuple[View, ...]) -> Ground:
+def _ground(data: Mapping[str, Any], views: tuple[View, ...]) -> Georeference:
     """Metres, if there is a reference and what GPS said of the shots agrees with where they are."""
     reference = data.get("reference_lla")
     if not isinstance(reference, dict):
-        return UNSAID
+        return NO_GEOREFERENCE
     if not (reference.get("latitude") or reference.get("longitude")):
-        return UNSAID
+        return NO_GEOREFERENCE
     shots = list(data["shots"].values())
     told = [i for i, s in enumerate(shots) if float(s.get("gps_dop", 0.0)) < _WORST_DOP]
     rows = [i for i in told if "gps_position" in shots[i]]
@@ -85,8 +85,8 @@ def _ground(data: Mapping[str, Any], views: tuple[View, ...]) -> Ground:
         apart = np.median(np.linalg.norm((there - here)[:, :2], axis=1))
         spread = np.linalg.norm((there - there.mean(axis=0))[:, :2], axis=1).mean()
         if len(rows) < _FEWEST_GPS or not apart <= _WORST_RESIDUAL * spread:
-            return UNSAID
-    return Ground(1.0, np.eye(3), "the file's GPS reference")
+            return NO_GEOREFERENCE
+    return Georeference(1.0, np.eye(3), "the file's GPS reference")
 
 
 def read_points(path: Path) -> FilePoints | None:

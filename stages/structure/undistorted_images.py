@@ -72,10 +72,10 @@ def write_undistorted_images(
         pinhole, share = known[key]
         pinholes.append(replace(pinhole, world_to_camera=camera.world_to_camera))
         shares.append(share)
-        if lens.bends and key not in tables:
+        if lens.distorts and key not in tables:
             tables = {key: remap_tables(camera, lens, pinhole)}
-        _write_picture(photo, source, folder, tables[key] if lens.bends else None)
-        _write_mask(photo, source, folder, tables[key] if lens.bends else None)
+        _write_picture(photo, source, folder, tables[key] if lens.distorts else None)
+        _write_mask(photo, source, folder, tables[key] if lens.distorts else None)
     report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
     return pinholes, float(np.mean(shares))
 

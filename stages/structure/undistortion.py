@@ -26,7 +26,7 @@ class SimpleRadial:
     """COLMAP's SIMPLE_RADIAL distortion, x (1 + k |x|^2), with the methods of `Lens`."""
 
     k: float
-    bends = True
+    distorts = True
 
     def distort(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """[..., 2] distorted from undistorted image-plane coordinates."""
@@ -53,7 +53,7 @@ AnyLens = Lens | SimpleRadial
 
 def undistorted_camera(camera: Camera, lens: AnyLens) -> Camera:
     """The pinhole camera for a photograph's `camera` and its `lens`."""
-    if not lens.bends:
+    if not lens.distorts:
         return camera
     left, top, right, bottom = _inner_rectangle(camera, lens)
     # A hundredth of a pixel forgives rounding: without it k = 0 would lose a row and a column.
@@ -63,7 +63,7 @@ def undistorted_camera(camera: Camera, lens: AnyLens) -> Camera:
 
 def visible_share(camera: Camera, lens: AnyLens, pinhole: Camera) -> float:
     """The share of the photograph that its pinhole picture shows."""
-    if not lens.bends:
+    if not lens.distorts:
         return 1.0
     x, y = np.meshgrid(
         (np.arange(_GRID) + 0.5) * camera.width / _GRID,

@@ -11,9 +11,9 @@ import pytest
 from stages.base.errors import SplatError
 from stages.cameras.colmap import (
     ColmapModel,
+    locate,
     read,
     read_model,
-    recognised,
     write_colmap_model,
 )
 from tests.cameras.models import example
@@ -78,7 +78,7 @@ def assert_same(found: ColmapModel, wanted: ColmapModel) -> None:
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     write_colmap_model(tmp_path / "sparse" / "0", example())
-    folder = recognised(tmp_path)
+    folder = locate(tmp_path)
     assert folder == tmp_path / "sparse" / "0"
     cameras, model = read_model(folder)
     assert_same(model, example())

@@ -29,7 +29,7 @@ def test_a_lens_shows_directions_where_colmap_does_and_can_be_undone(model: str)
     seen = optics.lens.distort(uv)
     np.testing.assert_allclose(seen * (fx, fy) + (cx, cy), wanted, rtol=0, atol=1e-9)
     np.testing.assert_allclose(optics.lens.undistort(seen), uv, rtol=0, atol=1e-9)
-    assert optics.lens.bends == (model not in ("SIMPLE_PINHOLE", "PINHOLE"))
+    assert optics.lens.distorts == (model not in ("SIMPLE_PINHOLE", "PINHOLE"))
 
 
 def test_a_skewed_lens_can_be_undone() -> None:
@@ -39,7 +39,7 @@ def test_a_skewed_lens_can_be_undone() -> None:
     straight = Lens(radial=(0.05,), tangential=(0.01, -0.01)).distort(uv)
     np.testing.assert_allclose(seen - straight, straight[:, 1:] * (0.1, 0.0), atol=1e-12)
     np.testing.assert_allclose(lens.undistort(seen), uv, atol=1e-9)
-    assert Lens(skew=0.1).bends
+    assert Lens(skew=0.1).distorts
 
 
 def test_what_a_lens_cannot_show_is_nowhere() -> None:

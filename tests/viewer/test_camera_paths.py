@@ -144,8 +144,8 @@ def test_a_steady_path_ends_where_it_did_and_turns_corners_gently() -> None:
     steady = smoothed(hand, 6.0)
 
     def kink(path) -> float:
-        bends = np.diff([c.centre for c in path], 2, axis=0)
-        return float(np.linalg.norm(bends, axis=1).max())
+        distorts = np.diff([c.centre for c in path], 2, axis=0)
+        return float(np.linalg.norm(distorts, axis=1).max())
 
     assert kink(steady) < 0.2 * kink(hand)
     for i in (0, -1):

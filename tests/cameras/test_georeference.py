@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.cameras.camera_file import Ground
+from stages.cameras.camera_file import Georeference
 from stages.cameras.table import read_cameras
 from tests.cameras.drawn import CHUNK, EYES, MADE, metashape, opensfm
 
@@ -19,7 +19,7 @@ LOCAL = CHUNK[CHUNK.index("LOCAL_CS") : CHUNK.index("</reference>")]
 
 def transformed(
     folder: Path, turn: np.ndarray, shift: tuple[float, ...], scale: float, reference: str = ""
-) -> Ground:
+) -> Georeference:
     """Of Metashape's cameras, the chunk so transformed."""
     path = metashape(folder)
     words = [" ".join(map(repr, map(float, np.ravel(v)))) for v in (turn, shift)]
@@ -58,7 +58,7 @@ def test_a_chunk_that_says_no_unit_is_arbitrary(
     assert (ground.metres, ground.axes) == (0.0, None)
 
 
-def referenced(folder: Path, latitude: float, gps: np.ndarray | None, dop: float = 5.0) -> Ground:
+def referenced(folder: Path, latitude: float, gps: np.ndarray | None, dop: float = 5.0) -> Georeference:
     """Of OpenSfM's reconstruction of cameras at EYES; gps [V, 3]: what each shot was told."""
     path = opensfm(folder)
     data: list[dict[str, Any]] = json.loads(path.read_text())
