@@ -1,4 +1,4 @@
-"""What a person sees: errors, tables, figures in words. Progress is in progress.py."""
+"""Errors, tables and figures as text for a terminal. Progress is in progress.py."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import json
 import os
 import shlex
 import sys
-import tempfile
-import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,11 +16,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from splatcli import log
 from stages.base.errors import CRASHED, STOPPED, Interrupted, SplatError
 from stages.run.failures import as_splat_error
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+LOSSLESS_DB = 99.0  # the PSNR that is recorded for equal pictures
 
 
 def emit(event: str, **values: Any) -> None:
@@ -32,14 +33,17 @@ def emit(event: str, **values: Any) -> None:
 
 
 def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command whose failures are told in words, with the exit status of their family."""
+    """A command whose failures are printed, with the exit status of their family."""
 
     @functools.wraps(command)
     def call(**values: Any) -> None:
         as_json = bool(values.get("as_json"))
         try:
+            if values.pop("verbose", False):
+                _start_log(as_json)
             command(**values)
         except SplatError as error:
+            log.write_failure(error)
             raise typer.Exit(show_error(error, as_json)) from error
         except (Interrupted, KeyboardInterrupt) as stop:
             raise typer.Exit(show_stopped(as_json)) from stop
@@ -48,12 +52,23 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
         except Exception as error:
             explained = as_splat_error(error, "the command", Path())
             if explained is not None:
+                log.write_failure(error)
                 raise typer.Exit(show_error(explained, as_json)) from error
             if os.environ.get("SPLAT_DEBUG") == "1":
                 raise
             raise typer.Exit(show_bug(error, as_json)) from error
+        finally:
+            log.stop()
 
     return call
+
+
+def _start_log(as_json: bool) -> None:
+    path = log.start()
+    if as_json:
+        emit("log", path=str(path) if path else None)
+    else:
+        note(f"Log: {path}" if path else "No log can be written to the temporary folder.")
 
 
 def show_error(error: SplatError, as_json: bool = False) -> int:
@@ -69,7 +84,7 @@ def show_error(error: SplatError, as_json: bool = False) -> int:
 
 
 def show_stopped(as_json: bool = False) -> int:
-    """Say how to go on after Ctrl-C; returns the exit status."""
+    """Print how to go on after Ctrl-C; returns the exit status."""
     again = shlex.join(["splat", *sys.argv[1:]])
     if as_json:
         emit("stopped", go_on=again)
@@ -80,29 +95,18 @@ def show_stopped(as_json: bool = False) -> int:
 
 
 def show_bug(error: BaseException, as_json: bool = False) -> int:
-    """Print an unexpected failure and where its traceback is; returns the exit status."""
-    log = _write_log(error)
+    """Print an unexpected failure and the log with its traceback; returns the exit status."""
+    path = log.start()
+    log.write_failure(error)
     what = f"{type(error).__name__}: {error}".splitlines()[0]
     if as_json:
-        emit("bug", message=what, log=str(log) if log else None)
+        emit("bug", message=what, log=str(path) if path else None)
         return CRASHED
     err.print(Text("Unexpected failure: ", style="bold red") + Text(what))
     err.print("This is a bug in splat. What was finished is kept.")
-    if log:
-        err.print(Text("Next: ", style="bold") + Text(f"report it with {log}"))
+    if path:
+        err.print(Text("Next: ", style="bold") + Text(f"report it with {path}"))
     return CRASHED
-
-
-def _write_log(error: BaseException) -> Path | None:
-    try:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="splat-", suffix=".log", delete=False, encoding="utf-8"
-        ) as file:
-            file.write(shlex.join(sys.argv) + "\n")
-            traceback.print_exception(error, file=file)
-            return Path(file.name)
-    except OSError:
-        return None
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> None:
@@ -118,7 +122,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "
 
 
 def columns(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table that is never broken to fit the screen: what is copied from it stays whole."""
+    """Print a table whose rows are never wrapped, so that paths can be copied from it."""
     every = [tuple(headings), *map(tuple, rows)]
     widths = [max(map(len, column)) for column in zip(*every, strict=True)]
     for number, row in enumerate(every):
@@ -131,6 +135,19 @@ def note(text: str, style: str = "") -> None:
     err.print(Text(text, style=style))
 
 
+def warn(text: str) -> None:
+    """One warning, on standard error."""
+    note(text, "yellow")
+
+
+def note_compiling() -> None:
+    """Explain the delay if the kernels are not compiled yet."""
+    from stages.raster.kernels import cache
+
+    if not cache.are_compiled():
+        note("Compiling the kernels; this is done once and takes about half a minute.")
+
+
 _UNITS = {"_db": " dB", "_px": " px", "_s": " s", "_mib": " MiB", "_deg": "°"}
 
 
@@ -140,7 +157,7 @@ def figures(numbers: Mapping[str, Any]) -> str:
 
 
 def label(name: str) -> str:
-    """A figure's name without its unit: "held_out_psnr_db" -> "held out PSNR"."""
+    """A figure's name without its unit: "held_out_psnr_db" becomes "held out PSNR"."""
     for suffix in _UNITS:
         name = name.removesuffix(suffix)
     words = name.replace("_", " ").split()
@@ -166,6 +183,18 @@ def size(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1000
     raise AssertionError
+
+
+def fidelity(psnr_db: float) -> str:
+    """PSNR between pictures: "41.3 dB"; "lossless" for pictures that are equal."""
+    return "lossless" if psnr_db >= LOSSLESS_DB else figure("psnr_db", psnr_db)
+
+
+def times(seconds: float, cpu_seconds: float | None) -> str:
+    """Wall time, with the CPU time of all cores if the two differ by half or more."""
+    if cpu_seconds is None or max(seconds, 0.1) / 1.5 < cpu_seconds < max(seconds, 0.1) * 1.5:
+        return duration(seconds)
+    return f"{duration(seconds)} ({duration(cpu_seconds)} CPU)"
 
 
 def duration(seconds: float) -> str:

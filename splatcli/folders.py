@@ -1,18 +1,23 @@
-"""Which run folder a command is about when none is named."""
+"""Finds the run folder or the splats that a command line names."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stages.base.errors import Family, SplatError
-from stages.run import runfolder
+from stages.run import results, runfolder
+from stages.run.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from stages.scene import Splats
 
 DEFAULT = Path("run")
 
 
 def find_run_folder(named: Path | None = None) -> Path:
-    """The named run folder; else the current folder, `run/`, or the only one in it; those in
-    which nothing ever succeeded count only if there is no other.
+    """The named run folder; else the current folder, `run/`, or the only run folder in the current
+    folder. Run folders without a finished stage count only if there is no other.
 
     Raises SplatError: run-folder-missing, run-folder-unclear.
     """
@@ -44,3 +49,25 @@ def find_run_folder(named: Path | None = None) -> Path:
         hint="Start one with `splat process PHOTOS`, or name one that exists.",
         family=Family.RUN_FOLDER,
     )
+
+
+def load_target(target: Path | None, strict: bool = True) -> tuple[Splats, Pipeline | None]:
+    """(splats, the run's pipeline or None) of a splat file or of the newest stage of a run folder.
+
+    Args:
+        target: None for the run folder here.
+        strict: whether a value that is not finite makes a file unreadable.
+
+    Raises SplatError.
+    """
+    if target is not None and target.is_file():
+        return results.read_file(target, strict), None
+    if target is not None and not target.exists():
+        raise SplatError(
+            "file-missing",
+            given=f"{target} does not exist.",
+            wanted="A run folder or a splat file.",
+            hint="Check the path.",
+        )
+    pipeline = Pipeline(find_run_folder(target))
+    return results.newest_splats(pipeline), pipeline

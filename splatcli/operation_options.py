@@ -1,4 +1,4 @@
-"""Options whose order matters: what `splat edit` does, one after the other."""
+"""The options of `splat edit`, whose order on the command line is the order of the operations."""
 
 from __future__ import annotations
 
@@ -13,43 +13,46 @@ from typer.core import TyperCommand
 from splatcli.options import keyword
 from stages.editing.syntax import OPERATIONS, ParsedOperation, parse_file
 
-_OPS = "ops"
-_TYPED = "splat.typed"  # where a context keeps the words of its command
+_FILE_OPTION = "ops"
+_WORDS = "splat.words"  # the key of the command's words in the context's `meta`
 
 
-class Chain(TyperCommand):
-    """A command that remembers its words: a parser hands them out sorted by option."""
+class OrderedCommand(TyperCommand):
+    """A command that keeps its words: the parser groups them by option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        ctx.meta[_TYPED] = tuple(args)
+        ctx.meta[_WORDS] = tuple(args)
         return super().parse_args(ctx, args)
 
 
-def chain_parameters() -> list[Parameter]:
-    """One keyword parameter an operation, each as often as one likes, and --ops."""
-    found = [
-        keyword(
-            word.name.replace("-", "_"),
-            list[str] | None if word.takes else bool,
-            typer.Option(
-                f"--{word.name}",
-                help=word.help,
-                show_default=False,
-                metavar=word.takes or None,
-            ),
-            None if word.takes else False,
+def operation_parameters() -> list[Parameter]:
+    """One repeatable keyword parameter for each operation, and --ops."""
+    found = []
+    for operation in OPERATIONS.values():
+        option = typer.Option(
+            f"--{operation.name}",
+            help=operation.help,
+            show_default=False,
+            metavar=operation.takes or None,
         )
-        for word in OPERATIONS.values()
-    ]
-    told = "Text file of operations, one a line: done where it stands."
-    option = typer.Option(f"--{_OPS}", help=told, show_default=False, metavar="FILE")
-    return [*found, keyword(_OPS, list[str] | None, option)]
+        name = operation.name.replace("-", "_")
+        if operation.takes:
+            found.append(keyword(name, list[str] | None, option))
+        else:
+            found.append(keyword(name, bool, option, False))
+    option = typer.Option(
+        f"--{_FILE_OPTION}",
+        help="Text file of operations, one a line, which are inserted here.",
+        show_default=False,
+        metavar="FILE",
+    )
+    return [*found, keyword(_FILE_OPTION, list[str] | None, option)]
 
 
-def typed_in(ctx: typer.Context) -> list[ParsedOperation]:
-    """The operations in the order in which they were typed, those of files in their place. The
-    parser has let the words pass. Raises SplatError "edit-ops"."""
-    return list(_operations(iter(ctx.meta[_TYPED])))
+def parsed_operations(ctx: typer.Context) -> list[ParsedOperation]:
+    """The operations in the order on the command line, those of files in the place of --ops. The
+    parser has accepted the words. Raises SplatError "edit-ops"."""
+    return list(_operations(iter(ctx.meta[_WORDS])))
 
 
 def _operations(words: Iterator[str]) -> Iterator[ParsedOperation]:
@@ -58,9 +61,9 @@ def _operations(words: Iterator[str]) -> Iterator[ParsedOperation]:
             return
         flag, given, value = word.partition("=")
         name = flag.removeprefix("--") if flag.startswith("--") else ""
-        if name != _OPS and name not in OPERATIONS:
+        if name != _FILE_OPTION and name not in OPERATIONS:
             continue
-        if name == _OPS:
+        if name == _FILE_OPTION:
             yield from parse_file(Path(value if given else next(words)))
         elif OPERATIONS[name].takes:
             yield ParsedOperation(name, value if given else next(words))

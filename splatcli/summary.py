@@ -1,26 +1,21 @@
-"""What was made, where, how large, how good."""
+"""The result of a run: its stages, and the exported files with their sizes and qualities."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from rich.text import Text
 
 from splatcli import console
 from stages.run.manifest import Manifest
-from stages.run.pipeline import Pipeline, Step
+from stages.run.pipeline import Pipeline
 
-# The figures worth a line in the final table, by stage; whatever of them a stage reports is shown.
+# The metrics in the tables of `process` and `status`, by stage.
 _HEADLINES = {
     "ingest": ("photographs", "left_out"),
-    "sfm": (
-        *("registered_images", "photographs", "points", "mean_reprojection_error_px"),
-        *("pairs_compared", "pairs_matched", "pairs_verified"),
-        *("features_seconds", "matching_seconds", "mapping_seconds"),
-    ),
+    "sfm": ("registered_images", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
-    "train": ("splats", "psnr_db", "ssim", "made_by"),
+    "train": ("splats", "psnr_db", "ssim", "trained_by"),
     # Later stages measure at sizes of their own: their PSNR is no sequel of training's.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),
@@ -29,7 +24,7 @@ _HEADLINES = {
 
 
 def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -> None:
-    """The end of a run: a table of stages, and the assets."""
+    """Print a table of the stages up to `until`, and the exported files."""
     reached = [stage.name for stage in pipeline.layout.up_to(until)]
     manifests = [m for m in map(pipeline.manifest, reached) if m is not None]
     assets = _assets(pipeline) if "export" in reached else []
@@ -41,10 +36,7 @@ def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -
             console.out.print(path, markup=False)
         return
     console.out.print()
-    rows = [
-        (m.stage, console.duration(m.seconds), f"{m.peak_memory_mib:,.0f} MiB", headline(m))
-        for m in manifests
-    ]
+    rows = [(m.stage, time_of(m), f"{m.peak_memory_mib:,.0f} MiB", headline(m)) for m in manifests]
     total_s = sum(m.seconds for m in manifests)
     peak_mib = max((m.peak_memory_mib for m in manifests), default=0.0)
     rows.append(("all", console.duration(total_s), f"{peak_mib:,.0f} MiB", ""))
@@ -52,15 +44,20 @@ def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -
     if assets:
         console.out.print()
         console.columns(
-            ("asset", "size", "read back and drawn again, PSNR"),
+            ("asset", "size", "PSNR when read back"),
             [(path, console.size(count), quality) for path, count, quality in assets],
         )
     else:
         console.out.print(Text(f"\nIn {pipeline.stage_folder(reached[-1])}"))
 
 
+def time_of(manifest: Manifest) -> str:
+    """How long a stage took."""
+    return console.times(manifest.seconds, getattr(manifest, "cpu_seconds", None))
+
+
 def headline(manifest: Manifest) -> str:
-    """The figures of one stage that matter most."""
+    """The most important metrics of one stage."""
     names = _HEADLINES.get(manifest.stage, ())
     chosen = {n: manifest.metrics[n] for n in names if n in manifest.metrics}
     if "psnr_db" in chosen:  # always of photographs that training did not see
@@ -70,7 +67,7 @@ def headline(manifest: Manifest) -> str:
 
 
 def _assets(pipeline: Pipeline) -> list[tuple[str, int, str]]:
-    """(path, bytes, quality in words) of each exported file."""
+    """(path, bytes, quality as text) of each exported file."""
     manifest = pipeline.manifest("export")
     if manifest is None:
         return []
@@ -83,23 +80,23 @@ def _assets(pipeline: Pipeline) -> list[tuple[str, int, str]]:
 
 
 def _quality(manifest: Manifest, name: str) -> str:
-    """How near pictures of the file are to pictures of the splats before export."""
+    """PSNR between pictures of the file and of the splats before export."""
     if name.startswith("mesh."):
         return _mesh_quality(manifest.metrics.get("mesh", {}))
     figures = manifest.metrics.get("formats", {}).get(name, {})
-    return console.figure("verify_db", figures["verify_db"]) if "verify_db" in figures else ""
+    return console.fidelity(figures["verify_db"]) if "verify_db" in figures else ""
 
 
 def _mesh_quality(mesh: dict[str, Any]) -> str:
-    """What a mesh is, what it covers, how near it is to the points of the reconstruction."""
-    words = [
+    """Triangles, coverage, and distance from the sparse points of the reconstruction."""
+    parts = [
         f"collision proxy: {mesh.get('triangles', 0):,} triangles",
         f"{mesh.get('covered_share', 0):.0%} of what the photographs show",
     ]
     if mesh.get("sparse_median_distance_share") is not None:
         apart = f"{mesh['sparse_median_distance_share']:.2%} of its size"
-        words.append(f"{apart} from the sparse points (median)")
-    return ", ".join(words)
+        parts.append(f"{apart} from the sparse points (median)")
+    return ", ".join(parts)
 
 
 def _as_data(
@@ -117,50 +114,5 @@ def _as_data(
             }
             for m in manifests
         },
-        "assets": [{"path": path, "bytes": count} for path, count, _ in assets],
+        "assets": [{"path": path, "size_bytes": count} for path, count, _ in assets],
     }
-
-
-def show_status(pipeline: Pipeline, steps: list[Step], as_json: bool) -> None:
-    """One line a stage: finished, or why it runs (again)."""
-    busy = pipeline.busy()
-    if as_json:
-        rows = [
-            {
-                "stage": s.stage.name,
-                "state": _state(s, busy),
-                "reason": s.reason or None,
-                "warnings": s.manifest.warnings if s.manifest else [],
-            }
-            for s in steps
-        ]
-        console.emit("status", run_folder=str(pipeline.run_folder), busy=busy, stages=rows)
-        return
-    console.table(
-        ("stage", "state", "time", "peak memory", ""),
-        [
-            (
-                f"{s.number}-{s.stage.name}",
-                _state(s, busy),
-                console.duration(s.manifest.seconds) if s.manifest else "-",
-                f"{s.manifest.peak_memory_mib:,.0f} MiB" if s.manifest else "-",
-                s.reason or (headline(s.manifest) if s.manifest else ""),
-            )
-            for s in steps
-        ],
-        title=str(Path(pipeline.run_folder)),
-    )
-    if busy:
-        console.out.print(f"\nProcess {busy} is working on it now.")
-
-
-def _state(step: Step, busy: int | None) -> str:
-    if busy and step.interrupted:
-        return "running"
-    if not step.will_run:
-        return "finished"
-    if step.failed:
-        return "failed"
-    if step.manifest is not None:
-        return "runs again"
-    return "interrupted" if step.interrupted else "to do"

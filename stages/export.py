@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
-from stages.capacity.output_formats import ALL_MESHES, DEFAULT_FORMATS, formats_setting
+from stages.capacity.output_formats import DEFAULT_FORMATS, formats_setting, mesh_formats
 from stages.formats.table import FORMATS
 from stages.raster.backends import (
     backend_of_settings,
@@ -24,7 +25,6 @@ from stages.raster.backends import (
     device_setting,
     report_backend,
 )
-from stages.surface.table import MESHES
 
 if TYPE_CHECKING:
     from stages.proof.prover import Prover
@@ -46,24 +46,17 @@ class ExportSettings:
     """Settings of the export."""
 
     formats: tuple[str, ...] = formats_setting(DEFAULT_FORMATS, panel="Output")
-    name: str = field(
-        default="scene",
-        metadata={
-            "help": "Name of the files, without a suffix.",
-            "pattern": _NAME,
-            "wanted": "A name that every system takes: letters, digits, spaces, - and _; no "
-            "folder, no suffix.",
-        },
+    name: str = setting(
+        "scene",
+        "Name of the files, without a suffix.",
+        pattern=_NAME,
+        wanted="A name that every system takes: letters, digits, spaces, - and _; no "
+        "folder, no suffix.",
     )
     backend: str = backend_setting()
     device: str = device_setting()
-    mesh_triangles: int = field(
-        default=50_000,
-        metadata={
-            "help": "Triangles of the mesh, at most about.",
-            "min": 100,
-            "max": 100_000_000,
-        },
+    mesh_triangles: int = setting(
+        50_000, "Triangles of the mesh, at most about.", min=100, max=100_000_000
     )
 
 
@@ -126,15 +119,13 @@ def _write_meshes(
     folder: Path,
     report: Report,
 ) -> list[ExportedFile]:
-    """Each mesh asked for, read back and compared; metric: mesh, see `CollisionMesh`. Raises
-    SplatError "export-verify-failed"."""
-    asked = (e for name in settings.formats for e in (MESHES if name == ALL_MESHES else (name,)))
-    wanted = [MESHES[ending] for ending in dict.fromkeys(asked) if ending in MESHES]
-    if not wanted:
+    """Write the meshes that were asked for, and prove each; metric: mesh, see `CollisionMesh`.
+    Raises SplatError "export-verify-failed"."""
+    rows = mesh_formats(settings.formats)
+    if not rows:
         return []
-    from stages.base.lazy import load_object
     from stages.scene import ExportedFile
-    from stages.surface.checks import fault_of
+    from stages.surface.checks import write_checked
     from stages.surface.collision_mesh import make_collision_mesh
 
     made = make_collision_mesh(
@@ -142,10 +133,9 @@ def _write_meshes(
     )
     report.metric("mesh", made.figures)
     files = []
-    for row in wanted:
+    for row in rows:
         path = folder / f"{settings.name}.{row.ending}"
-        load_object(row.writer)(path, made.mesh, reconstruction.units)
-        if fault := fault_of(path, row, made.mesh):
+        if fault := write_checked(path, row, made.mesh, reconstruction.units):
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
     return files

@@ -1,7 +1,7 @@
-"""Photographs -> Capture: every usable photograph as upright 8-bit sRGB, with what EXIF knows.
+"""The ingest stage: photographs -> Capture, each as upright 8-bit sRGB with what Exif says of it.
 
-Reads JPEG, PNG, TIFF, WebP, HEIC, AVIF and BMP from a folder and its sub-folders, which are only
-ever read, and takes sharp frames out of videos. Says in warnings what a photographer should change.
+Reads JPEG, PNG, TIFF, WebP, HEIC, AVIF and BMP from a folder and its sub-folders, in which nothing
+is written, and takes sharp frames from videos. Warnings say what a photographer should change.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from stages.base.stage import Report, Stage
 from stages.base.text import counted
 
 if TYPE_CHECKING:
-    from stages.photos.decode import Decoded, PixelBudget
-    from stages.photos.find import Findings, Source
+    from stages.photos.decode import Decoded, PixelBudget, Unusable
     from stages.photos.quality import Measures
+    from stages.photos.sources import Findings, Source
     from stages.scene import Capture, Photo
 
 FEWEST_PHOTOGRAPHS = 3
@@ -46,8 +46,8 @@ class IngestSettings:
         metadata={
             "panel": "Light and masks",
             "help": "Folder of masks, white where a photograph counts, named as the photographs "
-            "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside the "
-            "photographs' is found without.",
+            "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside "
+            "that of the photographs is found without this option.",
             "affects_output": False,  # its content does, which is an input
         },
     )
@@ -62,9 +62,8 @@ class IngestSettings:
         default="auto",
         metadata={
             "panel": "Light and masks",
-            "help": "What is outside a mask: ignore (something that does not count), transparent "
-            "(nothing, as around an object cut out) or auto (nothing where pictures themselves are "
-            "transparent, ignored where masks are files).",
+            "help": "How pixels outside a mask are treated: ignore (as unknown), transparent (as "
+            "empty space) or auto (ignore for mask files, transparent for transparent pictures).",
             "choices": ("auto", "ignore", "transparent"),
         },
     )
@@ -72,8 +71,8 @@ class IngestSettings:
         default=0,
         metadata={
             "panel": "Input",
-            "help": "Frames to take from each video, at most; 0 takes as many as its motion asks "
-            "for.",
+            "help": "Frames to take from each video, at most; 0 chooses by how far the camera "
+            "moves.",
             "min": 0,
             "max": 100_000,
         },
@@ -81,14 +80,25 @@ class IngestSettings:
 
 
 @dataclass(frozen=True)
-class _Taken:
-    """A photograph that was read, or `unusable`: why it was not. inside: the share of it that its
-    mask keeps."""
+class _Ingested:
+    """A photograph that was read and written, or why it cannot be used.
 
+    Args:
+        name: of the file, or of the frame.
+        photo: None for a file that cannot be used.
+        measures: of the photograph.
+        error: why the file cannot be used.
+        transparent: whether the file has transparent pixels.
+        inside: share of the photograph that its mask keeps.
+        mask_scaled: whether its mask had another size.
+        hdr, bad_profile: as in `Decoded`.
+    """
+
+    name: str
     photo: Photo | None = None
     measures: Measures | None = None
-    unusable: str = ""
-    alpha: bool = False
+    error: Unusable | None = None
+    transparent: bool = False
     inside: float = 1.0
     mask_scaled: bool = False
     hdr: bool = False
@@ -98,51 +108,53 @@ class _Taken:
 def run(
     inputs: Mapping[str, Any], settings: IngestSettings, folder: Path, report: Report
 ) -> Capture:
-    """Read the photographs in the folder inputs["photos"]; see the module's docstring.
+    """Read the photographs in the folder inputs["photos"].
 
-    Leaves in `folder`: photos/ (the normalised pictures), masks/ (where there are any) and
-    capture.json (`load` reads it). Raises SplatError for a folder without at least 3 usable
-    photographs and for masks that do not fit them, and Interrupted.
+    Writes to `folder`: photos/ (the normalised pictures), masks/ (where there are any) and
+    capture.json (`load` reads it).
+
+    Raises:
+        SplatError: there are fewer than 3 usable photographs, or masks do not fit them.
+        Interrupted: the user stopped it.
     """
-    from stages.photos import advice, capture_file, find, masking, masks
+    from stages.photos import advice, capture_file, masking
+    from stages.photos.find import find
+    from stages.photos.masks import check_pairing, mask_folder
     from stages.photos.quality import near_duplicates
     from stages.scene import Capture
 
     root = Path(inputs["photos"])
-    apart = masks.mask_folder(root, settings.masks)
-    found = find.find(root, apart)
-    masks.check_pairing(found, apart, settings.masks)
+    apart = mask_folder(root, settings.masks)
+    found = find(root, apart)
+    check_pairing(found, apart, settings.masks)
     folder.mkdir(parents=True, exist_ok=True)
-    taken = _take_all(found, settings, folder, report)
-    names = [source.name for source in found.sources]
+    ingested = _ingest_photographs(found, settings, folder, report)
     for source in found.videos:
-        frames = _frames_of(source, settings, folder, report)
-        names += [one.photo.name if one.photo else source.name for one in frames]
-        taken += frames
-    reasons = [(n, t.unusable) for n, t in zip(names, taken, strict=True) if t.photo is None]
+        ingested += _ingest_video(source, settings, folder, report)
+    unusable = [(one.name, str(one.error), one.error.hint) for one in ingested if one.error]
     advice.about_files(found, report.warn)
-    advice.about_left_out(reasons, report.warn)
-    photos = tuple(t.photo for t in taken if t.photo is not None)
+    advice.about_left_out(unusable, report.warn)
+    photos = tuple(one.photo for one in ingested if one.photo is not None)
     if len(photos) < FEWEST_PHOTOGRAPHS:
-        raise _too_few(root, len(photos), reasons)
+        raise _too_few(root, len(photos), unusable)
     advice.about_conversions(
-        [n for n, t in zip(names, taken, strict=True) if t.hdr],
-        [n for n, t in zip(names, taken, strict=True) if t.bad_profile],
+        [one.name for one in ingested if one.hdr],
+        [one.name for one in ingested if one.bad_profile],
         report.warn,
     )
-    inside = [t.inside for t in taken if t.photo is not None]
+    inside = [one.inside for one in ingested if one.photo is not None]
     masking.check_shares(photos, inside, bool(found.masks))
     advice.about_masks(
         photos,
-        [n for n, t in zip(names, taken, strict=True) if t.alpha],
-        [n for n, t in zip(names, taken, strict=True) if t.mask_scaled],
+        [one.name for one in ingested if one.transparent],
+        [one.name for one in ingested if one.mask_scaled],
         found.stray_masks,
         report.warn,
     )
-    duplicates = near_duplicates([t.measures.thumbnail for t in taken if t.measures is not None])
-    photos = _with_twins(photos, duplicates)
+    duplicates = near_duplicates([one.measures.thumbnail for one in ingested if one.measures])
+    photos = _with_duplicates(photos, duplicates)
     _report_capture(photos, duplicates, report)
-    report.metric("left_out", len(reasons))
+    report.metric("left_out", len(unusable))
     report.metric("files_ignored", found.others)
     capture = Capture(folder, photos)
     capture_file.save_capture(capture)
@@ -156,80 +168,80 @@ def load(folder: Path) -> Capture:
     return load_capture(folder)
 
 
-def _take_all(
+def _ingest_photographs(
     found: Findings, settings: IngestSettings, folder: Path, report: Report
-) -> list[_Taken]:
-    """Each source read, measured and written, in order, a few at a time."""
+) -> list[_Ingested]:
+    """All photographs, in order; a few are read at once."""
     from stages.photos.decode import PixelBudget, readers_set_up
 
     budget = PixelBudget(_PIXELS_AT_ONCE)
-    taken: list[_Taken] = []
+    ingested: list[_Ingested] = []
     total = len(found.sources)
     report.progress(0, total, "reading photographs")
     with readers_set_up(), ThreadPoolExecutor(threads.count()) as pool:
-        futures: list[Future[_Taken]] = [
-            pool.submit(_take, source, found.masks.get(source.name), settings, folder, budget)
+        futures: list[Future[_Ingested]] = [
+            pool.submit(
+                _ingest_photograph, source, found.masks.get(source.name), settings, folder, budget
+            )
             for source in found.sources
         ]
         try:
             for done, (source, future) in enumerate(zip(found.sources, futures, strict=True), 1):
-                taken.append(future.result())
+                ingested.append(future.result())
                 report.progress(done, total, source.name)
                 if report.stop_requested.is_set() and done < total:
                     raise Interrupted(f"stopped after {done} of {total} photographs")
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-    return taken
+    return ingested
 
 
-def _take(
+def _ingest_photograph(
     source: Source, mask: Path | None, settings: IngestSettings, folder: Path, budget: PixelBudget
-) -> _Taken:
-    """Read one photograph and its mask, and keep it."""
+) -> _Ingested:
     from stages.photos.decode import Unusable, decode
 
     try:
         decoded = decode(source.path, settings.max_side, budget)
-    except Unusable as finding:
-        return _Taken(unusable=str(finding))
-    return _kept(source.name, source.image, decoded, settings, folder, mask)
+    except Unusable as error:
+        return _Ingested(source.name, error=error)
+    return _write(source.name, source.image, decoded, settings, folder, mask)
 
 
-def _frames_of(
+def _ingest_video(
     source: Source, settings: IngestSettings, folder: Path, report: Report
-) -> list[_Taken]:
-    """The chosen frames of a video, kept as photographs of one camera."""
+) -> list[_Ingested]:
+    """The chosen frames of a video, as photographs of one camera."""
     from stages.photos import video_frames
     from stages.photos.decode import Unusable
 
     try:
         chosen = video_frames.photographs(source, settings.frames, settings.max_side, report)
         return [
-            _kept(
+            _write(
                 f"{source.name}/{number}",
                 f"{source.image}/{number}",
                 decoded,
                 settings,
                 folder,
-                film=source.name,
+                video=source.name,
             )
             for number, decoded in chosen
         ]
-    except Unusable as finding:
-        return [_Taken(unusable=str(finding))]
+    except Unusable as error:
+        return [_Ingested(source.name, error=error)]
 
 
-def _kept(
+def _write(
     name: str,
     image: str,
     decoded: Decoded,
     settings: IngestSettings,
     folder: Path,
     mask: Path | None = None,
-    film: str = "",
-) -> _Taken:
-    """Write a normalised picture and its mask, and measure it. film: the video that it comes
-    from."""
+    video: str = "",
+) -> _Ingested:
+    """Write a normalised picture and its mask, and measure it. video: that it is a frame of."""
     from stages.photos.masking import MaskedPhoto
     from stages.photos.quality import measure
     from stages.photos.write import write_mask, write_picture
@@ -252,7 +264,7 @@ def _kept(
         width=width,
         height=height,
         focal_px=round(focal, 3) if focal is not None else None,
-        camera=_film_key(film, width, height) if film else exif.camera_key(width, height),
+        camera=_video_key(video, width, height) if video else exif.camera_key(width, height),
         sharpness=measures.sharpness,
         log2_luminance=measures.log2_luminance,
         exposure_ev=round(exif.exposure_ev, 3) if exif.exposure_ev is not None else None,
@@ -260,10 +272,11 @@ def _kept(
         mask=masked.file(image),
         outside=masked.outside,
     )
-    return _Taken(
+    return _Ingested(
+        name,
         photo,
         measures,
-        alpha=decoded.alpha is not None,
+        transparent=decoded.alpha is not None,
         inside=masked.share,
         mask_scaled=masked.scaled,
         hdr=decoded.hdr,
@@ -271,13 +284,13 @@ def _kept(
     )
 
 
-def _film_key(film: str, width: int, height: int) -> str:
-    """As `Exif.camera_key`: a film has a lens of its own, and is no other make of camera."""
-    return f"video, {width}x{height} {film.replace(',', ' ')}"
+def _video_key(video: str, width: int, height: int) -> str:
+    """As `Exif.camera_key`: each video has a lens of its own, and no make of camera."""
+    return f"video, {width}x{height} {video.replace(',', ' ')}"
 
 
-def _with_twins(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
-    """The photographs, each of a group of near-duplicates knowing the group's first."""
+def _with_duplicates(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
+    """The photographs, with `duplicate_of` set to the first of each group of near-duplicates."""
     first = {index: photos[group[0]].name for group in groups for index in group}
     return tuple(replace(photo, duplicate_of=first.get(i, "")) for i, photo in enumerate(photos))
 
@@ -303,23 +316,23 @@ def _report_capture(
     report.metric("median_log2_luminance", round(float(medians[1]), 3))
 
 
-def _too_few(root: Path, usable: int, reasons: list[tuple[str, str]]) -> SplatError:
-    if root.is_file() and reasons:
+def _too_few(root: Path, usable: int, unusable: list[tuple[str, str, str]]) -> SplatError:
+    if root.is_file() and unusable:
         return SplatError(
             "ingest-video-unusable",
-            given=f"{root} cannot be used: {reasons[0][1]}.",
+            given=f"{root} cannot be used: {unusable[0][1]}.",
             wanted="A video with pictures that decode.",
-            hint="Copy it from the camera again, or export it anew as H.264 or HEVC.",
+            hint=f"{unusable[0][2]}.",
         )
     given = f"{root} holds {counted(usable, 'usable photograph')}."
-    if reasons:
-        few = "; ".join(f"{name}: {why}" for name, why in reasons[:3])
-        more = f"; and {len(reasons) - 3} more" if len(reasons) > 3 else ""
-        given = f"{given[:-1]}; {len(reasons)} could not be read ({few}{more})."
+    if unusable:
+        few = "; ".join(f"{name}: {why}" for name, why, _ in unusable[:3])
+        more = f"; and {len(unusable) - 3} more" if len(unusable) > 3 else ""
+        given = f"{given[:-1]}; {len(unusable)} could not be read ({few}{more})."
     return SplatError(
         "ingest-too-few-photographs",
         given=given,
-        wanted=f"At least {FEWEST_PHOTOGRAPHS}; 20 to 50 do an object or a room well.",
+        wanted=f"At least {FEWEST_PHOTOGRAPHS}; an object or a room needs 20 to 50.",
         hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
     )
 

@@ -6,10 +6,11 @@ See `capacity.pruning`. The PSNR of the held-out views before and after is in th
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.capacity import DECIDING_VIEWS, SOG_LOSS_DB
 from stages.formats.table import FORMATS
@@ -30,76 +31,50 @@ if TYPE_CHECKING:
 class PruneSettings:
     """Settings of pruning."""
 
-    rounds: int = field(
-        default=8,
-        metadata={
-            "help": "Rounds of pruning, each of a tenth of the splats at most; 0 for none.",
-            "min": 0,
-            "max": 100,
-        },
+    rounds: int = setting(
+        8, "Rounds of pruning, each of a tenth of the splats at most; 0 for none.", min=0, max=100
     )
-    strength: float = field(
-        default=1.0,
-        metadata={
-            "panel": "Size",
-            "help": "Pruning strength: larger removes more, and allows more loss.",
-            "min": 0.001,
-            "max": 1000,
-        },
+    strength: float = setting(
+        1.0,
+        "Pruning strength: larger removes more, and allows more loss.",
+        panel="Size",
+        min=0.001,
+        max=1000,
     )
-    max_loss_db: float = field(
-        default=0.1,
-        metadata={
-            "help": "PSNR that views which were not trained on may lose, as estimated from the "
-            "training views, at strength 1 (dB).",
-            "min": 0,
-            "max": 100,
-        },
+    max_loss_db: float = setting(
+        0.1,
+        "PSNR that views which were not trained on may lose, as estimated from the "
+        "training views, at strength 1 (dB).",
+        min=0,
+        max=100,
     )
-    max_splats: int = field(
-        default=0,
-        metadata={
-            "help": "Splats at most, whatever the loss; 0 for any number.",
-            "min": 0,
-            "max": 100_000_000,
-        },
+    max_splats: int = setting(
+        0, "Splats at most, whatever the loss; 0 for any number.", min=0, max=100_000_000
     )
-    max_mb: float = field(
-        default=0.0,
-        metadata={
-            "panel": "Size",
-            "help": "Size at most, whatever the loss, of the file that --mb-of names; 0 for any "
-            "(megabytes).",
-            "min": 0,
-            "max": 1_000_000,
-        },
+    max_mb: float = setting(
+        0.0,
+        "Size at most, whatever the loss, of the file that --mb-of names; 0 for any (megabytes).",
+        panel="Size",
+        min=0,
+        max=1_000_000,
     )
-    mb_of: str = field(
-        default="ply",
-        metadata={
-            "panel": "Size",
-            "help": "Format that --max-mb is about",
-            "choices": tuple(FORMATS),
-        },
+    mb_of: str = setting(
+        "ply", "Format that --max-mb is about", panel="Size", choices=tuple(FORMATS)
     )
-    min_psnr: float = field(
-        default=0.0,
-        metadata={
-            "panel": "Size",
-            "help": "Remove as much as leaves the training views this PSNR, instead of by "
-            "--strength; 0 for none (dB).",
-            "min": 0,
-            "max": 99,
-        },
+    min_psnr: float = setting(
+        0.0,
+        "Remove as much as leaves the training views this PSNR, instead of by "
+        "--strength; 0 for none (dB).",
+        panel="Size",
+        min=0,
+        max=99,
     )
-    finetune_steps: int = field(
-        default=90,
-        metadata={
-            "panel": "Advanced",
-            "help": "Steps of fine-tuning after each round; 0 for none.",
-            "min": 0,
-            "max": 100_000,
-        },
+    finetune_steps: int = setting(
+        90,
+        "Steps of fine-tuning after each round; 0 for none.",
+        panel="Advanced",
+        min=0,
+        max=100_000,
     )
     backend: str = backend_setting()
     device: str = device_setting()

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.capacity import DECIDING_VIEWS, SOG_LOSS_DB
 from stages.capacity.output_formats import (
@@ -23,6 +24,7 @@ from stages.capacity.output_formats import (
     formats_setting,
     rounding_formats,
 )
+from stages.formats.table import FORMATS
 from stages.raster.backends import (
     backend_of_settings,
     backend_setting,
@@ -49,36 +51,26 @@ class QuantiseSettings:
     """Settings of the choice of precision. Of the formats, only those that need fine-tuning are
     kept: a further lossless format changes nothing here."""
 
-    max_loss_db: float = field(
-        default=0.02,
-        metadata={
-            "help": "PSNR of training views that lower SH degrees may cost (dB).",
-            "min": 0,
-            "max": 100,
-        },
+    max_loss_db: float = setting(
+        0.02, "PSNR of training views that lower SH degrees may cost (dB).", min=0, max=100
     )
-    sog_loss_db: float = field(
-        default=SOG_LOSS_DB,
-        metadata={
-            "help": "PSNR of training views that fewer bits in a .sog may cost besides, before "
-            "fine-tuning recovers a part of it (dB).",
-            "min": 0,
-            "max": 100,
-        },
+    sog_loss_db: float = setting(
+        SOG_LOSS_DB,
+        "PSNR of training views that fewer bits in a .sog may cost besides, before "
+        "fine-tuning recovers a part of it (dB).",
+        min=0,
+        max=100,
     )
-    max_views: int = field(
-        default=DECIDING_VIEWS,
-        metadata={"help": "Training views to measure on, at most.", "min": 1, "max": 100_000},
+    max_views: int = setting(
+        DECIDING_VIEWS, "Training views to measure on, at most.", min=1, max=100_000
     )
     formats: tuple[str, ...] = formats_setting(rounding_formats(DEFAULT_FORMATS), may_be_empty=True)
-    rounding_steps: int = field(
-        default=45,
-        metadata={
-            "help": "Steps of fine-tuning after each attribute that a format rounds (.splat, .spz, "
-            ".sog, .compressed.ply); 0 for none.",
-            "min": 0,
-            "max": 100_000,
-        },
+    rounding_steps: int = setting(
+        45,
+        "Steps of fine-tuning after each attribute that a format rounds (.splat, .spz, "
+        ".sog, .compressed.ply); 0 for none.",
+        min=0,
+        max=100_000,
     )
     backend: str = backend_setting()
     device: str = device_setting()
@@ -99,17 +91,22 @@ def run(
     `capacity.rounding`). Raises SplatError if a photograph cannot be read, and Interrupted.
     """
     from stages.capacity.bits import choose_bits
+    from stages.capacity.rounding import write_and_read
+    from stages.formats.quantisation import splats_to_write
     from stages.scene import QuantisedSplats
 
     splats: Splats = inputs["prune"]
     decider, evaluator = _measures(inputs["sfm"], splats.draw_settings, settings, report)
     kept, by_degree, threshold = _choose_sh_degrees(splats, settings, decider)
     flat = _flat_colours(kept, inputs["sfm"], settings)
+    quantised = QuantisedSplats(kept, kept.sh_degree, {}, flat)
     bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
     figures = {
         "psnr_raw_db": evaluator.psnr(splats),
         "psnr_kept_db": evaluator.psnr(kept),
-        "psnr_splat32_db": evaluator.psnr(_as_splat32(kept, flat)),
+        "psnr_splat32_db": evaluator.psnr(
+            write_and_read(FORMATS["splat"], splats_to_write(FORMATS["splat"], quantised))
+        ),
         "sh_degree": kept.sh_degree,
         "splats_by_sh_degree": [
             int((kept.sh_degrees == d).sum()) for d in range(kept.sh_degree + 1)
@@ -131,7 +128,7 @@ def run(
     report.metric("kept_mib", round(_bytes(kept) / 2**20, 3))
     report.metric("evaluated_side_px", splats.draw_settings.side)
     report_backend(report, backend_of_settings(settings))
-    quantised = QuantisedSplats(kept, kept.sh_degree, decisions, flat)
+    quantised = replace(quantised, decisions=decisions)
     finetuned = _finetune_to_formats(quantised, inputs, settings, decider.views, report)
     quantised = replace(quantised, finetuned=finetuned)
     _save(folder, quantised)
@@ -167,7 +164,7 @@ def _choose_sh_degrees(
 
 def _flat_colours(
     splats: Splats, reconstruction: Reconstruction, settings: QuantiseSettings
-) -> NDArray[np.floating] | None:
+) -> NDArray[np.float32] | None:
     """[N, 3] DC coefficients for formats without view dependence; None where `splats` have none."""
     from stages.measure.sh import view_averaged_dc
     from stages.scene import split_held_out
@@ -176,18 +173,7 @@ def _flat_colours(
         return None
     views = split_held_out(reconstruction.views)[0]
     cameras = (splats.draw_settings.camera(view.camera) for view in views)
-    found: NDArray[np.floating] = view_averaged_dc(splats, cameras, backend_of_settings(settings))
-    return found
-
-
-def _as_splat32(splats: Splats, flat: NDArray[np.floating] | None) -> Splats:
-    """As a .splat file returns them, without fine-tuning."""
-    from stages.formats import FORMATS, splat32
-    from stages.formats.quantisation import splats_to_write
-    from stages.scene import QuantisedSplats
-
-    held = splats_to_write(FORMATS["splat"], QuantisedSplats(splats, splats.sh_degree, {}, flat))
-    return replace(splat32.decode(splat32.encode(held)), draw_settings=splats.draw_settings)
+    return view_averaged_dc(splats, cameras, backend_of_settings(settings))
 
 
 def _finetune_to_formats(
@@ -201,7 +187,6 @@ def _finetune_to_formats(
     import numpy as np
 
     from stages.capacity.rounding import RoundingFinetuner
-    from stages.formats import FORMATS
     from stages.formats.values import drop_undrawable
     from stages.measure.contribution import measure_contributions
     from stages.measure.evaluation import load_evaluation_views

@@ -20,8 +20,6 @@ from tests.docs_tables import PAGES, ROOT, renewed
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
 GUIDE = (ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md")))
 README_LINES = 200
-# Files of users and of run folders, which the code does not hold.
-WRITTEN = {"manifest.json", "transforms.json", "reconstruction.json"}
 _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
 # Strings of the source that look like codes and are something else.
 _NO_CODES = {
@@ -107,8 +105,8 @@ def test_paths_and_names_of_the_code_exist(page: Path) -> None:
     names = {
         path.name for top in ("stages", "splatcli", "tests") for path in (ROOT / top).rglob("*")
     }
-    for name in re.findall(r"`(\w+\.(?:py|cpp|json))`", text):
-        assert name in names | WRITTEN, name
+    for name in re.findall(r"`(\w+\.(?:py|cpp))`", text):
+        assert name in names, name
     for module in re.findall(r"python -m ((?:stages|tests)[\w.]*)", text):
         found = ROOT.joinpath(*module.split("."))
         assert found.with_suffix(".py").exists() or (found / "__main__.py").exists(), module

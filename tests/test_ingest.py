@@ -88,7 +88,7 @@ def test_a_photograph_that_may_not_be_read_is_left_out_and_named(
     capture, warnings, _ = ingested(photos)
     assert len(capture.photos) == 3
     assert "locked.jpg is left out" in warnings["ingest-left-out"]
-    assert "Change them" in warnings["ingest-left-out"]
+    assert "Change its permissions" in warnings["ingest-left-out"]
 
 
 def test_load_returns_what_run_returned(photos: Path) -> None:
@@ -278,7 +278,7 @@ def test_a_truncated_jpeg_with_a_whole_thumbnail_is_found(photos: Path) -> None:
         (b"", "the file is empty"),
         (b"GIF89a" + bytes(50), "it is a GIF"),
         (b"<html>not found</html>", "it holds text"),
-        (bytes(range(256)) * 9, "it is no picture"),
+        (bytes(range(256)) * 9, "it is not a picture"),
     ],
 )
 def test_files_that_only_claim_to_be_photographs_are_left_out(
@@ -302,6 +302,7 @@ def test_a_decompression_bomb_is_left_out(photos: Path) -> None:
     Image.new("1", (20000, 20000)).save(photos / "x.png")
     _, warnings, _ = ingested(photos)
     assert "x.png is left out: 20000 x 20000 is more than 200" in warnings["ingest-left-out"]
+    assert "Scale it down" in warnings["ingest-left-out"]
 
 
 def test_what_is_not_read_is_named_with_advice(photos: Path) -> None:

@@ -70,7 +70,7 @@ def test_a_video_gives_sharp_frames_that_are_what_was_filmed(video: Path, tmp_pa
     facts = report.metrics["videos"][0]
     assert [one["number"] for one in facts["chosen"]] == found
     assert facts["frames"] == 90
-    assert facts["colours"] == "taken as sRGB"
+    assert facts["colours"] == "read as sRGB"
 
 
 def test_as_many_frames_as_asked_for(video: Path, tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def broken(video: Path, kind: str) -> Path:
 
 @pytest.mark.parametrize(("kind", "told"), [
     ("encrypted", "encrypted"), ("empty", "the file is empty"), ("without index", "index"),
-    ("text", "does not open as a video"), ("only sound", "no pictures"),
+    ("text", "does not open as a video"), ("only sound", "no video"),
 ])  # fmt: skip
 def test_a_video_that_cannot_be_used_is_one_clear_error(
     video: Path, tmp_path: Path, kind: str, told: str
@@ -185,8 +185,8 @@ def test_a_broken_video_among_photographs_is_left_out_and_named(tmp_path: Path) 
 
 def test_memory_hardly_grows_with_length() -> None:
     """What is kept of a frame is a few hundred bytes, however large it is."""
-    from stages.photos.frame_selection import Watcher
+    from stages.photos.frame_selection import FrameMeter
 
-    watcher = Watcher()
-    seen = [watcher.see(at(i)[..., 0], i / 30) for i in range(20)]
-    assert all(one.moved.nbytes + 16 < 400 for one in seen)
+    meter = FrameMeter()
+    seen = [meter.measure(at(i)[..., 0], i / 30) for i in range(20)]
+    assert all(one.motion.nbytes + 16 < 400 for one in seen)

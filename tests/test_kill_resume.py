@@ -30,11 +30,11 @@ MIB, OTHER_MIB = 40.0, (60.0, 400.0)  # of which the first stops growth early
 IMPATIENT = """
 import sys
 import stages.base.memory as memory
-import stages.training.trainer as trainer
+import stages.training.hooks as hooks
 
 free_mib = float(sys.argv.pop(1))
 memory.available_mib = lambda: free_mib
-trainer.CHECKPOINT_SECONDS = 0.7
+hooks.CHECKPOINT_SECONDS = 0.7
 from splatcli.app import main
 
 main()

@@ -1,12 +1,15 @@
-"""`splat cameras`: those of a run, of nerfstudio or of COLMAP, for programs that train on them."""
+"""`splat cameras`: writes cameras in the format of nerfstudio or of COLMAP."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from splatcli import console
+from splatcli.arguments import AsJson
 from stages.base.atomic import make_folder
 from stages.base.errors import Family, SplatError
 from stages.run import runfolder
@@ -17,9 +20,20 @@ if TYPE_CHECKING:
     from stages.cameras.colmap import ColmapModel
 
 
-def convert(source: Path, out: Path, as_json: bool) -> None:
-    """Read cameras from `source` and write them to `out`: a .json file for nerfstudio, or a folder
-    for COLMAP. Raises SplatError."""
+def cameras(
+    source: Annotated[
+        Path, typer.Argument(help="Run folder, transforms.json, or folder with a COLMAP model.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(help="A .json name for nerfstudio, or a folder for COLMAP.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Write cameras for other programs: those of a run, of nerfstudio or of COLMAP.
+
+    A run's cameras belong to its undistorted photographs, which the file names; sparse points are
+    written with them. nerfstudio's world is z up; COLMAP's is y down, as in a run.
+    """
     from stages.cameras import colmap, nerfstudio
 
     to_nerfstudio = _is_json(out)
@@ -47,10 +61,10 @@ def convert(source: Path, out: Path, as_json: bool) -> None:
         "pictures": str(pictures),
         "pictures_found": (found.folder / found.views[0].image).is_file(),
     }
-    _tell(facts, as_json)
+    _print(facts, as_json)
 
 
-def _tell(facts: dict[str, Any], as_json: bool) -> None:
+def _print(facts: dict[str, Any], as_json: bool) -> None:
     if as_json:
         console.emit("cameras", **facts)
         return
@@ -59,7 +73,7 @@ def _tell(facts: dict[str, Any], as_json: bool) -> None:
     if facts["pictures_found"]:
         console.note(f"Their pictures are in {facts['pictures']}")
     else:
-        console.note(f"Warning: their pictures are not in {facts['pictures']}.", "yellow")
+        console.warn(f"Warning: their pictures are not in {facts['pictures']}.")
 
 
 def _is_json(out: Path) -> bool:
@@ -69,7 +83,7 @@ def _is_json(out: Path) -> bool:
         return False
     raise SplatError(
         "cameras-target",
-        given=f"{out} is to hold cameras.",
+        given=f"{out} cannot hold cameras.",
         wanted="A name that ends in .json for nerfstudio, or a folder's for COLMAP.",
         hint="For example transforms.json, or sparse",
         family=Family.USAGE,
@@ -77,7 +91,7 @@ def _is_json(out: Path) -> bool:
 
 
 def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
-    """The cameras, and the model with its points if it is one."""
+    """(the cameras, the COLMAP model with its points or None)."""
     from stages.cameras.colmap import locate, read_model
     from stages.cameras.table import read_cameras
 
@@ -97,7 +111,7 @@ def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
 
 
 def _without_points(found: CameraFile) -> tuple[ColmapModel, Path]:
-    """(a model, the folder that its picture names start from): the innermost that holds all."""
+    """(a model without points, the innermost folder that holds all pictures)."""
     import numpy as np
 
     from stages.cameras.colmap import ColmapModel

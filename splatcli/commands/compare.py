@@ -1,14 +1,17 @@
-"""`splat compare`: two runs of the same photographs, and whether they can be told apart."""
+"""`splat compare`: whether one of two runs of the same photographs is better."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from splatcli import console, sources
+import typer
+
+from splatcli import console
+from splatcli.arguments import AsJson, Quiet
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
-from stages.raster.kernels import cache
+from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
 
@@ -16,15 +19,27 @@ if TYPE_CHECKING:
     from stages.measure.tradeoff.comparison import Candidate
 
 
-def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) -> None:
-    """Judge both, write the report into `out`, print the verdict.
+def compare(
+    first: Annotated[Path, typer.Argument(help="Run folder.")],
+    second: Annotated[Path, typer.Argument(help="Another, of the same photographs.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path(
+        "comparison"
+    ),
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two runs: better, worse, or inconclusive.
 
-    Raises SplatError: stage-not-finished, run-half-anew, compare-other-photographs,
-    compare-nothing-in-common, and what keeps files from being written."""
-    from stages.measure.tradeoff.pair_report import fact_rows, write_comparison
-
+    Both are evaluated at one size, view by view, on photographs that neither was trained on.
+    """
     from stages.base.atomic import make_folder
-    from stages.measure.tradeoff.comparison import compare_runs, distinct_name, verdict_lines
+    from stages.measure.tradeoff.comparison import (
+        compare_runs,
+        distinct_name,
+        fact_rows,
+        verdict_lines,
+        write_comparison,
+    )
 
     runs = [Pipeline(find_run_folder(folder)) for folder in (first, second)]
     sides = [
@@ -32,25 +47,25 @@ def compare(first: Path, second: Path, out: Path, quiet: bool, as_json: bool) ->
         for run, other in zip(runs, reversed(runs), strict=True)
     ]
     _check_photographs(*runs)
-    if not quiet and not as_json and not cache.are_compiled():
-        console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    pairing = compare_runs(sides[0], sides[1])
+    if not quiet and not as_json:
+        console.note_compiling()
+    comparison = compare_runs(sides[0], sides[1])
     make_folder(out)
-    files = write_comparison(out, pairing)
+    files = write_comparison(out, comparison)
     if as_json:
-        change = pairing.psnr
+        change = comparison.psnr
         console.emit(
             "compared",
             verdict=change.verdict,
             psnr_change_db=change.mean,
             interval_db=[change.low, change.high] if change.views > 1 else None,
-            photographs=change.views,
+            views=change.views,
             files=[str(file) for file in files],
         )
         return
     if not quiet:
-        console.table(("", sides[0].name, sides[1].name), fact_rows(pairing))
-    for line in verdict_lines(pairing):
+        console.table(("", sides[0].name, sides[1].name), fact_rows(comparison))
+    for line in verdict_lines(comparison):
         console.out.print(line, markup=False)
     console.out.print(str(files[0]), markup=False)
 
@@ -74,14 +89,14 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
 def _side(run: Pipeline, name: str) -> Candidate:
     from stages.measure.tradeoff.comparison import Candidate
 
-    splats = sources.finished_splats(run)
-    told = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
+    splats = results.final_splats(run)
+    facts = {"splats": f"{len(splats):,}", "SH degree": str(splats.sh_degree)}
     trained = run.manifest("train")
     if trained is not None:
-        told["training"] = console.duration(trained.seconds)
+        facts["training"] = console.duration(trained.seconds)
         steps = trained.metrics.get("steps", trained.settings["steps"])
-        told["steps"] = f"{steps:,}"
-        told["seed"] = str(trained.settings["seed"])
-    for ending, figures in sources.exported_formats(run).items():
-        told[f".{ending}"] = console.size(figures["size_bytes"])
-    return Candidate(name, splats, run.load("sfm"), sources.backend_of(run), told)
+        facts["steps"] = f"{steps:,}"
+        facts["seed"] = str(trained.settings["seed"])
+    for ending, figures in results.exported_formats(run).items():
+        facts[f".{ending}"] = console.size(figures["size_bytes"])
+    return Candidate(name, splats, run.load("sfm"), results.backend_of_run(run), facts)

@@ -1,4 +1,4 @@
-"""`splat convert`: a splat file of one format made into another, and the difference told."""
+"""`splat convert`: writes a splat file in another format, and compares the two."""
 
 from __future__ import annotations
 
@@ -6,22 +6,30 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from splatcli import console
+from splatcli.arguments import ENDINGS, AsJson, Quiet
 from stages.base.errors import Family, SplatError
+from stages.run import results
 
 if TYPE_CHECKING:
     from stages.scene import Splats
 
-Say = Callable[[str], None]
 _STEPS = 3
 
 
-def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
-    """Read `source`, write `target`, read that again with another parser, draw it and compare.
+def convert(
+    source: Annotated[Path, typer.Argument(help="Splat file to read; its name says the format.")],
+    target: Annotated[Path, typer.Argument(help=f"Splat file to write: {ENDINGS}.")],
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a splat file in another format.
 
-    Raises SplatError: what keeps a file from being read or written, and "convert-verify-failed".
+    The new file is read with a second parser, drawn and compared with the first.
     """
     from stages import formats
     from stages.base import scratch
@@ -29,14 +37,14 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
     from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
-    make_folder(target.parent)
     begun = time.monotonic()
-    with _progress(quiet, as_json) as say, scratch.scratch_in(target.parent, spare=True):
-        say(f"reading {source}")
+    make_folder(target.parent)
+    with _progress(quiet, as_json) as begin, scratch.scratch_in(target.parent, spare=True):
+        begin(f"reading {source}")
         splats = formats.read(source)
-        say(f"writing {target}")
+        begin(f"writing {target}")
         dropped = formats.write(target, splats)
-        say(f"comparing {target}")
+        begin(f"comparing {target}")
         found = _proven(source, target, drop_undrawable(splats)[0])
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
@@ -53,26 +61,25 @@ def convert(source: Path, target: Path, quiet: bool, as_json: bool) -> None:
         console.emit("converted", **facts)
         return
     if dropped:
-        console.note(f"Warning: {dropped} splats that no viewer can draw were left out.", "yellow")
+        console.warn(f"Warning: {dropped} splats that no viewer can draw were left out.")
     _show(facts, found, quiet)
 
 
 def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
-    told = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
-    quality = console.figure("verify_db", found["verify_db"])
-    console.note(f"{facts['target']}: {told}, {facts['bytes_per_splat']:.1f} bytes each, {quality}")
+    size = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
+    quality = console.fidelity(found["verify_db"])
+    console.note(f"{facts['target']}: {size}, {facts['bytes_per_splat']:.1f} bytes each, {quality}")
     worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}
     if worst and not quiet:
         console.note(f"Largest differences: {console.figures(worst)}", "dim")
 
 
 def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
-    """What the proof found. Raises SplatError "convert-verify-failed"."""
-    from splatcli.sources import views_around
+    """The figures of the comparison. Raises SplatError "convert-verify-failed"."""
     from stages.formats import format_of
     from stages.proof.prover import Prover, cameras_for
 
-    cameras = cameras_for(splats, views_around(source))
+    cameras = cameras_for(splats, results.views_of(results.run_around(source)))
     proof = Prover.of(splats, cameras, source_format=format_of(source).ending).prove(target)
     if proof.fault:
         raise _failed(target, proof.fault)
@@ -90,13 +97,13 @@ def _failed(path: Path, reason: str) -> SplatError:
 
 
 @contextlib.contextmanager
-def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
-    """What tells the steps: lines, or events for machines; on a terminal a bar that also shows how
-    far each step is."""
+def _progress(quiet: bool, as_json: bool) -> Iterator[Callable[[str], None]]:
+    """Yield a function to call at the beginning of each step. It prints a line or an event; on a
+    terminal it shows a bar with the progress of the step."""
     done = 0
     if as_json or quiet or not console.err.is_terminal:
 
-        def say(label: str) -> None:
+        def begin(label: str) -> None:
             nonlocal done
             if as_json:
                 console.emit("progress", label=label, done=done, total=_STEPS)
@@ -104,7 +111,7 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
                 console.note(label)
             done += 1
 
-        yield say
+        yield begin
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
@@ -114,13 +121,13 @@ def _progress(quiet: bool, as_json: bool) -> Iterator[Say]:
     with Progress(*columns, console=console.err, transient=True) as bar:
         task = bar.add_task("", total=None)
 
-        def show(label: str) -> None:
+        def begin_bar(label: str) -> None:
             nonlocal done
             done += 1
             bar.reset(task, total=None, description=f"{done}/{_STEPS} {label}")
 
-        def pass_over(rows: int, total: int) -> None:
+        def update(rows: int, total: int) -> None:
             bar.update(task, completed=rows, total=total)
 
-        with progress_reported_to(pass_over):
-            yield show
+        with progress_reported_to(update):
+            yield begin_bar

@@ -10,7 +10,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import typer
+
 from splatcli import console
+from splatcli.arguments import AsJson
 from stages.base import threads
 from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family
@@ -36,8 +39,8 @@ class Check:
     advice: str = ""
 
 
-def show(as_json: bool = False) -> int:
-    """Print all checks; returns the exit status, 0 when nothing needed is missing."""
+def doctor(as_json: AsJson = False) -> None:
+    """Check what this machine has, and what is missing."""
     found = list(checks())
     missing = [check for check in found if not check.ok]
     if as_json:
@@ -46,7 +49,8 @@ def show(as_json: bool = False) -> int:
         marks = {True: "ok", False: "MISSING"}
         rows = [(c.name, marks[c.ok], " ".join(filter(None, (c.value, c.advice)))) for c in found]
         console.table(("check", "", "value"), rows)
-    return int(Family.RESOURCES) if missing else 0
+    if missing:
+        raise typer.Exit(int(Family.RESOURCES))
 
 
 def checks() -> Iterator[Check]:
@@ -76,11 +80,11 @@ def _library(distribution: str) -> Check:
         for module in modules:
             importlib.import_module(module)
     except Exception as error:  # a broken library may raise anything while it loads
-        return Check(distribution, _said(error), ok=False, advice=advice)
+        return Check(distribution, _first_line(error), ok=False, advice=advice)
     return Check(distribution, versions().get(distribution, "present"))
 
 
-def _said(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
@@ -110,7 +114,7 @@ def _kernel_cache() -> Check:
             value += console.size(sum(map(cache.size_bytes, others)))
         return Check("kernel cache", value)
     except Exception as error:  # no place to write to, or no Numba
-        return Check("kernel cache", _said(error), ok=False)
+        return Check("kernel cache", _first_line(error), ok=False)
 
 
 def _readable(what: str, names: Callable[[], list[str]]) -> Check:
@@ -119,7 +123,7 @@ def _readable(what: str, names: Callable[[], list[str]]) -> Check:
     try:
         return Check(label, ", ".join(names()))
     except Exception as error:  # of a library that is missing or broken
-        return Check(label, _said(error), ok=False)
+        return Check(label, _first_line(error), ok=False)
 
 
 def _photograph_formats() -> list[str]:
@@ -140,7 +144,7 @@ def _video_codecs() -> list[str]:
 def _camera_files() -> list[str]:
     from stages.cameras.table import CAMERA_FILES
 
-    return [row.what for row in CAMERA_FILES]
+    return [row.description for row in CAMERA_FILES]
 
 
 def _backend(backend: Backend) -> Check:
@@ -150,7 +154,7 @@ def _backend(backend: Backend) -> Check:
             return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
         load_object(backend.rasteriser)
     except Exception as error:
-        return Check(label, f"not present ({_said(error)})", ok=False)
+        return Check(label, f"not present ({_first_line(error)})", ok=False)
     return Check(label, "present")
 
 
@@ -162,4 +166,4 @@ def _gpu() -> Check:
         missing = device.missing()
         return Check("GPU", f"{missing}; {device.built()}" if missing else device.describe())
     except Exception as error:  # a broken driver may raise anything
-        return Check("GPU", _said(error))
+        return Check("GPU", _first_line(error))

@@ -1,31 +1,46 @@
-"""`splat edit`: a chain of operations on splats, and what each of them did."""
+"""`splat edit`: a sequence of operations on splats, and the effect of each."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from splatcli import console
+from splatcli.arguments import ENDINGS, AsJson, Quiet
+from splatcli.folders import load_target
+from splatcli.operation_options import parsed_operations
 from stages.base.errors import Family, SplatError
+from stages.run import results
 
 if TYPE_CHECKING:
     from stages.editing.operations import AppliedOperation
     from stages.editing.scene import EditedScene
-    from stages.editing.syntax import ParsedOperation
 
 
 def edit(
-    source: Path,
-    target: Path | None,
-    parsed: Sequence[ParsedOperation],
-    dry_run: bool,
-    quiet: bool,
-    as_json: bool,
+    ctx: typer.Context,
+    source: Annotated[Path, typer.Argument(help="Splat file, or a run folder for its splats.")],
+    target: Annotated[
+        Path | None,
+        typer.Argument(help=f"Splat file to write: {ENDINGS}; FOLDER/lod-meta.json to stream."),
+    ] = None,
+    *,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the effect of the operations; write nothing.")
+    ] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    **operation_options: Any,
 ) -> None:
-    """Read `source`, do what was typed, write `target`. Raises SplatError; nothing is written
-    then."""
+    """Select, move, join and thin out splats: operations in the order in which they are typed.
+
+    Coordinates are those of `splat info`: y down, less the capture's origin. If the splats are a
+    run's, or lie in its export folder, the PSNR of the run's photographs is printed for each
+    operation.
+    """
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
@@ -34,25 +49,28 @@ def edit(
     if target is None and not dry_run:
         raise SplatError(
             "edit-no-target",
-            given=f"splat edit {source} says nothing of where to.",
+            given=f"splat edit {source} names no file to write.",
             wanted="A second file name, or --dry-run.",
             hint=f"splat edit {source} edited.ply --keep 'opacity > 0.1'",
             family=Family.USAGE,
         )
     target = target or Path("scene.ply")
-    row, chain = formats.format_of(target), operations.prepare_operations(parsed, target)
+    row, chain = (
+        formats.format_of(target),
+        operations.prepare_operations(parsed_operations(ctx), target),
+    )
     if not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
         if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
-        scene = _opened(source)
+        scene = _load_scene(source)
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps = []
         for step in operations.apply_operations(scene, chain):
             scene = step.scene
-            steps.append(_told(step, as_json, quiet))
+            steps.append(_report(step, as_json, quiet))
         facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
         if start_db is not None:
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
@@ -68,32 +86,31 @@ def edit(
         _show(facts)
 
 
-def _opened(source: Path) -> EditedScene:
-    """With the photographs of the run that it is of, or lies in. Raises SplatError."""
-    from splatcli.sources import backend_of, pipeline_around, splats_of
+def _load_scene(source: Path) -> EditedScene:
+    """The splats, with the photographs of their run if there is one. Raises SplatError."""
     from stages.editing.scene import EditedScene
     from stages.formats import units_of
     from stages.formats.values import drop_undrawable
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
-    splats, pipeline = splats_of(source)
-    pipeline = pipeline or pipeline_around(source)
+    splats, pipeline = load_target(source)
+    pipeline = pipeline or results.run_around(source)
     splats = drop_undrawable(splats)[0]
     if pipeline is None or pipeline.manifest("sfm") is None:
         return EditedScene(splats, units_of(source))
     found = pipeline.load("sfm")
     training, held = split_held_out(found.views)
     photographs = load_evaluation_views(found.folder, training, splats.draw_settings)
-    held_out_views = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
+    evaluation = load_evaluation_views(found.folder, held, splats.draw_settings) or photographs
     return EditedScene(
-        *(splats, found.units, photographs, held_out_views, found.views),
-        backend=backend_of(pipeline),
+        *(splats, found.units, photographs, evaluation, found.views),
+        backend=results.backend_of_run(pipeline),
     )
 
 
 def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
-    """What another parser reads in `target`, drawn from cameras that training never saw. Raises
+    """The figures of comparing `target`, read by a second parser, with the splats. Raises
     SplatError "edit-verify-failed"."""
     from stages.formats import format_of
     from stages.formats.values import drop_undrawable
@@ -119,7 +136,7 @@ def _db(scene: EditedScene) -> float | None:
     return None if found is None else round(found, 3)
 
 
-def _told(step: AppliedOperation, as_json: bool, quiet: bool) -> dict[str, Any]:
+def _report(step: AppliedOperation, as_json: bool, quiet: bool) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "operation": str(step.parsed),
         "splats_before": step.before,
@@ -137,13 +154,13 @@ def _told(step: AppliedOperation, as_json: bool, quiet: bool) -> dict[str, Any]:
 
 
 def _show(facts: dict[str, Any]) -> None:
-    told = f"{facts['splats']:,} splats, {facts['splats_before']:,} before"
+    result = f"{facts['splats']:,} splats, {facts['splats_before']:,} before"
     if "psnr_db" in facts:
         change = facts["psnr_db"] - facts["psnr_before_db"]
-        told += f", {facts['psnr_db']:.2f} dB on photographs ({change:+.2f})"
+        result += f", {facts['psnr_db']:.2f} dB on photographs ({change:+.2f})"
     if "verify_db" in facts:
-        told += f", {console.figure('verify_db', facts['verify_db'])} read back and drawn again"
+        result += f", {console.fidelity(facts['verify_db'])} read back and drawn again"
     if "target" in facts:
-        console.note(f"{facts['target']}: {told}, {console.size(facts['size_bytes'])}")
+        console.note(f"{facts['target']}: {result}, {console.size(facts['size_bytes'])}")
     else:
-        console.note(f"Nothing was written. It would be {told}.")
+        console.note(f"Nothing was written. It would be {result}.")

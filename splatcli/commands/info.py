@@ -1,19 +1,22 @@
-"""`splat info`: what is in a run or a splat file, and what in it may cause trouble."""
+"""`splat info`: statistics and warnings of a splat file or of a run's newest splats."""
 
 from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from splatcli import console
-from splatcli.sources import backend_of, newest_with_splats, pipeline_around, splats_of
-from splatcli.viewpoints import views_of
-from stages.raster.backends import backend_of as chosen_backend
-from stages.raster.kernels import cache
+from splatcli.arguments import AsJson, RunOrFile
+from splatcli.folders import load_target
+from stages.raster.backends import backend_of
+from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
+    from stages.proof.cost import Memory as MemoryUse
     from stages.proof.statistics import Statistics
     from stages.scene import ExportedFile, Splats
 
@@ -28,17 +31,19 @@ _ATTRIBUTES = {
 _TIMED_FRAMES = 8
 
 
-def show(target: Path | None, speed: bool, as_json: bool) -> None:
-    """Print counts, degrees, bounds, bytes and warnings of a file or of a run's newest splats;
-    speed: also how fast they are drawn here.
-
-    Raises SplatError for what cannot be read; values that are not finite are warned of.
-    """
+def info(
+    target: RunOrFile = None,
+    speed: Annotated[
+        bool, typer.Option("--speed", help="Draw some pictures too: frames a second, here.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Print statistics of a file or a run: splats, SH degrees, bounds, bytes, and warnings."""
     from stages.base import scratch
     from stages.proof.statistics import statistics_of
 
     with scratch.scratch_in(Path(tempfile.gettempdir()), spare=True):
-        splats, pipeline = splats_of(target, strict=False)
+        splats, pipeline = load_target(target, strict=False)
         statistics = statistics_of(splats)
     facts = describe(splats, statistics)
     if pipeline is None and target is not None:
@@ -46,92 +51,90 @@ def show(target: Path | None, speed: bool, as_json: bool) -> None:
     if pipeline is not None:
         facts = {**_about_run(pipeline), **facts}
     if speed and statistics.count:
-        facts |= _speed(splats, pipeline or pipeline_around(target))
+        facts |= _speed(splats, pipeline or results.run_around(target))
     warnings = warnings_of(statistics)
     if as_json:
         console.emit("info", **facts, warnings=dict(warnings))
         return
-    rows = [(console.label(k), console.figure(k, _flat(v))) for k, v in facts.items()]
+    rows = [(console.label(name), _text(name, value)) for name, value in facts.items()]
     console.table(("", ""), rows)
     for code, sentence in warnings:
-        console.note(f"Warning: {sentence} ({code})", "yellow")
+        console.warn(f"Warning: {sentence} ({code})")
 
 
 def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
-    """Plain facts: count, SH degrees, bounds of the centres, typical size and opacity."""
+    """Count, SH degrees, bounds of the centres, median size and opacity, and memory."""
     facts: dict[str, Any] = {"splats": statistics.count, "sh_degree": splats.sh_degree}
     if not statistics.count:
         return facts
     facts["splats_by_degree"] = {str(degree): n for degree, n in statistics.by_degree.items()}
     facts["not_finite"] = statistics.count - statistics.whole
     if statistics.whole:
-        facts["bounds_low"], facts["bounds_high"] = (
-            _rounded(statistics.low),
-            _rounded(statistics.high),
-        )
+        facts["bounds_low"] = _rounded(statistics.low)
+        facts["bounds_high"] = _rounded(statistics.high)
         facts["middle_98_percent_low"] = _rounded(statistics.middle_low)
         facts["middle_98_percent_high"] = _rounded(statistics.middle_high)
         facts["median_centre"] = _rounded(statistics.median_centre)
         facts["median_scale"] = statistics.median_scale
         facts["median_opacity"] = statistics.median_opacity
     facts["origin"] = [float(value) for value in splats.origin]
-    return facts | _cost(splats)
+    return facts | _memory(splats)
 
 
-def _cost(splats: Splats) -> dict[str, Any]:
-    """What they take in memory, and the few numbers that explain a splat."""
+def _memory(splats: Splats) -> dict[str, Any]:
+    """Floats and bytes in memory for each splat and for all, and the mass of a Gaussian within 1, 2
+    and 3 standard deviations."""
     from stages.proof.cost import DEGREES, floats_of, mass_within, memory_of
 
     one, every = (memory_of(splats.sh_degree, count) for count in (1, len(splats)))
     return {
         "floats_per_splat": floats_of(splats.sh_degree),
         "floats_per_splat_by_degree": {str(degree): floats_of(degree) for degree in DEGREES},
-        "memory_bytes_per_splat": {
-            "float32": one.single,
-            "half precision": one.half,
-            "while trained": one.trained,
-        },
-        "memory": {
-            "float32": console.size(every.single),
-            "half precision": console.size(every.half),
-            "while trained": console.size(every.trained),
-        },
-        "mass_within_sigmas": {str(n): f"{mass_within(n):.1%}" for n in (1, 2, 3)},
+        "memory_bytes_per_splat": _by_precision(one),
+        "memory_bytes": _by_precision(every),
+        "mass_share_within_sigmas": {str(n): round(mass_within(n), 4) for n in (1, 2, 3)},
+    }
+
+
+def _by_precision(memory: MemoryUse) -> dict[str, int]:
+    return {
+        "float32": memory.single,
+        "half precision": memory.half,
+        "in training": memory.trained,
     }
 
 
 def _speed(splats: Splats, pipeline: Pipeline | None) -> dict[str, Any]:
-    """Frames a second from the photographs' cameras, at the size that the splats were fitted at;
-    around the splats where there are none."""
-    from stages.measure.speed import seconds_per_frame
-
+    """Frames a second from some of the photographs' cameras, at the size of the training; from
+    cameras around the splats if there are no photographs."""
+    from stages.measure.evaluation import seconds_per_frame
     from stages.scene.framing import orbit_cameras
 
-    if not cache.are_compiled():
-        console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    views = views_of(pipeline)
+    console.note_compiling()
+    views = results.views_of(pipeline)
     chosen = views[:: max(1, len(views) // _TIMED_FRAMES)][:_TIMED_FRAMES]
     cameras = [splats.draw_settings.camera(v.camera) for v in chosen] or orbit_cameras(
         splats, _TIMED_FRAMES, 0.9
     )
-    backend = backend_of(pipeline)
+    backend = results.backend_of_run(pipeline)
     seconds = seconds_per_frame(splats, cameras, backend)
     return {
         "frames_a_second": round(1 / float(seconds.mean()), 2),
-        "frame_size": f"{cameras[0].width} x {cameras[0].height}",
+        "frame_width": cameras[0].width,
+        "frame_height": cameras[0].height,
         "frames_timed": len(cameras),
-        "drawn_by": chosen_backend(backend).name,
+        "backend": backend_of(backend).name,
     }
 
 
 def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
-    """(code, sentence) for each kind of trouble that is there."""
+    """(code, sentence) for each kind of defect that is there."""
     from stages.proof.statistics import GIANT_PART, NEEDLE_ASPECT, OUTLIER_BOXES
 
     found = []
     for name, count in statistics.not_finite.items():
-        told = f"{_share(count, statistics)} not finite in their {_ATTRIBUTES[name]}"
-        found.append((f"not-finite-{_ATTRIBUTES[name]}", f"{told}: no viewer can draw them."))
+        what = f"{_share(count, statistics)} not finite in their {_ATTRIBUTES[name]}"
+        found.append((f"not-finite-{_ATTRIBUTES[name]}", f"{what}: no viewer can draw them."))
     kinds = {
         "no-rotation": (statistics.no_rotation, "without a rotation: no viewer can draw them."),
         "too-large": (statistics.too_large, "larger than numbers go: no viewer can draw them."),
@@ -160,7 +163,7 @@ def _about_file(path: Path, count: int) -> dict[str, Any]:
     from stages.proof.checks import byte_breakdown_of
 
     size = format_of(path).size_bytes(path)
-    facts: dict[str, Any] = {"file": str(path), "size": console.size(size)}
+    facts: dict[str, Any] = {"file": str(path), "size_bytes": size}
     breakdown = byte_breakdown_of(path)
     if breakdown.unknown:
         facts["bytes_per_splat_unknown"] = breakdown.unknown
@@ -171,7 +174,7 @@ def _about_file(path: Path, count: int) -> dict[str, Any]:
 
 
 def _about_run(pipeline: Pipeline) -> dict[str, Any]:
-    name = newest_with_splats(pipeline)
+    name = results.newest_stage_with_splats(pipeline)
     facts: dict[str, Any] = {"run": str(pipeline.run_folder), "splats_from": name}
     if pipeline.manifest("sfm") is not None:
         reconstruction = pipeline.load("sfm")
@@ -183,25 +186,38 @@ def _about_run(pipeline: Pipeline) -> dict[str, Any]:
         folder = pipeline.stage_folder("export")
         proven = manifest.metrics.get("formats", {})
         facts["assets"] = {
-            str(folder / file.path): _size_and_quality(file, proven.get(file.format, {}))
+            str(folder / file.path): _size_and_fidelity(file, proven.get(file.format, {}))
             for file in pipeline.load("export").files
         }
     return facts
 
 
-def _size_and_quality(file: ExportedFile, proven: dict[str, Any]) -> str:
-    """proven: what export found when it read the file back and drew it."""
-    told = [console.size(file.size_bytes)]
-    if "verify_db" in proven:
-        told.append(console.figure("verify_db", proven["verify_db"]))
-    return ", ".join(told)
+def _size_and_fidelity(file: ExportedFile, figures: dict[str, Any]) -> dict[str, Any]:
+    """figures: of the export, which read the file back and drew it. psnr_db: None if lossless."""
+    facts: dict[str, Any] = {"size_bytes": file.size_bytes}
+    if "verify_db" in figures:
+        lossless = figures["verify_db"] >= console.LOSSLESS_DB
+        facts |= {"psnr_db": None if lossless else figures["verify_db"], "lossless": lossless}
+    return facts
 
 
 def _rounded(values: Any) -> list[float]:
     return [float(f"{value:.5g}") for value in values]
 
 
-def _flat(value: Any) -> Any:
+def _text(name: str, value: Any) -> str:
+    """A fact as text for the table."""
+    if name == "assets":
+        return ", ".join(f"{path}: {_asset_text(**facts)}" for path, facts in value.items())
     if isinstance(value, dict):
-        return ", ".join(f"{key}: {item}" for key, item in value.items())
-    return " ".join(map(str, value)) if isinstance(value, list) else value
+        return ", ".join(f"{key}: {_text(name, item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return " ".join(map(str, value))
+    if name in ("size_bytes", "memory_bytes"):
+        return console.size(value)
+    return console.figure(name, value)
+
+
+def _asset_text(size_bytes: int, psnr_db: float | None = None, lossless: bool = False) -> str:
+    quality = "lossless" if lossless else console.figure("psnr_db", psnr_db) if psnr_db else ""
+    return ", ".join(filter(None, (console.size(size_bytes), quality)))

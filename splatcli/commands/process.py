@@ -1,152 +1,85 @@
-"""From what was typed to a run of the pipeline: settings, presets, which stages may run."""
+"""`splat process` and the commands of single stages."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
-from inspect import Parameter
 from pathlib import Path
 from typing import Any
 
-import typer
-
-from splatcli import console, options, progress, summary
-from splatcli import live_view as watching
+from splatcli import console, log, options, progress, run_settings, summary
+from splatcli.arguments import AsJson, Cluster, Out, Photos, Quiet, Run, Verbose
 from splatcli.folders import DEFAULT, find_run_folder
-from stages import STAGE_NAMES, load_stage
+from stages import STAGE_NAMES
 from stages.base.errors import Family, SplatError
-from stages.base.settings import Setting, settings_of
 from stages.distributed import blocks, cluster, sfm_chunks
 from stages.distributed.tasks import Executor
-from stages.raster.backends import backend_of, backend_of_settings
 from stages.run import runfolder
 from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.precompile import PrecompileListener
 
-DEFAULT_PRESET = "standard"
-# What speaks of one capture and no other: a batch gives the same options to all of its runs.
-_OF_ONE_CAPTURE = ("masks", "cameras", "split", "refine_cameras", "scale", "blocks", "view")
+
+def process(
+    photos: Photos = None,
+    *,
+    out: Out = None,
+    cluster: Cluster = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
+    **given: Any,
+) -> None:
+    """Photographs in, assets out: all seven stages.
+
+    Finished work is kept: after an interruption the same command goes on where it stopped.
+    """
+    run_folder, photos = _run_folder_and_photos(photos, out)
+    pipeline = distribute(Pipeline(run_folder, photos), cluster)
+    given = options.given_only(given)
+    view, preset = given.pop("view", False), given.pop("preset", None)
+    base = run_settings.defaults() if photos is not None else pipeline.recorded_settings()
+    settings = run_settings.combined(base, given, preset)
+    if "cameras" in given:
+        _check_cameras(given["cameras"])
+    if photos is None and not (quiet or as_json):
+        console.note(run_settings.training_summary(settings["train"], given, preset))
+    _run(pipeline, settings, quiet=quiet, as_json=as_json, view=view)
 
 
-def preset_parameter(shown: str) -> Parameter:
-    """`--preset`, with the names that training defines. shown: the default."""
-    setting = Setting(
-        "preset",
-        "--preset",
-        str,
-        choices=tuple(presets()),
-        help="How much training: preview (minutes), standard, or best (the full recipe).",
-        panel="Quality and time",
-    )
-    return options.keyword("preset", str | None, options.option(setting, shown))
+def stage_command(name: str) -> Callable[..., None]:
+    """The command that runs the stage `name`."""
+
+    def ingest(
+        photos: Photos = None,
+        *,
+        out: Out = None,
+        quiet: Quiet = False,
+        as_json: AsJson = False,
+        verbose: Verbose = False,
+        **given: Any,
+    ) -> None:
+        pipeline = Pipeline(*_run_folder_and_photos(photos, out))
+        _run_stage("ingest", pipeline, given, quiet, as_json)
+
+    def later(
+        run: Run = None,
+        *,
+        quiet: Quiet = False,
+        as_json: AsJson = False,
+        verbose: Verbose = False,
+        **given: Any,
+    ) -> None:
+        _run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
+
+    return ingest if name == "ingest" else later
 
 
-def view_parameter() -> Parameter:
-    """`--view`, of the commands that train."""
-    option = typer.Option(
-        "--view",
-        help="Show the scene in the browser while it is trained.",
-        rich_help_panel="Output",
-    )
-    return options.keyword("view", bool, option, default=False)
-
-
-def presets() -> Mapping[str, Any]:
-    """Training settings by preset name."""
-    from stages.train import PRESETS
-
-    found: Mapping[str, Any] = PRESETS
-    return found
-
-
-def process_parameters() -> list[Parameter]:
-    """The few options of `process`; one that several stages share is given to all of them."""
-    found: dict[str, Parameter] = {}
-    for name in STAGE_NAMES:
-        kind = load_stage(name).settings_type
-        for parameter in options.parameters(kind, _shown, only_in_process=True):
-            found.setdefault(parameter.name, parameter)
-    shown = f"{DEFAULT_PRESET}; as before where a run goes on"
-    return [preset_parameter(shown), *found.values(), view_parameter()]
-
-
-def batch_parameters() -> list[Parameter]:
-    """Those of `process` that can be asked of many captures at once."""
-    return [p for p in process_parameters() if p.name not in _OF_ONE_CAPTURE]
-
-
-def stage_parameters(name: str) -> list[Parameter]:
-    """All settings of one stage; training has presets too, and can be watched."""
-    kind = load_stage(name).settings_type
-    if name == "ingest":
-        return options.parameters(kind)
-    if name != "train":
-        return options.parameters(kind, shown=_kept)
-    own = options.parameters(kind, shown=_kept)
-    return [preset_parameter(f"as before, else {DEFAULT_PRESET}"), *own, view_parameter()]
-
-
-def _shown(setting: Setting) -> str | bool:
-    """The default for the help: that of the preset, where presets differ in it."""
-    values = {getattr(preset, setting.name, setting.default) for preset in presets().values()}
-    return options.shown_default(setting) if len(values) == 1 else "by preset"
-
-
-def _kept(setting: Setting) -> str | bool:
-    """As `_shown`, where what the run was asked before comes first."""
-    shown = _shown(setting)
-    return f"as before, else {shown}" if shown else "as before"
-
-
-def settings_for(
-    base: Mapping[str, Any], typed: Mapping[str, Any], preset: str | None
-) -> dict[str, Any]:
-    """`base` (settings by stage name) with a preset and what was typed. Raises SplatError."""
-    chosen = dict(base)
-    if preset is not None and "train" in chosen:
-        chosen["train"] = presets()[preset]
-    found = {name: options.changed(settings, typed) for name, settings in chosen.items()}
-    if typed.keys() & {"backend", "device"}:  # said now, not after an hour of other work
-        for asked in {
-            backend_of_settings(each) for each in found.values() if hasattr(each, "backend")
-        }:
-            backend_of(asked).require()
-    return found
-
-
-def training_in_words(settings: Any, typed: Mapping[str, Any], preset: str | None) -> str:
-    """What training is asked of a run that goes on, and which of it was not asked just now."""
-    origins: dict[str, list[str]] = {}
-    before = f"preset {preset}" if preset else "as this run was asked before"
-    for setting in settings_of(type(settings)):
-        name = setting.name
-        if name in typed or _shown(setting) == "by preset":
-            origin = "as typed" if name in typed else before
-            words = f"{console.label(name)} {console.figure(name, getattr(settings, name))}"
-            origins.setdefault(origin, []).append(words)
-    told = "; ".join(f"{', '.join(words)} ({origin})" for origin, words in origins.items())
-    return f"Training: {told}."
-
-
-def defaults() -> dict[str, Any]:
-    """Settings by stage name, with the default preset."""
-    fresh = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
-    return {**fresh, "train": presets()[DEFAULT_PRESET]}
-
-
-def fresh_settings(typed: Mapping[str, Any]) -> dict[str, Any]:
-    """What a new run is asked: settings by stage name, by what was typed, the preset included.
-    Raises SplatError."""
-    others = {name: value for name, value in typed.items() if name != "preset"}
-    return settings_for(defaults(), others, typed.get("preset"))
-
-
-def target_of(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]:
-    """(run folder, photographs or None) that a command is about.
+def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]:
+    """(run folder, photographs or None) of a command's arguments.
 
     Photographs start or continue the run folder `out`, or `run/`; a run folder in their place, or
-    nothing, continues what it was asked before. Raises SplatError.
+    nothing, continues with the recorded settings. Raises SplatError.
     """
     if photos is None:
         return find_run_folder(out), None
@@ -163,7 +96,65 @@ def target_of(photos: Path | None, out: Path | None) -> tuple[Path, Path | None]
     return out or DEFAULT, photos
 
 
-def run(
+def _check_cameras(path: Path) -> None:
+    """Raises SplatError for a camera file that cannot be read, before the photographs are."""
+    from stages.cameras.table import read_cameras
+
+    read_cameras(path)
+
+
+def _run_stage(
+    name: str, pipeline: Pipeline, given: Mapping[str, Any], quiet: bool, as_json: bool
+) -> None:
+    """One stage, with the recorded settings and the given options. The stages after training take
+    little time: those that are missing in between run too."""
+    is_known = runfolder.is_run_folder(pipeline.run_folder)
+    base = pipeline.recorded_settings() if is_known else run_settings.defaults()
+    given = options.given_only(given)
+    preset, view = given.pop("preset", None), given.pop("view", False)
+    if "formats" in given:
+        given["formats"] = _with_exported(pipeline, given["formats"])
+    settings = run_settings.combined({name: base[name]}, given, preset)
+    if name == "export" and "formats" in given:  # `quantise` may have to fine-tune for them
+        formats = (*base["quantise"].formats, *given["formats"])
+        settings["quantise"] = options.changed(base["quantise"], {"formats": formats})
+    if not is_known:
+        settings = {**base, **settings}
+    if name == "train" and not (quiet or as_json):
+        console.note(run_settings.training_summary(settings["train"], given, preset))
+    after_training = STAGE_NAMES[STAGE_NAMES.index("train") + 1 :]
+    _run(
+        distribute(pipeline, None),
+        settings,
+        until=name,
+        may_run=after_training if name in after_training else (name,),
+        quiet=quiet,
+        as_json=as_json,
+        view=view,
+    )
+
+
+def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:
+    """The given formats after those that were exported before, which stay."""
+    manifest = pipeline.manifest("export")
+    earlier = manifest.settings.get("formats", ()) if manifest is not None else ()
+    return tuple(dict.fromkeys((*earlier, *formats)))
+
+
+def distribute(pipeline: Pipeline, address: str | None) -> Pipeline:
+    """The pipeline, which trains blocks on the cluster at `address`, or in this process without
+    one. A cluster computes chunks of features and matches, too."""
+
+    def open_executor(folder: Path, listener: Listener) -> AbstractContextManager[Executor]:
+        paths = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
+        return cluster.open_executor(address, folder, paths, listener)
+
+    if address is not None:
+        pipeline = sfm_chunks.with_chunks(pipeline, open_executor)
+    return blocks.in_blocks(pipeline, open_executor)
+
+
+def _run(
     pipeline: Pipeline,
     settings: Mapping[str, Any],
     *,
@@ -173,96 +164,26 @@ def run(
     as_json: bool = False,
     view: bool = False,
 ) -> None:
-    """Run the pipeline and show what came of it. view: on a page too, while it trains."""
-    listener = progress.listener_for(quiet, as_json)
+    """Run the pipeline and print the result. view: show the training on a page, too."""
+    log.write_settings(settings)
+    listeners: list[Listener] = [log.LogListener(), progress.listener_for(quiet, as_json)]
     if until is None:
-        listener = Listeners(PrecompileListener(settings["train"].backend), listener)
+        listeners.insert(0, PrecompileListener(settings["train"].backend))
     if view:
-        listener = Listeners(watching.LiveTraining(pipeline, as_json), listener)
-    pipeline.run(settings, until=until, may_run=may_run, listener=listener)
+        listeners.insert(0, _live_training(pipeline, as_json))
+    pipeline.run(settings, until=until, may_run=may_run, listener=Listeners(*listeners))
     summary.show(pipeline, until, quiet=quiet, as_json=as_json)
 
 
-def run_all(
-    photos: Path | None,
-    out: Path | None,
-    address: str | None,
-    given: Mapping[str, Any],
-    quiet: bool,
-    as_json: bool,
-) -> None:
-    """`splat process`. Without photographs, what was asked before counts too. address: of the
-    cluster that trains blocks."""
-    run_folder, photos = target_of(photos, out)
-    pipeline = in_blocks(Pipeline(run_folder, photos), address)
-    base = defaults() if photos is not None else pipeline.recorded_settings()
-    typed = options.given_only(given)
-    view = typed.pop("view", False)
-    preset = typed.pop("preset", None)
-    settings = settings_for(base, typed, preset)
-    if "cameras" in typed:
-        _check_cameras(typed["cameras"])
-    if photos is None and not (quiet or as_json):
-        console.note(training_in_words(settings["train"], typed, preset))
-    run(pipeline, settings, quiet=quiet, as_json=as_json, view=view)
+def _live_training(pipeline: Pipeline, as_json: bool) -> Listener:
+    from stages.viewer.live_training import LiveTraining
+    from stages.viewer.server import open_in_browser
 
+    def announce(address: str) -> None:
+        if as_json:
+            console.emit("view", address=address)
+        else:
+            console.note(f"Watch the training at {address}", "bold")
+        open_in_browser(address)
 
-def _check_cameras(path: Path) -> None:
-    """Raises SplatError for cameras that cannot be read: before all photographs are."""
-    from stages.cameras.table import read_cameras
-
-    read_cameras(path)
-
-
-def run_stage(
-    name: str,
-    pipeline: Pipeline,
-    given: Mapping[str, Any],
-    quiet: bool,
-    as_json: bool,
-) -> None:
-    """One stage, with the settings recorded before and what was typed.
-
-    The stages after training are cheap: those that are missing in between run too.
-    """
-    known = runfolder.is_run_folder(pipeline.run_folder)
-    base = pipeline.recorded_settings() if known else defaults()
-    typed = options.given_only(given)
-    preset, view = typed.pop("preset", None), typed.pop("view", False)
-    if "formats" in typed:
-        typed["formats"] = _with_exported(pipeline, typed["formats"])
-    settings = settings_for({name: base[name]}, typed, preset)
-    if name == "export" and "formats" in typed:  # which quantise may have to fine-tune to first
-        formats = (*base["quantise"].formats, *typed["formats"])
-        settings["quantise"] = options.changed(base["quantise"], {"formats": formats})
-    if not known:
-        settings = {**base, **settings}
-    if name == "train" and not (quiet or as_json):
-        console.note(training_in_words(settings["train"], typed, preset))
-    pipeline = in_blocks(pipeline, None)
-    may_run = _may_run(name)
-    run(pipeline, settings, until=name, may_run=may_run, quiet=quiet, as_json=as_json, view=view)
-
-
-def in_blocks(pipeline: Pipeline, address: str | None) -> Pipeline:
-    """The pipeline; if it has blocks, the cluster at `address` trains them, or this process. A
-    cluster does shares of structure from motion, too."""
-
-    def opened(folder: Path, listener: Listener) -> AbstractContextManager[Executor]:
-        seen = filter(None, [pipeline.run_folder, pipeline.photos or pipeline.recorded_photos()])
-        return cluster.open_executor(address, folder, seen, listener)
-
-    shared = pipeline if address is None else sfm_chunks.with_shares(pipeline, opened)
-    return blocks.in_blocks(shared, opened)
-
-
-def _with_exported(pipeline: Pipeline, formats: Collection[str]) -> tuple[str, ...]:
-    """The formats asked for, after those that lie there already: asking for one more loses none."""
-    manifest = pipeline.manifest("export")
-    earlier = manifest.settings.get("formats", ()) if manifest is not None else ()
-    return tuple(dict.fromkeys((*earlier, *formats)))
-
-
-def _may_run(name: str) -> Collection[str]:
-    after_training = STAGE_NAMES[STAGE_NAMES.index("train") + 1 :]
-    return after_training if name in after_training else (name,)
+    return LiveTraining(pipeline, announce, console.warn)

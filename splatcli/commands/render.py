@@ -1,4 +1,4 @@
-"""`splat render`: a picture, a film or a folder of pictures, drawn along a path."""
+"""`splat render`: a picture, a film or a folder of frames."""
 
 from __future__ import annotations
 
@@ -7,172 +7,172 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from splatcli import console, sources, viewpoints
+import typer
+
+from splatcli import console
+from splatcli.arguments import AsJson, Backend, Device, Quiet, RunOrFile
+from splatcli.folders import load_target
+from splatcli.options import number
 from splatcli.progress import counting
 from stages.base import memory
 from stages.base.errors import Family, SplatError
-from stages.raster.kernels import cache
+from stages.run import results
 
 if TYPE_CHECKING:
     from stages.raster.definition import Rendering
-    from stages.scene import Camera
+    from stages.scene import Camera, Splats, View
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
-_BYTES_PER_PIXEL = 100  # planes of colour and depth, their copies, and what tiles remember
+_BYTES_PER_PIXEL = 100  # colour and depth planes, their copies, and the tiles' lists
 _LARGEST_FILM_SIDE = 1280  # pixels, unless --width or a camera file says otherwise
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What was typed. None: not given."""
+class _Options:
+    """The options of the command; None where they are not given."""
 
     out: Path
-    camera: str | None = None
-    path: str | None = None
-    frames: int | None = None
-    seconds: float | None = None
-    fps: float = 30.0
-    width: int | None = None
-    depth: bool = False
-    backend: str | None = None
-    device: str | None = None
-    quiet: bool = False
-    as_json: bool = False
+    camera: str | None
+    path: str | None
+    frames: int | None
+    seconds: float | None
+    fps: float
+    width: int | None
+    depth: bool
+
+    def kind(self) -> str:
+        """picture, film or folder, by the name of `out`. Raises SplatError for options that do not
+        go together."""
+        out = self.out
+        suffix = out.suffix.lower()
+        if suffix in PICTURES and not out.is_dir():
+            path = {"--path": self.path, "--frames": self.frames, "--seconds": self.seconds}
+            given = [name for name, value in path.items() if value is not None]
+            if given:
+                raise _clash(f"{given[0]} makes many pictures, and {out} holds one.", "film.mp4")
+            return "picture"
+        if self.camera is not None and (suffix == ".mp4" or not suffix or out.is_dir()):
+            raise _clash(f"--camera makes one picture, and {out} is for many.", "view.png")
+        if self.frames is not None and self.seconds is not None:
+            raise SplatError(
+                "render-length",
+                given=f"--frames {self.frames} and --seconds {self.seconds:g}.",
+                wanted="One of them: the other follows from --fps.",
+                hint="Leave one of them away.",
+                family=Family.USAGE,
+            )
+        if suffix == ".mp4" and not out.is_dir():
+            return "film"
+        if out.is_dir() or (not suffix and not out.exists()):
+            return "folder"
+        raise SplatError(
+            "render-picture-type",
+            given=f"{out} cannot hold a rendering.",
+            wanted=f"A name that ends in one of {' '.join((*PICTURES, '.mp4'))}, or a folder's.",
+            hint="For example --out view.png, --out film.mp4 or --out frames",
+            family=Family.USAGE,
+        )
 
 
-def render(target: Path | None, wanted: Wanted) -> None:
-    """Draw what was asked for. Raises SplatError."""
+def render(
+    target: RunOrFile = None,
+    *,
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Picture (.png), film (.mp4) or folder of frames."),
+    ] = Path("view.png"),
+    camera: Annotated[
+        str | None,
+        typer.Option(help="A photograph's name or number; by default the first, or one in front."),
+    ] = None,
+    path: Annotated[
+        str | None,
+        typer.Option(
+            help="For films and frames: orbit, capture (past the photographs' cameras), or a "
+            "camera file (transforms.json, COLMAP folder).",
+            show_default="orbit",
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, number("--frames", int, 1, 100_000, "How many frames along the path.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        number("--seconds", float, 0.01, 3600, "How long the film lasts.", "by path"),
+    ] = None,
+    fps: Annotated[float, number("--fps", float, 1, 240, "Frames a second.")] = 30.0,
+    width: Annotated[
+        int | None, number("--width", int, 1, 16384, "Width of the picture (pixels).")
+    ] = None,
+    depth: Annotated[
+        bool,
+        typer.Option("--depth", help="Depth too: .depth.tiff of 32-bit floats, or .depth.mp4."),
+    ] = False,
+    backend: Backend = None,
+    device: Device = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the splats: from a photograph's camera, or as a film along a path.
+
+    Frames that are in the folder already are written again. Depth is z in world units, 0 where
+    there is nothing; in films near is light and far is dark.
+    """
     from stages.raster.backends import AUTO, qualified_name
     from stages.raster.draw import renderer
     from stages.raster.torch_device import CPU
-    from stages.viewer import sinks
 
-    kind = _kind_of(wanted)
-    splats, pipeline = sources.splats_of(target)
-    seen = viewpoints.views_of(pipeline or sources.pipeline_around(target))
+    options = _Options(out, camera, path, frames, seconds, fps, width, depth)
+    kind = options.kind()
     begun = time.monotonic()
-    if kind == "picture":
-        cameras = [_widened(viewpoints.one_camera(splats, seen, wanted.camera), wanted.width)]
-    else:
-        cameras = _film_cameras(splats, seen, wanted, kind == "film")
+    splats, pipeline = load_target(target)
+    run = pipeline or results.run_around(target)
+    cameras = _cameras(splats, results.views_of(run), options, kind)
     _check_memory(max(cameras, key=lambda camera: camera.width * camera.height))
-    if not cache.are_compiled():
-        console.note("Compiling the kernels; this is done once and takes about half a minute.")
-    backend = sources.backend_of(pipeline or sources.pipeline_around(target))
-    if wanted.backend or wanted.device:
-        backend = qualified_name(wanted.backend or AUTO, wanted.device or CPU)
+    console.note_compiling()
+    backend = (
+        qualified_name(backend or AUTO, device or CPU)
+        if backend or device
+        else results.backend_of_run(run)
+    )
     draw = renderer(splats, backend=backend)
-    out = wanted.out
-    facts: dict[str, Any] = {}
-    if kind == "film":
-        near_far = sinks.sampled_range(draw, cameras) if wanted.depth else None
-        if near_far is not None:
-            facts = {"depth_near": near_far[0], "depth_far": near_far[1]}
-        sink = sinks.film_sink(out, cameras[0].width, cameras[0].height, wanted.fps, near_far)
-    elif kind == "folder":
-        sink = sinks.folder_sink(out, len(cameras), wanted.depth)
-    else:
-        sink = sinks.picture_sink(out, wanted.depth)
-    rate = _draw_all(draw, cameras, sink, wanted)
+    sink, facts = _sink(options, kind, draw, cameras)
+    with_bar = not quiet and (len(cameras) > 1 or as_json)
+    rate = _draw_all(draw, cameras, sink, not with_bar, as_json)
     facts |= {"frames": len(cameras), "width": cameras[0].width, "height": cameras[0].height}
     if rate is not None:
         facts["frames_a_second"] = round(rate, 2)
     facts |= {"splats": len(splats), "seconds": round(time.monotonic() - begun, 2)}
-    _tell(wanted, kind, facts)
+    if kind == "folder" and not quiet:
+        _warn_of_other_frames(out, len(cameras))
+    if as_json:
+        console.emit("rendered", out=str(out), kind=kind, **facts)
+    else:
+        _print(out, kind, facts)
 
 
-def _draw_all(
-    draw: Callable[[Camera], Rendering],
-    cameras: list[Camera],
-    sink: AbstractContextManager[Callable[[Rendering], None]],
-    wanted: Wanted,
-) -> float | None:
-    """Frames drawn in a second, writing left out; None for a single one, since the first readies
-    kernels and buffers."""
-    quiet = wanted.quiet or (len(cameras) == 1 and not wanted.as_json)
-    seconds = []
-    with counting("frames", len(cameras), quiet, wanted.as_json) as tick, sink as put:
-        for camera in cameras:
-            begun = time.perf_counter()
-            drawn = draw(camera)
-            seconds.append(time.perf_counter() - begun)
-            put(drawn)
-            tick()
-    return len(seconds[1:]) / sum(seconds[1:]) if len(seconds) > 1 else None
+def _cameras(splats: Splats, views: tuple[View, ...], options: _Options, kind: str) -> list[Camera]:
+    """One camera for each frame; for a film, all of one even size. Raises SplatError."""
+    from stages.viewer.render_cameras import Duration, camera_of_view, path_cameras
 
-
-def _tell(wanted: Wanted, kind: str, facts: dict[str, Any]) -> None:
-    if kind == "folder" and not wanted.quiet:
-        from stages.viewer.sinks import frames_beyond
-
-        left = frames_beyond(wanted.out, facts["frames"])
-        if left:
-            console.note(f"Warning: {left} frames of an earlier, longer path are still there.")
-    if wanted.as_json:
-        console.emit("rendered", out=str(wanted.out), kind=kind, **facts)
-        return
-    many = f"{facts['frames']} frames, " if kind != "picture" else ""
-    size = f"{facts['width']} x {facts['height']}"
-    told = facts.get("frames_a_second")
-    rate = f", drawn at {told:.3g} frames a second" if told else ""
-    console.note(f"{wanted.out}: {many}{size}, {facts['splats']:,} splats{rate}")
-    if "depth_near" in facts:
-        ends = f"{facts['depth_near']:.3g} to {facts['depth_far']:.3g}"
-        console.note(f"Depth, light to dark: {ends} world units")
-
-
-def _kind_of(wanted: Wanted) -> str:
-    """picture, film or folder: by the name to write. Raises SplatError for options that do not go
-    with it."""
-    out = wanted.out
-    suffix = out.suffix.lower()
-    if suffix in PICTURES and not out.is_dir():
-        moving = {"--path": wanted.path, "--frames": wanted.frames, "--seconds": wanted.seconds}
-        given = [name for name, value in moving.items() if value is not None]
-        if given:
-            raise _clash(f"{given[0]} makes many pictures, and {out} holds one.", "film.mp4")
-        return "picture"
-    if wanted.camera is not None and (suffix == ".mp4" or not suffix or out.is_dir()):
-        raise _clash(f"--camera makes one picture, and {out} is for many.", "view.png")
-    if wanted.frames is not None and wanted.seconds is not None:
-        raise SplatError(
-            "render-length",
-            given=f"--frames {wanted.frames} and --seconds {wanted.seconds:g}.",
-            wanted="One of them: the other follows from --fps.",
-            hint="Leave one of them away.",
-            family=Family.USAGE,
-        )
-    if suffix == ".mp4" and not out.is_dir():
-        return "film"
-    if out.is_dir() or (not suffix and not out.exists()):
-        return "folder"
-    raise SplatError(
-        "render-picture-type",
-        given=f"{out} is to hold what is drawn.",
-        wanted=f"A name that ends in one of {' '.join((*PICTURES, '.mp4'))}, or a folder's.",
-        hint="For example --out view.png, --out film.mp4 or --out frames",
-        family=Family.USAGE,
-    )
-
-
-def _film_cameras(splats: Any, seen: Any, wanted: Wanted, is_film: bool) -> list[Camera]:
-    """A camera a frame; for a film, all of one even size."""
-    cameras, as_given = viewpoints.along(
-        wanted.path or "orbit", splats, seen, (wanted.frames, wanted.seconds, wanted.fps)
-    )
-    if wanted.width is not None:
-        cameras = [_widened(camera, wanted.width) for camera in cameras]
-    elif not as_given:
+    if kind == "picture":
+        return [_resized(camera_of_view(splats, views, options.camera), options.width)]
+    duration = Duration(options.frames, options.seconds, options.fps)
+    found = path_cameras(options.path or "orbit", splats, views, duration)
+    for text in found.notes:
+        console.note(text)
+    cameras = [_resized(camera, options.width) for camera in found.cameras]
+    if options.width is None and not found.keeps_size:
         cameras = [camera.fitted(_LARGEST_FILM_SIDE) for camera in cameras]
-    if not is_film:
+    if kind == "folder":
         return cameras
     width, height = (max(2, 2 * round(n / 2)) for n in (cameras[0].width, cameras[0].height))
     return [camera.reframed(width, height) for camera in cameras]
 
 
-def _widened(camera: Camera, width: int | None) -> Camera:
+def _resized(camera: Camera, width: int | None) -> Camera:
     if width is None:
         return camera
     return camera.resized(width, max(1, round(width * camera.height / camera.width)))
@@ -189,6 +189,61 @@ def _check_memory(camera: Camera) -> None:
             hint="Choose a smaller --width.",
             family=Family.RESOURCES,
         )
+
+
+def _sink(
+    options: _Options, kind: str, draw: Callable[[Camera], Rendering], cameras: list[Camera]
+) -> tuple[AbstractContextManager[Callable[[Rendering], None]], dict[str, Any]]:
+    """(what writes the renderings, the depth range of a film with depth)."""
+    from stages.viewer import sinks
+
+    if kind == "folder":
+        return sinks.folder_sink(options.out, len(cameras), options.depth), {}
+    if kind == "picture":
+        return sinks.picture_sink(options.out, options.depth), {}
+    near_far = sinks.sampled_range(draw, cameras) if options.depth else None
+    size = cameras[0].width, cameras[0].height
+    facts = {"depth_near": near_far[0], "depth_far": near_far[1]} if near_far else {}
+    return sinks.film_sink(options.out, *size, options.fps, near_far), facts
+
+
+def _draw_all(
+    draw: Callable[[Camera], Rendering],
+    cameras: list[Camera],
+    sink: AbstractContextManager[Callable[[Rendering], None]],
+    quiet: bool,
+    as_json: bool,
+) -> float | None:
+    """Draw and write all frames. Returns frames a second without the writing, from the second frame
+    on, because the first also compiles kernels and makes buffers; None for a single frame."""
+    seconds = []
+    with counting("frames", len(cameras), quiet, as_json) as tick, sink as put:
+        for camera in cameras:
+            begun = time.perf_counter()
+            drawn = draw(camera)
+            seconds.append(time.perf_counter() - begun)
+            put(drawn)
+            tick()
+    return len(seconds[1:]) / sum(seconds[1:]) if len(seconds) > 1 else None
+
+
+def _warn_of_other_frames(folder: Path, frames: int) -> None:
+    from stages.viewer.sinks import frames_beyond
+
+    if left := frames_beyond(folder, frames):
+        console.note(f"Warning: {left} frames of an earlier, longer path are still there.")
+
+
+def _print(out: Path, kind: str, facts: dict[str, Any]) -> None:
+    many = f"{facts['frames']} frames, " if kind != "picture" else ""
+    size = f"{facts['width']} x {facts['height']}"
+    rate = ""
+    if "frames_a_second" in facts:
+        rate = f", drawn at {facts['frames_a_second']:.3g} frames a second"
+    console.note(f"{out}: {many}{size}, {facts['splats']:,} splats{rate}")
+    if "depth_near" in facts:
+        ends = f"{facts['depth_near']:.3g} to {facts['depth_far']:.3g}"
+        console.note(f"Depth, light to dark: {ends} world units")
 
 
 def _clash(given: str, example: str) -> SplatError:

@@ -1,75 +1,90 @@
-"""`splat tradeoff`: what a minute, a megabyte and a splat are worth in a run's own scene."""
+"""`splat tradeoff`: quality against time, bytes and number of splats for one run."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from splatcli import console, sources
+import typer
+
+from splatcli import console
+from splatcli.arguments import AsJson, Quiet, Run
 from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
-from stages.raster.kernels import cache
+from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
     from stages.measure.tradeoff.measurement import TradeoffInputs
 
 
-def tradeoff(run: Path | None, out: Path | None, quiet: bool, as_json: bool) -> None:
-    """Measure, write the report into `out` (by default a folder in the run), and say the gist.
+def tradeoff(
+    run: Run = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for the report.", show_default="RUN/tradeoff"),
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure quality against time, bytes and number of splats: a report with plots.
 
-    Raises SplatError: stage-not-finished, run-half-anew, nothing-held-out, and what keeps files
-    from being written."""
+    The quality is measured on held-out views. Nothing is trained: the course of training comes from
+    its log, files are really written and read, splats are removed in the order of what they
+    contribute.
+    """
     from stages.base.atomic import make_folder
     from stages.measure.tradeoff.measurement import measure_tradeoff
     from stages.measure.tradeoff.report import summarise, write_report
 
     pipeline = Pipeline(find_run_folder(run))
-    material = material_of(pipeline)
+    inputs = _inputs(pipeline)
     folder = out or pipeline.run_folder / "tradeoff"
     make_folder(folder)
-    if not quiet and not cache.are_compiled():
-        console.note("Compiling the kernels; this is done once and takes about half a minute.")
+    if not quiet:
+        console.note_compiling()
 
-    def tell(label: str) -> None:
+    def report_step(label: str) -> None:
         if as_json:
             console.emit("progress", label=label)
         elif not quiet:
             console.note(label)
 
-    trade = measure_tradeoff(material, tell)
-    files = write_report(folder, pipeline.run_folder.absolute().name, trade, material)
+    found = measure_tradeoff(inputs, report_step)
+    files = write_report(folder, pipeline.run_folder.absolute().name, found, inputs)
     if as_json:
-        said = summarise(trade)
-        console.emit("tradeoff", folder=str(folder), files=[str(f) for f in files], said=said)
+        console.emit(
+            "tradeoff", folder=str(folder), files=[str(f) for f in files], summary=summarise(found)
+        )
         return
     if not quiet:
-        for title, lines in summarise(trade).items():
+        for title, lines in summarise(found).items():
             for number, line in enumerate(lines):
                 console.out.print(f"{title if not number else '':<12} {line}", markup=False)
     console.out.print(str(files[0]), markup=False)
 
 
-def material_of(pipeline: Pipeline) -> TradeoffInputs:
-    """What is measured of a finished run. Raises SplatError (stage-not-finished, run-half-anew,
-    nothing-held-out)."""
+def _inputs(pipeline: Pipeline) -> TradeoffInputs:
+    """The splats, views and files to measure, of a finished run. Raises SplatError
+    (stage-not-finished, run-half-anew, nothing-held-out)."""
     from stages.measure.evaluation import load_evaluation_views
     from stages.measure.tradeoff.measurement import TradeoffInputs, deciding_views
     from stages.scene import split_held_out
 
-    splats = sources.finished_splats(pipeline)
+    splats = results.final_splats(pipeline)
+    settings = splats.draw_settings
     reconstruction = pipeline.load("sfm")
     training, held = split_held_out(reconstruction.views)
     if not held:
         raise SplatError(
             "nothing-held-out",
-            given=f"{pipeline.run_folder} holds no photograph out: there are too few to spare one.",
-            wanted="A run with photographs that training did not see, to judge by.",
-            hint="Take more photographs: four are the least; of every eight, one judges.",
+            given=f"{pipeline.run_folder} has no held-out view: there are too few photographs.",
+            wanted="A run with photographs that training did not use, to measure quality on.",
+            hint="Take more photographs: at least four; one of every eight is held out.",
             family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
-    exported = tuple(sources.exported_formats(pipeline))
+    exported = tuple(results.exported_formats(pipeline))
     return TradeoffInputs(
         splats=splats,
         training=load_evaluation_views(
@@ -77,10 +92,10 @@ def material_of(pipeline: Pipeline) -> TradeoffInputs:
             deciding_views(training, splats.draw_settings),
             splats.draw_settings,
         ),
-        held_out=load_evaluation_views(reconstruction.folder, held, splats.draw_settings),
+        held_out=load_evaluation_views(reconstruction.folder, held, settings),
         views=reconstruction.views,
         units=reconstruction.units,
-        backend=sources.backend_of(pipeline),
+        backend=results.backend_of_run(pipeline),
         levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
         exported=exported,

@@ -1,16 +1,19 @@
-"""`splat verify`: does a file hold what was trained?"""
+"""`splat verify`: whether a file holds what was trained."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from splatcli import console, sources
+import typer
+
+from splatcli import console
+from splatcli.arguments import AsJson, Quiet
+from splatcli.folders import find_run_folder
 from stages.base.errors import Family, SplatError
-from stages.raster.kernels import cache
-from stages.run import runfolder
+from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -26,8 +29,11 @@ _ONLY_ITSELF = (
 
 @dataclass(frozen=True)
 class _Original:
-    """What files are compared with. name: in words. came_as: the format that it was read from.
-    itself: whether that was the file in question. backend: what draws. quantised: of a run."""
+    """What files are compared with.
+
+    name: for messages. source_format: the format that it was read from. itself: whether it is the
+    file to verify. backend: of the rendering. quantised: of a run.
+    """
 
     splats: Splats
     views: tuple[View, ...]
@@ -37,9 +43,9 @@ class _Original:
     backend: str = "auto"
     quantised: QuantisedSplats | None = None
 
-    def held_in(self, file: Path) -> Iterator[Splats]:
-        """What `file` may hold, likeliest first: what the run's export writes, which may be
-        fine-tuned to the format, and what a conversion of the run's splats writes."""
+    def candidates(self, file: Path) -> Iterator[Splats]:
+        """The splats that `file` may hold, likeliest first: of a run, those that its export writes,
+        which may be fine-tuned for the format, then those that a conversion would write."""
         from stages.formats import format_of
         from stages.formats.quantisation import splats_to_write
 
@@ -52,30 +58,48 @@ class _Original:
             yield splats_to_write(row, replace(self.quantised, finetuned={}))
 
 
-def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool) -> None:
-    """Prove one file, or all that a run exported. Raises SplatError: what keeps a file from being
-    read, and "verify-failed" for one that is wrong."""
+def verify(
+    target: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Splat file, or a run folder for all its files; by default the run here."
+        ),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            help="Run folder or splat file that it must equal; by default the run around it."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Verify a file: read it with a second parser, draw it, compare it with what was trained.
+
+    A file outside a run, without --against, is compared with itself: two parsers that share no
+    code must read the same. Exit status 7 if a file is wrong.
+    """
     from stages import formats
     from stages.proof.prover import Prover, cameras_for
 
     files = _files(target)
     for file in files:
-        formats.format_of(file)  # before any work is done
+        formats.format_of(file)  # raises before any work is done
     quiet = quiet or as_json
-    if not quiet and not cache.are_compiled():
-        console.note("Compiling the kernels; this is done once and takes about half a minute.")
+    if not quiet:
+        console.note_compiling()
     original, prover, found = None, None, []
     for number, file in enumerate(files):
-        _tell(f"verifying {file}", number, len(files), quiet, as_json)
-        # Our own reader first: it survives what ends other parsers, and says what is damaged.
+        _report_step(f"verifying {file}", number, len(files), quiet, as_json)
+        # Our own reader first: it reports damage that makes other parsers crash.
         read = formats.read(file)
         if original is None or prover is None:
             original = _original(file, against, read)
             cameras = cameras_for(original.splats, original.views)
             prover = Prover.of(original.splats, cameras, original.backend, original.source_format)
         del read
-        for held in original.held_in(file):
-            proof = replace(prover, splats=held).prove(file, exact=original.itself)
+        for splats in original.candidates(file):
+            proof = replace(prover, splats=splats).prove(file, exact=original.itself)
             if not proof.fault:
                 break
         found.append((file, proof))
@@ -83,18 +107,16 @@ def verify(target: Path | None, against: Path | None, quiet: bool, as_json: bool
             console.emit("verified", **_facts(file, proof, original))
     assert original is not None
     if not as_json:
-        _show(found, original, quiet)
-    _judge(found, original)
+        _print(found, original, quiet)
+    _raise_if_wrong(found, original)
 
 
 def _files(target: Path | None) -> list[Path]:
-    """The file itself; of a run folder, what it exported but for meshes, which hold no splats."""
+    """The file itself, or the exported files of a run except meshes, which hold no splats."""
     from stages.surface.table import MESHES
 
     if target is not None and not target.is_dir():
         return [target]
-    from splatcli.folders import find_run_folder
-
     assets = Pipeline(find_run_folder(target)).load("export")
     files = [file for file in assets.files if file.format not in MESHES]
     if not files:
@@ -114,24 +136,25 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     from stages.formats.values import drop_undrawable
 
     if against is not None and not against.is_dir():
-        seen = sources.views_around(against) or sources.views_around(file)
+        around = (results.run_around(path) for path in (against, file))
+        views = next(filter(None, map(results.views_of, around)), ())
         splats = drop_undrawable(formats.read(against))[0]
-        return _Original(splats, seen, str(against), formats.format_of(against).ending)
+        return _Original(splats, views, str(against), formats.format_of(against).ending)
     if against is not None and not runfolder.is_run_folder(against):
         raise runfolder.missing(against)
-    run = Pipeline(against) if against is not None else sources.pipeline_around(file)
+    run = Pipeline(against) if against is not None else results.run_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
         source_format = formats.format_of(file).ending
         return _Original(drop_undrawable(read)[0], (), _ITSELF, source_format, itself=True)
-    seen = run.load("sfm").views
+    views = run.load("sfm").views
     quantised = run.load("quantise")
     splats = drop_undrawable(quantised.splats)[0]
-    backend = sources.backend_of(run)
+    backend = results.backend_of_run(run)
     name = f"the run {run.run_folder}"
-    return _Original(splats, seen, name, backend=backend, quantised=quantised)
+    return _Original(splats, views, name, backend=backend, quantised=quantised)
 
 
-def _tell(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:
+def _report_step(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:
     if as_json:
         console.emit("progress", label=label, done=done, total=total)
     elif not quiet:
@@ -156,11 +179,11 @@ def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
     }
 
 
-def _show(found: list[tuple[Path, Proof]], original: _Original, quiet: bool) -> None:
+def _print(found: list[tuple[Path, Proof]], original: _Original, quiet: bool) -> None:
     facts = [_facts(file, proof, original) for file, proof in found]
     if quiet:
         for each in facts:
-            what = each["fault"] or console.figure("verify_db", each["verify_db"])
+            what = each["fault"] or console.fidelity(each["verify_db"])
             console.out.print(f"{each['file']}: {what}", markup=False)
         return
     shown = dict.fromkeys(name for each in facts for name in each)
@@ -175,8 +198,7 @@ def _show(found: list[tuple[Path, Proof]], original: _Original, quiet: bool) -> 
     ):
         shown.pop(name, None)
     rows = [
-        (_label(name), *(console.figure(name, each.get(name, "-")) for each in facts))
-        for name in shown
+        (_label(name), *(_figure(name, each.get(name, "-")) for each in facts)) for name in shown
     ]
     rows.append(("worst", *map(_worst, facts)))
     rows.append(("verdict", *("wrong" if each["fault"] else "right" for each in facts)))
@@ -188,7 +210,7 @@ def _show(found: list[tuple[Path, Proof]], original: _Original, quiet: bool) -> 
     for file, proof in found:
         if proof.loss_db is not None:
             loss = f"{file.name} shows: it differs by {proof.loss_db:.1f} dB. {_why(file)}"
-            console.note(f"Warning: {loss}", "yellow")
+            console.warn(f"Warning: {loss}")
 
 
 def _worst(facts: dict[str, Any]) -> str:
@@ -196,12 +218,17 @@ def _worst(facts: dict[str, Any]) -> str:
     return f"{console.label(name)} of splat {facts['worst_splat']:,}" if name else "-"
 
 
+def _figure(name: str, value: Any) -> str:
+    is_psnr = name in ("verify_db", "verify_mean_db") and isinstance(value, float)
+    return console.fidelity(value) if is_psnr else console.figure(name, value)
+
+
 def _label(name: str) -> str:
-    words = {"verify_db": "worst PSNR", "verify_mean_db": "mean PSNR", "verify_cameras": "cameras"}
+    labels = {"verify_db": "worst PSNR", "verify_mean_db": "mean PSNR", "verify_cameras": "cameras"}
     if name.startswith("max_"):
         what, _, unit = name.removeprefix("max_").partition("_error")
         return f"{console.label(what)} off by" + unit.replace("_", ", ")
-    return words.get(name, console.label(name))
+    return labels.get(name, console.label(name))
 
 
 def _why(file: Path) -> str:
@@ -211,7 +238,7 @@ def _why(file: Path) -> str:
     return f"The format {why}." if why else "The original had lost more already."
 
 
-def _judge(found: list[tuple[Path, Proof]], original: _Original) -> None:
+def _raise_if_wrong(found: list[tuple[Path, Proof]], original: _Original) -> None:
     wrong = [(file, proof.fault) for file, proof in found if proof.fault]
     if not wrong:
         return

@@ -1,18 +1,21 @@
-"""`splat view`: a page on this machine to look at splats with."""
+"""`splat view`: a page on this machine that shows splats."""
 
 from __future__ import annotations
 
-import os
 import signal
-import sys
 import tempfile
 import threading
-import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from splatcli import console, sources
+import typer
+
+from splatcli import console
+from splatcli.arguments import RunOrFile
+from splatcli.folders import load_target
+from splatcli.options import number
 from stages.base.errors import Family, SplatError
+from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
@@ -20,15 +23,27 @@ if TYPE_CHECKING:
     from stages.viewer.server import Item, LocalServer
 
 
-def show(target: Path | None, port: int, open_browser: bool) -> None:
-    """Serve the page until Ctrl-C. Raises SplatError."""
+def view(
+    target: RunOrFile = None,
+    *,
+    port: Annotated[
+        int, number("--port", int, 0, 65535, "Port to serve on; 0 for any that is free.")
+    ] = 0,
+    open_browser: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the browser, or only print the address.")
+    ] = True,
+) -> None:
+    """Show the splats in a browser: orbit, fly, stand where the photographs were taken.
+
+    The page is served to this machine only and needs no network. Ctrl-C ends it.
+    """
     from stages.base import scratch
     from stages.formats.values import drop_undrawable
     from stages.viewer.server import LocalServer
 
     with tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
-            splats, pipeline = sources.splats_of(target)
+            splats, pipeline = load_target(target)
             splats, _ = drop_undrawable(splats)
             count = len(splats)
             if not count:
@@ -39,7 +54,7 @@ def show(target: Path | None, port: int, open_browser: bool) -> None:
                     hint="See what it holds with `splat info`.",
                 )
             items = _items(target, pipeline, splats, Path(folder) / "scene.ply")
-        del splats  # the page is made: it need not wait beside them
+        del splats  # frees the memory: the page holds what it needs
         try:
             server = LocalServer(items, port)
         except OSError as error:
@@ -51,21 +66,21 @@ def show(target: Path | None, port: int, open_browser: bool) -> None:
 def _items(
     target: Path | None, pipeline: Pipeline | None, splats: Splats, content: Path
 ) -> dict[str, Item]:
-    """What is served; the splats are written to `content`, as the viewer reads them best. An asset
-    that streams is served as it is."""
+    """The items to serve. The splats are written to `content` as .ply, which the page reads best;
+    a streamed asset is served as it is."""
     from stages.formats import format_of, ply
     from stages.viewer.site import site
 
-    run = pipeline or sources.pipeline_around(target)
+    run = pipeline or results.run_around(target)
     sfm = run.load("sfm") if run is not None and run.manifest("sfm") is not None else None
     units = sfm.units if sfm else "arbitrary"
     if pipeline is None and target is not None and format_of(target).streamed:
         content = target
     else:
         ply.write(content, splats, units=units)
-    seen, photos = (sfm.views, sfm.folder) if sfm else ((), None)
+    views, photos = (sfm.views, sfm.folder) if sfm else ((), None)
     source = str(pipeline.run_folder if pipeline is not None else target)
-    return site(_title(target, pipeline), splats, content, seen, photos, units, source)
+    return site(_title(target, pipeline), splats, content, views, photos, units, source)
 
 
 def _title(target: Path | None, pipeline: Pipeline | None) -> str:
@@ -74,28 +89,21 @@ def _title(target: Path | None, pipeline: Pipeline | None) -> str:
 
 
 def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
+    from stages.viewer.server import open_in_browser
+
     try:
         _end_like_ctrl_c()
         console.out.print(server.address)
         console.note(f"{count:,} splats. Ctrl-C ends it.")
-        if open_browser and not open_page(server.address):
+        if open_browser and not open_in_browser(server.address):
             console.note("No browser could be opened; open the address yourself.")
         server.serve_forever()
     except KeyboardInterrupt:
         console.note("Ended.")
 
 
-def open_page(address: str) -> bool:
-    """Whether a browser took the address. On a machine without a screen none is tried: one that
-    draws in the terminal could show nothing, and would hold it."""
-    screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
-    if sys.platform.startswith("linux") and not screen:
-        return False
-    return webbrowser.open(address)
-
-
 def _end_like_ctrl_c() -> None:
-    """A closed terminal too must not leave the temporary folder behind."""
+    """Handle a closed terminal as Ctrl-C, so that the temporary folder is removed."""
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGTERM", "SIGHUP"):
             if hasattr(signal, name):
@@ -107,6 +115,6 @@ def _port_refused(port: int, error: OSError) -> SplatError:
         "view-port",
         given=f"Port {port} of this machine cannot be listened on: {error.strerror or error}.",
         wanted="A port that is free and allowed.",
-        hint="Leave --port away: then one that is free is taken.",
+        hint="Leave --port away to get a free one.",
         family=Family.USAGE,
     )

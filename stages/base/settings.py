@@ -17,6 +17,7 @@ import math
 import re
 import types
 from dataclasses import MISSING, dataclass, fields
+from dataclasses import field as dataclass_field
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from stages.base.errors import Family, SplatError
@@ -103,6 +104,11 @@ class Setting:
         if self.low is not None and self.high is not None:
             return f"{what} from {self.low:,} to {self.high:,}."
         return f"{what} of at least {self.low:,}." if self.low is not None else f"{what}."
+
+
+def setting(default: Any, help: str, **metadata: Any) -> Any:
+    """A field of a settings dataclass. metadata: as listed in this module's docstring."""
+    return dataclass_field(default=default, metadata={"help": help, **metadata})
 
 
 def settings_of(settings_type: type) -> list[Setting]:

@@ -7,7 +7,7 @@ from dataclasses import field
 from typing import Any
 
 from stages.formats.table import FORMATS
-from stages.surface.table import MESHES
+from stages.surface.table import MESHES, MeshFormat
 
 DEFAULT_FORMATS = ("ply", "splat", "glb", "usdz")
 ALL_MESHES = "mesh"  # a value of `--format`: every format of meshes
@@ -18,6 +18,12 @@ def rounding_formats(names: Iterable[str]) -> tuple[str, ...]:
     """Those of the formats whose rounding needs fine-tuning, in the order of the table."""
     chosen = set(names)
     return tuple(n for n, row in FORMATS.items() if n in chosen and row.needs_finetuning)
+
+
+def mesh_formats(names: Iterable[str]) -> list[MeshFormat]:
+    """The mesh formats among the names."""
+    endings = (e for name in names for e in (MESHES if name == ALL_MESHES else (name,)))
+    return [MESHES[ending] for ending in dict.fromkeys(endings) if ending in MESHES]
 
 
 def formats_setting(default: tuple[str, ...], **metadata: Any) -> Any:

@@ -102,6 +102,8 @@ def finetune_to_rounding(
 
 def write_and_read(row: Format, splats: Splats) -> Splats:
     """`splats` as a file of the format returns them, in their own order. All must be drawable."""
+    if not len(splats):
+        return splats  # no format holds none
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / row.file_name("scene")
         formats.write(path, splats)

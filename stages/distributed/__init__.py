@@ -1,1 +1,1 @@
-"""One scene in blocks: where it is cut, who sees which block, and how blocks become one again."""
+"""Runs, blocks of a scene and chunks of structure from motion, here or on a Ray cluster."""

@@ -60,7 +60,7 @@ def _finish(folder: Path, like: Manifest) -> Manifest:
     """Write a manifest that says what `like` says, of the files that lie there."""
     folder.mkdir(exist_ok=True)
     outputs = record_files(folder, leave_out=frozenset([MANIFEST]))
-    metrics: Mapping[str, Any] = {"made_by": "the run that this is a block of"}
+    metrics: Mapping[str, Any] = {"trained_by": "the run that this is a block of"}
     manifest = replace(
         like,
         outputs=outputs,

@@ -1,4 +1,4 @@
-"""Which photographs show which block: by what the coarse model of the whole puts into each."""
+"""Which views show which block, measured by rendering the coarse model of the whole scene."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from stages.raster.definition import WEIGHT, splat_arrays
 from stages.raster.draw import raster_settings_of
 from stages.scene import Camera, Splats
 
-SIDE = 160  # pixels, of the pictures that tell
-LEAST = 0.1  # of a picture: a photograph that shows less of a block is none of its own
+SIDE = 160  # longer side of the renderings, pixels
+SMALLEST_FRACTION = 0.1  # of a picture that must show a block for the view to train it
 
 
-def shares(
+def block_fractions(
     splats: Splats, cells: Sequence[Cell], cameras: Iterable[Camera], backend: str
 ) -> NDArray[np.float64]:
-    """[blocks, cameras] how much of what each camera sees lies in each cell, 0 to 1; what hides
-    behind something else does not count. All 0 for a camera that sees nothing."""
+    """[blocks, cameras] the fraction of each picture that comes from splats in each cell, 0 to 1;
+    occluded splats do not count. All 0 for a camera that sees nothing."""
     rasteriser, arrays, settings = (
         rasteriser_of(backend),
         splat_arrays(splats),
@@ -32,22 +32,23 @@ def shares(
     for camera in cameras:
         small = camera.fitted(SIDE)
         forward = rasteriser.forward(arrays, small, settings)
-        nothing = np.zeros((3, small.height, small.width), np.float32)
-        weight = rasteriser.contributions(forward, nothing)[:, WEIGHT].astype(np.float64)
+        no_gradient = np.zeros((3, small.height, small.width), np.float32)
+        contributions = rasteriser.contributions(forward, no_gradient)
+        weight = contributions[:, WEIGHT].astype(np.float64)
         rows, total = forward.visible, float(weight.sum())
         found.append([float(weight[own[rows]].sum()) / total if total else 0.0 for own in inside])
     return np.array(found).T.reshape(len(cells), -1)
 
 
-def members(share: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """[blocks, photographs] which photographs teach which block, by `shares`: those that show
-    enough of it, and each at least that one of which it shows most."""
-    chosen = share >= LEAST
-    most = share.argmax(axis=0)
-    chosen[most, np.arange(share.shape[1])] |= share.max(axis=0) > 0
-    return chosen
+def assign_views(fractions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[blocks, views] which views train which block, from `block_fractions`: each view trains the
+    block that it shows most of, and all blocks that it shows enough of."""
+    assigned = fractions >= SMALLEST_FRACTION
+    most = fractions.argmax(axis=0)
+    assigned[most, np.arange(fractions.shape[1])] |= fractions.max(axis=0) > 0
+    return assigned
 
 
-def crossing(member: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[photographs] which show more than one block."""
-    return np.asarray(member.sum(axis=0) > 1)
+def crosses_blocks(assigned: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[views] which views show more than one block."""
+    return np.asarray(assigned.sum(axis=0) > 1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stages.distributed.partition import Cell
-    from stages.measure.evaluation import EvaluationView
-    from stages.scene import Camera, DrawSettings, Reconstruction, Splats, TrainedSplats, View
-    from stages.training.clock import Elapsed
+    from stages.scene import DrawSettings, Reconstruction, Splats, TrainedSplats, View
 
 FOLDER, COARSE = "blocks", "coarse"
 PHOTOGRAPHS_A_BLOCK = 250
@@ -90,34 +88,44 @@ class _Scene:
         """The merged splats, written to `folder` as training writes them."""
         from stages.distributed import block_views, partition
         from stages.scene import draw_settings_of, split_held_out
-        from stages.train import corrects_light, save, write_quality
+        from stages.train import save
+        from stages.training.build import corrects_light
 
         started = time.monotonic()
         light = corrects_light(self.whole, self.settings.light, self.report)
         self.settings = replace(self.settings, light="on" if light else "off")
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
-        places, weights = partition.looked_at(replace(self.whole, views=training))
-        cells = partition.cut(places, weights, blocks)
+        places, weights = partition.weighted_points(replace(self.whole, views=training))
+        cells = partition.partition(places, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
-        member = block_views.members(
-            block_views.shares(coarse, cells, cameras, backend_of_settings(self.settings))
+        member = block_views.assign_views(
+            block_views.block_fractions(coarse, cells, cameras, backend_of_settings(self.settings))
         )
         folders = self._blocks(seeds, coarse, cells, member, partition.margin(places))
         parts = self._parts(folders, cells, member)
         draw_settings = draw_settings_of(self.whole.views, self.settings.train_side, light)
-        crossed = block_views.crossing(member)
+        crossed = block_views.crosses_blocks(member)
         crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
         teachers = [view for view in crossing if view in training]
         trained = self._joined(parts, cells, teachers, draw_settings)
         save(folder, trained)
-        judged = _judged(trained.splats, self, held)
-        write_quality(judged, self.whole, folder, self.report)
-        self.report.metric("train_photographs", len(training))
-        self.report.metric("held_out_photographs", len(held))
+        self._evaluate(trained.splats, held, folder)
+        self.report.metric("training_views", len(training))
+        self.report.metric("held_out_views", len(held))
         self.report.metric("crossing", [view.name for view in crossing])
         self.report.metric("train_seconds", round(time.monotonic() - started, 1))
         return trained
+
+    def _evaluate(self, splats: Splats, held: Sequence[View], folder: Path) -> None:
+        from stages.measure.evaluation import image_renderer, load_evaluation_views
+        from stages.training.quality import write_history, write_quality
+
+        settings = splats.draw_settings
+        views = load_evaluation_views(self.whole.folder, held, settings)
+        render = image_renderer(splats, backend_of_settings(self.settings))
+        write_quality(render, views, settings, self.whole, folder, self.report)
+        write_history([], [], folder, self.report)
 
     def _coarse(self, seeds: Splats, fewer: int) -> Splats:
         settings = replace(
@@ -274,29 +282,6 @@ class _Scene:
         self.report.metric("splats_at_seams", int(seam.sum()))
         self.report.metric("pruned_at_seams", int(gone.sum()))
         return replace(found, splats=splats)
-
-
-@dataclass
-class _Judged:
-    """See `stages.train.TrainedResult`."""
-
-    draw: Callable[[Camera], Any]
-    held_out: Sequence[EvaluationView]
-    draw_settings: DrawSettings
-    history: list[dict[str, Any]]
-    times: list[Elapsed]
-
-    def drawn(self, camera: Camera) -> NDArray[np.float32]:
-        image: NDArray[np.float32] = self.draw(camera)
-        return image
-
-
-def _judged(splats: Splats, scene: _Scene, held: Sequence[View]) -> _Judged:
-    from stages.measure.evaluation import image_renderer, load_evaluation_views
-
-    photographs = load_evaluation_views(scene.whole.folder, held, splats.draw_settings)
-    draw = image_renderer(splats, backend_of_settings(scene.settings))
-    return _Judged(draw, photographs, splats.draw_settings, [], [])
 
 
 class _Told(Listener):

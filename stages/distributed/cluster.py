@@ -1,8 +1,7 @@
-"""Ray, the one place that knows it: tasks on the workers of a cluster, or of this machine.
+"""Ray: an executor on the workers of a cluster, or of this machine. No other module imports Ray.
 
-Nothing but paths and figures travels: photographs and run folders lie where all workers see them.
-A worker that is lost takes nothing with it: its task is placed again, and goes on from the stage's
-checkpoint in the run folder.
+Only paths and figures are sent: photographs and run folders lie where all workers see them. The
+task of a lost worker is scheduled again and resumes from the stage's checkpoint in the run folder.
 """
 
 from __future__ import annotations
@@ -33,24 +32,28 @@ from stages.distributed.tasks import (
 )
 from stages.run.pipeline import Listener
 
-LOCAL = re.compile(r"local:([1-9]\d{0,3})")
-_PLACE = re.compile(r"(?:ray://)?([^/:\s]+):(\d{1,5})")
-_ANSWER_S, _KNOCK_S = 120.0, 5.0
-_LOOK_UP_S = 1.0  # whether to stop
-_LOST_AT_MOST = 20  # times that one task may lose its worker
+_LOCAL = re.compile(r"local:([1-9]\d{0,3})")
+_ADDRESS = re.compile(r"(?:ray://)?([^/:\s]+):(\d{1,5})")
+_DESCRIBE_TIMEOUT_S, _CONNECT_TIMEOUT_S = 120.0, 5.0
+_POLL_S = 1.0  # how often a request to stop is looked for
+_MAX_RETRIES = 20  # of one task whose worker was lost
 _MIB = 1024 * 1024
 
 
 def edition() -> str:
-    """What must be the same everywhere for the bytes to be: splat's version and its stages'."""
+    """The version of the project and of its stages. Workers with another edition could write other
+    bytes."""
     stages = ".".join(str(load_stage(name).version) for name in STAGE_NAMES)
     return f"{VERSION} (stages {stages})"
 
 
 @dataclass(frozen=True)
 class Worker:
-    """What a worker says of itself. edition: "" where there is no splat. unseen: of the paths asked
-    for, those that it does not see. cpus, memory_mib: of its machine, for tasks."""
+    """A worker's description of itself.
+
+    edition: "" if the project is not installed there. unseen: the requested paths that it does not
+    see. cpus, memory_mib: of its machine, for tasks.
+    """
 
     host: str
     edition: str
@@ -61,7 +64,7 @@ class Worker:
 
 @dataclass(frozen=True)
 class RayExecutor:
-    """Workers that were asked and can do the work."""
+    """Executes tasks on workers that have been checked."""
 
     ray: Any
     workers: tuple[Worker, ...]
@@ -69,26 +72,26 @@ class RayExecutor:
     def results(
         self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
     ) -> Iterator[tuple[int, TaskResult]]:
-        """See `tasks.Engine`. Raises SplatError "cluster-too-small"."""
-        cpus, memory_mib = self.share(len(tasks), need)
-        do = self.ray.remote(_with_threads).options(
+        """See `tasks.Executor`. Raises SplatError "cluster-too-small"."""
+        cpus, memory_mib = self.allocation(len(tasks), need)
+        remote_run = self.ray.remote(_with_threads).options(
             num_cpus=cpus,
             num_gpus=need.gpus,
             memory=int(memory_mib * _MIB),
-            max_retries=_LOST_AT_MOST,
-            retry_exceptions=[Interrupted],  # a worker that was asked to go
+            max_retries=_MAX_RETRIES,
+            retry_exceptions=[Interrupted],  # of a worker that was asked to shut down
         )
-        waiting = {do.remote(task, cpus): number for number, task in enumerate(tasks)}
+        waiting = {remote_run.remote(task, cpus): number for number, task in enumerate(tasks)}
         while waiting:
-            ready, _ = self.ray.wait(list(waiting), num_returns=1, timeout=_LOOK_UP_S)
+            ready, _ = self.ray.wait(list(waiting), num_returns=1, timeout=_POLL_S)
             if stop is not None and stop.is_set():
                 raise Interrupted("the cluster's workers go on from their checkpoints")
             for reference in ready:
-                yield waiting.pop(reference), self._ending(reference)
+                yield waiting.pop(reference), self._result(reference)
 
-    def share(self, tasks: int, need: Resources) -> tuple[int, float]:
-        """(CPUs, MiB) for each of as many tasks: processors are shared, memory is what it takes.
-        Raises SplatError "cluster-too-small": Ray would wait for ever."""
+    def allocation(self, tasks: int, need: Resources) -> tuple[int, float]:
+        """(CPUs, MiB) for each of `tasks` tasks: the CPUs are divided among them, the memory is
+        what one task needs. Raises SplatError "cluster-too-small", where Ray would wait forever."""
         least = min(worker.memory_mib for worker in self.workers)
         memory_mib = least if need.memory_mib is None else need.memory_mib
         largest = max(worker.memory_mib for worker in self.workers)
@@ -105,20 +108,20 @@ class RayExecutor:
         fewest = min(worker.cpus for worker in self.workers)
         return max(1, min(fewest, every // tasks)), memory_mib
 
-    def _ending(self, reference: Any) -> TaskResult:
+    def _result(self, reference: Any) -> TaskResult:
         try:
             found: TaskResult = self.ray.get(reference)
             return found
         except self.ray.exceptions.RayError as error:
-            said = str(error).strip().splitlines()[0]
-            return TaskResult(int(Family.RESOURCES), "worker-lost", f"Its worker was lost: {said}")
+            why = str(error).strip().splitlines()[0]
+            return TaskResult(int(Family.RESOURCES), "worker-lost", f"Its worker was lost: {why}")
 
 
 def _with_threads(task: Task, threads: int) -> TaskResult:
     os.environ["SPLAT_THREADS"] = str(threads)
-    ending = run_task(task)
-    where = f" (On {socket.gethostname()}.)"  # whose disk is full, say
-    return replace(ending, said=ending.said + where) if ending.status else ending
+    result = run_task(task)
+    host = f" (On {socket.gethostname()}.)"  # for errors of that machine, such as a full disk
+    return replace(result, message=result.message + host) if result.status else result
 
 
 @contextmanager
@@ -128,8 +131,8 @@ def open_executor(
     paths: Iterable[Location],
     listener: Listener | None = None,
 ) -> Iterator[Executor]:
-    """What does the work in `folder`: a cluster, or without an address this process, which tells
-    the listener. Raises as `opened`."""
+    """An executor for tasks in `folder`: the cluster at `address`, or without an address this
+    process, which reports to the listener. Raises what `connect` raises."""
     if address is None:
         yield SerialExecutor(listener)
         return
@@ -141,9 +144,9 @@ def open_executor(
 def connect(address: str, folder: Location, paths: Iterable[Location]) -> Iterator[RayExecutor]:
     """The cluster at `address` ("local:N": N workers of this machine, started and ended here).
 
-    Each of its machines must have this splat, and see `folder` (which exists, and may be written
-    to, or is a URL) and what exists of `paths`. Raises SplatError: cluster-not-installed,
-    cluster-not-found, cluster-other-splat, cluster-folder-unseen.
+    Each of its machines must have the same edition of the project, and see `folder` (a writable
+    folder that exists, or a URL) and those of `paths` that exist. Raises SplatError:
+    cluster-not-installed, cluster-not-found, cluster-other-splat, cluster-folder-unseen.
     """
     ray = _ray()
     _start(ray, address)
@@ -151,18 +154,18 @@ def connect(address: str, folder: Location, paths: Iterable[Location]) -> Iterat
         with _token(folder) as token:
             paths = list(paths)
             local = (p.absolute() for p in paths if isinstance(p, Path) and p.exists())
-            far = [path for path in (*paths, folder) if isinstance(path, str)]
-            here = [path for path in (token, *local) if path is not None]
-            answers = _asked(ray, [*map(str, here), *far])
-            check(answers, edition(), token)
-        yield RayExecutor(ray, tuple(answers))
+            urls = [path for path in (*paths, folder) if isinstance(path, str)]
+            files = [path for path in (token, *local) if path is not None]
+            workers = _describe_workers(ray, [*map(str, files), *urls])
+            check(workers, edition(), token)
+        yield RayExecutor(ray, tuple(workers))
     finally:
         ray.shutdown()
 
 
 @contextmanager
 def _token(folder: Location) -> Iterator[Path | None]:
-    """A file that is new there; none at a URL."""
+    """A new file in the folder, which workers must see; None for a URL."""
     if isinstance(folder, str):
         yield None
         return
@@ -170,24 +173,24 @@ def _token(folder: Location) -> Iterator[Path | None]:
         yield Path(file.name)
 
 
-def check(answers: Sequence[Worker], ours: str, token: Path | None = None) -> None:
-    """Raises SplatError (cluster-other-splat, cluster-folder-unseen) for workers that cannot."""
-    for answer in answers:
-        if answer.edition != ours:
-            theirs = f"splat {answer.edition}" if answer.edition else "no splat"
+def check(workers: Sequence[Worker], ours: str, token: Path | None = None) -> None:
+    """Raises SplatError (cluster-other-splat, cluster-folder-unseen) for unsuitable workers."""
+    for worker in workers:
+        if worker.edition != ours:
+            theirs = f"splat {worker.edition}" if worker.edition else "no splat"
             raise SplatError(
                 "cluster-other-splat",
-                given=f"The worker {answer.host} has {theirs}; here it is splat {ours}.",
+                given=f"The worker {worker.host} has {theirs}; here it is splat {ours}.",
                 wanted="The same splat everywhere: another one makes other bytes.",
                 hint=f"Install the same on all of them: {install_command('cluster')}",
                 family=Family.USAGE,
             )
-        if answer.unseen:
-            new = token is not None and str(token) in answer.unseen
-            folder = token.parent if token is not None and new else answer.unseen[0]
+        if worker.unseen:
+            new = token is not None and str(token) in worker.unseen
+            folder = token.parent if token is not None and new else worker.unseen[0]
             raise SplatError(
                 "cluster-folder-unseen",
-                given=f"The worker {answer.host} does not see {folder}.",
+                given=f"The worker {worker.host} does not see {folder}.",
                 wanted="Photographs and run folders where all workers see them, at the same path.",
                 hint="Put them on a folder that is shared, and name that; or at a URL that all of "
                 "them can read.",
@@ -197,7 +200,7 @@ def check(answers: Sequence[Worker], ours: str, token: Path | None = None) -> No
 
 def _ray() -> Any:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # A cluster asks for the token where there is one; who joins it does not show it by itself.
+    # A cluster that was started with a token requires it; a client does not send it by default.
     token = Path.home() / ".ray" / "auth_token"
     if token.is_file() or os.environ.keys() & {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}:
         os.environ.setdefault("RAY_AUTH_MODE", "token")
@@ -215,16 +218,16 @@ def _ray() -> Any:
 
 def _start(ray: Any, address: str) -> None:
     quiet = {"log_to_driver": False, "logging_level": "ERROR", "include_dashboard": False}
-    if local := LOCAL.fullmatch(address):
-        store = {"object_store_memory": 100 * _MIB}  # paths and figures need no more
+    if local := _LOCAL.fullmatch(address):
+        store = {"object_store_memory": 100 * _MIB}  # enough for paths and figures
         ray.init(address="local", num_cpus=int(local[1]), **store, **quiet)
         return
-    place = _PLACE.fullmatch(address)
-    if place is None and address != "auto":
+    found = _ADDRESS.fullmatch(address)
+    if found is None and address != "auto":
         raise _not_found(address, "it is no address")
     try:
-        if place is not None:
-            socket.create_connection((place[1], int(place[2])), _KNOCK_S).close()
+        if found is not None:
+            socket.create_connection((found[1], int(found[2])), _CONNECT_TIMEOUT_S).close()
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (OSError, OverflowError, RuntimeError, ValueError) as error:
         raise _not_found(address, str(error).strip().splitlines()[0]) from error
@@ -240,14 +243,14 @@ def _not_found(address: str, why: str) -> SplatError:
     )
 
 
-def _asked(ray: Any, paths: list[str]) -> list[Worker]:
-    """What each machine of the cluster that takes tasks says. Raises SplatError."""
+def _describe_workers(ray: Any, paths: list[str]) -> list[Worker]:
+    """Each machine of the cluster that takes tasks. Raises SplatError."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
-    ask = ray.remote(question())
-    asked = [
-        ask.options(
+    describe = ray.remote(make_describe())
+    references = [
+        describe.options(
             num_cpus=0,
             scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
         ).remote(paths)
@@ -256,7 +259,7 @@ def _asked(ray: Any, paths: list[str]) -> list[Worker]:
     if not nodes:
         raise _not_found("this address", "none of its machines takes tasks")
     try:
-        told = ray.get(asked, timeout=_ANSWER_S)
+        described = ray.get(references, timeout=_DESCRIBE_TIMEOUT_S)
     except (ray.exceptions.RayError, TimeoutError) as error:
         raise _not_found("this address", str(error).strip().splitlines()[0]) from error
     return [
@@ -266,11 +269,11 @@ def _asked(ray: Any, paths: list[str]) -> list[Worker]:
             cpus=int(node["Resources"]["CPU"]),
             memory_mib=node["Resources"].get("memory", 0) / _MIB,
         )
-        for node, (found, unseen) in zip(nodes, told, strict=True)
+        for node, (found, unseen) in zip(nodes, described, strict=True)
     ]
 
 
-def question() -> Callable[[list[str]], tuple[str, list[str]]]:
+def make_describe() -> Callable[[list[str]], tuple[str, list[str]]]:
     """The function that a worker runs to describe itself: (edition, paths that it does not see).
 
     It is a nested function, so that it is sent as code: a worker without the project could not
@@ -287,11 +290,11 @@ def question() -> Callable[[list[str]], tuple[str, list[str]]]:
 
             system, root = fsspec.core.url_to_fs(path)
             system.exists(root)
-        except Exception:  # whatever is missing there: a package, a right, a network
+        except Exception:  # fsspec or its plugin, a permission, or the network is missing
             return False
         return True
 
-    def ask(paths: list[str]) -> tuple[str, list[str]]:
+    def describe(paths: list[str]) -> tuple[str, list[str]]:
         import importlib.metadata
 
         try:
@@ -305,4 +308,4 @@ def question() -> Callable[[list[str]], tuple[str, list[str]]]:
                 found = ""
         return found, [path for path in paths if not seen(path)]
 
-    return ask
+    return describe

@@ -71,7 +71,7 @@ def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> ND
     found = np.zeros(len(splats), bool)
     for cell, start, end in zip(cells, ends[:-1], ends[1:], strict=True):
         rows = slice(start, end)
-        found[rows] = cell.from_border(splats.means[rows]) < reach[rows]
+        found[rows] = cell.border_distance(splats.means[rows]) < reach[rows]
     return found
 
 

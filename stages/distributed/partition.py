@@ -1,8 +1,9 @@
-"""The ground plane (x and z of the world) cut into rectangles of about equal photographs.
+"""The ground plane (x and z of the world) partitioned into rectangles that as many views look at.
 
-It is cut by what photographs look at, not by where they were taken: no block lies where nobody
-looks, and a ring of cameras around an object is cut through the object. About equal means that the
-shares of photographs that fall into each rectangle add up to the same.
+The partition depends on what the views show, not on where the cameras are, so that no block lies
+where no view looks, and a ring of cameras around an object is cut through the object. Each view
+has a weight of one, which is spread over the points that it shows; all cells have about the same
+total weight.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 
 from stages.scene import Reconstruction
 
-ENDLESS = 1e30  # world units: the outer sides of the outer cells (JSON has no infinity)
-MARGIN = 0.05  # of what photographs look at: as far beyond its own cell a block grows
-_GROUND = [0, 2]
-_POINTS = 20_000  # of the sparse cloud, about: enough to say where to cut
-_MIDDLE_PERCENT = (5, 95)
+UNBOUNDED = 1e30  # world units: the outer sides of the outer cells (JSON has no infinity)
+MARGIN = 0.05  # of the scene's extent: how far beyond its own cell a block densifies
+_GROUND = [0, 2]  # the axes of the ground plane
+_POINTS = 20_000  # about, of the sparse cloud
+_EXTENT_PERCENTILES = (5, 95)
 
 
 @dataclass(frozen=True)
@@ -29,30 +30,32 @@ class Cell:
     high: tuple[float, float]
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """[N] which of the points [N, 3] lie in it. Each point lies in one cell of a cut."""
-        at = points[:, _GROUND]
-        return np.asarray(((at >= self.low) & (at < self.high)).all(1))
+        """[N] which of the points [N, 3] lie in it. Each point lies in one cell of a partition."""
+        ground = points[:, _GROUND]
+        return np.asarray(((ground >= self.low) & (ground < self.high)).all(1))
 
     def widened(self, by: float) -> Cell:
         """With a border of `by` world units."""
         low, high = np.array(self.low) - by, np.array(self.high) + by
         return Cell((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
 
-    def from_border(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """[N] how far the points [N, 3] are from the border to another cell, inside or outside
-        along the axis in question; world units."""
-        at = points[:, _GROUND].astype(np.float64)
-        sides = np.concatenate([np.abs(at - self.low), np.abs(at - self.high)], axis=1)
+    def border_distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """[N] the distance of the points [N, 3] from the nearest of the four border lines, along
+        that line's axis; world units."""
+        ground = points[:, _GROUND].astype(np.float64)
+        sides = np.concatenate([np.abs(ground - self.low), np.abs(ground - self.high)], axis=1)
         found: NDArray[np.float64] = sides.min(axis=1)
         return found
 
 
-EVERYWHERE = Cell((-ENDLESS, -ENDLESS), (ENDLESS, ENDLESS))
+EVERYWHERE = Cell((-UNBOUNDED, -UNBOUNDED), (UNBOUNDED, UNBOUNDED))
 
 
-def looked_at(reconstruction: Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """([P, 2] x and z of points that photographs show, [P] how many photographs look there: each
-    photograph counts one, shared by what it shows). The cameras' own places if they show none."""
+def weighted_points(
+    reconstruction: Reconstruction,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """([P, 2] x and z of the sparse points that views show, [P] weights: each view gives a total of
+    one to the points that it shows). The camera centres with weight one if views show no points."""
     every = reconstruction.points
     points = every[:: max(1, len(every) // _POINTS)]
     weights = np.zeros(len(points))
@@ -62,26 +65,29 @@ def looked_at(reconstruction: Reconstruction) -> tuple[NDArray[np.float64], NDAr
         weights[shown] += 1.0 / max(1, int(shown.sum()))
     if weights.any():
         return points[weights > 0][:, _GROUND], weights[weights > 0]
-    places = np.array([view.camera.centre for view in reconstruction.views])[:, _GROUND]
-    return places, np.ones(len(places))
+    centres = np.array([view.camera.centre for view in reconstruction.views])[:, _GROUND]
+    return centres, np.ones(len(centres))
 
 
-def cut(
+def partition(
     places: NDArray[np.float64],
     weights: NDArray[np.float64],
     blocks: int,
     cell: Cell = EVERYWHERE,
 ) -> list[Cell]:
-    """As many cells, with about as much of the weights [P] of the places [P, 2] in each; together
-    they are `cell`.
+    """Cut `cell` into `blocks` cells that hold about the same total weight.
 
-    What is cut is cut again, along the axis on which its places spread farther. Fewer cells where
-    places coincide and no line parts them.
+    Cuts recursively, along the axis on which the places extend farther. Returns fewer cells where
+    places coincide and no line separates them.
+
+    Args:
+        places: [P, 2] x and z.
+        weights: [P].
     """
     if blocks < 2 or len(places) < 2:
         return [cell]
     first = blocks // 2
-    for axis in np.argsort(-_spread(places)):
+    for axis in np.argsort(-_extent(places)):
         order = np.argsort(places[:, axis], kind="stable")
         sums, at = np.cumsum(weights[order]), places[order, axis]
         row = int(np.searchsorted(sums, sums[-1] * first / blocks))
@@ -93,19 +99,19 @@ def cut(
             high[axis] = low[axis] = line
             lower = Cell(cell.low, (high[0], high[1]))
             upper = Cell((low[0], low[1]), cell.high)
-            return cut(places[below], weights[below], first, lower) + cut(
+            return partition(places[below], weights[below], first, lower) + partition(
                 places[~below], weights[~below], blocks - first, upper
             )
     return [cell]
 
 
-def _spread(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[2] of the middle of the places, along each axis."""
-    low, high = np.percentile(places, _MIDDLE_PERCENT, axis=0)
+def _extent(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[2] the distance between two percentiles along each axis."""
+    low, high = np.percentile(places, _EXTENT_PERCENTILES, axis=0)
     found: NDArray[np.float64] = high - low
     return found
 
 
 def margin(places: NDArray[np.float64]) -> float:
-    """`MARGIN` in world units, for a scene whose photographs look at `places` [P, 2]."""
-    return MARGIN * float(_spread(places).max())
+    """`MARGIN` in world units, for the places [P, 2] that the views show."""
+    return MARGIN * float(_extent(places).max())

@@ -1,8 +1,8 @@
-"""Captures and run folders at URLs, for workers that share no disk: fsspec knows how.
+"""Captures and run folders at URLs, through fsspec, for workers that share no disk.
 
-Whoever does a run fetches photographs and what there is of the run folder, works on a disk of its
-own, and puts back what is finished and training's checkpoints. A manifest goes last, and is taken
-away first: a stage that is half there is not there.
+A worker downloads the photographs and the run folder, works on its own disk, and uploads finished
+stages and the checkpoints of training. A stage's manifest is uploaded last and removed first, so
+that a partly uploaded stage does not count as finished.
 """
 
 from __future__ import annotations
@@ -28,60 +28,60 @@ from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Listener
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
-from stages.training.checkpoint import FILE_NAME
 
 
 def parse_location(text: str) -> Location:
-    """What was typed, as a path unless it is a URL."""
+    """A URL as it is, anything else as a path."""
     return text if "://" in text else Path(text)
 
 
-def expand_locations(typed: Iterable[str]) -> list[Location]:
-    """The places that were typed; a URL with * in it stands for all that it fits. Raises
-    SplatError."""
+def expand_locations(texts: Iterable[str]) -> list[Location]:
+    """The locations; a URL with * in it is replaced by all that match it. Raises SplatError."""
     found: list[Location] = []
-    for place in map(parse_location, typed):
-        found += RemoteFolder.at(place).fitting() if isinstance(place, str) else [place]
+    for location in map(parse_location, texts):
+        found += RemoteFolder.at(location).matches() if isinstance(location, str) else [location]
     return found
 
 
-def capture_name(place: Location) -> str:
-    """Of a capture: its folder's, or its video's without the ending. Raises SplatError."""
-    if isinstance(place, str):
-        folder = RemoteFolder.at(place)
-        last = PurePosixPath(folder.root)
-        return last.stem if folder.is_file() else last.name
-    whole = place.absolute()
-    return whole.stem if whole.is_file() else whole.name
+def capture_name(location: Location) -> str:
+    """The name of the folder, or of the video without its suffix. Raises SplatError."""
+    if isinstance(location, str):
+        folder = RemoteFolder.at(location)
+        path = PurePosixPath(folder.root)
+        return path.stem if folder.is_file() else path.name
+    local = location.absolute()
+    return local.stem if local.is_file() else local.name
 
 
-def joined(place: Location, name: str) -> Location:
-    return f"{place.rstrip('/')}/{name}" if isinstance(place, str) else place / name
+def joined(location: Location, name: str) -> Location:
+    """The location of `name` in a folder."""
+    return f"{location.rstrip('/')}/{name}" if isinstance(location, str) else location / name
 
 
 @contextmanager
-def prepare_output(place: Location) -> Iterator[Path]:
-    """The folder itself, made if it is new, and locked; of one at a URL, which nobody can lock, an
-    empty one for copies. Raises SplatError."""
-    if isinstance(place, str):
+def prepare_output(location: Location) -> Iterator[Path]:
+    """The folder, made if it is new, and locked. For a URL, which cannot be locked, an empty
+    temporary folder for copies. Raises SplatError."""
+    if isinstance(location, str):
         with tempfile.TemporaryDirectory(prefix="splat-") as name:
             yield Path(name)
     else:
-        make_folder(place)
-        with locked(place):
-            yield place
+        make_folder(location)
+        with locked(location):
+            yield location
 
 
-def fetch_manifests(place: Location, name: str, here: Path) -> None:
-    """Copy the manifests of the run `name` to `here`, if it lies at a URL. Raises SplatError."""
-    if isinstance(place, str):
-        run = RemoteFolder.at(place) / name
-        run.fetch([file for file in run.names() if file.endswith(f"/{MANIFEST}")], here / name)
+def fetch_manifests(location: Location, name: str, folder: Path) -> None:
+    """Copy the manifests of the run `name` into `folder`, if the location is a URL. Raises
+    SplatError."""
+    if isinstance(location, str):
+        run = RemoteFolder.at(location) / name
+        run.fetch([file for file in run.names() if file.endswith(f"/{MANIFEST}")], folder / name)
 
 
 @dataclass(frozen=True)
 class RemoteFolder:
-    """A folder at a URL. system: fsspec's. root: its path there."""
+    """A folder at a URL. system: fsspec's file system. root: the folder's path in it."""
 
     url: str
     system: Any
@@ -94,9 +94,9 @@ class RemoteFolder:
             system, root = importlib.import_module("fsspec").core.url_to_fs(url)
         except ImportError as error:
             ours = error.name == "fsspec"
-            said = "fsspec is missing, which reads it" if ours else str(error)
+            why = "fsspec, which reads it, is not installed" if ours else str(error)
             hint = install_command("cluster") if ours else "Install it wherever runs are done."
-            raise _error("url-not-installed", url, said, hint) from error
+            raise _error("url-not-installed", url, why, hint) from error
         except ValueError as error:
             hint = "Name a protocol that fsspec knows, such as s3://, gs:// or sftp://."
             raise _error("url-unknown", url, str(error), hint) from error
@@ -106,23 +106,23 @@ class RemoteFolder:
         return replace(self, url=f"{self.url}/{name}", root=f"{self.root}/{name}")
 
     def is_file(self) -> bool:
-        with self._told():
+        with self._as_splat_errors():
             return bool(self.system.isfile(self.root))
 
-    def fitting(self) -> list[Location]:
-        """URLs of what the pattern fits, in order. Raises SplatError."""
+    def matches(self) -> list[Location]:
+        """The sorted URLs that match the pattern. Raises SplatError."""
         if "*" not in self.root:
             return [self.url]
-        with self._told():
+        with self._as_splat_errors():
             found = sorted(self.system.glob(self.root))
         if not found:
             raise _missing(self.url)
         return [self.system.unstrip_protocol(path) for path in found]
 
     def names(self) -> list[str]:
-        """Of all files in it, relative and posix; "" of a file itself; [] if it is not there.
+        """The relative posix paths of all files in it; [""] for a file, [] if it does not exist.
         Raises SplatError."""
-        with self._told():
+        with self._as_splat_errors():
             self.system.invalidate_cache()
             if not self.system.exists(self.root):
                 return []
@@ -135,29 +135,29 @@ class RemoteFolder:
         for name in names:
             file = target / name
             file.parent.mkdir(parents=True, exist_ok=True)
-            with self._told():
+            with self._as_splat_errors():
                 self.system.get_file(f"{self.root}/{name}" if name else self.root, str(file))
 
     def put(self, source: Path, names: Iterable[str]) -> None:
         """Copy these files of `source` into it, in this order. Raises SplatError."""
         for name in names:
             target = f"{self.root}/{name}"
-            with self._told():
+            with self._as_splat_errors():
                 self.system.makedirs(target.rpartition("/")[0], exist_ok=True)
                 self.system.put_file(str(source / name), target)
 
     def remove(self) -> None:
-        """With all that is in it, if it is there: a manifest first. Raises SplatError."""
+        """Remove the folder if it exists, its manifest first. Raises SplatError."""
         names = self.names()
-        with self._told():
+        with self._as_splat_errors():
             if MANIFEST in names:
                 self.system.rm_file(f"{self.root}/{MANIFEST}")
             if names:
                 self.system.rm(self.root, recursive=True)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Whatever a file system raises, as a SplatError."""
+    def _as_splat_errors(self) -> Iterator[None]:
+        """Turn every exception of the file system into a SplatError."""
         try:
             yield
         except FileNotFoundError as error:
@@ -168,9 +168,9 @@ class RemoteFolder:
         except Exception as error:
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
                 raise disk_full("copying", Path(tempfile.gettempdir())) from error
-            said = f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
+            what = f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
             hint = "Give the same command again: what is finished is kept."
-            raise _error("url-failed", self.url, said, hint, Family.RESOURCES) from error
+            raise _error("url-failed", self.url, what, hint, Family.RESOURCES) from error
 
 
 def _missing(url: str) -> SplatError:
@@ -185,8 +185,8 @@ def _error(code: str, url: str, what: str, hint: str, family: Family = Family.IN
 
 @dataclass(frozen=True)
 class RemoteRunTask:
-    """`tasks.Run`, of which the photographs or the run folder are at a URL. TMPDIR says where its
-    scratch folder is made."""
+    """A `tasks.RunTask` whose photographs or run folder are at a URL. Its temporary folder is made
+    in TMPDIR."""
 
     run_folder: Location
     photos: Location
@@ -194,86 +194,89 @@ class RemoteRunTask:
 
     @property
     def folder(self) -> Path:
-        far = isinstance(self.run_folder, str)
-        return Path(tempfile.gettempdir()) if far else Path(self.run_folder)
+        is_url = isinstance(self.run_folder, str)
+        return Path(tempfile.gettempdir()) if is_url else Path(self.run_folder)
 
-    def work(self, listener: Listener | None = None) -> None:
+    def run(self, listener: Listener | None = None) -> None:
         with tempfile.TemporaryDirectory(prefix="splat-") as name:
             photos = _fetched(self.photos, Path(name) / "photographs")
-            run_folder, put_back = self.run_folder, Listener()
+            run_folder, upload = self.run_folder, Listener()
             if isinstance(run_folder, str):
-                far, run_folder = RemoteFolder.at(run_folder), Path(name) / "run"
-                far.fetch(far.names(), run_folder)
-                put_back = UploadListener(run_folder, far)
+                remote, run_folder = RemoteFolder.at(run_folder), Path(name) / "run"
+                remote.fetch(remote.names(), run_folder)
+                upload = UploadListener(run_folder, remote)
             try:
-                listeners = Listeners(put_back, listener or Listener())
-                RunTask(run_folder, photos, self.settings).work(listeners)
+                listeners = Listeners(upload, listener or Listener())
+                RunTask(run_folder, photos, self.settings).run(listeners)
             except SplatError as error:
-                if error.code == "disk-full":  # the scratch folder's
+                if error.code == "disk-full":  # of the temporary folder
                     raise
-                said = error.given.replace(str(run_folder), str(self.run_folder))
-                error.given = said.replace(str(photos), str(self.photos))
+                given = error.given.replace(str(run_folder), str(self.run_folder))
+                error.given = given.replace(str(photos), str(self.photos))
                 raise
 
 
 def task_for(
     run_folder: Location, photos: Location, settings: Mapping[str, Any]
 ) -> RunTask | RemoteRunTask:
-    """The task, by where its folders are: paths as they are seen from anywhere."""
+    """The task of one run, with absolute paths."""
     if isinstance(run_folder, Path) and isinstance(photos, Path):
         return RunTask(run_folder.absolute(), photos.absolute(), settings)
-    return RemoteRunTask(_anywhere(run_folder), _anywhere(photos), settings)
-
-
-def _anywhere(place: Location) -> Location:
-    return place.absolute() if isinstance(place, Path) else place
+    run_folder, photos = (
+        location.absolute() if isinstance(location, Path) else location
+        for location in (run_folder, photos)
+    )
+    return RemoteRunTask(run_folder, photos, settings)
 
 
 def _fetched(photos: Location, target: Path) -> Path:
-    """Where the photographs are; those at a URL are copied into `target`, under the name that they
-    have there. Raises SplatError."""
+    """The local path of the photographs; those at a URL are copied into `target` under their own
+    name. Raises SplatError."""
     if isinstance(photos, Path):
         return photos
-    far = RemoteFolder.at(photos)
-    names = far.names()
+    remote = RemoteFolder.at(photos)
+    names = remote.names()
     if not names:
-        raise _missing(far.url)
-    place = target / PurePosixPath(far.root).name
-    far.fetch(names, place)
-    return place
+        raise _missing(remote.url)
+    local = target / PurePosixPath(remote.root).name
+    remote.fetch(names, local)
+    return local
 
 
 class UploadListener(Listener):
-    """Puts what a run finishes, and training's checkpoints, where its run folder really is."""
+    """Uploads finished stages and the checkpoints of training."""
 
-    def __init__(self, run_folder: Path, far: RemoteFolder) -> None:
-        self._here, self._far = run_folder, far
+    def __init__(self, run_folder: Path, remote: RemoteFolder) -> None:
+        self._local, self._remote = run_folder, remote
         self._partial, self._saved_ns = "", 0
-        self._there: dict[str, int] = {}  # when what was put there was made
+        self._uploaded: dict[str, int] = {}  # modification times of uploaded files, nanoseconds
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        self._far.put(self._here, [RUN_FILE])
+        self._remote.put(self._local, [RUN_FILE])
         self._partial = f".{number}-{stage.name}.partial"
-        self._there.clear()
+        self._uploaded.clear()
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        folder = self._here / self._partial
-        with suppress(OSError, SplatError):  # without it, more is done again
+        from stages.training.checkpoint import FILE_NAME
+
+        folder = self._local / self._partial
+        with suppress(OSError, SplatError):  # without a checkpoint, a resumed run repeats more
             saved_ns = (folder / FILE_NAME).stat().st_mtime_ns
             if saved_ns != self._saved_ns:
                 self._saved_ns = saved_ns
                 for name in (REQUEST, FILE_NAME):
-                    self._put(folder, name)
+                    self._upload(folder, name)
 
-    def _put(self, folder: Path, name: str) -> None:
+    def _upload(self, folder: Path, name: str) -> None:
+        """Upload a file of the working folder unless it is unchanged."""
         made_ns = (folder / name).stat().st_mtime_ns
-        if self._there.get(name) != made_ns:
-            (self._far / self._partial).put(folder, [name])
-            self._there[name] = made_ns
+        if self._uploaded.get(name) != made_ns:
+            (self._remote / self._partial).put(folder, [name])
+            self._uploaded[name] = made_ns
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         label = f"{number}-{stage.name}"
-        done = self._far / label
-        done.remove()
-        done.put(self._here / label, [*sorted(manifest.outputs), MANIFEST])
-        (self._far / self._partial).remove()
+        target = self._remote / label
+        target.remove()
+        target.put(self._local / label, [*sorted(manifest.outputs), MANIFEST])
+        (self._remote / self._partial).remove()

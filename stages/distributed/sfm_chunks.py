@@ -1,4 +1,4 @@
-"""Structure from motion with shares of its features and matching done by a cluster."""
+"""Structure from motion whose features and matches are computed in chunks by an executor."""
 
 from __future__ import annotations
 
@@ -15,46 +15,47 @@ if TYPE_CHECKING:
     from stages.structure.chunks import Chunk
 
 
-def with_shares(pipeline: Pipeline, open_engine: OpenExecutor) -> Pipeline:
-    """The pipeline, whose features and matches are found by what `open_engine` opens."""
-    plain = pipeline.layout.stage("sfm")
-    return pipeline.with_run("sfm", partial(_sfm, pipeline, plain, open_engine))
+def with_chunks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
+    """The pipeline with the stage `sfm` in chunks."""
+    stage = pipeline.layout.stage("sfm")
+    return pipeline.with_run("sfm", partial(_sfm, pipeline, stage, open_executor))
 
 
 def _sfm(
     pipeline: Pipeline,
-    plain: Stage,
-    open_engine: OpenExecutor,
+    stage: Stage,
+    open_executor: OpenExecutor,
     inputs: Mapping[str, Any],
     settings: Any,
     folder: Path,
     report: Report,
 ) -> Any:
-    if settings.cameras is not None:  # few pairs, of cameras of their own
-        return plain.run(inputs, settings, folder, report)
-    run: Callable[..., Any] = plain.run
-    with open_engine(pipeline.run_folder, Listener()) as engine:
-        return run(inputs, settings, folder, report, executor=partial(_hand_out, engine, report))
+    if settings.cameras is not None:  # known cameras have few pairs to match
+        return stage.run(inputs, settings, folder, report)
+    run: Callable[..., Any] = stage.run
+    with open_executor(pipeline.run_folder, Listener()) as executor:
+        return run(inputs, settings, folder, report, executor=partial(_execute, executor, report))
 
 
-def _hand_out(
-    engine: Executor, report: Report, shares: Sequence[Chunk], look: Callable[[], None]
+def _execute(
+    executor: Executor, report: Report, chunks: Sequence[Chunk], check: Callable[[], None]
 ) -> None:
+    """See `structure.chunks.ChunkExecutor`."""
     from stages.structure.chunks import CHUNK_MEMORY_MIB
 
-    if not shares:
+    if not chunks:
         return
-    what = "finding features" if shares[0].photographs else "matching"
+    label = "extracting features" if chunks[0].photographs else "matching"
 
-    def tick(done: int) -> None:
-        report.progress(done, len(shares), f"{what} (shares)")
-        look()
+    def progress(done: int) -> None:
+        report.progress(done, len(chunks), f"{label} (chunks)")
+        check()
 
     run_all(
-        engine,
-        [ChunkTask(share) for share in shares],
+        executor,
+        [ChunkTask(chunk) for chunk in chunks],
         Resources(CHUNK_MEMORY_MIB),
         report.stop_requested,
-        tick,
-        hint="Give the same command again: shares that are finished are kept.",
+        progress,
+        hint="Give the same command again: finished chunks are kept.",
     )

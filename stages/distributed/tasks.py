@@ -1,11 +1,11 @@
-"""A run, or a share of one, as a task: what is handed to whoever does it, here or elsewhere, and
-what comes back.
+"""Tasks and executors: what is sent to a worker, and what comes back.
 
-Only paths and settings go out, only figures come back: everything else lies in run folders.
+A task holds paths and settings, its result only figures. All data is in run folders.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -20,24 +20,29 @@ from stages.run.pipeline import Listener, Pipeline
 if TYPE_CHECKING:
     from stages.structure.chunks import Chunk
 
+_log = logging.getLogger(__name__)
 
 Location: TypeAlias = Path | str  # a path, or a URL
 
 
 class Task(Protocol):
-    """Something to do. folder: where what comes of it lies."""
+    """Work for one worker. folder: where its output lies."""
 
     @property
     def folder(self) -> Path: ...
 
-    def work(self, listener: Listener | None = None) -> None:
-        """Do it, in this process; the listener hears of it. Raises what went wrong."""
+    def run(self, listener: Listener | None = None) -> None:
+        """Do the work in this process and report its events to the listener. Raises SplatError and
+        any other exception."""
 
 
 @dataclass(frozen=True)
 class RunTask:
-    """What `splat process PHOTOS --out RUN_FOLDER` does; without photos, it goes on with the run
-    folder. settings: by stage name, the recorded ones where left out. until: the last stage."""
+    """`splat process PHOTOS --out RUN_FOLDER`.
+
+    photos: None to continue the run folder. settings: by stage name; stages that are left out use
+    the recorded ones. until: the last stage.
+    """
 
     run_folder: Path
     photos: Path | None = None
@@ -48,46 +53,46 @@ class RunTask:
     def folder(self) -> Path:
         return self.run_folder
 
-    def work(self, listener: Listener | None = None) -> None:
+    def run(self, listener: Listener | None = None) -> None:
         pipeline = Pipeline(self.run_folder, self.photos)
         pipeline.run(self.settings, until=self.until, listener=listener)
 
 
 @dataclass(frozen=True)
 class ChunkTask:
-    """A share of features or matches."""
+    """A chunk of features or matches."""
 
-    share: Chunk
+    chunk: Chunk
 
     @property
     def folder(self) -> Path:
-        return self.share.out.parent
+        return self.chunk.out.parent
 
-    def work(self, listener: Listener | None = None) -> None:
+    def run(self, listener: Listener | None = None) -> None:
         from stages.structure.chunks import run_chunk
 
-        run_chunk(self.share)
+        run_chunk(self.chunk)
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """How it went. status: exit status; code, said: of the error, "" if there was none."""
+    """status: exit status. code, message: of the error; "" if there was none."""
 
     status: int = 0
     code: str = ""
-    said: str = ""
+    message: str = ""
 
 
 @dataclass(frozen=True)
 class Resources:
-    """What one task takes. memory_mib: None for all that one machine has."""
+    """What one task needs. memory_mib: None for all the memory of a machine."""
 
     memory_mib: float | None
     gpus: int = 0
 
 
 def resources_of(train: Any) -> Resources:
-    """What a run with these settings of training takes at most."""
+    """The most that a run with these training settings needs."""
     from stages.training.cap import needed_mib
 
     memory_mib = needed_mib(train.max_splats) if train.max_splats else None
@@ -95,68 +100,76 @@ def resources_of(train: Any) -> Resources:
 
 
 class Executor(Protocol):
-    """Brings tasks to their ends, one or several at a time."""
+    """Executes tasks, one or several at a time."""
 
     def results(
         self, tasks: Sequence[Task], need: Resources, stop: Event | None = None
     ) -> Iterator[tuple[int, TaskResult]]:
-        """(which task, how it ended), as they end. Raises SplatError, and Interrupted where `stop`
-        is set, or a signal stopped what was being done at a safe place."""
+        """Yield (number of the task, its result) in the order in which tasks end.
+
+        Raises SplatError, and Interrupted if `stop` is set or a signal stopped a task.
+        """
 
 
 OpenExecutor = Callable[[Path, Listener], AbstractContextManager[Executor]]
-"""open_engine(folder, listener): what does the work in that folder."""
+"""open_executor(folder, listener): an executor for tasks in that folder."""
 
 
 def run_task(task: Task, listener: Listener | None = None) -> TaskResult:
-    """Do it, in this process. A failure is an ending; only Interrupted is raised."""
+    """Run a task in this process. A failure becomes a result; only Interrupted is raised."""
     try:
-        task.work(listener)
+        task.run(listener)
     except Interrupted:
         raise
-    except SplatError as error:
-        return error_result(error)
     except Exception as error:
-        known = as_splat_error(error, "the run", task.folder)
-        return error_result(known or error)
+        _log.debug("%s failed", task.folder, exc_info=error)
+        if isinstance(error, SplatError):
+            return error_result(error)
+        return error_result(as_splat_error(error, "the run", task.folder) or error)
     return TaskResult()
 
 
 def run_all(
-    engine: Executor,
+    executor: Executor,
     tasks: Sequence[Task],
     need: Resources,
     stop: Event,
-    tick: Callable[[int], None],
+    progress: Callable[[int], None],
     hint: str,
 ) -> None:
-    """Bring all to their ends; tick: told how many have. Raises SplatError for the first that
-    failed, once the others have ended, with this hint; and as `Engine.results`, and as `tick`."""
+    """Run all tasks.
+
+    Args:
+        progress: called with the number of tasks that have ended.
+        hint: of the error that is raised for the first failed task, after all others have ended.
+
+    Raises SplatError, and what `Executor.results` and `progress` raise.
+    """
     failed = None
-    for done, (number, ending) in enumerate(engine.results(tasks, need, stop), start=1):
-        tick(done)
-        if ending.status and failed is None:
+    for done, (number, result) in enumerate(executor.results(tasks, need, stop), start=1):
+        progress(done)
+        if result.status and failed is None:
             failed = SplatError(
-                ending.code,
-                given=f"In {tasks[number].folder}: {ending.said}",
-                wanted="All of it done.",
+                result.code,
+                given=f"In {tasks[number].folder}: {result.message}",
+                wanted="All tasks finished.",
                 hint=hint,
-                family=Family(max(ending.status, Family.USAGE)),
+                family=Family(max(result.status, Family.USAGE)),
             )
     if failed is not None:
         raise failed
 
 
-def error_result(error: Exception) -> TaskResult:
-    """An error as figures and words."""
+def error_result(error: BaseException) -> TaskResult:
+    """The result of a task that raised `error`."""
     if isinstance(error, SplatError):
         return TaskResult(int(error.family), error.code, error.given)
-    said = str(error).splitlines()[0] if str(error) else "no more is known"
-    return TaskResult(CRASHED, "bug", f"{type(error).__name__}: {said}.")
+    message = str(error).splitlines()[0] if str(error) else "no message"
+    return TaskResult(CRASHED, "bug", f"{type(error).__name__}: {message}.")
 
 
 class SerialExecutor:
-    """One task after the other, in this process."""
+    """Executes tasks one after another in this process."""
 
     def __init__(self, listener: Listener | None = None) -> None:
         self.listener = listener

@@ -1,4 +1,4 @@
-"""What a photographer should change, from what was measured: warnings with stable codes."""
+"""Warnings about a capture that say what a photographer should change, with stable codes."""
 
 from __future__ import annotations
 
@@ -8,30 +8,23 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from stages.base.text import counted
-from stages.photos.decode import DENIED
-from stages.photos.find import RAW_ADVICE, Findings
+from stages.photos.sources import RAW_ADVICE, Findings, listed
 from stages.scene import TRANSPARENT, Photo
 
 Warn = Callable[[str, str], None]
 
 FEWEST_WITHOUT_WARNING = 20
 BLURRED_BELOW = 0.6  # of the capture's median; a blur of 1.5 px at 1600 px gives about 0.55
-SOFT_BELOW = 2.5  # median sharpness; enlarged four times or blurred by 3 px, pictures fall below
+SOFT_BELOW = 2.5  # median sharpness; of pictures enlarged four times or blurred by 3 px it is less
 EV_RANGE_STOPS = 1.0
-LUMINANCE_RANGE_STOPS = 2.0  # without EXIF, and what is in the picture changes it too
+LUMINANCE_RANGE_STOPS = 2.0  # without Exif; the subject changes brightness, too
 DARK_BELOW = -6.5  # log2 of linear luminance: about 30 of 255
 SMALL_BELOW_PX = 640
 _NAMED = 8
 
 
-def listed(names: Sequence[str]) -> str:
-    """Names for a sentence, the first few in full."""
-    shown = ", ".join(names[:_NAMED])
-    return shown + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-
-
 def about_files(found: Findings, warn: Warn) -> None:
-    """Files that look like the user's material but are not read."""
+    """Files that may belong to the capture but are not read."""
     if found.raws:
         warn("ingest-raw-not-read", f"Raw files are not read: {listed(found.raws)}. {RAW_ADVICE}")
     if found.other_pictures:
@@ -42,14 +35,12 @@ def about_files(found: Findings, warn: Warn) -> None:
         )
 
 
-def about_left_out(reasons: Sequence[tuple[str, str]], warn: Warn) -> None:
-    """reasons: (name, why) of photographs that could not be used."""
-    for name, why in reasons[:_NAMED]:
-        next_step = "Change them" if why == DENIED else "Copy it from the camera again"
-        warn("ingest-left-out", f"{name} is left out: {why}. {next_step}.")
-    rest = [name for name, _ in reasons[_NAMED:]]
-    if rest:
-        warn("ingest-left-out", f"Left out too, for like reasons: {listed(rest)}.")
+def about_left_out(unusable: Sequence[tuple[str, str, str]], warn: Warn) -> None:
+    """unusable: (name, why, what to do) of files that cannot be used."""
+    for name, why, hint in unusable[:_NAMED]:
+        warn("ingest-left-out", f"{name} is left out: {why}. {hint}.")
+    if rest := [name for name, *_ in unusable[_NAMED:]]:
+        warn("ingest-left-out", f"Also left out, for similar reasons: {listed(rest)}.")
 
 
 def about_conversions(
@@ -57,7 +48,7 @@ def about_conversions(
     bad_profiles: Sequence[str],
     warn: Warn,
 ) -> None:
-    """Names of photographs of which something was lost on the way to 8-bit sRGB."""
+    """Names of photographs that lost something in the conversion to 8-bit sRGB."""
     if hdr:
         warn(
             "ingest-hdr",
@@ -79,14 +70,21 @@ def about_masks(
     stray: Sequence[str],
     warn: Warn,
 ) -> None:
-    """by_alpha: photographs that are partly transparent. scaled: whose masks had another size.
-    stray: masks of no photograph."""
-    cut_out = [name for name in by_alpha if _outside(photos, name) == TRANSPARENT]
-    if cut_out:
+    """Warn about masks.
+
+    Args:
+        photos: all of the capture.
+        by_alpha: names of photographs that are partly transparent.
+        scaled: names of photographs whose masks had another size.
+        stray: names of masks that belong to no photograph.
+        warn: is called with the code and the text.
+    """
+    transparent = [name for name in by_alpha if _outside(photos, name) == TRANSPARENT]
+    if transparent:
         warn(
             "ingest-transparency",
-            f"Transparent parts are taken for empty space: {listed(cut_out)}. "
-            "--mask-means ignore takes them for parts that are not known.",
+            f"Transparent parts are treated as empty space: {listed(transparent)}. "
+            "With --mask-means ignore they are treated as unknown.",
         )
     if scaled:
         warn(
@@ -97,13 +95,13 @@ def about_masks(
     if stray:
         warn(
             "ingest-mask-unused",
-            f"Masks of no photograph, by their names, are not used: {listed(stray)}.",
+            f"Masks that belong to no photograph by their names are not used: {listed(stray)}.",
         )
     bare = [photo.name for photo in photos if not photo.mask]
     if 0 < len(bare) < len(photos):
         warn(
             "ingest-mask-missing",
-            f"Nothing is masked in {counted(len(bare), 'photograph')}: {listed(bare)}. "
+            f"{counted(len(bare), 'photograph has', 'photographs have')} no mask: {listed(bare)}. "
             "There everything counts.",
         )
 
@@ -119,9 +117,8 @@ def about_capture(
     if len(photos) < FEWEST_WITHOUT_WARNING:
         warn(
             "ingest-few-photographs",
-            f"The capture holds {counted(len(photos), 'usable photograph')}. 20 to 50 do an "
-            "object or a room well: "
-            "take more, in small steps around the scene, with 60-80 % overlap.",
+            f"The capture holds {counted(len(photos), 'usable photograph')}. An object or a room "
+            "needs 20 to 50: take more, in small steps around the scene, with 60-80 % overlap.",
         )
     blurred = _about_sharpness(photos, warn)
     _about_light(photos, warn)
@@ -133,7 +130,7 @@ def about_capture(
             "ingest-near-duplicates",
             f"{extra} of {len(photos)} photographs {'shows' if extra == 1 else 'show'} nearly the "
             f"same as another: {groups}. "
-            "That adds no depth: take a step sideways between photographs.",
+            "They add no depth: take a step sideways between photographs.",
         )
     return blurred
 
@@ -191,7 +188,7 @@ def _about_light(photos: Sequence[Photo], warn: Warn) -> None:
 
 
 def _about_cameras(photos: Sequence[Photo], warn: Warn) -> None:
-    """Photo.camera is "name, 4.4 mm, 26 mm equivalent, 1600x1200"."""
+    """The parts of Photo.camera are "name, 4.4 mm, 26 mm equivalent, 1600x1200"."""
     names = Counter(photo.camera.split(", ")[0] for photo in photos)
     lenses = Counter(", ".join(photo.camera.split(", ")[1:-1]) for photo in photos)
     sizes = Counter(

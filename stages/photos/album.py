@@ -1,4 +1,4 @@
-"""Many pictures in little memory: their bytes lie in a file that is mapped, not loaded."""
+"""Many pictures in little memory: they are in a file that is memory-mapped, not loaded."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-RESIDENT_MIB = 1024  # of an album, at most and about, that count as this process's memory
+RESIDENT_MIB = 1024  # roughly at most, of pictures that count as this process's memory
 
 
 class Album:
-    """Pictures that were added once, read as often as wanted, each an array of bytes.
+    """Pictures in a memory-mapped temporary file, each an array of bytes.
 
-    The file is nameless where the system allows it, so that nothing is left of it however the
-    process ends. The system keeps in memory what fits and drops the rest first when memory is
-    short; beyond `resident_mib` the process gives back by itself what it has touched.
+    The file has no name where the system allows it, so nothing of it is left however the process
+    ends. The system keeps in memory what fits, and drops the rest first when memory is short.
+    Beyond `resident_mib` the process releases the pages that it has touched.
 
-    Used as a context manager to `add`; after that, `pictures` may be read until it is closed by
-    the garbage collector.
+    Pictures are added inside the context manager (`add`), and can be read after it (`picture`)
+    until the object is garbage collected.
     """
 
     def __init__(self, folder: Path, resident_mib: float = RESIDENT_MIB) -> None:
@@ -49,32 +49,32 @@ class Album:
         self._file.close()
 
     def add(self, picture: NDArray[np.uint8]) -> int:
-        """Keep a copy; its number. Raises OSError where the disk is full."""
+        """Add a copy and return its number. Raises OSError if the disk is full."""
         self._file.write(np.ascontiguousarray(picture).data)
         self._shapes.append(picture.shape)
         self._starts.append(self._starts[-1] + picture.nbytes)
         return len(self._shapes) - 1
 
     def picture(self, number: int) -> NDArray[np.uint8]:
-        """The bytes where they lie: to be read, and not kept for long."""
+        """A view of the mapped bytes, to be read and not kept for long."""
         assert self._map is not None
         start, end = self._starts[number : number + 2]
         if number not in self._touched:
             if self._bytes + end - start > self._most:
-                self._let_go()
+                self._release()
             self._touched.add(number)
             self._bytes += end - start
         flat = np.frombuffer(self._map, np.uint8, end - start, start)
         return flat.reshape(self._shapes[number])
 
     def expect(self, number: int) -> None:
-        """That picture comes soon: the system may begin to read it, beside other work."""
+        """Announce that a picture is needed soon, so that the system can begin to read it."""
         assert self._map is not None
         start = self._starts[number] // mmap.PAGESIZE * mmap.PAGESIZE
         self._advise("MADV_WILLNEED", start, self._starts[number + 1] - start)
 
-    def _let_go(self) -> None:
-        """What was touched stays in the system's cache, but is no longer this process's."""
+    def _release(self) -> None:
+        """Release touched pages: they stay in the system's cache, but do not count as ours."""
         assert self._map is not None
         self._touched.clear()
         self._bytes = 0
@@ -82,6 +82,6 @@ class Album:
 
     def _advise(self, advice: str, start: int, length: int) -> None:
         assert self._map is not None
-        value = getattr(mmap, advice, None)  # not under Windows, which looks after itself
+        value = getattr(mmap, advice, None)  # not on Windows, which manages it itself
         if value is not None:
             self._map.madvise(value, start, length)

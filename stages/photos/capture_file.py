@@ -1,4 +1,4 @@
-"""capture.json: what ingest found, for the stages that follow."""
+"""capture.json: what ingest found, for the later stages."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 
 def save_capture(capture: Capture) -> None:
-    """Write capture.json into the capture's folder. Raises SplatError if the disk refuses."""
+    """Write capture.json into the capture's folder. Raises SplatError if it cannot be written."""
     data = {"schema": _SCHEMA, "photos": [asdict(photo) for photo in capture.photos]}
     text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
     with replacing(capture.folder / FILE) as path:

@@ -1,4 +1,4 @@
-"""Pictures in other colour spaces, converted to sRGB."""
+"""Converts pictures of other colour spaces to sRGB, by ICC profile, nclx code points or Exif."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ADOBE_GAMMA = 563 / 256
 def icc_to_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, bool]:
     """(`image` in sRGB, whether that changed it). Grey and CMYK pictures become RGB.
 
-    Raises ImageCms.PyCMSError for a profile that is damaged or of another kind of picture.
+    Raises ImageCms.PyCMSError for a profile that is damaged, or made for another colour mode.
     """
     transform = _transform(profile, image.mode)
     if transform is None:
@@ -40,7 +40,7 @@ def icc_to_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, bool]:
 
 @lru_cache(maxsize=32)
 def _transform(profile: bytes, mode: str) -> Any:
-    """The transform to sRGB, or None if it moves no colour by more than one step in 255."""
+    """The transform to sRGB, or None if it changes no colour by more than 1 of 255."""
     source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
     transform = ImageCms.buildTransform(
         source,
@@ -65,12 +65,12 @@ def _transform(profile: bytes, mode: str) -> Any:
 
 
 def nclx_is_p3(nclx: dict[str, Any] | None) -> bool:
-    """Whether a HEIC file without ICC profile declares Display P3 by code points."""
+    """Whether the nclx box of a HEIF file without ICC profile declares Display P3."""
     return nclx is not None and int(nclx.get("color_primaries", 1)) == _P3_PRIMARIES
 
 
 def nclx_is_hdr(nclx: dict[str, Any] | None) -> bool:
-    """Whether the declared transfer function is one of high dynamic range."""
+    """Whether the nclx box declares a transfer function of high dynamic range, PQ or HLG."""
     return nclx is not None and int(nclx.get("transfer_characteristics", 13)) in _HDR_TRANSFERS
 
 
@@ -89,15 +89,21 @@ def _convert(
 ) -> NDArray[np.uint8]:
     out = np.empty_like(pixels)
     table, weights = decoded.astype(np.float32), matrix.T.astype(np.float32)
-    for top in range(0, len(pixels), 256):  # strips: a float copy of it all would be large
+    for top in range(
+        0, len(pixels), 256
+    ):  # strips: a float copy of the whole picture would be large
         linear = np.clip(table[pixels[top : top + 256]] @ weights, 0, 1)
-        encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        out[top : top + 256] = np.round(encoded * 255)
+        out[top : top + 256] = np.round(srgb_encoded(linear) * 255)
     return out
 
 
+def srgb_encoded(linear: NDArray[Any]) -> NDArray[Any]:
+    """The sRGB transfer function (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
 def _srgb_decoded(value: NDArray[np.floating]) -> NDArray[np.floating]:
-    """IEC 61966-2-1."""
+    """Its inverse."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 

@@ -1,4 +1,4 @@
-"""A photograph of any supported format as upright 8-bit sRGB, no larger than asked for."""
+"""Decodes a photograph of any supported format to upright 8-bit sRGB of limited size."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ from stages.scene import fitted_size
 
 MAX_MEGAPIXELS = 200
 MAX_FILE_BYTES = 2**31
-DENIED = "its permissions forbid to read it"
+COPY_AGAIN = "Copy it from the camera again"
+EIGHT_OR_SIXTEEN_BITS = "Save it with 8 or 16 bits a sample"
+AS_JPEG = "Save it as JPEG or PNG if it belongs to the capture"
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "HEIF", "AVIF", "BMP")  # MPO opens as JPEG
 _SMALLEST_SIDE_PX = 16
 UPRIGHT = {
@@ -40,29 +42,39 @@ UPRIGHT = {
 
 
 class Unusable(Exception):  # noqa: N818 - a finding about a file, not a failure
-    """A file that cannot be used; the message says why, to be put after its name."""
+    """A file that cannot be used. The message says why, as what follows "name: "; hint says what to
+    do, as a sentence without its full stop."""
+
+    def __init__(self, why: str, hint: str = COPY_AGAIN) -> None:
+        super().__init__(why)
+        self.hint = hint
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """pixels: [H, W, 3] uint8 sRGB, upright, fitted to the size asked for.
+    """A decoded photograph.
 
-    stored: (width, height) in the file, before turning. as_it_was: the bytes of the file, if it is
-    a JPEG that already is what `pixels` says. alpha [H, W]: how solid each pixel is, where not all
-    of them are; `pixels` are over black then. hdr, bad_profile: what was met on the way.
+    Args:
+        pixels: [H, W, 3] uint8 sRGB, upright, of limited size, over black where transparent.
+        stored: (width, height) in the file, before it was turned upright.
+        exif: what the camera wrote.
+        unchanged_jpeg: the bytes of the file, if it is a JPEG of exactly these pixels.
+        alpha: [H, W] uint8 opacity; None where all pixels are opaque.
+        hdr: whether the file declares a transfer function of high dynamic range.
+        bad_profile: whether its ICC profile is damaged.
     """
 
     pixels: NDArray[np.uint8]
     stored: tuple[int, int]
     exif: Exif
-    as_it_was: bytes | None = None
+    unchanged_jpeg: bytes | None = None
     alpha: NDArray[np.uint8] | None = None
     hdr: bool = False
     bad_profile: bool = False
 
 
 class PixelBudget:
-    """Lets threads decode side by side only as long as their pictures fit a budget of pixels."""
+    """Limits how many pixels threads decode at once."""
 
     def __init__(self, pixels: int) -> None:
         self._free = self._all = pixels
@@ -120,7 +132,7 @@ def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
     except (Unusable, MemoryError):
         raise
     except UnidentifiedImageError as error:
-        raise Unusable(_what_it_is(data)) from error
+        raise _unidentified(data) from error
     except Exception as error:  # decoders raise whatever the damage leads to
         raise Unusable(f"it does not decode ({_first_line(error)})") from error
 
@@ -128,10 +140,10 @@ def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
 def _read(path: Path) -> bytes:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
-            raise Unusable("the file is larger than 2 GiB")
+            raise Unusable("the file is larger than 2 GiB", "Scale it down")
         data = path.read_bytes()
     except PermissionError as error:
-        raise Unusable(DENIED) from error
+        raise Unusable("permission to read it is denied", "Change its permissions") from error
     except OSError as error:
         raise Unusable(f"it cannot be opened ({error.strerror or error})") from error
     if not data:
@@ -143,9 +155,10 @@ def _read(path: Path) -> bytes:
 
 def _check_size(size: tuple[int, int]) -> tuple[int, int]:
     if size[0] * size[1] > MAX_MEGAPIXELS * 1_000_000:
-        raise Unusable(f"{size[0]} x {size[1]} is more than {MAX_MEGAPIXELS} megapixels")
+        why = f"{size[0]} x {size[1]} is more than {MAX_MEGAPIXELS} megapixels"
+        raise Unusable(why, f"Scale it down to {MAX_MEGAPIXELS} megapixels or less")
     if min(size) < _SMALLEST_SIDE_PX:
-        raise Unusable(f"{size[0]} x {size[1]} pixels are too few")
+        raise Unusable(f"{size[0]} x {size[1]} pixels are too few", "Use the original file")
     return size
 
 
@@ -158,8 +171,8 @@ def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
     if image.format == "HEIF":
         exif = replace(exif, orientation=1)  # the decoder has turned the pixels already
     native_mode = image.mode
-    plain = _resized(_plain_mode(_loaded(image, data)), size, stored)
-    shown, alpha = _over_black(plain)
+    basic = _resized(_basic_mode(_loaded(image, data)), size, stored)
+    shown, alpha = _over_black(basic)
     shown, converted, bad_profile = _in_srgb(shown, info.get("icc_profile"))
     upright = exif.orientation == 1
     if not upright:
@@ -174,7 +187,7 @@ def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
         pixels=pixels,
         stored=stored,
         exif=exif,
-        as_it_was=data if unchanged and not converted else None,
+        unchanged_jpeg=data if unchanged and not converted else None,
         alpha=np.array(alpha) if alpha is not None else None,
         hdr=colour.nclx_is_hdr(info.get("nclx_profile")),
         bad_profile=bad_profile,
@@ -182,7 +195,8 @@ def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
 
 
 def _declared_space(exif: Exif, info: dict[Any, Any]) -> Any:
-    """The conversion for a colour space that is declared without an ICC profile, or None."""
+    """The conversion for a colour space that Exif or nclx declares without an ICC profile, or
+    None."""
     if exif.adobe_rgb:
         return colour.adobe_to_srgb
     return colour.p3_to_srgb if colour.nclx_is_p3(info.get("nclx_profile")) else None
@@ -199,10 +213,10 @@ def _loaded(image: Image.Image, data: bytes) -> Image.Image:
     if image.mode.startswith("I"):  # 16-bit grey; older Pillows widen it to 32 bits
         samples = np.asarray(image).astype(np.int64)
         if samples.min() < 0 or samples.max() > 65535:
-            raise Unusable("its samples have more than 16 bits")
+            raise Unusable("its samples have more than 16 bits", EIGHT_OR_SIXTEEN_BITS)
         return Image.fromarray(_to_8_bit(samples))
     if image.mode == "F":
-        raise Unusable("its samples are floating-point numbers; save it with 8 or 16 bits")
+        raise Unusable("its samples are floating-point numbers", EIGHT_OR_SIXTEEN_BITS)
     return image
 
 
@@ -210,7 +224,8 @@ def _loaded_by_opencv(data: bytes) -> Image.Image:
     """For the TIFF variants that Pillow does not read."""
     samples = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if samples is None or samples.dtype not in (np.uint8, np.uint16):
-        raise Unusable("it does not decode, or its samples are not of 8 or 16 bits")
+        why = "it does not decode, or its samples do not have 8 or 16 bits"
+        raise Unusable(why, EIGHT_OR_SIXTEEN_BITS)
     if samples.dtype == np.uint16:
         samples = _to_8_bit(samples)
     if samples.ndim == 3 and samples.shape[2] == 4:
@@ -224,7 +239,7 @@ def _to_8_bit(samples: NDArray[Any]) -> NDArray[np.uint8]:
     return ((samples.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
-def _plain_mode(image: Image.Image) -> Image.Image:
+def _basic_mode(image: Image.Image) -> Image.Image:
     """The picture as RGB, L, CMYK, RGBA or LA."""
     if image.mode in ("PA", "RGBa", "La") or "transparency" in image.info:
         return image.convert("RGBA")
@@ -232,7 +247,7 @@ def _plain_mode(image: Image.Image) -> Image.Image:
 
 
 def _over_black(image: Image.Image) -> tuple[Image.Image, Image.Image | None]:
-    """(the picture over black where it is transparent, its alpha if it is anywhere)."""
+    """(the picture over black, its alpha channel if it is transparent anywhere)."""
     if image.mode not in ("RGBA", "LA"):
         return image, None
     layered = image.convert("RGBA")
@@ -262,14 +277,15 @@ def _in_srgb(image: Image.Image, profile: bytes | None) -> tuple[Image.Image, bo
     return image, False, False
 
 
-def _what_it_is(data: bytes) -> str:
+def _unidentified(data: bytes) -> Unusable:
     if data[:4] in (b"II*\0", b"MM\0*"):
-        return "it is damaged, or a TIFF with other samples than integers of 8 or 16 bits"
+        why = "it is damaged, or a TIFF with other samples than integers of 8 or 16 bits"
+        return Unusable(why, EIGHT_OR_SIXTEEN_BITS)
     if data[:6] in (b"GIF87a", b"GIF89a"):
-        return "it is a GIF"
+        return Unusable("it is a GIF", AS_JPEG)
     if data[:64].isascii() and b"\0" not in data[:64]:
-        return "it holds text, not a picture"
-    return "it is no picture, or a damaged one"
+        return Unusable("it holds text, not a picture", "Remove it, or replace it by the picture")
+    return Unusable("it is not a picture, or is damaged")
 
 
 def _first_line(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""What a photograph's EXIF says about camera, lens and exposure (Exif 2.32, CIPA DC-008)."""
+"""Exif tags about camera, lens, exposure and place (Exif 2.32, CIPA DC-008)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,21 @@ _FOCAL_OVER_LONG_SIDE = (0.2, 30.0)  # from fisheye to long telephoto
 
 @dataclass(frozen=True)
 class Exif:
-    """The tags that matter here; None or "" where missing or senseless.
+    """The tags that are used; None or "" where missing or invalid.
 
-    orientation: 1 to 8. focal_35mm: 35 mm equivalent. pixels: (width, height) that the camera
-    wrote. plane_px_per_mm: sensor pixels per millimetre along x. adobe_rgb: whether the colours are
-    declared as Adobe RGB without a profile, as cameras do (DCF "R03"). gps: latitude and longitude
-    in degrees, north and east.
+    Args:
+        make, model, lens: Make, Model, LensModel.
+        orientation: Orientation, 1 to 8.
+        focal_mm: FocalLength.
+        focal_35mm: FocalLengthIn35mmFilm.
+        exposure_s: ExposureTime.
+        f_number: FNumber.
+        iso: PhotographicSensitivity.
+        pixels: (PixelXDimension, PixelYDimension), the size that the camera wrote.
+        focal_plane_px_per_mm: FocalPlaneXResolution in pixels per millimetre.
+        adobe_rgb: whether the colour space is declared as Adobe RGB without a profile
+            (InteroperabilityIndex "R03" of DCF).
+        gps: GPSLatitude and GPSLongitude in degrees, north and east positive.
     """
 
     make: str = ""
@@ -33,23 +42,28 @@ class Exif:
     f_number: float | None = None
     iso: float | None = None
     pixels: tuple[float, float] | None = None
-    plane_px_per_mm: float | None = None
+    focal_plane_px_per_mm: float | None = None
     adobe_rgb: bool = False
     gps: tuple[float, float] | None = None
 
     @property
     def exposure_ev(self) -> float | None:
-        """EV at ISO 100: log2(N^2 / t) - log2(ISO / 100); a stop less light is one more."""
+        """Exposure value at ISO 100: log2(N^2 / t) - log2(ISO / 100). One stop less light is one EV
+        more."""
         if self.exposure_s is None or self.f_number is None or self.iso is None:
             return None
         return math.log2(self.f_number**2 / self.exposure_s) - math.log2(self.iso / 100.0)
 
     def focal_px(self, stored: tuple[int, int], width: int, height: int) -> float | None:
-        """Focal length in pixels of a picture of width x height (upright) made from `stored`.
+        """Focal length in pixels of the normalised picture; None for a cropped file.
 
-        stored: (width, height) in the file. From the 35 mm equivalent, taken along the longer side
-        (36 mm); else from the sensor's resolution, but only if the file still has the size that the
-        camera wrote, since resizing programs leave that tag as it was. None for a cropped file.
+        It comes from the 35 mm equivalent, taken along the longer side (36 mm). Else it comes from
+        the sensor's resolution, but only if the file still has the size that the camera wrote:
+        programs that resize leave that tag as it was.
+
+        Args:
+            stored: (width, height) in the file.
+            width, height: of the normalised picture, upright.
         """
         longer = max(width, height)
         if self._cropped(stored):
@@ -57,9 +71,9 @@ class Exif:
         focal = None
         if self.focal_35mm is not None:
             focal = self.focal_35mm / FULL_FRAME_WIDTH_MM * longer
-        elif self.focal_mm is not None and self._plane_is_trustworthy(stored):
-            assert self.plane_px_per_mm is not None
-            focal = self.focal_mm * self.plane_px_per_mm * longer / max(stored)
+        elif self.focal_mm is not None and self._sensor_width_is_valid(stored):
+            assert self.focal_plane_px_per_mm is not None
+            focal = self.focal_mm * self.focal_plane_px_per_mm * longer / max(stored)
         low, high = _FOCAL_OVER_LONG_SIDE
         return focal if focal is not None and low < focal / longer < high else None
 
@@ -79,16 +93,17 @@ class Exif:
         was = max(self.pixels) / min(self.pixels)
         return abs(was / (max(stored) / min(stored)) - 1.0) > 0.02
 
-    def _plane_is_trustworthy(self, stored: tuple[int, int]) -> bool:
-        if self.pixels is None or self.plane_px_per_mm is None:
+    def _sensor_width_is_valid(self, stored: tuple[int, int]) -> bool:
+        if self.pixels is None or self.focal_plane_px_per_mm is None:
             return False
         low, high = _SENSOR_WIDTHS_MM
         same_size = sorted(self.pixels) == sorted(stored)
-        return same_size and low < max(stored) / self.plane_px_per_mm < high
+        return same_size and low < max(stored) / self.focal_plane_px_per_mm < high
 
 
 def read_exif(image: Any) -> Exif:
-    """The tags of an open PIL image. Damaged EXIF counts as none: cameras' makers err a lot."""
+    """The tags of an open PIL image. Damaged Exif counts as none, because many cameras write it
+    wrongly."""
     try:
         main = image.getexif()
         tags = {**dict(main), **dict(main.get_ifd(_EXIF_IFD))}
@@ -99,9 +114,9 @@ def read_exif(image: Any) -> Exif:
     except Exception:  # before Pillow 13 also where there is none
         interoperability = {}
     try:
-        place = dict(main.get_ifd(_GPS_IFD))
+        gps = dict(main.get_ifd(_GPS_IFD))
     except Exception:
-        place = {}
+        gps = {}
     orientation = _number(tags.get(0x0112))
     width, height = _number(tags.get(0xA002)), _number(tags.get(0xA003))
     return Exif(
@@ -115,14 +130,14 @@ def read_exif(image: Any) -> Exif:
         f_number=_number(tags.get(0x829D)),
         iso=_iso(tags),
         pixels=(width, height) if width and height else None,
-        plane_px_per_mm=_plane_px_per_mm(tags),
+        focal_plane_px_per_mm=_focal_plane_px_per_mm(tags),
         adobe_rgb=_text(interoperability.get(1)) == "R03",
-        gps=_place(place),
+        gps=_gps(gps),
     )
 
 
-def _place(tags: dict[int, Any]) -> tuple[float, float] | None:
-    """Latitude and longitude in degrees. None also at 0, 0, where receivers without a fix are."""
+def _gps(tags: dict[int, Any]) -> tuple[float, float] | None:
+    """Latitude and longitude in degrees; None also at 0, 0, which receivers without a fix write."""
     found = []
     for reference, number, most in ((1, 2, 90.0), (3, 4, 180.0)):
         sign = {"N": 1, "E": 1, "S": -1, "W": -1}.get(_text(tags.get(reference)).upper()[:1])
@@ -138,12 +153,12 @@ def _place(tags: dict[int, Any]) -> tuple[float, float] | None:
 
 
 def _iso(tags: dict[int, Any]) -> float | None:
-    """PhotographicSensitivity; where it is full (65535), RecommendedExposureIndex says more."""
+    """PhotographicSensitivity; RecommendedExposureIndex where that is 65535, its largest value."""
     iso = _number(tags.get(0x8827))
     return _number(tags.get(0x8832)) if iso == 65535 else iso
 
 
-def _plane_px_per_mm(tags: dict[int, Any]) -> float | None:
+def _focal_plane_px_per_mm(tags: dict[int, Any]) -> float | None:
     resolution = _number(tags.get(0xA20E))
     unit = _PLANE_UNIT_MM.get(int(_number(tags.get(0xA210)) or 2))
     return resolution / unit if resolution and unit else None

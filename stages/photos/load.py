@@ -1,4 +1,4 @@
-"""Normalised photographs as arrays."""
+"""Loads normalised photographs and masks as arrays."""
 
 from __future__ import annotations
 
@@ -40,17 +40,18 @@ def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
 
 
 def load_mask(path: Path, width: int, height: int, outside: str) -> NDArray[np.uint8]:
-    """[height, width] of a mask as ingest and structure from motion write them; 0 is outside.
+    """[height, width] a mask as ingest and structure from motion write it; 0 is outside.
 
-    Scaled down as `load_image` does it: what is cut out keeps its share of each new pixel; of what
-    is to be ignored, a pixel that holds any is ignored. Raises SplatError "photo-unreadable".
+    It is scaled down as `load_image` does. A transparent photograph keeps its mean opacity in each
+    new pixel; where the outside is ignored, a new pixel that holds any of it is ignored. Raises
+    SplatError "photo-unreadable".
     """
     mask = np.round(load_image(path, width, height)[..., 0] * 255).astype(np.uint8)
     return mask if outside == TRANSPARENT else np.where(mask == 255, mask, np.uint8(0))
 
 
 def mask_of(folder: Path, view: View, width: int, height: int) -> NDArray[np.uint8] | None:
-    """A view's mask by `load_mask`; None where everything counts."""
+    """A view's mask, see `load_mask`; None where everything counts."""
     return load_mask(folder / view.mask, width, height, view.outside) if view.mask else None
 
 

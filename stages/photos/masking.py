@@ -1,4 +1,4 @@
-"""What masks and transparency leave of a photograph."""
+"""Applies masks and transparency to a photograph."""
 
 from __future__ import annotations
 
@@ -14,20 +14,26 @@ from PIL import Image
 from stages.base.errors import SplatError
 from stages.photos.decode import FORMATS, MAX_MEGAPIXELS, UPRIGHT, Decoded
 from stages.photos.masks import FOLDER
+from stages.photos.sources import listed
 from stages.scene import IGNORE, TRANSPARENT, Photo
 from stages.scene.capture import PHOTOS_FOLDER
 
 AUTO = "auto"
-SAME_SHAPE = 0.03  # sides in another proportion than that: a mask of something else
-LEAST_SHARE = 1e-3  # of a photograph; with less inside, nothing is left of it
-_NAMED = 5
+MAX_ASPECT_DIFFERENCE = 0.03  # relative; more: a mask of another photograph
+MIN_SHARE = 1e-3  # of a photograph; less inside its mask counts as nothing
 
 
 @dataclass(frozen=True)
 class MaskedPhoto:
-    """A photograph and what of it counts. decoded: over black where nothing is. mask [H, W], 0 is
-    outside, and outside: as in `scene.Photo`; None where everything counts. scaled: whether a mask
-    file had another size. share: of the photograph that is inside."""
+    """A photograph and the part of it that counts.
+
+    Args:
+        decoded: over black where it is transparent.
+        mask: [H, W], 0 outside; None where everything counts.
+        outside: what is outside, as in `scene.Photo`.
+        scaled: whether a mask file had another size than the photograph.
+        share: of the photograph that is inside.
+    """
 
     decoded: Decoded
     mask: NDArray[np.uint8] | None = None
@@ -39,10 +45,18 @@ class MaskedPhoto:
     def of(
         cls, decoded: Decoded, name: str, file: Path | None, invert: bool, means: str
     ) -> MaskedPhoto:
-        """From the photograph's alpha and the mask in `file`, white inside (or black: invert).
+        """Apply the photograph's alpha channel and a mask file.
 
-        means: IGNORE, TRANSPARENT, or AUTO: what the file masks is ignored, what alpha does is
-        empty. Raises SplatError "mask-unfit", which names the photograph.
+        Args:
+            decoded: the photograph.
+            name: its name, for messages.
+            file: the mask, white inside; None without one.
+            invert: the mask is black inside.
+            means: IGNORE, TRANSPARENT, or AUTO: outside a mask file is ignored, and outside alpha
+                alone is transparent.
+
+        Raises:
+            SplatError: "mask-unfit".
         """
         if file is None and decoded.alpha is None:
             return cls(decoded)
@@ -55,7 +69,7 @@ class MaskedPhoto:
         outside = means if means != AUTO else TRANSPARENT if file is None else IGNORE
         if outside == TRANSPARENT and file is not None:
             black = np.where(mask[..., None] > 0, decoded.pixels, np.uint8(0))
-            decoded = replace(decoded, pixels=black, as_it_was=None)
+            decoded = replace(decoded, pixels=black, unchanged_jpeg=None)
         return cls(decoded, mask, outside, scaled, float(np.mean(mask > 127)))
 
     def file(self, image: str) -> str:
@@ -64,34 +78,40 @@ class MaskedPhoto:
 
 
 def check_shares(photos: Sequence[Photo], shares: Sequence[float], files: bool) -> None:
-    """shares: of each photograph that is inside its mask. files: whether masks came as files.
+    """Check that masks leave something and remove something.
 
-    Raises SplatError "mask-empty" where a mask leaves nothing, "mask-full" where no mask of a
-    capture masks anything.
+    Args:
+        photos: all of the capture.
+        shares: of each photograph that is inside its mask.
+        files: whether there are mask files.
+
+    Raises:
+        SplatError: "mask-empty" if a mask leaves nothing, "mask-full" if no mask removes anything.
     """
-    empty = [p.name for p, share in zip(photos, shares, strict=True) if share < LEAST_SHARE]
+    empty = [p.name for p, share in zip(photos, shares, strict=True) if share < MIN_SHARE]
     if empty:
         raise SplatError(
             "mask-empty",
-            given=f"Masks leave nothing of {_listed(empty)}.",
+            given=f"Masks leave nothing of {listed(empty)}.",
             wanted="White where a photograph counts, black elsewhere.",
-            hint="Take these photographs away; if black is where they count, add --invert-masks.",
+            hint="Remove these photographs; or add --invert-masks if their masks are black inside.",
         )
     masked = [share for photo, share in zip(photos, shares, strict=True) if photo.mask]
     if files and masked and min(masked) == 1.0:
         names = [photo.name for photo in photos if photo.mask]
         raise SplatError(
             "mask-full",
-            given=f"Masks take nothing away from any photograph: {_listed(names)}.",
+            given=f"Masks remove nothing from any photograph: {listed(names)}.",
             wanted="White where a photograph counts, black elsewhere.",
-            hint="Check the masks, or take them away.",
+            hint="Check the masks, or remove them.",
         )
 
 
 def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArray[np.bool_], bool]:
     """([H, W] what the mask keeps, whether it had another size than the photograph's file).
 
-    A mask that lies as the file does is turned with it. Raises SplatError "mask-unfit".
+    A mask with the orientation of the stored file is turned upright with it. Raises SplatError
+    "mask-unfit".
     """
     image, stored = _opened(path, name), decoded.stored
     turn = UPRIGHT.get(decoded.exif.orientation)
@@ -99,11 +119,11 @@ def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArra
     if (
         turn is not None
         and turn in _QUARTERS
-        and _alike(image.size, stored)
-        and not _alike(image.size, upright)
+        and _same_aspect(image.size, stored)
+        and not _same_aspect(image.size, upright)
     ):
         image = image.transpose(turn)
-    if not _alike(image.size, upright):
+    if not _same_aspect(image.size, upright):
         sizes = f"{image.width} x {image.height}, the photograph {upright[0]} x {upright[1]}"
         raise _unfit(path, name, f"it is {sizes}")
     values = _values(image)
@@ -134,13 +154,13 @@ def _opened(path: Path, name: str) -> Image.Image:
                 return image.copy()
     except Exception as error:  # decoders raise whatever the damage leads to
         denied = isinstance(error, PermissionError)
-        why = "it may not be read" if denied else "it is damaged, or no picture"
+        why = "permission to read it is denied" if denied else "it is damaged, or not a picture"
         raise _unfit(path, name, why) from error
     raise _unfit(path, name, f"it has more than {MAX_MEGAPIXELS} megapixels")
 
 
 def _values(image: Image.Image) -> NDArray[np.float32]:
-    """[H, W] brightness; of a picture that is one colour all over, its alpha if it has one."""
+    """[H, W] brightness, or alpha if the picture has alpha and a single colour."""
     if image.mode in ("P", "PA") or "transparency" in image.info:
         image = image.convert("RGBA")
     if image.mode in ("RGBA", "LA"):
@@ -151,9 +171,9 @@ def _values(image: Image.Image) -> NDArray[np.float32]:
     return np.asarray(grey, np.float32)
 
 
-def _alike(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
-    """Whether both have the same proportions, to a few hundredths."""
-    return abs(size[0] * wanted[1] / (size[1] * wanted[0]) - 1.0) < SAME_SHAPE
+def _same_aspect(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
+    """Whether both have the same aspect ratio, to a few hundredths."""
+    return abs(size[0] * wanted[1] / (size[1] * wanted[0]) - 1.0) < MAX_ASPECT_DIFFERENCE
 
 
 def _unfit(path: Path, name: str, why: str) -> SplatError:
@@ -161,10 +181,5 @@ def _unfit(path: Path, name: str, why: str) -> SplatError:
         "mask-unfit",
         given=f"{path}, the mask of {name}, cannot be used: {why}.",
         wanted="A grey picture with its photograph's proportions, white where that counts.",
-        hint="Masks of another capture? Name their folder with --masks, or take them away.",
+        hint="If they are masks of another capture, remove them, or name a folder with --masks.",
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + rest

@@ -1,31 +1,35 @@
-"""Which masks belong to which photographs, by their names."""
+"""Pairs masks with photographs by their names."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 from stages.base.errors import SplatError
-
-if TYPE_CHECKING:
-    from stages.photos.find import Findings
+from stages.photos.sources import Findings, stem_of
 
 FOLDER = "masks"  # beside the photographs' folder, or in it
 MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".webp"})
 
 
 def mask_folder(photos: Path, chosen: Path | None) -> Path | None:
-    """Where masks lie besides the photographs' own folder: as chosen, or beside it."""
+    """The folder of masks outside the photographs' folder: the one that was chosen, or one called
+    masks beside it."""
     beside = photos.absolute().parent / FOLDER
     return chosen or (beside if beside.is_dir() and beside != photos.absolute() else None)
 
 
 def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> None:
-    """apart: the folder of masks that was looked into, `chosen` or only found beside.
+    """Check that masks which were given belong to photographs.
 
-    Raises SplatError: "masks-missing" where the folder chosen holds none, "masks-of-others" where
-    masks belong to no photograph by their names.
+    Args:
+        found: what the capture's folder holds.
+        apart: the folder of masks that was searched: `chosen`, or one found beside.
+        chosen: the folder that was given as a setting.
+
+    Raises:
+        SplatError: "masks-missing" if `chosen` holds none, "masks-of-others" if no mask belongs to
+            a photograph by its name.
     """
     if found.masks or (chosen is None and (apart is not None or not found.stray_masks)):
         return
@@ -42,25 +46,28 @@ def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> N
         "masks-of-others",
         given=f"No mask belongs to a photograph by its name: {mask}, say, and {photograph}.",
         wanted=f"For {photograph}: {stem}.png, {photograph}.png or {stem}_mask.png.",
-        hint="Masks of another capture? Name their folder with --masks, or take them away.",
+        hint="If they are masks of another capture, remove them, or name a folder with --masks.",
     )
 
 
 def names_for(photograph: str) -> tuple[str, ...]:
-    """What the mask of a photograph ("day 1/a.jpg") may be called, without its own ending: by
-    COLMAP (a.jpg.png), nerfstudio (a.png), Metashape (a_mask.png). Folded."""
+    """Names that the mask of a photograph ("day 1/a.jpg") may have, case-folded, without its own
+    ending: those of COLMAP (a.jpg.png), nerfstudio (a.png) and Metashape (a_mask.png)."""
     stem = str(PurePosixPath(photograph).with_suffix(""))
     return photograph.casefold(), stem.casefold(), f"{stem}_mask".casefold()
 
 
-def paired(photographs: Iterable[str], masks: Mapping[str, Path]) -> dict[str, Path]:
+def pair_masks(photographs: Iterable[str], masks: Mapping[str, Path]) -> dict[str, Path]:
     """The mask of each photograph that has one, by the photograph's name.
 
-    masks: by name relative to their folder. A folder without the photographs' sub-folders will do
-    where names are not used twice.
+    The folder of masks need not have the photographs' sub-folders if no name is used twice.
+
+    Args:
+        photographs: names relative to their folder.
+        masks: by name relative to theirs.
     """
     photographs = list(photographs)
-    by_stem = {_stem(name): path for name, path in sorted(masks.items())}
+    by_stem = {stem_of(name): path for name, path in sorted(masks.items())}
     found = {}
     for name in photographs:
         match = next((by_stem[key] for key in names_for(name) if key in by_stem), None)
@@ -70,7 +77,7 @@ def paired(photographs: Iterable[str], masks: Mapping[str, Path]) -> dict[str, P
     if not found and len({name.casefold() for name in bare}) == len(bare):
         short = {PurePosixPath(name).name: path for name, path in sorted(masks.items())}
         if short != dict(masks) or bare != photographs:
-            again = paired(bare, short)
+            again = pair_masks(bare, short)
             found = {
                 name: again[last]
                 for name, last in zip(photographs, bare, strict=True)
@@ -79,16 +86,12 @@ def paired(photographs: Iterable[str], masks: Mapping[str, Path]) -> dict[str, P
     return found
 
 
-def beside(photographs: Iterable[str]) -> dict[str, str]:
-    """Of files in one folder, those that are masks of others there (a.jpg.png, a_mask.png beside
-    a.jpg): the photograph's name by the mask's."""
+def masks_beside(photographs: Iterable[str]) -> dict[str, str]:
+    """Files of a folder that are masks of others there (a.jpg.png or a_mask.png beside a.jpg): the
+    photograph's name by the mask's."""
     photographs = list(photographs)
     by_key = {}
     for name in photographs:
         whole, _, marked = names_for(name)
         by_key[whole] = by_key[marked] = name
-    return {name: by_key[_stem(name)] for name in photographs if _stem(name) in by_key}
-
-
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix("")).casefold()
+    return {name: by_key[stem_of(name)] for name in photographs if stem_of(name) in by_key}

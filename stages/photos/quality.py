@@ -1,4 +1,4 @@
-"""What can be measured in one photograph, and which photographs are nearly the same."""
+"""Measures sharpness and brightness of photographs, and finds near-duplicates."""
 
 from __future__ import annotations
 
@@ -26,9 +26,12 @@ _SECOND_DERIVATIVES = tuple(
 
 @dataclass(frozen=True)
 class Measures:
-    """sharpness: see `sharpness`. log2_luminance: log2 of the median linear luminance.
+    """Measures of one photograph.
 
-    thumbnail: [36, 48] float32, zero mean, unit norm (0 for a uniform picture).
+    Args:
+        sharpness: see `sharpness`.
+        log2_luminance: log2 of the median linear luminance.
+        thumbnail: [36, 48] float32, zero mean, unit norm (0 for a uniform picture).
     """
 
     sharpness: float
@@ -37,7 +40,7 @@ class Measures:
 
 
 def measure(pixels: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> Measures:
-    """Measures of sRGB pixels [H, W, 3]. mask [H, W]: 0 where the picture says nothing of light."""
+    """Measures of sRGB pixels [H, W, 3]. mask [H, W]: 0 where brightness does not count."""
     height, width = pixels.shape[:2]
     size = fitted_size(width, height, MEASURED_SIDE_PX)
     small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -55,12 +58,12 @@ def measure(pixels: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) ->
 
 
 def sharpness(grey: NDArray[np.uint8]) -> float:
-    """How much fine detail there is for the coarse detail that there is, in the worst direction.
+    """The ratio of fine to coarse detail, in the direction where it is least.
 
-    The ratio of the energy of second derivatives at full scale and after a blur of 2 px, in each of
-    four directions, over the parts of the picture with most coarse detail. Unlike the variance of
-    the Laplacian, it hardly depends on contrast or on how much of the picture is a bare wall; the
-    worst direction shows a camera that moved.
+    It is the ratio of the energy of second derivatives at full scale to that after a blur of 2 px,
+    in each of four directions, over the parts of the picture with most coarse detail. Unlike the
+    variance of the Laplacian, it hardly depends on contrast or on how much of the picture is a bare
+    wall. The direction with the least detail shows motion blur.
     """
     image = grey.astype(np.float32)
     blurred = cv2.GaussianBlur(image, (0, 0), 2.0)
@@ -91,19 +94,17 @@ def near_duplicates(
     alike: correlation of thumbnails above which two photographs count as taken from one spot; a
     shift by half a percent of the picture's width brings it to about 0.98.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     stack = np.stack([thumbnail.ravel() for thumbnail in thumbnails])
-    group = list(range(len(stack)))
-
-    def head(index: int) -> int:
-        while group[index] != index:
-            index = group[index]
-        return index
-
-    for first in range(len(stack)):
-        scores = stack[first + 1 :] @ stack[first]
-        for second in np.nonzero(scores > alike)[0] + first + 1:
-            group[head(int(second))] = head(first)
-    members: dict[int, list[int]] = {}
-    for index in range(len(stack)):
-        members.setdefault(head(index), []).append(index)
-    return [tuple(indices) for indices in members.values() if len(indices) > 1]
+    pairs = [
+        (first, first + 1 + int(second))
+        for first in range(len(stack))
+        for second in np.flatnonzero(stack[first + 1 :] @ stack[first] > alike)
+    ]
+    ends = np.array(pairs, np.intp).reshape(-1, 2).T
+    links = coo_array((np.ones(len(pairs)), ends), shape=(len(stack), len(stack)))
+    count, labels = connected_components(links, directed=False)
+    groups = [tuple(map(int, np.flatnonzero(labels == label))) for label in range(count)]
+    return [group for group in groups if len(group) > 1]

@@ -1,4 +1,4 @@
-"""The pictures of a video file, one after another, upright; damage ends or thins them out."""
+"""Reads the frames of a video file in order, upright; frames that are damaged are skipped."""
 
 from __future__ import annotations
 
@@ -19,15 +19,23 @@ from stages.scene import fitted_size
 _CONTAINERS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,gif,flv,ogg,h264,hevc"
 )
+_COPY_OR_EXPORT = "Copy it from the camera again, or export it as H.264 or HEVC"
 _SMALLEST_SIDE_PX = 16
 _LARGEST_SIDE_PX = 16_384
-_LOST_SECONDS = 1.0  # at the end: fewer is how containers round
+_LOST_SECONDS = 1.0  # at the end: less may be rounding of the container
 
 
 @dataclass
 class Frame:
-    """number: from 0, in the order shown, of those that decode. seconds: since the film's start.
-    aspect: width of a pixel over its height."""
+    """A decoded frame.
+
+    Args:
+        number: from 0, in the order shown, among those that decode.
+        seconds: since the start of the video.
+        picture: the PyAV frame.
+        colours: what the video declares of its colours.
+        aspect: width of a pixel over its height.
+    """
 
     number: int
     seconds: float
@@ -38,35 +46,40 @@ class Frame:
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) upright, in square pixels."""
-        width, height = self._lying_size()
+        width, height = self._stored_size()
         return (height, width) if self._quarter_turns() % 2 else (width, height)
 
     def grey(self, longer_side: int) -> NDArray[np.uint8]:
-        """[H, W], not turned upright, the longer side at most `longer_side` pixels."""
-        width, height = fitted_size(*self._lying_size(), longer_side)
+        """[H, W] as stored, not upright, the longer side at most `longer_side` pixels."""
+        width, height = fitted_size(*self._stored_size(), longer_side)
         small = self.picture.reformat(width, height, "gray", interpolation="AREA")
         return np.ascontiguousarray(small.to_ndarray())
 
     def srgb(self, longer_side: int) -> NDArray[np.uint8]:
         """[H, W, 3] upright, the longer side at most `longer_side` pixels."""
-        width, height = fitted_size(*self._lying_size(), longer_side)
+        width, height = fitted_size(*self._stored_size(), longer_side)
         pixels = srgb(self.picture, self.colours, width, height)
         return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns()))
 
     def _quarter_turns(self) -> int:
-        """Anticlockwise."""
+        """Anticlockwise, from the stored to the upright picture."""
         degrees: int = self.picture.rotation
         return round(degrees / 90) % 4
 
-    def _lying_size(self) -> tuple[int, int]:
+    def _stored_size(self) -> tuple[int, int]:
         return max(1, round(self.picture.width * self.aspect)), self.picture.height
 
 
 class Video:
-    """A video file that is read as often as wanted, in memory that does not grow with its length.
+    """A video file. It can be read several times, in memory that does not grow with its length.
 
-    After `frames` has come to its end: decoded, how many pictures it gave; damaged, how many
-    packets did not decode; missing_s, seconds at its end that the file announces and lacks.
+    These are known after `frames` has ended:
+
+    Args:
+        path: of the file.
+        decoded: how many frames decoded.
+        damaged: how many packets did not.
+        missing_s: seconds at the end that the file announces but does not have.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,10 +88,10 @@ class Video:
         self.missing_s = 0.0
 
     def frames(self) -> Iterator[Frame]:
-        """Every picture that decodes. Raises Unusable where there is none."""
+        """Every frame that decodes. Raises Unusable if there is none."""
         self.decoded = self.damaged = 0
         with _opened(self.path) as container:
-            stream = _picture_stream(container)
+            stream = _video_stream(container)
             stream.thread_type = "AUTO"
             start = stream.start_time or 0
             aspect = float(stream.sample_aspect_ratio or 1)
@@ -93,16 +106,17 @@ class Video:
             whole = float(stream.duration * stream.time_base) if stream.duration else 0.0
         if not self.decoded:
             raise Unusable(
-                "none of its pictures decodes: it is encrypted, or damaged"
+                "none of its frames decodes: it is encrypted, or damaged"
                 if self.damaged
-                else "it holds no pictures"
+                else "it holds no frames",
+                _COPY_OR_EXPORT,
             )
         self.missing_s = whole - last if whole - last > _LOST_SECONDS else 0.0
 
     def about_frames(self) -> int:
-        """How many frames the file announces; a guess, 0 where it says nothing."""
+        """The number of frames that the file announces, roughly; 0 if it announces none."""
         with _opened(self.path) as container:
-            stream = _picture_stream(container)
+            stream = _video_stream(container)
             seconds = stream.duration * stream.time_base if stream.duration else 0
             return stream.frames or round(float(seconds * (stream.average_rate or 0)))
 
@@ -125,31 +139,32 @@ class Video:
 
 
 def _opened(path: Path) -> Any:
-    """The container. Raises Unusable."""
+    """The PyAV container. Raises Unusable."""
     try:
         if path.stat().st_size == 0:
-            raise Unusable("the file is empty")
+            raise Unusable("the file is empty", _COPY_OR_EXPORT)
         limits = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
         return av.open(str(path), options=limits, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise Unusable(
             f"it does not open as a video ({reason}); a recording that was cut off may lack "
-            "its index"
+            "its index",
+            _COPY_OR_EXPORT,
         ) from error
 
 
-def _picture_stream(container: Any) -> Any:
-    """The first video stream that is no cover. Raises Unusable."""
+def _video_stream(container: Any) -> Any:
+    """The first video stream that is not a cover picture. Raises Unusable."""
     cover = av.stream.Disposition.attached_pic
     streams = [s for s in container.streams.video if not s.disposition & cover]
     if not streams:
-        raise Unusable("it holds no pictures, only sound or data")
+        raise Unusable("it holds no video, only sound or data", "Use a file with video")
     if streams[0].codec_context is None:
-        raise Unusable("its pictures are coded in a way that is not known here")
+        raise Unusable("its codec is not known here", "Export it as H.264 or HEVC")
     return streams[0]
 
 
 def _check_size(width: int, height: int) -> None:
     if not _SMALLEST_SIDE_PX <= min(width, height) <= max(width, height) <= _LARGEST_SIDE_PX:
-        raise Unusable(f"its pictures have {width} x {height} pixels")
+        raise Unusable(f"its frames have {width} x {height} pixels", "Export it in a usual size")

@@ -1,6 +1,7 @@
-"""Frames of video as 8-bit sRGB: matrix, range, primaries and high dynamic range.
+"""Converts video frames to 8-bit sRGB: matrix coefficients, range, primaries and HDR transfer.
 
-Code points are those of ITU-T H.273. What is not declared is taken as players take it.
+Code points are those of ITU-T H.273. Where a video declares none, the usual defaults of players
+apply.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.photos.colour import srgb_encoded
+
 _FULL_RANGE = 2
 _PQ, _HLG = 16, 18
 _BT2020, _P3 = 9, 12
-_KR_KB = {
+_KR_KB = {  # by MatrixCoefficients
     1: (0.2126, 0.0722),  # BT.709
     4: (0.30, 0.11),  # FCC
     5: (0.299, 0.114),  # BT.601
@@ -35,12 +38,14 @@ _TO_SRGB = {
     ),
 }  # fmt: skip
 _BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
-PEAK, WHITE = 1000.0, 203.0  # cd/m2: of HLG's display and of most PQ; reference white (BT.2408)
+# cd/m2. Peak of the HLG reference display and of most PQ video; HDR reference white (BT.2408).
+PEAK, WHITE = 1000.0, 203.0
 
 
 @dataclass(frozen=True)
 class Colours:
-    """What a video declares about its colours: code points."""
+    """The code points that a video declares: MatrixCoefficients, TransferCharacteristics,
+    ColourPrimaries, and FFmpeg's colour range."""
 
     matrix: int
     transfer: int
@@ -49,7 +54,7 @@ class Colours:
 
     @classmethod
     def of(cls, context: Any) -> Colours:
-        """As a PyAV codec context has them: not every version has them at frames."""
+        """From a PyAV codec context: not every version has them on frames."""
         return cls(
             int(context.colorspace),
             int(context.color_trc),
@@ -62,34 +67,34 @@ class Colours:
         return self.transfer in (_PQ, _HLG)
 
     @property
-    def words(self) -> str:
-        """How they come to sRGB."""
+    def conversion(self) -> str:
+        """How they are converted to sRGB, in words."""
         if self.hdr:
             return (
-                f"{'PQ' if self.transfer == _PQ else 'HLG'} (BT.2100) through the roll-off of "
-                f"BT.2390 from {PEAK:,.0f} to {WHITE:.0f} cd/m2, BT.2020 primaries to sRGB"
+                f"{'PQ' if self.transfer == _PQ else 'HLG'} (BT.2100), tone mapped as in BT.2390 "
+                f"from {PEAK:,.0f} to {WHITE:.0f} cd/m2, BT.2020 primaries to sRGB"
             )
         if self.primaries in _TO_SRGB:
             return {_BT2020: "BT.2020", _P3: "Display P3"}[self.primaries] + " to sRGB"
-        return "taken as sRGB"
+        return "read as sRGB"
 
 
 def srgb(frame: Any, colours: Colours, width: int, height: int) -> NDArray[np.uint8]:
-    """[height, width, 3] of a PyAV frame, scaled to that size."""
+    """A PyAV frame, scaled to [height, width, 3]."""
     encoded = _encoded_rgb(frame, colours, width, height)
     hdr = colours.hdr
     matrix = _TO_SRGB.get(_BT2020 if hdr else colours.primaries)
     if matrix is not None:
         for top in range(0, height, 256):  # strips: a float64 copy of it all would be large
             rows = np.clip(encoded[top : top + 256], 0.0, 1.0).astype(np.float64)
-            linear = _sdr_light(colours.transfer, rows) if hdr else rows**2.4
+            linear = _tone_mapped(colours.transfer, rows) if hdr else rows**2.4
             linear = np.clip(linear @ matrix.T, 0.0, 1.0)
-            encoded[top : top + 256] = _srgb_encoded(linear) if hdr else linear ** (1 / 2.4)
+            encoded[top : top + 256] = srgb_encoded(linear) if hdr else linear ** (1 / 2.4)
     return np.rint(np.clip(encoded, 0.0, 1.0) * 255).astype(np.uint8)
 
 
 def _encoded_rgb(frame: Any, colours: Colours, width: int, height: int) -> NDArray[np.float32]:
-    """[H, W, 3] R'G'B', nominally 0 to 1, whatever they mean."""
+    """[H, W, 3] non-linear R'G'B' in the video's own encoding, nominally 0 to 1."""
     name, bits = frame.format.name, frame.format.components[0].bits
     if not name.startswith(("yuv", "nv", "p0", "p2", "uyvy", "yuyv")):  # RGB, grey, a palette
         plain = frame.reformat(width, height, "rgb48le", interpolation="LANCZOS")
@@ -103,7 +108,7 @@ def _encoded_rgb(frame: Any, colours: Colours, width: int, height: int) -> NDArr
     top, grey = 256 * unit - 1, 128 * unit
     black, white, chroma = (0, top, top) if full else (16 * unit, 219 * unit, 224 * unit)
     luma, blueness, redness = (y - black) / white, (cb - grey) / chroma, (cr - grey) / chroma
-    kr, kb = _KR_KB.get(colours.matrix) or _KR_KB[_usual_matrix(frame, colours)]
+    kr, kb = _KR_KB.get(colours.matrix) or _KR_KB[_default_matrix(frame, colours)]
     red, blue = luma + 2 * (1 - kr) * redness, luma + 2 * (1 - kb) * blueness
     green = (luma - kr * red - kb * blue) / (1 - kr - kb)
     return np.stack([red, green, blue], axis=-1).astype(np.float32)
@@ -115,35 +120,35 @@ def _samples(plane: Any, kind: type) -> NDArray[np.float32]:
     return np.ascontiguousarray(rows).view(kind)[:, : plane.width].astype(np.float32)
 
 
-def _usual_matrix(frame: Any, colours: Colours) -> int:
+def _default_matrix(frame: Any, colours: Colours) -> int:
     if colours.hdr:
         return _BT2020
     return 1 if min(frame.width, frame.height) >= _HD_HEIGHT else 6
 
 
-def _sdr_light(transfer: int, signal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[..., 3] linear BT.2020 light of an SDR display, 1 its white, of an HDR signal [..., 3]."""
-    light = pq_light(signal) if transfer == _PQ else hlg_light(signal)
+def _tone_mapped(transfer: int, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[..., 3] linear BT.2020 of an SDR display, 1 its white, from an HDR signal [..., 3]."""
+    light = pq_eotf(signal) if transfer == _PQ else hlg_eotf(signal)
     brightest = light.max(axis=-1, keepdims=True)
-    return np.asarray(light * rolled_off(brightest) / np.maximum(brightest, 1e-6) / WHITE)
+    return np.asarray(light * eetf(brightest) / np.maximum(brightest, 1e-6) / WHITE)
 
 
-def pq_light(signal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cd/m2 of a PQ signal in 0..1 (SMPTE ST 2084)."""
+def pq_eotf(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """cd/m2 of a PQ signal in 0..1 (EOTF of SMPTE ST 2084)."""
     power = signal ** (32 / 2523)
     ratio = np.maximum(power - 3424 / 4096, 0.0) / (2413 / 128 - 2392 / 128 * power)
     return 10_000.0 * ratio ** (16384 / 2610)
 
 
-def _pq_signal(light: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pq_inverse_eotf(light: NDArray[np.float64]) -> NDArray[np.float64]:
     power = (light / 10_000.0) ** (2610 / 16384)
     return np.asarray(
         ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
     )
 
 
-def hlg_light(signal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[..., 3] cd/m2 that a display of 1,000 cd/m2 shows of an HLG signal in 0..1 (BT.2100)."""
+def hlg_eotf(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[..., 3] cd/m2 of an HLG signal in 0..1 on a display of 1,000 cd/m2 (EOTF of BT.2100)."""
     a = 0.17883277
     b, c = 1 - 4 * a, 0.5 - a * np.log(4 * a)
     scene = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
@@ -151,20 +156,17 @@ def hlg_light(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(PEAK * np.maximum(luminance, 0.0)[..., None] ** 0.2 * scene)
 
 
-def rolled_off(light: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cd/m2 up to `PEAK` brought below `WHITE`; what is dark stays (BT.2390, section 5.4.1)."""
-    peak, white = _pq_signal(np.array([PEAK, WHITE]))
-    signal = np.minimum(_pq_signal(light) / peak, 1.0)
+def eetf(light: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Tone mapping of cd/m2 from `PEAK` to `WHITE`, without change of dark colours: the EETF of
+    BT.2390, section 5.4.1, a Hermite spline above its knee."""
+    peak, white = _pq_inverse_eotf(np.array([PEAK, WHITE]))
+    signal = np.minimum(_pq_inverse_eotf(light) / peak, 1.0)
     most = white / peak
     knee = 1.5 * most - 0.5
     t = np.clip((signal - knee) / (1 - knee), 0.0, 1.0)
-    bent = (
+    spline = (
         (2 * t**3 - 3 * t**2 + 1) * knee
         + (t**3 - 2 * t**2 + t) * (1 - knee)
         + (3 * t**2 - 2 * t**3) * most
     )
-    return pq_light(np.where(signal < knee, signal, bent) * peak)
-
-
-def _srgb_encoded(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return pq_eotf(np.where(signal < knee, signal, spline) * peak)

@@ -1,4 +1,4 @@
-"""Photographs out of a video: it is read once to measure its frames and once to keep the chosen."""
+"""Photographs from a video. It is read twice: to measure all frames, and to keep those selected."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from stages.base.stage import Report
 from stages.base.text import counted
 from stages.photos.decode import Decoded
 from stages.photos.exif import Exif
-from stages.photos.find import Source
 from stages.photos.frame_selection import (
     BLURRED_BELOW,
+    MAX_FRAMES,
+    MAX_GAP,
     MEASURED_SIDE_PX,
-    MOST,
     STEP,
-    WIDEST_GAP,
-    Chosen,
-    Seen,
-    Watcher,
-    choose,
+    FrameMeter,
+    MeasuredFrame,
+    SelectedFrame,
+    select_frames,
 )
+from stages.photos.sources import Source
 from stages.photos.video import Video
 
 
 def photographs(
     source: Source, wanted: int, max_side: int, report: Report
 ) -> Iterator[tuple[str, Decoded]]:
-    """(name within the video, picture) of the chosen frames, at most `wanted`; 0: as the motion
-    asks. Which and why goes into the report's metric "videos".
+    """(name within the video, picture) of the selected frames, at most `wanted`; 0 selects by
+    motion. The report's metric "videos" says which frames were selected and why.
 
-    Raises Unusable for a file without pictures that decode, and Interrupted.
+    Raises Unusable for a file without frames that decode, and Interrupted.
     """
     video = Video(source.path)
     seen, colours = _measured(video, source.name, report)
-    chosen = choose(seen, wanted)
+    chosen = select_frames(seen, wanted)
     facts = _facts(source.name, video, seen, chosen, colours)
     report.metric("videos", [*report.metrics.get("videos", []), facts])
-    _tell(source.name, video, seen, chosen, colours, wanted == 0, report)
+    _warn(source.name, video, seen, chosen, colours, wanted == 0, report)
     numbers = {one.number for one in chosen}
     for frame in video.frames():
         if frame.number in numbers:
@@ -48,14 +48,14 @@ def photographs(
             return
 
 
-def _measured(video: Video, name: str, report: Report) -> tuple[list[Seen], str]:
-    """(every frame, how its colours come to sRGB)."""
-    watcher, seen, colours = Watcher(), [], ""
+def _measured(video: Video, name: str, report: Report) -> tuple[list[MeasuredFrame], str]:
+    """(measurements of every frame, how its colours are converted to sRGB)."""
+    meter, seen, colours = FrameMeter(), [], ""
     total = video.about_frames()
     for frame in video.frames():
-        _tick(report, frame.number, max(total, frame.number + 1), f"looking through {name}")
-        colours = frame.colours.words
-        seen.append(watcher.see(frame.grey(MEASURED_SIDE_PX), frame.seconds))
+        _tick(report, frame.number, max(total, frame.number + 1), f"measuring frames of {name}")
+        colours = frame.colours.conversion
+        seen.append(meter.measure(frame.grey(MEASURED_SIDE_PX), frame.seconds))
     return seen, colours
 
 
@@ -66,9 +66,9 @@ def _tick(report: Report, done: int, total: int, label: str) -> None:
 
 
 def _facts(
-    name: str, video: Video, seen: list[Seen], chosen: list[Chosen], colours: str
+    name: str, video: Video, seen: list[MeasuredFrame], chosen: list[SelectedFrame], colours: str
 ) -> dict[str, Any]:
-    """For the manifest: which frames and why."""
+    """For the manifest: which frames were selected, and why."""
     return {
         "name": name,
         "frames": len(seen),
@@ -76,18 +76,18 @@ def _facts(
         "damaged_packets": video.damaged,
         "missing_seconds": round(video.missing_s, 1),
         "colours": colours,
-        "chosen_by": f"the sharpest in each stretch of equal motion; a frame is blurred below "
-        f"{BLURRED_BELOW} of its neighbours' sharpness, and taken only where the picture would "
-        f"move by more than {WIDEST_GAP} of its longer side without it",
+        "chosen_by": f"the sharpest in each stretch of equal motion; a frame with less than "
+        f"{BLURRED_BELOW} of its neighbours' sharpness is blurred, and used only where the "
+        f"picture would otherwise move by more than {MAX_GAP} of its longer side",
         "chosen": [vars(one) for one in chosen],
     }
 
 
-def _tell(
+def _warn(
     name: str,
     video: Video,
-    seen: list[Seen],
-    chosen: list[Chosen],
+    seen: list[MeasuredFrame],
+    chosen: list[SelectedFrame],
     colours: str,
     automatic: bool,
     report: Report,
@@ -109,7 +109,7 @@ def _tell(
             f"{name} has no sharp frame near {at}. Move more slowly, with more light.",
         )
     moved = sum(one.moved for one in chosen)
-    if automatic and moved > 2 * STEP * MOST:
+    if automatic and moved > 2 * STEP * MAX_FRAMES:
         report.warn(
             "ingest-video-long",
             f"{name} moves so far that its {len(chosen)} frames are {moved / len(chosen):.2f} of a "

@@ -1,4 +1,4 @@
-"""Normalised pictures on disk."""
+"""Writes normalised pictures and masks."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _JPEG_QUALITY = 95
 
 
 def write_picture(path: Path, decoded: Decoded) -> None:
-    """Write the picture as the suffix of `path` says: JPEG (4:4:4) or PNG.
+    """Write the picture as JPEG (4:4:4) or PNG, by the suffix of `path`.
 
-    A JPEG that needed no change keeps its bytes: encoding it again would only lose detail. Raises
-    SplatError if the disk refuses.
+    A JPEG that needed no change keeps its bytes, because encoding it again would lose detail.
+    Raises SplatError if it cannot be written.
     """
     as_png = path.suffix.lower() == ".png"
-    data = None if as_png else decoded.as_it_was
+    data = None if as_png else decoded.unchanged_jpeg
     if data is None:
         encoded = io.BytesIO()
         picture = Image.fromarray(decoded.pixels)
@@ -36,7 +36,7 @@ def write_picture(path: Path, decoded: Decoded) -> None:
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
-    """Write a mask [H, W] as grey PNG. Raises SplatError if the disk refuses."""
+    """Write a mask [H, W] as grey PNG. Raises SplatError if it cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     encoded = io.BytesIO()
     Image.fromarray(mask).save(encoded, "PNG", compress_level=3)

@@ -1,4 +1,4 @@
-"""Kernels are compiled while photographs are read and placed, by a process beside the run."""
+"""Compiles kernels in a process beside the first stages, which do not draw."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from stages.base import threads
 from stages.base.stage import Stage
 from stages.run.pipeline import Listener
 
-_BEFORE = ("ingest", "sfm", "seed")  # stages that draw nothing
-_PATIENCE_S = 300.0
-_LAST = "gather_contributions"  # of the kernels, see `training.warm`
+_STAGES_WITHOUT_KERNELS = ("ingest", "sfm", "seed")
+_TIMEOUT_S = 300.0
+_LAST_KERNEL = "gather_contributions"  # compiled last, see `training.compile_kernels`
 
 
 class PrecompileListener(Listener):
-    """Starts the process with the first stage, and waits for it before anything is drawn: two
-    processes must not compile the same. Whatever becomes of it, the run goes on and compiles what
-    is missing. backend: that the run will train with.
+    """Starts the compiling process with the first stage and waits for it before the first stage
+    that draws, because two processes must not compile the same kernels.
 
-    Compiling takes one core for as long as 20 photographs are placed and seeded on the other; it is
-    as urgent as that, because training waits for both.
+    The run never depends on it: what the process did not compile is compiled later. It takes one
+    core for as long as 20 photographs take to register and seed on another core; it has the same
+    priority, because training waits for both.
+
+    backend: the backend that the run will train with.
     """
 
     def __init__(self, backend: str) -> None:
@@ -31,7 +33,7 @@ class PrecompileListener(Listener):
         self._process: subprocess.Popen[bytes] | None = None
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        if stage.name not in _BEFORE:
+        if stage.name not in _STAGES_WITHOUT_KERNELS:
             self._wait()
         elif self._process is None and threads.count() > 1:
             self._start()
@@ -45,17 +47,17 @@ class PrecompileListener(Listener):
         self._wait()
 
     def _start(self) -> None:
-        from stages.raster.kernels import cache  # which makes a folder
+        from stages.raster.kernels import cache  # importing it makes a folder
 
-        if cache.are_compiled(_LAST):
+        if cache.are_compiled(_LAST_KERNEL):
             return
-        root = str(Path(__file__).resolve().parents[1])
+        root = str(Path(__file__).resolve().parents[2])
         paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        with suppress(OSError):  # then training compiles, as it always could
+        with suppress(OSError):
             self._process = subprocess.Popen(
                 # -P: the current folder may hold anything, also a file named numpy.py.
                 [sys.executable, "-P", "-m", "stages.training.compile_kernels", self._backend],
-                stdin=subprocess.PIPE,  # it ends when this does
+                stdin=subprocess.PIPE,  # the process ends when this process does
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=os.environ | {"PYTHONPATH": paths},
@@ -67,7 +69,7 @@ class PrecompileListener(Listener):
         if process is None:
             return
         try:
-            process.wait(_PATIENCE_S)
+            process.wait(_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

@@ -10,10 +10,14 @@ from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
 from stages.scene import Capture
 from stages.structure.fallbacks import Attempt, best_attempt
-from stages.structure.gates import Thresholds, borderline_failures
+from stages.structure.gates import THRESHOLDS, borderline_failures
 from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PARTIAL_POINTS = 50
+_REPORTED = (
+    *("configuration", "keypoints_median", "mean_track_length"),
+    *("median_triangulation_angle_deg", "baseline_over_depth"),
+)
 _MOST_NAMES = 12  # photographs that a message names
 
 
@@ -22,7 +26,7 @@ def accepted_model(attempts: list[Attempt], capture: Capture, allow_partial: boo
     and the model has enough photographs and points."""
     best = best_attempt(attempts)
     model = best.result.model if best.result is not None else None
-    if model is not None and len(model.names) >= Thresholds().fewest_views:
+    if model is not None and len(model.names) >= THRESHOLDS.fewest_views:
         enough = len(model.points) >= _FEWEST_PARTIAL_POINTS
         if best.passed or (enough and allow_partial):
             return model
@@ -80,16 +84,11 @@ def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -
 
 def report_metrics(best: Attempt, model: SparseModel, report: Report) -> None:
     """The metrics of the attempt that is used, and of its `model`."""
-    statistics = best.statistics
-    report.metric("mean_track_length", round(statistics.mean_track_length, 3))
-    report.metric(
-        "median_triangulation_angle_deg", round(statistics.median_triangulation_angle_deg, 2)
-    )
-    report.metric("baseline_over_depth", round(statistics.baseline_over_depth, 4))
-    report.metric("keypoints_median", best.keypoints_median)
+    metrics = attempt_metrics(best)
+    for name in _REPORTED:
+        report.metric(name, metrics[name])
     report.metric("focal_px", [round(float(f), 2) for f in model.camera_params[:, 0]])
     report.metric("distortion", [round(float(k), 5) for k in model.camera_params[:, 3]])
-    report.metric("configuration", best.configuration.name)
     report.metric("pairs_matched", best.pairs_matched)
     report.metric("pairs_verified", best.pairs_verified)
 

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
+from zipfile import BadZipFile
 
 from stages.base.atomic import replacing
 from stages.base.stage import Report
@@ -224,7 +225,7 @@ def _is_mapped(out: Path) -> bool:
     """Whether an earlier run finished this mapping before its time limit."""
     try:
         return not load_result(out).timed_out
-    except (OSError, ValueError):
+    except (OSError, ValueError, BadZipFile):
         return False
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,32 +57,20 @@ def inlier_ratios(
     return ratios
 
 
-def likely_mistakes(poses: NDArray[np.float64]) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Common mistakes in camera files: (the mistake, the poses [V, 4, 4] corrected for it)."""
+def likely_mistakes(poses: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Common mistakes in camera files, each with the poses [V, 4, 4] corrected for it."""
     inverse = np.asarray(np.linalg.inv(poses), np.float64)
-    yield (
+    return {
         "y and z of each camera are negated: does the file have OpenGL's axes where OpenCV's are "
-        "expected, or the reverse?",
-        _OPENCV_FROM_OPENGL @ poses,
-    )
-    yield (
-        "each pose is inverted: does the file have camera to world instead of world to camera?",
-        inverse,
-    )
-    yield (
+        "expected, or the reverse?": _OPENCV_FROM_OPENGL @ poses,
+        "each pose is inverted: does the file have camera to world instead of world to "
+        "camera?": inverse,
         "each pose is inverted, and y and z are negated: does the file have OpenGL's camera to "
-        "world?",
-        _OPENCV_FROM_OPENGL @ inverse,
-    )
-    yield (
-        "each photograph has the camera after its own: are they in order?",
-        np.roll(poses, -1, axis=0),
-    )
-    yield (
-        "each photograph has the camera before its own: are they in order?",
-        np.roll(poses, 1, axis=0),
-    )
-    yield "the cameras are in the opposite order: are they in order?", poses[::-1]
+        "world?": _OPENCV_FROM_OPENGL @ inverse,
+        "each photograph has the camera after its own: are they in order?": np.roll(poses, -1, 0),
+        "each photograph has the camera before its own: are they in order?": np.roll(poses, 1, 0),
+        "the cameras are in the opposite order: are they in order?": poses[::-1],
+    }
 
 
 def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:

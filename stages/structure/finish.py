@@ -61,10 +61,7 @@ def finish(
     if scale is not None:
         poses, points = scale.poses(model.world_to_camera), scale.points(model.points)
         model = replace(model, world_to_camera=poses, points=points)
-        cameras = [
-            replace(camera, world_to_camera=pose)
-            for camera, pose in zip(cameras, poses, strict=True)
-        ]
+        cameras = scale.cameras(cameras)
     observed_px = np.empty_like(model.observed_px)
     camera_of = model.view_cameras[model.observing_views]
     for number in np.unique(model.view_cameras):

@@ -6,6 +6,7 @@ that the others miss."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import median
 
@@ -102,6 +103,9 @@ class Thresholds:
     same_position_share: float = 0.9
 
 
+THRESHOLDS = Thresholds()
+
+
 @dataclass(frozen=True)
 class Failure:
     """A gate that was not passed; the fields are those of `SplatError`."""
@@ -121,40 +125,28 @@ MOVE = (
     "another place, a step apart."
 )
 
-_STATIC = "Nothing may move between photographs, and no part of the scene may look like another."
-_REPEATED = (
-    "If the subject was turned or moved between photographs, put those before and those after into "
-    "folders of their own, or hide everything else by masks; if the same picture or pattern is "
-    "there twice, hide one of the two. If the arrangement is right all the same, --allow-partial "
-    "goes on with it."
-)
 
-
-def check_keypoints(counts: list[int], thresholds: Thresholds | None = None) -> list[Failure]:
+def check_keypoints(counts: list[int]) -> list[Failure]:
     """Before matching: does the median photograph have enough features?"""
-    thresholds = thresholds or Thresholds()
     typical = median(counts) if counts else 0
-    if typical >= thresholds.keypoints:
+    if typical >= THRESHOLDS.keypoints:
         return []
     return [
         Failure(
             "sfm-too-few-features",
             f"The median photograph has only {typical:.0f} features that can be matched.",
-            f"At least {thresholds.keypoints} are needed to find its camera pose.",
+            f"At least {THRESHOLDS.keypoints} are needed to find its camera pose.",
             "Check that the photographs are sharp and well lit, and that the subject is no blank "
             "or shiny surface; patterned paper or cloth in the scene helps.",
         )
     ]
 
 
-def check_pairs(
-    pairs: list[tuple[int, int, int, int]], photographs: int, thresholds: Thresholds | None = None
-) -> list[Failure]:
+def check_pairs(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[Failure]:
     """After matching: is the view graph connected, and did the camera move?
 
     pairs: (first, second, inliers, configuration) as `database.verified_pairs` gives them.
     """
-    thresholds = thresholds or Thresholds()
     if not pairs:
         return [
             Failure(
@@ -168,13 +160,11 @@ def check_pairs(
     # A pure rotation maps one picture to the next by a homography. COLMAP calls such a pair
     # panoramic if it also finds no translation; a flat scene alone (drones, walls) is planar.
     rotating = sum(config in (PANORAMIC, PLANAR_OR_PANORAMIC) for _, _, _, config in pairs)
-    if rotating >= thresholds.same_position_share * len(pairs):
+    if rotating >= THRESHOLDS.same_position_share * len(pairs):
         failures.append(_no_parallax("Nearly all pairs of photographs"))
     groups = connected_groups(pairs, photographs)
-    if len(groups[0]) < thresholds.registered_share * photographs:
-        others = [len(group) for group in groups[1:] if len(group) > 1]
-        single = sum(len(group) == 1 for group in groups)
-        failures.append(_separate(len(groups[0]), others, single, photographs))
+    if len(groups[0]) < THRESHOLDS.registered_share * photographs:
+        failures.append(_separate(groups, photographs))
     return failures
 
 
@@ -187,73 +177,60 @@ def connected_groups(pairs: list[tuple[int, int, int, int]], photographs: int) -
     return sorted(groups, key=lambda group: (-len(group), group))
 
 
-def check_model(model: ModelStatistics, thresholds: Thresholds | None = None) -> list[Failure]:
+def check_model(model: ModelStatistics) -> list[Failure]:
     """After mapping: every gate that the largest model fails, the most serious first."""
-    thresholds = thresholds or Thresholds()
     if model.timed_out:
         return [_timed_out(model)]
     if model.models and not model.points:
         # Photographs were registered, but all points were dropped because their rays are parallel.
         return [_no_parallax("No depth could be measured: photographs")]
-    if model.registered < thresholds.fewest_views or not model.points:
+    if model.registered < THRESHOLDS.fewest_views or not model.points:
         return [_no_model(model)]
     checks = (_check_geometry, _check_camera, _check_registered, _check_support, _check_consistency)
-    return [failure for check in checks for failure in check(model, thresholds)]
+    return [failure for check in checks for failure in check(model, THRESHOLDS)]
 
 
 def borderline_failures(model: ModelStatistics) -> list[Failure]:
     """Failures of stricter thresholds, which deserve a warning but do not refuse a model."""
-    return _check_consistency(model, Thresholds(inconsistent_share=0.02, cut_points=100))
+    return list(_check_consistency(model, Thresholds(inconsistent_share=0.02, cut_points=100)))
 
 
-def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
+def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
     angle, baseline = model.median_triangulation_angle_deg, model.baseline_over_depth
     if angle < thresholds.triangulation_angle_deg:
-        return [_no_parallax(f"The median triangulation angle is {angle:.1f} degrees: photographs")]
-    if baseline < thresholds.baseline_over_depth:
-        return [
-            _no_parallax(
-                f"The cameras moved by {baseline:.3f} of their distance to the scene: photographs"
-            )
-        ]
-    return []
+        yield _no_parallax(f"The median triangulation angle is {angle:.1f} degrees: photographs")
+    elif baseline < thresholds.baseline_over_depth:
+        yield _no_parallax(
+            f"The cameras moved by {baseline:.3f} of their distance to the scene: photographs"
+        )
 
 
-def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
-    failures = []
+def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
     hint = (
         "Look for something that stays in the same place of every picture (a date stamp, a frame, "
         "a dirty lens) and crop it away; and do not mix zoom settings."
     )
     if abs(model.distortion) > thresholds.distortion:
-        failures.append(
-            Failure(
-                "sfm-implausible-distortion",
-                f"The radial distortion of the lens was estimated as k = {model.distortion:.2f}.",
-                f"Lenses have |k| below {thresholds.distortion:g}.",
-                hint,
-            )
+        yield Failure(
+            "sfm-implausible-distortion",
+            f"The radial distortion of the lens was estimated as k = {model.distortion:.2f}.",
+            f"Lenses have |k| below {thresholds.distortion:g}.",
+            hint,
         )
     ratio = model.focal_over_prior
     if ratio is not None and not 1 / thresholds.focal_ratio <= ratio <= thresholds.focal_ratio:
-        failures.append(
-            Failure(
-                "sfm-implausible-focal",
-                f"The focal length was estimated as {ratio:.2f} times that in EXIF.",
-                f"It should lie within a factor of {thresholds.focal_ratio:g}.",
-                hint,
-            )
+        yield Failure(
+            "sfm-implausible-focal",
+            f"The focal length was estimated as {ratio:.2f} times what the photographs' EXIF says.",
+            f"It should lie within a factor of {thresholds.focal_ratio:g}.",
+            hint,
         )
-    return failures
 
 
-def _check_registered(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
-    share = model.registered / max(1, model.photographs)
-    if share >= thresholds.registered_share:
-        return []
-    others = f" ({len(model.models)} separate models)" if len(model.models) > 1 else ""
-    return [
-        Failure(
+def _check_registered(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
+    if model.registered < thresholds.registered_share * max(1, model.photographs):
+        others = f" ({len(model.models)} separate models)" if len(model.models) > 1 else ""
+        yield Failure(
             "sfm-too-few-registered",
             f"Only {model.registered} of {model.photographs} photographs could be "
             f"registered in one model{others}.",
@@ -261,97 +238,82 @@ def _check_registered(model: ModelStatistics, thresholds: Thresholds) -> list[Fa
             MORE_OVERLAP + " If the folder holds several scenes, put each into a folder of its "
             "own. --allow-partial goes on with the largest model.",
         )
-    ]
 
 
-def _check_support(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
+def _check_support(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
     """Are there enough points, with long enough tracks and small enough errors?"""
-    failures = []
-    texture = "Add texture to blank surfaces (patterned paper, cloth), and take more photographs."
     if model.points < thresholds.points_per_view * model.registered:
-        failures.append(
-            Failure(
-                "sfm-too-few-points",
-                f"Only {counted(model.points, 'point')} could be triangulated from "
-                f"{counted(model.registered, 'photograph')}.",
-                f"At least {thresholds.points_per_view} for each photograph are needed.",
-                texture,
-            )
+        yield Failure(
+            "sfm-too-few-points",
+            f"Only {counted(model.points, 'point')} could be triangulated from "
+            f"{counted(model.registered, 'photograph')}.",
+            f"At least {thresholds.points_per_view} for each photograph are needed.",
+            "Add texture to blank surfaces (patterned paper, cloth), and take more photographs.",
         )
     if model.weak_photographs > thresholds.weak_share * model.registered:
-        failures.append(
-            Failure(
-                "sfm-weak-photographs",
-                f"{model.weak_photographs} of {model.registered} photographs observe fewer "
-                "than 30 points.",
-                f"At most {thresholds.weak_share:.0%} of them may.",
-                MORE_OVERLAP,
-            )
+        yield Failure(
+            "sfm-weak-photographs",
+            f"{model.weak_photographs} of {model.registered} photographs observe fewer than 30 "
+            "points.",
+            f"At most {thresholds.weak_share:.0%} of them may.",
+            MORE_OVERLAP,
         )
     if model.mean_track_length < thresholds.track_length:
-        failures.append(
-            Failure(
-                "sfm-short-tracks",
-                f"A point is observed in {model.mean_track_length:.2f} photographs on average.",
-                f"At least {thresholds.track_length} are needed.",
-                MORE_OVERLAP,
-            )
+        yield Failure(
+            "sfm-short-tracks",
+            f"A point is observed in {model.mean_track_length:.2f} photographs on average.",
+            f"At least {thresholds.track_length} are needed.",
+            MORE_OVERLAP,
         )
-    largest = max(
-        thresholds.error_floor_px, thresholds.error_share_of_long_side * model.long_side_px
-    )
+    relative = thresholds.error_share_of_long_side * model.long_side_px
+    largest = max(thresholds.error_floor_px, relative)
     if not model.mean_reprojection_error_px <= largest:
-        failures.append(
-            Failure(
-                "sfm-high-error",
-                f"The mean reprojection error is {model.mean_reprojection_error_px:.2f} px.",
-                f"It may be {largest:.2f} px at most.",
-                "The scene must stand still while it is photographed, and the photographs must be "
-                "sharp; leave out moving things and stabilised video.",
-            )
+        yield Failure(
+            "sfm-high-error",
+            f"The mean reprojection error is {model.mean_reprojection_error_px:.2f} px.",
+            f"It may be {largest:.2f} px at most.",
+            "The scene must stand still while it is photographed, and the photographs must be "
+            "sharp; leave out moving things and stabilised video.",
         )
-    return failures
 
 
-def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> list[Failure]:
+def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
     """Do the verified pairs fit the model, and are its parts well connected?"""
-    failures = []
     bad, checked = model.pairs_inconsistent, model.pairs_checked
     if bad >= thresholds.fewest_inconsistent and bad > thresholds.inconsistent_share * checked:
-        failures.append(
-            Failure(
-                "sfm-contradictions",
-                f"The matches of {bad} of {checked} pairs of photographs "
-                f"({' and '.join(model.inconsistent_pair)}, for example) contradict the camera "
-                "poses found.",
-                _STATIC,
-                _REPEATED,
-            )
+        yield _contradiction(
+            f"The matches of {bad} of {checked} pairs of photographs "
+            f"({' and '.join(model.inconsistent_pair)}, for example) contradict the camera poses "
+            "found."
         )
     if model.rotation_to_other_deg > thresholds.rotation_to_other_deg:
-        failures.append(
-            Failure(
-                "sfm-contradictions",
-                "Some photographs are in two models, whose relative rotations differ by "
-                f"{model.rotation_to_other_deg:.0f} degrees.",
-                _STATIC,
-                _REPEATED,
-            )
+        yield _contradiction(
+            "Some photographs are in two models, whose relative rotations differ by "
+            f"{model.rotation_to_other_deg:.0f} degrees."
         )
     # The global mapper registers every photograph; without common points such a pose is a guess.
     least = thresholds.cut_points_global if model.mapper == "global" else thresholds.cut_points
     if model.cut_views and model.cut_points < least:
-        failures.append(
-            Failure(
-                "sfm-weak-link",
-                f"{model.cut_views} of {model.registered} photographs share only "
-                f"{counted(model.cut_points, 'point')} with the others, too few to know where "
-                "they belong.",
-                f"At least {least} points must be observed in both parts.",
-                MORE_OVERLAP,
-            )
+        yield Failure(
+            "sfm-weak-link",
+            f"{model.cut_views} of {model.registered} photographs share only "
+            f"{counted(model.cut_points, 'point')} with the others, too few to know where they "
+            "belong.",
+            f"At least {least} points must be observed in both parts.",
+            MORE_OVERLAP,
         )
-    return failures
+
+
+def _contradiction(given: str) -> Failure:
+    return Failure(
+        "sfm-contradictions",
+        given,
+        "Nothing may move between photographs, and no part of the scene may look like another.",
+        "If the subject was turned or moved between photographs, put those before and those after "
+        "into folders of their own, or hide everything else by masks; if the same picture or "
+        "pattern is there twice, hide one of the two. If the poses are right all the same, "
+        "--allow-partial goes on with them.",
+    )
 
 
 def _no_parallax(what: str) -> Failure:
@@ -363,13 +325,15 @@ def _no_parallax(what: str) -> Failure:
     )
 
 
-def _separate(largest: int, others: list[int], single: int, photographs: int) -> Failure:
-    parts = [str(largest), *map(str, others[:5])]
+def _separate(groups: list[list[int]], photographs: int) -> Failure:
+    single = sum(len(group) == 1 for group in groups)
+    parts = [str(len(group)) for group in groups if len(group) > 1 or group is groups[0]]
     match = "matches" if single == 1 else "match"
     alone = f", and {counted(single, 'photograph')} {match} no other" if single else ""
     return Failure(
         "sfm-separate-groups",
-        f"The {photographs} photographs fall into unconnected groups of {', '.join(parts)}{alone}.",
+        f"The {photographs} photographs fall into unconnected groups of "
+        f"{', '.join(parts[:6])}{alone}.",
         "All must show the same scene with overlap.",
         "Put each scene into a folder of its own, or add photographs that connect the groups. "
         "--allow-partial goes on with the largest group.",
@@ -377,14 +341,11 @@ def _separate(largest: int, others: list[int], single: int, photographs: int) ->
 
 
 def _no_model(model: ModelStatistics) -> Failure:
+    found = f" ({model.registered} were, with {counted(model.points, 'point')})"
     return Failure(
         "sfm-no-model",
         f"The {model.photographs} photographs could not be registered"
-        + (
-            f" ({model.registered} were, with {counted(model.points, 'point')})."
-            if model.registered
-            else "."
-        ),
+        f"{found if model.registered else ''}.",
         "At least 3 photographs must show the same points from different places.",
         f"{MOVE} {MORE_OVERLAP}",
     )

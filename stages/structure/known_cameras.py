@@ -78,8 +78,7 @@ def reconstruct(
     if len(posed) < 3:
         raise _too_few(len(posed))
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
-    photos = [one.photo for one in posed]
-    taken, lenses = [one.camera for one in posed], [one.lens for one in posed]
+    photos, taken, lenses = zip(*((p.photo, p.camera, p.lens) for p in posed), strict=True)
     cameras, share = write_undistorted_images(photos, taken, lenses, capture.folder, folder, report)
     _report_lost_area(1.0 - share, report)
     training = [i for i, one in enumerate(posed) if one.role != "test"]
@@ -94,12 +93,22 @@ def reconstruct(
     cloud, observations = find_points(
         from_file, triangulated, training, photos, cameras, folder, seed, report
     )
-    if found.ground.metres and not known_scale.metres_per_unit:
+    if found.georeference.metres_per_unit and not known_scale.metres_per_unit:
         known_scale = replace(
-            known_scale, metres_per_unit=found.ground.metres, source=found.ground.said_by
+            known_scale,
+            metres_per_unit=found.georeference.metres_per_unit,
+            source=found.georeference.source,
         )
     return _finish(
-        posed, cameras, cloud, observations, folder, report, known_scale, capture, found.ground.axes
+        posed,
+        cameras,
+        cloud,
+        observations,
+        folder,
+        report,
+        known_scale,
+        capture,
+        found.georeference.axes,
     )
 
 
@@ -264,7 +273,7 @@ def _finish(
     capture: Capture,
     axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
-    """Level, recentre and scale; write the COLMAP model. axes: as in `Ground`."""
+    """Level, recentre and scale; write the COLMAP model. axes: as in `Georeference`."""
     turn, levelled = _levelling(cameras, axes)
     middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
     world_from_new = np.eye(4)
@@ -275,12 +284,7 @@ def _finish(
     pictures = [folder / IMAGES / one.photo.picture for one in posed]
     scale = find_metric_scale(known_scale, capture, names, cameras, pictures, levelled, report)
     if scale is not None:
-        poses = np.array([camera.world_to_camera for camera in cameras])
-        points, poses = scale.points(points), scale.poses(poses)
-        cameras = [
-            replace(camera, world_to_camera=pose)
-            for camera, pose in zip(cameras, poses, strict=True)
-        ]
+        points, cameras = scale.points(points), scale.cameras(cameras)
         world_from_new[:3, :3] = world_from_new[:3, :3] @ scale.turn.T / scale.metres
     report.metric("file_from_world", world_from_new.tolist())
     return write_reconstruction(

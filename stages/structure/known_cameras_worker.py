@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stages.scene.similarity import similarity
 from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
 from stages.structure.job import Job, known_cameras_path
-from stages.structure.mapping import observations
+from stages.structure.mapping import point_arrays
 from stages.structure.matching import match_pairs
 from stages.structure.sparse_model import camera_centres
 
@@ -54,7 +54,7 @@ def triangulate(job: Job) -> None:
         "rough": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
         "mistakes": {
             name: median_inlier_ratio(pairs, lens, corrected, side)
-            for name, corrected in likely_mistakes(poses)
+            for name, corrected in likely_mistakes(poses).items()
         },
     }
     if job.refine:
@@ -154,14 +154,6 @@ def _triangulated(
 
 
 def _save_points(model: pycolmap.Reconstruction, poses: NDArray[np.float64], path: Path) -> None:
-    ids = sorted(model.point3D_ids())
-    points = [model.points3D[i] for i in ids]
-    position = {image_id: image_id - 1 for image_id in sorted(model.reg_image_ids())}
-    np.savez(
-        path,
-        points=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        colours=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        errors_px=np.array([point.error for point in points], np.float64),
-        world_to_camera=poses,
-        **observations(model, points, position),  # type: ignore[arg-type]
-    )
+    arrays = point_arrays(model, {i: i - 1 for i in sorted(model.reg_image_ids())})
+    errors = [model.points3D[i].error for i in sorted(model.point3D_ids())]
+    np.savez(path, **arrays, errors_px=np.array(errors, np.float64), world_to_camera=poses)  # type: ignore[arg-type]

@@ -164,8 +164,6 @@ def _sparse_model(
     """
     image_ids = sorted(model.reg_image_ids())
     position = {image_id: i for i, image_id in enumerate(image_ids)}
-    point_ids = sorted(model.point3D_ids())
-    points = [model.points3D[point_id] for point_id in point_ids]
     rotations = [_rotation_between(model, other) for other in others if _credible(other, model)]
     cameras = [
         model.cameras[camera_id + 1]
@@ -184,9 +182,7 @@ def _sparse_model(
         focal_priors_px=np.array(
             [job.cameras[c.camera_id - 1].focal_px or np.nan for c in cameras], np.float64
         ),
-        points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
-        colours=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-        **observations(model, points, position),
+        **point_arrays(model, position),
         **_pair_inlier_ratios(job, model, position),
         rotations_to_others_deg=np.array([r for r in rotations if r is not None], np.float64),
     )
@@ -221,13 +217,10 @@ def _matrix(pose: Any) -> np.ndarray:
     return matrix
 
 
-def observations(
-    model: pycolmap.Reconstruction, points: list[Any], position: dict[int, int]
-) -> dict[str, np.ndarray]:
-    """Observations of `points` as in `SparseModel`: observed_points, observing_views, observed_px.
-
-    position: index of each registered photograph by image id.
-    """
+def point_arrays(model: pycolmap.Reconstruction, position: dict[int, int]) -> dict[str, np.ndarray]:
+    """points, colours, observed_points, observing_views and observed_px as in `SparseModel`, points
+    in order of their ids. position: index of each registered photograph by image id."""
+    points = [model.points3D[point_id] for point_id in sorted(model.point3D_ids())]
     keypoints = {i: model.images[i].points2D for i in position}
     rows = []
     for number, point in enumerate(points):
@@ -237,6 +230,8 @@ def observations(
     rows.sort()
     table = np.array(rows, np.float64).reshape(-1, 4)
     return {
+        "points": np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        "colours": np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         "observed_points": table[:, 0].astype(np.int32),
         "observing_views": table[:, 1].astype(np.int32),
         "observed_px": table[:, 2:],

@@ -13,7 +13,7 @@ from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import Lens
-from stages.photos.find import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
+from stages.photos.sources import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
 from stages.scene import Camera, Capture, Photo, View
 
 _MOST_NAMES = 6  # in a message

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +65,11 @@ class MetricScale:
         moved[:, :3, :3] = moved[:, :3, :3] @ self.turn.T
         moved[:, :3, 3] *= self.metres
         return moved
+
+    def cameras(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """The cameras in the new world."""
+        poses = self.poses(np.array([camera.world_to_camera for camera in cameras]))
+        return [replace(c, world_to_camera=pose) for c, pose in zip(cameras, poses, strict=True)]
 
     def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """[P, 3] the points in the new world."""

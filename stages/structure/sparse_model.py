@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure.gates import ModelStatistics, Thresholds
+from stages.structure.gates import THRESHOLDS, ModelStatistics
 from stages.structure.view_graph import weakest_cut
 
 _SAMPLED_POINTS = 4000  # every pair of rays of a point is compared, so a sample must do
@@ -97,48 +97,34 @@ def save_model(
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    if model is not None:
-        for field in fields(model):
-            if field.name != "names":
-                np.save(partial / f"{field.name}.npy", getattr(model, field.name))
-    result = {
-        "names": None if model is None else list(model.names),
-        "groups": groups,
-        "timed_out": timed_out,
-    }
+    arrays = {} if model is None else vars(model) | {"names": np.array(model.names)}
+    np.savez(partial / "model.npz", **arrays)
+    result = {"groups": groups, "timed_out": timed_out}
     (partial / "result.json").write_text(json.dumps(result), encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(partial, folder)
 
 
 def load_result(folder: Path) -> MappingResult:
-    """What `save_model` wrote. Raises OSError or ValueError if it is missing or damaged."""
+    """What `save_model` wrote. Raises OSError, ValueError or BadZipFile if it is missing
+    or damaged."""
     result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    model = None
-    if result["names"] is not None:
-        arrays = {
-            field.name: np.load(folder / f"{field.name}.npy", allow_pickle=False)
-            for field in fields(SparseModel)
-            if field.name != "names"
-        }
-        model = SparseModel(names=tuple(result["names"]), **arrays)
+    arrays = dict(np.load(folder / "model.npz"))
+    model = SparseModel(**arrays | {"names": tuple(arrays["names"].tolist())}) if arrays else None
     groups = tuple(tuple(group) for group in result["groups"])
     return MappingResult(model=model, groups=groups, timed_out=bool(result["timed_out"]))
 
 
-def without_implausible_views(
-    model: SparseModel, thresholds: Thresholds | None = None
-) -> SparseModel:
+def without_implausible_views(model: SparseModel) -> SparseModel:
     """The model without photographs whose poses are unreliable: those that observe fewer than 15
     points, and those with implausible intrinsics. The latter stay if they are more than a tenth:
     then the whole model is implausible, and the gates must refuse it."""
-    thresholds = thresholds or Thresholds()
     seen = np.bincount(model.observing_views, minlength=len(model.names))
     keep = seen >= FEWEST_OBSERVATIONS
     with np.errstate(invalid="ignore"):
         zoom = np.abs(np.log(model.camera_params[:, 0] / model.focal_priors_px))
-        implausible = (np.abs(model.camera_params[:, 3]) > thresholds.distortion) | (
-            zoom > np.log(thresholds.focal_ratio)
+        implausible = (np.abs(model.camera_params[:, 3]) > THRESHOLDS.distortion) | (
+            zoom > np.log(THRESHOLDS.focal_ratio)
         )
     views = implausible[model.view_cameras]
     if views.mean() <= IMPLAUSIBLE_SHARE:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 _SMALLEST_PART = 0.1  # of the photographs; a few outer ones may be weakly connected
 
@@ -57,10 +57,10 @@ def _shared(
     points: NDArray[np.integer], views: NDArray[np.integer], photographs: int
 ) -> NDArray[np.float64]:
     """[V, V] number of points that two photographs both observe."""
-    shared = np.zeros((photographs, photographs))
-    starts = np.flatnonzero(np.diff(points, prepend=-1, append=-1))
-    for start, end in pairwise(starts.tolist()):
-        mine = views[start:end]
-        shared[mine[:, None], mine] += 1.0
+    shape = (photographs, int(points.max(initial=-1)) + 1)
+    observes = csr_array((np.ones(len(points), np.bool_), (views, points)), shape).astype(
+        np.float64
+    )
+    shared = np.asarray((observes @ observes.T).todense())
     np.fill_diagonal(shared, 0.0)
     return shared

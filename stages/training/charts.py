@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ def contact_sheet(
         temporary.write_text("".join(legend), encoding="utf-8")
 
 
-def training_plot(path: Path, history: list[dict[str, Any]]) -> None:
+def training_plot(path: Path, history: Sequence[dict[str, Any]]) -> None:
     """A PNG of held-out PSNR (dB) and number of splats over the steps; none without two figures."""
     from stages.measure.plots import BLUE, ORANGE, new_plot, write_plot
 

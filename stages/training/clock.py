@@ -1,4 +1,4 @@
-"""Time that training took, over interruptions."""
+"""Time that training took, summed over interruptions."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class Elapsed:
 
 
 class Clock:
-    """Runs from when it is made, on top of what was spent before."""
+    """Measures time from its creation on, added to what earlier processes took."""
 
     def __init__(self, before: Elapsed | None = None) -> None:
         self._before = before or Elapsed()
         self._wall, self._cpu = time.monotonic(), time.process_time()
 
-    def spent(self) -> Elapsed:
+    def elapsed(self) -> Elapsed:
         return Elapsed(
             self._before.seconds + time.monotonic() - self._wall,
             self._before.cpu_seconds + time.process_time() - self._cpu,

@@ -32,7 +32,7 @@ class FreeSpace:
     cameras: tuple[Camera, ...]
     depths: tuple[NDArray[np.float64], ...]
 
-    def holds(self, means: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def contains(self, means: NDArray[np.floating]) -> NDArray[np.bool_]:
         """[N] which of these places [N, 3] at least WITNESSES and fewer than ENOUGH photographs
         look past, at something twice as far away, while none has a surface there."""
         passed = np.zeros(len(means), np.int32)

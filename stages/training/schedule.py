@@ -12,7 +12,7 @@ MEANS_LR = 1.6e-4  # x scene extent
 MEANS_LR_END = 0.01  # of the first
 DENSIFICATION_END = 0.5  # share of the run in which the model grows
 BOOST_POWER, BOOST_MAX = 0.6, 6.0
-SETTLE_FROM, SETTLE_TO = 0.6, 0.1  # share of the run; share of the rate at its end
+RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1  # share of the run; share of the rate at its end
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer do not see enough of the scene to judge a splat by
 # (share of the run, scale of the picture): coarse pictures first, they are cheap and smooth
 RESOLUTIONS = ((0.2, 0.5), (1.0, 1.0))
@@ -78,9 +78,9 @@ class Schedule:
         return float(MEANS_LR * self.extent * self.boost * decay)
 
     def rate_factor(self, step: int) -> float:
-        """What all other rates are multiplied by: the boost, and a settling at the end."""
-        settling = max(0.0, (self.share(step) - SETTLE_FROM) / (1.0 - SETTLE_FROM))
-        return float(self.boost * SETTLE_TO**settling)
+        """What all other rates are multiplied by: the boost, and a decay at the end."""
+        decay = max(0.0, (self.share(step) - RATE_DECAY_FROM) / (1.0 - RATE_DECAY_FROM))
+        return float(self.boost * RATE_DECAY_END**decay)
 
     def active_sh_degree(self, step: int) -> int:
         """One degree more every 1000 steps of the recipe."""
@@ -99,7 +99,7 @@ class Schedule:
         share = min(1.0, self.share(step + 1) / DENSIFICATION_END)
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
-    def prunes_giants(self, step: int) -> bool:
+    def removes_giants(self, step: int) -> bool:
         return self.share(step) >= 3000 / RECIPE_STEPS
 
     def level(self, step: int) -> int:
@@ -118,7 +118,7 @@ class Schedule:
         red, green, blue = np.random.default_rng([self.seed, 3, step]).random(3)
         return float(red), float(green), float(blue)
 
-    def key(self, step: int) -> int:
+    def dropout_key(self, step: int) -> int:
         """32 random bits, for numbers that a device makes by itself."""
         return int(np.random.default_rng([self.seed, 4, step]).integers(1 << 32))
 

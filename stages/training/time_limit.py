@@ -1,32 +1,56 @@
-"""How many steps fit into a time."""
+"""A limit of wall time: how many steps fit into it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-PLANS = 50  # times, at most, that a run with a time limit is planned anew
-PLAN_STEPS = 10  # fewer do not show a pace
+if TYPE_CHECKING:
+    from stages.training.trainer import Trainer
+
+PLANS = 50  # plans of a run, at most
+PLAN_STEPS = 10  # fewer do not show how long a step takes
+# The final evaluation with FLIP and the writing of results, in durations of one evaluation.
+FINAL_EVALUATION = 8.0
 
 
 @dataclass
 class TimeLimit:
-    """Keeps a run within `seconds` of wall time, of which `reserve` are wanted after the last step.
-    Each plan asks how long a step takes since the last one, so it follows pictures that become
-    larger, splats that become more, and a machine that is needed elsewhere. The first steps, in
-    which kernels are compiled, tell nothing."""
+    """Keeps a run within `seconds` of wall time by changing its number of steps.
+
+    Each plan measures how long a step took since the last plan, so it follows larger images, more
+    splats and other load on the machine. The first step, in which kernels are compiled, is left
+    out.
+
+    Args:
+        seconds: the limit; 0 for none.
+        reserve: seconds of it that are kept for what follows the last step.
+    """
 
     seconds: float
     reserve: float = 0.0
     _last: tuple[int, float] | None = None
 
-    def steps(self, step: int, spent: float) -> int | None:
-        """Steps in all that fit, when `step` are done after `spent` seconds; None: no new plan."""
+    def steps(self, step: int, elapsed: float) -> int | None:
+        """How many steps in all fit, if `step` steps took `elapsed` seconds; None for no new
+        plan."""
         if self._last is None:
-            self._last = step, spent
+            self._last = step, elapsed
             return None
-        since, lasted = step - self._last[0], spent - self._last[1]
-        if since < PLAN_STEPS or lasted < self.seconds / PLANS:
+        steps, seconds = step - self._last[0], elapsed - self._last[1]
+        if steps < PLAN_STEPS or seconds < self.seconds / PLANS:
             return None
-        self._last = step, spent
-        left = self.seconds - self.reserve - spent
-        return step + max(1, int(left * since / lasted))
+        self._last = step, elapsed
+        left = self.seconds - self.reserve - elapsed
+        return step + max(1, int(left * steps / seconds))
+
+    def reserve_for_end(self, evaluation_seconds: float) -> None:
+        """Keep time for the end of a run in which one evaluation took so long."""
+        self.reserve = FINAL_EVALUATION * evaluation_seconds
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        """See `hooks.StepHook`."""
+        if not self.seconds or step == trainer.schedule.steps:
+            return
+        if steps := self.steps(step, trainer.clock.elapsed().seconds):
+            trainer.schedule = trainer.schedule.replanned(step, steps)

@@ -14,8 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from stages.measure.image_metrics import psnr
 from stages.training.schedule import Schedule
+from stages.training.target import target_of
+
+if TYPE_CHECKING:
+    from stages.training.trainer import Trainer
 
 DROPOUT_BELOW = 15  # training views
 MAX_VALIDATION_VIEWS = 4  # more of them would be missed more than their advice is worth
@@ -48,8 +56,8 @@ class EarlyStopping:
         stopped_at: number of steps after which densification was stopped; 0 if it was not.
     """
 
-    patience_db: float
-    rows: tuple[int, ...]
+    patience_db: float = 0.0
+    rows: tuple[int, ...] = ()
     best_db: list[float] = field(default_factory=list)
     stopped_at: int = 0
 
@@ -67,3 +75,17 @@ class EarlyStopping:
             return schedule
         self.stopped_at = step
         return schedule.without_densification(step)
+
+    def after_step(self, trainer: Trainer, step: int) -> None:
+        """See `hooks.StepHook`."""
+        trainer.schedule = self.next_schedule(
+            trainer.schedule, step, lambda row: view_psnr_db(trainer, row)
+        )
+
+
+def view_psnr_db(trainer: Trainer, row: int) -> float:
+    """PSNR of a training view with the current model, at full size."""
+    level = trainer.train[row].levels[-1]
+    image = np.clip(trainer.render(level.camera), 0.0, 1.0).transpose(2, 0, 1)
+    target = target_of(level, image, (trainer.draw_settings.background,) * 3)
+    return psnr(image, np.asarray(target, np.float32) / (255 if level.plain else 1))

@@ -57,10 +57,10 @@ class TrainingView:
     name: str
     levels: Sequence[Level]
 
-    def expect(self, level: int) -> None:
-        """That level is wanted soon."""
+    def prefetch(self, level: int) -> None:
+        """Announce that a level is needed soon."""
         if isinstance(self.levels, _Stored):
-            self.levels.expect(level)
+            self.levels.prefetch(level)
 
 
 class _Stored(Sequence[Level]):
@@ -75,7 +75,7 @@ class _Stored(Sequence[Level]):
         bare = replace(level, pixels=np.zeros((3, 0, 0), np.uint8), mask=None)
         self._known.append((bare, self._album.add(level.pixels), mask))
 
-    def expect(self, level: int) -> None:
+    def prefetch(self, level: int) -> None:
         self._album.expect(self._known[level][1])
 
     def __len__(self) -> int:

@@ -1,7 +1,7 @@
-"""Pictures of work in progress, for whoever asks, drawn by the thread that does the work.
+"""Frames of a training scene on request, drawn by the training thread itself.
 
-Whoever asks waits in a thread of their own; the worker never waits for anybody. It draws between
-two of its steps, where nothing changes under the kernels, one picture at a time.
+Requests wait in threads of their own; the training thread never waits. It draws between two steps,
+where no kernel is running, one frame at a time.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from stages.base.stage import DrawView
 from stages.scene import Camera
 
-SHARE = 0.2  # of the worker's time, at most, goes into pictures
-LOOKING_S = 5.0  # how long after a sign of life somebody is taken to be there still
+LARGEST_SHARE = 0.2  # of the training thread's time that goes into frames
+WATCHED_FOR_S = 5.0  # after the last request a viewer is taken to be still there
 
 
 @dataclass(frozen=True)
-class Picture:
-    """pixels [H, W, 3] sRGB, after `step` steps. seconds: what drawing it took of the work."""
+class Frame:
+    """pixels [H, W, 3] uint8 sRGB, after `step` steps. seconds: what drawing it took."""
 
     pixels: NDArray[np.uint8]
     step: int
@@ -32,80 +32,80 @@ class Picture:
 
 
 @dataclass
-class _Wish:
+class _Request:
     camera: Camera
     answered: threading.Event = field(default_factory=threading.Event)
-    picture: Picture | None = None
-    given_up: bool = False
+    frame: Frame | None = None
+    abandoned: bool = False
 
 
-class Pictures:
-    """Between one worker, which offers, and any number of onlookers, who ask.
+class LiveFrames:
+    """Connects one training thread, which offers to draw, with any number of requests.
 
-    seconds: what all pictures together have taken of the worker's time.
+    seconds: what all frames together have taken of the training thread's time.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._wishes: queue.Queue[_Wish] = queue.Queue(maxsize=1)
-        self._not_before = self._seen = -np.inf
+        self._requests: queue.Queue[_Request] = queue.Queue(maxsize=1)
+        self._not_before = self._last_seen = -np.inf
         self._camera: Camera | None = None
-        self._last: Picture | None = None
+        self._last: Frame | None = None
         self._closed = False
         self.seconds = 0.0
 
-    def ask(self, camera: Camera, patience_s: float) -> Picture | None:
-        """The next picture from `camera`; None if there is none within twice `patience_s`. After
-        the end of the work, its last picture, whatever the camera."""
+    def request(self, camera: Camera, timeout_s: float) -> Frame | None:
+        """The next frame from `camera`; None if there is none within twice `timeout_s`. After the
+        end of training, the last frame, whatever the camera."""
         self._camera = camera
-        self.looked()
+        self.mark_watched()
         if self._closed:
             return self._last
-        wish = _Wish(camera)
+        request = _Request(camera)
         try:
-            self._wishes.put(wish, timeout=patience_s)
+            self._requests.put(request, timeout=timeout_s)
         except queue.Full:
             return None
-        wish.given_up = not wish.answered.wait(patience_s)
-        return wish.picture or self._last
+        request.abandoned = not request.answered.wait(timeout_s)
+        return request.frame or self._last
 
-    def looked(self) -> None:
-        """Somebody is there, even if the picture that they have will do for a while."""
-        self._seen = self._clock()
+    def mark_watched(self) -> None:
+        """Note that a viewer is there, even if it requests no frame for a while."""
+        self._last_seen = self._clock()
 
-    def watched(self) -> bool:
-        """Whether somebody was there a moment ago."""
-        return self._clock() - self._seen < LOOKING_S
+    def is_watched(self) -> bool:
+        """Whether a viewer was there in the last `WATCHED_FOR_S`."""
+        return self._clock() - self._last_seen < WATCHED_FOR_S
 
     def offer(self, draw: DrawView, step: int) -> None:
-        """Draw what is wanted, if anything is and the time for it has come."""
-        if self._wishes.empty() or self._clock() < self._not_before:
+        """Draw the requested frame, if there is one and `LARGEST_SHARE` allows it."""
+        if self._requests.empty() or self._clock() < self._not_before:
             return
-        wish = self._wishes.get_nowait()
-        if not wish.given_up:
-            wish.picture = self._drawn(draw, wish.camera, step)
-            wish.answered.set()
+        request = self._requests.get_nowait()
+        if not request.abandoned:
+            request.frame = self._draw(draw, request.camera, step)
+            request.answered.set()
 
     def offer_last(self, draw: DrawView, step: int) -> None:
-        """The work is done: one more picture for whoever is looking, which stays."""
-        if self._camera is not None and self.watched():
-            self._last = self._drawn(draw, self._camera, step)
+        """Training has ended: draw one more frame for the viewer, which is kept."""
+        if self._camera is not None and self.is_watched():
+            self._last = self._draw(draw, self._camera, step)
         self.close()
 
     def close(self) -> None:
-        """No more pictures: nobody waits any longer."""
+        """Draw no more frames, and let no request wait any longer."""
         self._closed = True
-        while not self._wishes.empty():
-            self._wishes.get_nowait().answered.set()
+        while not self._requests.empty():
+            self._requests.get_nowait().answered.set()
 
-    def _drawn(self, draw: DrawView, camera: Camera, step: int) -> Picture | None:
+    def _draw(self, draw: DrawView, camera: Camera, step: int) -> Frame | None:
         start = self._clock()
         try:
             pixels = draw(camera)
-        except MemoryError:  # a picture that does not fit must not end the work
+        except MemoryError:  # a frame that does not fit must not end the training
             return None
         finally:
             end = self._clock()
             self.seconds += end - start
-            self._not_before = end + (end - start) * (1 / SHARE - 1)
-        return Picture(pixels, step, end - start)
+            self._not_before = end + (end - start) * (1 / LARGEST_SHARE - 1)
+        return Frame(pixels, step, end - start)

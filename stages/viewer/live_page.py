@@ -1,7 +1,7 @@
-"""The page that shows a scene while it is trained: the addresses behind it.
+"""The page that shows a scene while it is trained, and the addresses that it requests.
 
-The page holds the camera; a picture is asked for with a place and drawn by the trainer itself, so
-that it shows what is being trained, to the last bit of view-dependent colour.
+The page holds the camera. It requests a frame with a pose, and the trainer itself draws it, so that
+the frame shows the splats in training with their view-dependent colour.
 """
 
 from __future__ import annotations
@@ -23,21 +23,26 @@ from stages.formats.page import document
 from stages.formats.page.cameras import PageCamera
 from stages.scene import Camera, View
 from stages.scene.framing import median_depth
-from stages.viewer.live_frames import Picture, Pictures
-from stages.viewer.server import Answer, Item
+from stages.viewer.live_frames import Frame, LiveFrames
+from stages.viewer.server import Item, Response
 from stages.viewer.site import with_photographs
 
-SIDES = (16, 1280)  # pixels of a picture's longer side
-PATIENCE_S = 10.0
+SIDES = (16, 1280)  # shortest and longest allowed longer side of a frame, pixels
+TIMEOUT_S = 10.0
 JPEG_QUALITY = 92  # no visible blocks; about 100 kB at 640 px
 
 
 class LivePage:
-    """items: what to serve. pictures: where the trainer offers them. told: whether a browser has
-    heard of the end, and has the last picture.
+    """The content of the page.
 
-    views: the capture's cameras. photos: the folder that `View.image` starts from. points [N, 3]:
-    something of the scene, for the distance to turn around.
+    Attributes: `items`, what to serve by address; `frames`, where the trainer offers to draw;
+    `end_delivered`, whether a browser has received the end and the last frame.
+
+    Args:
+        views: the capture's views.
+        shots: the cameras that the page lists.
+        points: [N, 3] of the scene; their median depth is the distance to orbit at.
+        photos: the folder that `View.image` starts from.
     """
 
     def __init__(
@@ -48,15 +53,15 @@ class LivePage:
         points: NDArray[np.floating],
         photos: Path | None = None,
     ) -> None:
-        self.pictures = Pictures()
-        self.told = self._end_told = False
+        self.frames = LiveFrames()
+        self.end_delivered = self._end_requested = False
         self._cameras = [shot.camera for shot in shots]
         self._state: dict[str, Any] = {"phase": "", "done": 0, "total": 0, "end": ""}
         self._start, self._first = time.monotonic(), 0
         shown, photographs = with_photographs(shots, views, photos)
         scene = {"title": title, "shots": [_plain(shot, points) for shot in shown]}
         page = document.live(scene).encode("utf-8")
-        self.items: dict[str, Item | Answer] = {
+        self.items: dict[str, Item | Response] = {
             **photographs,
             "/": Item(page, "text/html; charset=utf-8"),
             "/state": self._answer_state,
@@ -64,7 +69,7 @@ class LivePage:
         }
 
     def progressed(self, label: str, done: int, total: int, numbers: Numbers) -> None:
-        """Take note of how far training is."""
+        """Note the progress of training."""
         now = time.monotonic()
         if label != self._state["phase"]:
             self._first, self._start = done, now
@@ -80,43 +85,45 @@ class LivePage:
         }
 
     def ended(self, how: str) -> None:
-        """how: "finished" or "stopped". The page hears of it when it next asks."""
-        self.pictures.close()
+        """how: "finished" or "stopped". The page gets it with its next request for the state."""
+        self.frames.close()
         self._state = {**self._state, "end": how}
 
     def _answer_state(self, query: dict[str, str]) -> Item:
-        self.pictures.looked()
+        self.frames.mark_watched()
         state = self._state
-        self._end_told = state["end"] != ""
+        self._end_requested = state["end"] != ""
         spent = state.get("spent_s", 0.0)
-        share = self.pictures.seconds / spent if spent else 0.0
+        share = self.frames.seconds / spent if spent else 0.0
         return _json({**state, "drawing_share": share})
 
     def _answer_picture(self, query: dict[str, str]) -> Item:
-        """shot: number of the camera whose lens is used. side: longer side in pixels. place:
-        12 numbers, the upper rows of world_to_camera."""
+        """A frame. Its query has `shot`, the number of the camera whose intrinsics are used;
+        `side`, the longer side in pixels; `place`, the 12 numbers of the upper three rows of
+        world_to_camera. Raises ValueError."""
         number, side = int(query.get("shot", "")), int(query.get("side", ""))
         if not (0 <= number < len(self._cameras) and SIDES[0] <= side <= SIDES[1]):
             raise ValueError(f"shot {number}, side {side}")
         place = _rigid(query.get("place", ""))
         camera = replace(self._cameras[number].fitted(side), world_to_camera=place)
-        last = self._end_told
-        picture = self.pictures.ask(camera, PATIENCE_S)
-        self.told = last
-        return _json({} if picture is None else _as_data(picture))
+        last = self._end_requested
+        frame = self.frames.request(camera, TIMEOUT_S)
+        self.end_delivered = last
+        return _json({} if frame is None else _encoded(frame))
 
 
 def _rigid(text: str) -> NDArray[np.float64]:
-    """[4, 4] from 12 numbers; rounding in the page is no matter. Raises ValueError."""
+    """[4, 4] world_to_camera from 12 numbers, rounded by the page. Raises ValueError if they are no
+    rigid transform."""
     rows = np.array([float(word) for word in text.split(",")]).reshape(3, 4)
     rotation = rows[:, :3]
     if not (np.isfinite(rows).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)):
-        raise ValueError("not a place to look from")
+        raise ValueError("not a rigid transform")
     return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
 
 def _plain(shot: PageCamera, points: NDArray[np.floating]) -> dict[str, Any]:
-    """A shot as the page takes it. depth: how far ahead the point to turn around lies."""
+    """A shot as the page reads it. `depth`: the distance to the point that the page orbits."""
     camera: Camera = shot.camera
     return {
         "name": shot.name,
@@ -128,14 +135,14 @@ def _plain(shot: PageCamera, points: NDArray[np.floating]) -> dict[str, Any]:
     }
 
 
-def _as_data(picture: Picture) -> dict[str, Any]:
+def _encoded(frame: Frame) -> dict[str, Any]:
     from PIL import Image
 
     file = BytesIO()
-    Image.fromarray(picture.pixels).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    Image.fromarray(frame.pixels).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     text = base64.b64encode(file.getvalue()).decode("ascii")
     jpeg = f"data:image/jpeg;base64,{text}"
-    return {"jpeg": jpeg, "step": picture.step, "seconds": picture.seconds}
+    return {"jpeg": jpeg, "step": frame.step, "seconds": frame.seconds}
 
 
 def _json(data: dict[str, Any]) -> Item:

@@ -1,13 +1,15 @@
 """Serves a list of files to browsers on this machine, and nothing else.
 
-What may be asked for is a dictionary of addresses; a path in a request is only ever looked up in
-it, so there is nothing to climb out of. An address may also stand for an answer that is worked out
-when it is asked for.
+A request's path is only looked up in a dictionary of addresses, so that no request can reach
+another file. An address may also stand for a function that computes the response.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
+import webbrowser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -22,7 +24,7 @@ LOOPBACK = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Item:
-    """What an address gives. content: bytes, or the file that holds them."""
+    """A response. content: bytes, or the file that holds them. kind: the MIME type."""
 
     content: bytes | Path
     kind: str
@@ -34,29 +36,35 @@ class Item:
         return self.content.open("rb"), self.content.stat().st_size
 
 
-Answer = Callable[[dict[str, str]], Item]
-"""From the options of an address (what follows "?"). Raises ValueError for those that make no
-sense."""
+Response = Callable[[dict[str, str]], Item]
+"""Computes a response from the query of a request. Raises ValueError for a query that it does not
+accept."""
 
 
 class LocalServer(ThreadingHTTPServer):
-    """Listens on 127.0.0.1 only. items: by address, such as "/" or "/scene.ply"; answers are worked
-    out in a thread of their own, for pages of this server alone. port: 0 for any that is free.
-    Raises OSError if the port is taken."""
+    """Listens on 127.0.0.1 only.
+
+    Args:
+        items: the responses by address, such as "/" or "/scene.ply". Functions are called in a
+            thread of each request, and only for pages of this server.
+        port: 0 for any that is free.
+
+    Raises OSError if the port is taken.
+    """
 
     daemon_threads = True
 
-    def __init__(self, items: Mapping[str, Item | Answer], port: int = 0) -> None:
+    def __init__(self, items: Mapping[str, Item | Response], port: int = 0) -> None:
         self.items = dict(items)
         super().__init__((LOOPBACK, port), _Handler)
 
     @property
     def address(self) -> str:
-        """Where a browser finds the page."""
+        """The URL of the page."""
         return f"http://{LOOPBACK}:{self.server_port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that hangs up in the middle is no news."""
+        """Print nothing when a browser closes the connection early."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -69,20 +77,20 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=False)
 
     def _answer(self, *, with_body: bool) -> None:
-        # A page elsewhere can point a name of its own at this machine; the name gives it away.
+        # Against DNS rebinding: another site's name may resolve to this machine.
         host = self.headers.get("Host", "")
         if host not in (f"{name}:{self.server.server_port}" for name in (LOOPBACK, "localhost")):
             self.send_error(HTTPStatus.FORBIDDEN)
             return
-        asked = urlsplit(self.path)
-        item = self.server.items.get(asked.path)
+        url = urlsplit(self.path)
+        item = self.server.items.get(url.path)
         if item is not None and not isinstance(item, Item):
-            # A page elsewhere cannot read the answer, but must not cause the work either.
+            # Another site's page could not read the response, but must not cause the work either.
             if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
                 self.send_error(HTTPStatus.FORBIDDEN)
                 return
             try:
-                item = item(dict(parse_qsl(asked.query)))
+                item = item(dict(parse_qsl(url.query)))
             except ValueError:
                 self.send_error(HTTPStatus.BAD_REQUEST)
                 return
@@ -104,4 +112,13 @@ class _Handler(BaseHTTPRequestHandler):
                 shutil.copyfileobj(source, self.wfile)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not for the terminal."""
+        """Print no requests."""
+
+
+def open_in_browser(address: str) -> bool:
+    """Open the address in a browser; whether one was started. On Linux without a display none is
+    tried: a browser in the terminal cannot show the page and would block the command."""
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+    if sys.platform.startswith("linux") and not has_display:
+        return False
+    return webbrowser.open(address)

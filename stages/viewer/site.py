@@ -1,4 +1,4 @@
-"""The list of files that `splat view` serves: the page, the splats, the photographs."""
+"""The files that `splat view` serves: the page, the splats, the photographs."""
 
 from __future__ import annotations
 
@@ -23,9 +23,15 @@ def site(
     units: str = "arbitrary",
     source: str = "",
 ) -> dict[str, Item]:
-    """By address. content: the splats as .ply, or the lod-meta.json of an asset that streams.
-    photos: the folder that `View.image` starts from; a photograph that is not there is left out.
-    source: what `splat edit` would read, if it is not the content. Raises SplatError."""
+    """The items to serve, by address.
+
+    Args:
+        content: the splats as .ply, or the lod-meta.json of a streamed asset.
+        photos: the folder that `View.image` starts from; missing photographs are left out.
+        source: what `splat edit` would read, if it is not the content.
+
+    Raises SplatError.
+    """
     shots, items = with_photographs(page_cameras(views, splats), views, photos)
     streams = format_of(content).streamed
     files = streamed_sog.parts_of(content) if streams else {"scene.ply": content}
@@ -46,13 +52,13 @@ def site(
 def with_photographs(
     shots: Sequence[PageCamera], views: Sequence[View], photos: Path | None
 ) -> tuple[list[PageCamera], dict[str, Item]]:
-    """(the shots with the addresses of their photographs, what these addresses give)."""
+    """(the shots with the addresses of their photographs, the items by address)."""
     images = {view.name: view.image for view in views}
     found, items = [], {}
     for number, shot in enumerate(shots):
         file = _inside(photos, images.get(shot.name, ""))
         if file is not None:
-            # An address of our own: names of photographs hold anything.
+            # Numbered addresses: the names of photographs may hold any character.
             address = f"photos/{number}{file.suffix.lower()}"
             kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             items[f"/{address}"] = Item(file, kind)
@@ -62,8 +68,8 @@ def with_photographs(
 
 
 def _inside(folder: Path | None, name: str) -> Path | None:
-    """The file of that name in the folder, if there is one: a damaged list of photographs must
-    not make another file public."""
+    """The file of that name if it lies in the folder: a damaged list of photographs must not
+    publish another file."""
     if folder is None or not name:
         return None
     file = (folder / name).resolve()

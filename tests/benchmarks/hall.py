@@ -104,11 +104,11 @@ def _pillar(number: int, x: float, z: float) -> tuple[Shape, ...]:
 
 def through_run(run: Path, photographs: int, width: int) -> Walk:
     """From one photograph's place to the next, on a smooth way, all along a finished run's."""
-    from splatcli.sources import splats_of
+    from splatcli.folders import load_target
     from stages.raster.draw import renderer
     from stages.viewer import camera_paths
 
-    splats, pipeline = splats_of(run)
+    splats, pipeline = load_target(run)
     assert pipeline is not None, "a run folder is wanted"
     cameras = [view.camera for view in pipeline.load("sfm").views]
     order = camera_paths.tour(cameras, splats)

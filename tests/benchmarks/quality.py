@@ -41,7 +41,8 @@ from stages.measure.evaluation import (
 from stages.run.pipeline import Pipeline
 from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
 from stages.sfm import SfmSettings
-from stages.train import PRESETS, TrainSettings, corrects_light
+from stages.train import PRESETS, TrainSettings
+from stages.training.build import corrects_light
 from tests.benchmarks.sample_test_views import judges_in, render_judges
 from tests.sample import PHOTOS
 

@@ -87,7 +87,7 @@ class Stepper:
 
     def size(self) -> tuple[int, int]:
         """(visible splats, intersections)."""
-        settings = self.trainer.settings(3)
+        settings = self.trainer.raster_settings(3)
         forward = self.rasteriser.forward(self.model.arrays, self.camera, settings)
         return len(forward.visible), forward.n_intersections
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from splatcli import console
+from stages.base.distribution import NAME, VERSION
 from stages.base.errors import Interrupted, SplatError
 from stages.raster import torch_device
 from stages.raster.gpu import device as gpu
@@ -67,6 +68,33 @@ def test_exporting_one_more_format_keeps_those_that_are_there(splat) -> None:
     assert manifest["settings"]["formats"] == ["ply", "glb"]
 
 
+def test_verbose_writes_what_a_bug_report_needs(splat, pretend) -> None:
+    result = splat("process", "photos", "--verbose", "--steps", "123")
+    assert result.exit_code == 0
+    log = Path(result.stderr.split("Log: ")[1].splitlines()[0])
+    text = log.read_text()
+    log.unlink()
+    for part in (f"{NAME} {VERSION}", "platform: ", "cores", "free memory: ", "numpy ", "torch "):
+        assert part in text
+    assert "settings of train: {'steps': 123" in text
+    assert "warning pretend-careful: Nothing was really done." in text
+    assert "train: finished in" in text
+
+
+def test_the_log_holds_the_traceback_of_an_error_that_is_explained(splat, pretend) -> None:
+    def run(inputs, settings, folder, report) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    pretend["seed"] = run
+    result = splat("process", "photos", "--verbose", "--json")
+    assert result.exit_code == 6
+    log = Path(events(result)[0]["path"])
+    text = log.read_text()
+    log.unlink()
+    assert "Traceback (most recent call last)" in text
+    assert "OSError: [Errno 28] No space left on device" in text
+
+
 def test_quiet_prints_only_paths_and_warnings(splat) -> None:
     result = splat("process", "photos", "--quiet")
     assert result.stdout == f"{Path('run/7-export/out.ply')}\n"
@@ -87,7 +115,7 @@ def test_json_is_lines_of_json_ending_in_the_result(splat, pretend) -> None:
     assert last["run_folder"] == "elsewhere"
     assert set(last["stages"]) == set(STAGES)
     assert 0.05 <= last["stages"]["train"]["seconds"] <= time.monotonic() - begun
-    assert last["assets"] == [{"path": str(Path("elsewhere/7-export/out.ply")), "bytes": 12}]
+    assert last["assets"] == [{"path": str(Path("elsewhere/7-export/out.ply")), "size_bytes": 12}]
 
 
 def test_changed_steps_are_named_by_status(splat, pretend) -> None:
@@ -230,7 +258,7 @@ def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
         (["process", "photos", "--train-side", "nan"], "--train-side nan cannot be used"),
         (["export", "--name", "a/b"], "--name a/b cannot be used"),
         (["proces", "photos"], "splat has no command proces."),
-        (["process", "photos", "more"], "splat process has no use for more."),
+        (["process", "photos", "more"], "splat process does not accept more."),
         (["process", "photos", "--split"], "--split means nothing without --cameras."),
         (["convert", "a.ply"], "splat convert needs a target"),
         (["render", "--width", "0"], "A whole number from 1 to 16,384."),
@@ -284,8 +312,8 @@ def test_training_that_goes_on_says_which_settings_it_keeps(splat) -> None:
     assert "Training:" not in fresh.stderr
     again = splat("train", "--steps", "7000")
     assert (
-        "Training: steps 7,000 (as typed); train side 480, SH degree 1, max splats 60,000 "
-        "(as this run was asked before)." in again.stderr
+        "Training: steps 7,000 (as given); train side 480, SH degree 1, max splats 60,000 "
+        "(as recorded in the run)." in again.stderr
     )
     other = splat("process", "--preset", "standard").stderr
     assert "steps 7,000, train side 800, SH degree 2, max splats 250,000 (preset stan" in other

@@ -133,3 +133,10 @@ def test_a_mesh_is_made_from_a_run_and_converted_neither_to_nor_from(
         assert f"splat export --format {ending}" in err
         assert "reading" not in err
         assert not (tmp_path / target).exists()
+
+
+def test_missing_folders_above_the_target_are_made(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(20))
+    _, err = converted(tmp_path / "a.ply", tmp_path / "new" / "deep" / "b.ply")
+    assert len(formats.read(tmp_path / "new" / "deep" / "b.ply")) == 20
+    assert "lossless" in err

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from splatcli import console
 from splatcli.app import app
 from stages import formats
 from tests.formats.truth import many_splats
@@ -74,7 +73,7 @@ def test_a_format_whose_parts_nobody_can_tell_says_so(tmp_path: Path) -> None:
 def test_the_size_of_a_gltf_counts_its_bin(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.gltf", many_splats(3000))
     both = sum(path.stat().st_size for path in tmp_path.iterdir())
-    assert info(tmp_path / "a.gltf")["size"] == console.size(both)
+    assert info(tmp_path / "a.gltf")["size_bytes"] == both
 
 
 def test_values_that_are_not_finite_are_described_and_not_refused(tmp_path: Path) -> None:
@@ -116,8 +115,9 @@ def test_what_a_splat_costs_is_told_at_its_own_degree(tmp_path: Path) -> None:
     assert (told["floats_per_splat"], plain["floats_per_splat"]) == (59, 14)
     assert told["floats_per_splat_by_degree"] == {"0": 14, "1": 23, "2": 38, "3": 59}
     assert list(told["memory_bytes_per_splat"].values()) == [236, 118, 944]
-    assert list(told["memory"].values()) == ["236.0 kB", "118.0 kB", "944.0 kB"]
-    assert list(told["mass_within_sigmas"].values()) == ["39.3%", "86.5%", "98.9%"]
+    assert list(told["memory_bytes"].values()) == [236_000, 118_000, 944_000]
+    shares = list(told["mass_share_within_sigmas"].values())
+    assert np.allclose(shares, [0.393, 0.865, 0.989], atol=1e-3)
 
 
 def test_speed_is_measured_when_asked_for_and_says_of_what(tmp_path: Path) -> None:
@@ -127,5 +127,5 @@ def test_speed_is_measured_when_asked_for_and_says_of_what(tmp_path: Path) -> No
     result = CliRunner().invoke(app, ["info", str(path), "--speed", "--json"])
     told = json.loads(result.stdout)
     assert told["frames_a_second"] > 0
-    assert (told["frame_size"], told["frames_timed"]) == ("960 x 720", 8)
+    assert (told["frame_width"], told["frame_height"], told["frames_timed"]) == (960, 720, 8)
     assert told["splats"] == 300

@@ -72,3 +72,21 @@ def test_durations_read_well(seconds: float, text: str) -> None:
 @pytest.mark.parametrize(("count", "text"), [(12, "12 B"), (1300, "1.3 kB"), (2.5e9, "2.5 GB")])
 def test_sizes_read_well(count: float, text: str) -> None:
     assert console.size(count) == text
+
+
+def test_equal_pictures_are_lossless_and_no_number_of_decibels() -> None:
+    assert console.fidelity(99.0) == "lossless"
+    assert console.fidelity(41.26) == "41.26 dB"
+
+
+@pytest.mark.parametrize(
+    ("cpu_s", "text"),
+    [
+        (None, "10.0 s"),
+        (12.0, "10.0 s"),
+        (19.0, "10.0 s (19.0 s CPU)"),
+        (5.0, "10.0 s (5.0 s CPU)"),
+    ],
+)
+def test_cpu_time_is_shown_where_it_differs_by_half(cpu_s: float | None, text: str) -> None:
+    assert console.times(10.0, cpu_s) == text

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatcli import viewpoints
 from stages import formats
 from stages.base import memory
 from stages.cameras import nerfstudio
 from stages.raster.draw import render
+from stages.run import results
 from stages.scene import Camera, View, look_at
 from stages.viewer.image_files import eight_bits
 from tests import processes, scenes
@@ -46,7 +46,7 @@ def around(count: int = 8) -> tuple[View, ...]:
 @pytest.fixture
 def captured(monkeypatch: pytest.MonkeyPatch) -> tuple[View, ...]:
     """As if the file lay in a run with these photographs."""
-    monkeypatch.setattr(viewpoints, "views_of", lambda pipeline: around())
+    monkeypatch.setattr(results, "views_of", lambda pipeline: around())
     return around()
 
 
@@ -149,7 +149,7 @@ def test_frames_of_a_longer_path_are_counted_and_kept(splat, scene: Path) -> Non
 
 
 def test_half_a_capture_is_said(splat, scene: Path, monkeypatch) -> None:
-    monkeypatch.setattr(viewpoints, "views_of", lambda pipeline: around(8)[:3])
+    monkeypatch.setattr(results, "views_of", lambda pipeline: around(8)[:3])
     result = splat("render", str(scene), "--frames", "2", "--width", "16", "--out", "f")
     assert "81 degrees" in result.stderr
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from splatcli import sources
 from splatcli.app import app
 from splatcli.commands import verify as command
 from stages import formats
 from stages.base.errors import SplatError
+from stages.run import results
 from stages.scene import ExportedAssets, ExportedFile, QuantisedSplats, Splats
 from stages.train import TrainSettings
 from tests.small_scene import SmallScene, small_scene
@@ -74,7 +74,7 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
             recorded_settings=lambda: {"train": TrainSettings()},
         )
 
-    monkeypatch.setattr(sources, "Pipeline", pipeline)
+    monkeypatch.setattr(results, "Pipeline", pipeline)
     monkeypatch.setattr(command, "Pipeline", pipeline)
     return folder
 

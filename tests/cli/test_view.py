@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from splatcli.commands import view as command
 from stages import formats
+from stages.viewer import server
 from tests import processes
 from tests.formats.truth import many_splats
 from tests.processes import line_of, python, running
@@ -118,7 +118,7 @@ def test_no_browser_is_tried_without_a_screen(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(webbrowser, "open", note)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
-    assert not command.open_page("http://127.0.0.1:1/")
+    assert not server.open_in_browser("http://127.0.0.1:1/")
     monkeypatch.setenv("DISPLAY", ":0")
-    assert command.open_page("http://127.0.0.1:2/")
+    assert server.open_in_browser("http://127.0.0.1:2/")
     assert opened == ["http://127.0.0.1:2/"]

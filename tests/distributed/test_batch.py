@@ -85,7 +85,7 @@ def test_a_bug_in_one_capture_is_its_own(splat, captures, pretend) -> None:
     result = splat("batch", *captures, "--json")
     assert result.exit_code == 1
     ended = [json.loads(line) for line in result.stdout.splitlines()]
-    assert ended[0]["said"] == "RuntimeError: unheard of."
+    assert ended[0]["message"] == "RuntimeError: unheard of."
     assert [e["status"] for e in ended if e["event"] == "ended"] == ["bug", "done", "done"]
 
 
@@ -163,7 +163,7 @@ def test_a_worker_without_splat_can_answer(monkeypatch, tmp_path) -> None:
     def unknown(name: str) -> str:
         raise importlib.metadata.PackageNotFoundError(name)
 
-    ask = cluster.question()
+    ask = cluster.make_describe()
     monkeypatch.setattr(builtins, "__import__", without_splat)
     monkeypatch.setattr(importlib.metadata, "version", unknown)
     assert ask([str(tmp_path), str(tmp_path / "gone")]) == ("", [str(tmp_path / "gone")])
@@ -181,10 +181,10 @@ def test_tasks_share_the_processors_and_take_the_memory_they_need(
     tasks, workers, memory_mib, wanted
 ) -> None:
     found = cluster.RayExecutor(None, tuple(workers))
-    assert found.share(tasks, Resources(memory_mib)) == wanted
+    assert found.allocation(tasks, Resources(memory_mib)) == wanted
 
 
 def test_a_run_that_no_worker_has_the_memory_for_is_refused() -> None:
     """Ray would wait for such a worker for ever."""
     with pytest.raises(SplatError, match="20,000 MiB, and no worker has more than 9,000"):
-        cluster.RayExecutor(None, (answer(),)).share(1, Resources(20_000.0))
+        cluster.RayExecutor(None, (answer(),)).allocation(1, Resources(20_000.0))

@@ -63,7 +63,7 @@ def pipeline_at(run_folder: Path, photos: Path) -> Pipeline:
 
 
 def trained(run_folder: Path, photos: Path, listener: Listener | None = None, **asked) -> Pipeline:
-    pipeline = process.in_blocks(pipeline_at(run_folder, photos), None)
+    pipeline = process.distribute(pipeline_at(run_folder, photos), None)
     settings = replace(pipeline.recorded_settings()["train"], **SMALL | asked)
     pipeline.run({"train": settings}, listener=listener)
     return pipeline
@@ -157,7 +157,7 @@ def test_a_block_that_no_photograph_shows_is_the_coarse_model_s(
     tmp_path, photos, monkeypatch
 ) -> None:
     monkeypatch.setattr(
-        block_views, "members", lambda share: np.array([[True], [False]]) & (share >= 0)
+        block_views, "assign_views", lambda share: np.array([[True], [False]]) & (share >= 0)
     )
     manifest = trained(tmp_path / "run", photos, blocks="2", steps=20).manifest("train")
     assert manifest is not None

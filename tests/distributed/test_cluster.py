@@ -141,10 +141,11 @@ def cameras_of(folder: Path, address: str | None, kills: int = 0) -> dict[str, s
     """Outputs of the sample's first two stages."""
     name = f"at-{address}"
     code = (
-        "from pathlib import Path; from splatcli import jobs; "
+        "from pathlib import Path; from splatcli import run_settings; "
+        "from splatcli.commands import process; "
         "from stages.run.pipeline import Pipeline; "
         f"whole = Pipeline(Path({name!r}), Path({str(sample.PHOTOS)!r})); "
-        f"jobs.in_blocks(whole, {address!r}).run(jobs.defaults(), until='sfm')"
+        f"process.distribute(whole, {address!r}).run(run_settings.defaults(), until='sfm')"
     )
     assert with_kills(folder, processes.python(code), kills) == kills
     return outputs(folder / name, "")

@@ -22,7 +22,7 @@ def places(n: int = 101) -> np.ndarray:
 @pytest.mark.parametrize("blocks", [2, 3, 4, 7])
 def test_blocks_hold_about_equal_photographs(blocks: int) -> None:
     at, weights = places(2000), np.random.default_rng(2).uniform(0, 1, 2000)
-    cells = partition.cut(at, weights, blocks)
+    cells = partition.partition(at, weights, blocks)
     found = [weights[cell.holds(np.insert(at, 1, 0.0, axis=1))].sum() for cell in cells]
     assert len(found) == blocks
     assert np.isclose(sum(found), weights.sum())
@@ -30,7 +30,7 @@ def test_blocks_hold_about_equal_photographs(blocks: int) -> None:
 
 
 def test_every_point_lies_in_one_cell() -> None:
-    cells = partition.cut(places(), np.ones(101), 5)
+    cells = partition.partition(places(), np.ones(101), 5)
     points = np.random.default_rng(1).normal(0, 1000, (500, 3))
     lines = [value for cell in cells for value in (*cell.low, *cell.high) if abs(value) < 1e29]
     points[: len(lines), 0] = points[: len(lines), 2] = lines  # on the borders too
@@ -41,12 +41,12 @@ def test_each_photograph_counts_as_much_as_any_other(tmp_path) -> None:
     """However many points it shows."""
     scene = small_scene(tmp_path, views=6).reconstruction
     points = np.random.default_rng(4).normal(0, 0.4, (300, 3))
-    _, weights = partition.looked_at(replace(scene, points=points))
+    _, weights = partition.weighted_points(replace(scene, points=points))
     assert np.isclose(weights.sum(), 6.0)
 
 
 def test_photographs_that_look_at_one_spot_are_one_block() -> None:
-    assert partition.cut(np.ones((20, 2)), np.ones(20), 4) == [partition.EVERYWHERE]
+    assert partition.partition(np.ones((20, 2)), np.ones(20), 4) == [partition.EVERYWHERE]
 
 
 def test_a_photograph_teaches_what_it_shows_and_not_what_is_hidden(tmp_path) -> None:
@@ -64,23 +64,23 @@ def test_a_photograph_teaches_what_it_shows_and_not_what_is_hidden(tmp_path) -> 
     lines = (np.array([-2.0, 0.0]), np.array([0.0, 2.0]))
     halves = [partition.Cell((low, -9.0), (high, 9.0)) for low, high in lines]
     both, _ = merge.merged([wall, behind], halves, wall.draw_settings)
-    cells = partition.cut(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
+    cells = partition.partition(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
     eye = Camera(72, 54, 160.0, 160.0, 36.0, 27.0, look_at(np.array([-4.0, 0, 0]), np.zeros(3)))
-    share = block_views.shares(both, cells, [eye], AUTO)
+    share = block_views.block_fractions(both, cells, [eye], AUTO)
     assert share[0, 0] > 0.9
-    assert block_views.members(share)[:, 0].tolist() == [True, False]
+    assert block_views.assign_views(share)[:, 0].tolist() == [True, False]
 
 
 def test_each_photograph_teaches_one_block_at_least() -> None:
     share = np.array([[0.06, 0.5, 0.0], [0.04, 0.5, 0.0]])
-    member = block_views.members(share)
+    member = block_views.assign_views(share)
     assert member.tolist() == [[True, True, False], [False, True, False]]
-    assert block_views.crossing(member).tolist() == [False, True, False]
+    assert block_views.crosses_blocks(member).tolist() == [False, True, False]
 
 
 def test_merged_blocks_give_each_place_once_and_in_order(tmp_path) -> None:
     splats = small_scene(tmp_path, views=2).splats
-    cells = partition.cut(splats.means[:, [0, 2]].astype(np.float64), np.ones(len(splats)), 3)
+    cells = partition.partition(splats.means[:, [0, 2]].astype(np.float64), np.ones(len(splats)), 3)
     whole, counts = merge.merged([splats] * 3, cells, splats.draw_settings)
     assert sum(counts) == len(splats)
     assert sorted(map(tuple, whole.means)) == sorted(map(tuple, splats.means))
@@ -94,7 +94,7 @@ def test_seams_are_where_a_splat_reaches_over_its_border(tmp_path) -> None:
     means = np.array([[-0.1, 0, 0], [-3, 0, 0], [3, 0, 0]], np.float32)
     sizes = np.log(np.array([[0.05] * 3, [0.05] * 3, [0.05, 2.0, 0.05]], np.float32))
     splats = replace(splats, means=means, log_scales=sizes)
-    cells = partition.cut(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
+    cells = partition.partition(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
     assert merge.at_seams(splats, [2, 1], cells).tolist() == [True, False, True]
 
 

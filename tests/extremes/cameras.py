@@ -13,6 +13,7 @@ from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from stages.scene import Camera, look_at, scene_extent
+from stages.training import build
 from tests.extremes.measured import Measured, broken, difference, worst
 from tests.extremes.oracles import centre_in_picture, inside_clamp, means2d, textbook_picture
 from tests.scenes import camera, cloud, splats, textbook_alpha
@@ -132,7 +133,7 @@ def _coincident_training(backend):
         settings = train.TrainSettings(
             steps=steps, train_side=36, sh_degree=1, max_splats=100, backend=backend
         )
-        trainer = train.make_trainer(reconstruction, 40, settings, folder, Report())
+        trainer = build.make_trainer(reconstruction, 40, settings, folder, Report())
         model = trainer.run(scene.splats)
         missing = int(not 0 < scene_extent(views) < np.inf) + abs(len(model) - len(scene.splats))
         return missing + broken(*model.arrays)

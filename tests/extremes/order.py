@@ -13,6 +13,7 @@ from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.kernels.pool import Pool
+from stages.training import build
 from stages.training.cpu_step import CpuStep
 from tests.extremes.measured import Measured, difference, worst
 from tests.scenes import PARAMETERS, camera, cloud, gradients, relative
@@ -128,7 +129,7 @@ def _trained(backend, steps, threads):
             backend=backend,
         )
         start = scene.splats.take(np.arange(0, 80, 2)).with_sh_degree(0)
-        trainer = train.make_trainer(scene.reconstruction, len(start), settings, folder, Report())
+        trainer = build.make_trainer(scene.reconstruction, len(start), settings, folder, Report())
         if backend == "cpu":
             trainer.stepper = CpuStep(CpuRasteriser(Pool(threads)))
         model = trainer.run(start)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.photos.find import find, natural_key, picture_names
+from stages.photos.find import find
+from stages.photos.sources import natural_key, picture_names
 
 NAMES = st.lists(
     st.builds(

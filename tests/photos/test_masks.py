@@ -14,7 +14,7 @@ from stages.base.stage import Report
 from stages.ingest import IngestSettings
 from stages.photos.find import find
 from stages.photos.load import load_image
-from stages.photos.masks import beside, paired
+from stages.photos.masks import masks_beside, pair_masks
 from stages.scene import Capture
 from tests.photos.made_files import exif, folder_of, save, textured
 
@@ -73,18 +73,18 @@ def test_a_folder_called_masks_in_or_beside_the_photographs_is_used(
 
 
 def test_masks_may_lie_among_their_photographs() -> None:
-    found = beside(["a.jpg", "a_mask.png", "b.jpg", "b.jpg.png", "c.jpg", "c.png"])
+    found = masks_beside(["a.jpg", "a_mask.png", "b.jpg", "b.jpg.png", "c.jpg", "c.png"])
     assert found == {"a_mask.png": "a.jpg", "b.jpg.png": "b.jpg"}
 
 
 def test_sub_folders_tell_masks_apart_and_may_be_left_out_where_names_do() -> None:
     deep = {name: Path(name) for name in ("one/a.png", "two/a.png")}
-    found = paired(["one/a.jpg", "two/a.jpg"], deep)
+    found = pair_masks(["one/a.jpg", "two/a.jpg"], deep)
     assert found == {"one/a.jpg": Path("one/a.png"), "two/a.jpg": Path("two/a.png")}
     flat = {name: Path(name) for name in ("a.png", "b.png")}
-    found = paired(["one/a.jpg", "two/b.jpg"], flat)
+    found = pair_masks(["one/a.jpg", "two/b.jpg"], flat)
     assert found == {"one/a.jpg": Path("a.png"), "two/b.jpg": Path("b.png")}
-    assert not paired(["one/a.jpg", "two/a.jpg"], flat)
+    assert not pair_masks(["one/a.jpg", "two/a.jpg"], flat)
 
 
 def test_photographs_of_a_folder_called_masks_are_photographs(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import av
 import numpy as np
 import pytest
 
-from stages.photos.video_colour import PEAK, WHITE, Colours, hlg_light, pq_light, rolled_off, srgb
+from stages.photos.video_colour import PEAK, WHITE, Colours, eetf, hlg_eotf, pq_eotf, srgb
 
 PATCHES = np.array(
     [[250, 20, 20], [20, 250, 20], [20, 20, 250], [128, 128, 128], [250, 250, 250], [10, 10, 10],
@@ -56,14 +56,14 @@ def signal_frame(signal: np.ndarray) -> av.VideoFrame:
 
 def test_hlg_and_pq_curves_pass_through_the_values_of_the_standards() -> None:
     grey = np.array([[0.75, 0.75, 0.75], [1.0, 1.0, 1.0], [0.5, 0.5, 0.5]])
-    assert hlg_light(grey)[:, 0] == pytest.approx([203, 1000, 50.7], rel=0.01)  # BT.2408, table 1
+    assert hlg_eotf(grey)[:, 0] == pytest.approx([203, 1000, 50.7], rel=0.01)  # BT.2408, table 1
     signals = np.array([0.58, 0.7518, 0.5081, 1.0])
-    assert pq_light(signals) == pytest.approx([202, 1000, 100, 10_000], rel=0.01)
+    assert pq_eotf(signals) == pytest.approx([202, 1000, 100, 10_000], rel=0.01)
 
 
 def test_the_roll_off_keeps_what_is_dark_and_never_turns_round() -> None:
     light = np.linspace(0, PEAK, 500)
-    out = rolled_off(light)
+    out = eetf(light)
     assert out[light < 80] == pytest.approx(light[light < 80], rel=1e-3, abs=1e-3)
     assert (np.diff(out) > 0).all()
     assert out[-1] == pytest.approx(WHITE, rel=1e-3)
@@ -91,6 +91,6 @@ def test_wide_colours_come_out_as_the_srgb_colour_that_they_stand_for() -> None:
 
 
 def test_the_mapping_is_named() -> None:
-    assert "HLG" in HLG.words
-    assert "BT.2390" in PQ.words
-    assert Colours(1, 1, 1, 1).words == "taken as sRGB"
+    assert "HLG" in HLG.conversion
+    assert "BT.2390" in PQ.conversion
+    assert Colours(1, 1, 1, 1).conversion == "read as sRGB"

@@ -18,7 +18,6 @@ import torch
 
 pytest.importorskip("triton")
 
-from splatcli import sources
 from stages.base.errors import SplatError
 from stages.raster import backends
 from stages.raster.backends import backend_of, rasteriser_of
@@ -26,6 +25,7 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.gpu import device
 from stages.raster.gpu.rasteriser import GpuRasteriser
 from stages.raster.reference_rasteriser import ReferenceRasteriser
+from stages.run import results
 from stages.train import TrainSettings
 from tests import processes
 from tests.extremes.gpu import on_gpu
@@ -230,11 +230,11 @@ def test_what_is_missing_is_named(fault, said, monkeypatch, tmp_path):
 def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
     run: Any = SimpleNamespace(recorded_settings=lambda: {"train": TrainSettings(backend="gpu")})
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    assert sources.backend_of(run) == "gpu"
+    assert results.backend_of_run(run) == "gpu"
     monkeypatch.delenv("TRITON_INTERPRET")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert sources.backend_of(run) == "auto"
-    assert sources.backend_of(None) == "auto"
+    assert results.backend_of_run(run) == "auto"
+    assert results.backend_of_run(None) == "auto"
 
 
 def test_memory_that_runs_out_names_the_cap_that_would_fit():

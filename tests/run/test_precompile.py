@@ -83,7 +83,7 @@ def test_stages_that_draw_nothing_do_not_wait(busy: PrecompileListener) -> None:
 def test_a_helper_that_does_not_end_is_ended(
     busy: PrecompileListener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.run.precompile._PATIENCE_S", 0.2)
+    monkeypatch.setattr("stages.run.precompile._TIMEOUT_S", 0.2)
     process = helper(busy)
     begin(busy, "train")
     assert process.poll() is not None

@@ -7,10 +7,12 @@ import pytest
 
 from stages.base.stage import Report
 from stages.scene import DrawSettings, look_at
+from stages.training import hooks
 from stages.training.free_space import ENOUGH, WITNESSES, known_free_space
+from stages.training.hooks import FLOATER_REMOVALS
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
-from stages.training.trainer import FLOATER_REMOVALS, Trainer
+from stages.training.trainer import Trainer
 from tests.scenes import camera, splats
 from tests.training.pictures import view_of
 
@@ -35,7 +37,7 @@ def cameras(n):
 
 def held(means, n=2, start=None):
     air = known_free_space((wall() if start is None else start).means, cameras(n))
-    return air.holds(np.array(means, np.float32).reshape(-1, 3)).tolist()
+    return air.contains(np.array(means, np.float32).reshape(-1, 3)).tolist()
 
 
 def test_what_is_nearer_than_half_of_the_way_to_the_wall_hangs_in_the_air():
@@ -74,7 +76,7 @@ def test_what_one_photograph_has_a_surface_at_stays_whatever_others_look_past():
     post = np.concatenate([wall().means, np.array([[0.0, 0.0, 4.8]], np.float32)])
     beside, at_the_post = (2.0, 0.0, 4.8), (0.0, 0.0, 4.9)
     air = known_free_space(post, cameras(2))
-    assert air.holds(np.array([beside, at_the_post])).tolist() == [True, False]
+    assert air.contains(np.array([beside, at_the_post])).tolist() == [True, False]
 
 
 def test_depths_are_of_cells_whatever_the_photographs_size():
@@ -117,7 +119,7 @@ def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, monkeypatch
         *(schedule, views, [], DrawSettings(near=0.1), 10_000, tmp_path, Report()), backend="cpu"
     )
     clouds = Clouds()
-    monkeypatch.setattr(made, "_strategy", clouds)
+    monkeypatch.setattr(hooks, "AdaptiveDensity", lambda *_: clouds)
     model = made.run(start)
     assert clouds.made == sum(schedule.densifies_after(step) for step in range(steps))
     assert len(model) == len(start)

@@ -15,7 +15,7 @@ from stages.base.stage import Report
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import MemoryFull, RasterSettings, splat_arrays
 from stages.train import TrainSettings
-from stages.training import trainer
+from stages.training import hooks, trainer
 from stages.training.cap import most_opaque
 from stages.training.cpu_step import CpuStep
 from stages.training.loss import channel_means
@@ -49,7 +49,7 @@ class TightStep(CpuStep):
 @pytest.fixture
 def tight(monkeypatch: pytest.MonkeyPatch) -> type[TightStep]:
     monkeypatch.setattr(trainer, "step_of", lambda backend: TightStep(CpuRasteriser()))
-    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(hooks, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(TightStep, "room", 150)
     return TightStep
 
@@ -79,7 +79,7 @@ def test_a_backend_that_was_asked_for_stops_and_goes_on_from_its_checkpoint(
     tight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tight.room = 300
-    monkeypatch.setattr(trainer.Trainer, "_adapt", _filled_after_ten)
+    monkeypatch.setattr(hooks.Densification, "after_step", _filled_after_ten)
     with pytest.raises(SplatError) as told:
         trained(tmp_path, "cpu")
     assert told.value.code == "raster-gpu-memory"
@@ -92,9 +92,9 @@ def test_a_backend_that_was_asked_for_stops_and_goes_on_from_its_checkpoint(
     assert "train-gpu-memory" in dict(report.warnings)
 
 
-def _filled_after_ten(self: trainer.Trainer, step: int) -> None:
+def _filled_after_ten(self: hooks.Densification, trainer: trainer.Trainer, step: int) -> None:
     """Another program takes the rest of the card."""
-    if step == 10:
+    if step == 11:
         TightStep.room = 130
 
 

@@ -100,7 +100,9 @@ def test_what_is_black_is_there_if_a_scene_is_for_any_background(
     view = TrainingView("a", tuple(black for _ in RESOLUTIONS))
     schedule = Schedule(steps=150, extent=10.0, sh_degree=0, n_start=9, seed=0)
     draw_settings = DrawSettings(near=0.1)
-    made = Trainer(schedule, [view], [], draw_settings, 9, tmp_path, Report(), over_any=over_any)
+    made = Trainer(
+        schedule, [view], [], draw_settings, 9, tmp_path, Report(), random_background=over_any
+    )
     model = made.run(start)
     opacities = 1 / (1 + np.exp(-model.opacity_logits))
     assert (opacities.mean() > 0.7) == over_any

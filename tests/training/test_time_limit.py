@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.training.schedule import DENSIFICATION_END, RESOLUTIONS, SETTLE_TO, Schedule
+from stages.training.schedule import DENSIFICATION_END, RATE_DECAY_END, RESOLUTIONS, Schedule
 from stages.training.time_limit import TimeLimit
 
 
@@ -39,7 +39,7 @@ def test_a_run_with_a_time_limit_ends_within_a_tenth_of_it_and_goes_through_all_
     took, plan = simulated(seconds, cost)
     assert took == pytest.approx(seconds, rel=0.1)
     assert plan.share(plan.steps) == pytest.approx(1.0)
-    assert plan.rate_factor(plan.steps) == pytest.approx(SETTLE_TO * plan.boost)
+    assert plan.rate_factor(plan.steps) == pytest.approx(RATE_DECAY_END * plan.boost)
 
 
 def test_steps_that_take_a_second_each_still_end_in_time():

@@ -18,10 +18,11 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import DrawSettings, Splats, look_at, split_held_out
-from stages.train import TrainSettings, finished
-from stages.training import cap
+from stages.train import TrainSettings
+from stages.training import build, cap
 from stages.training.checkpoint import MAGIC
 from stages.training.clock import Clock, Elapsed
+from stages.training.conversion import splats_of
 from stages.training.density import AdaptiveDensity
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
@@ -49,7 +50,7 @@ def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, back
 
 def psnr_of(trained):
     """Of the first photograph, drawn as it is now."""
-    return evaluate(trained.drawn, trained.held_out)[0].psnr_db
+    return evaluate(trained.render, trained.held_out)[0].psnr_db
 
 
 def disc_and_square():
@@ -140,7 +141,7 @@ def small_problem(tmp_path, name, report=None, steps=60, backend="cpu"):
 
 def test_training_brings_the_picture_closer(tmp_path):
     t, start = small_problem(tmp_path, "a", steps=200)
-    t._begin(start)
+    t._resume(start)
     before = psnr_of(t)
     t.run(start)
     assert psnr_of(t) > before + 5
@@ -175,7 +176,7 @@ def test_a_time_limit_takes_as_many_steps_as_fit_and_not_many_more(tmp_path, mon
         def __init__(self, before=None):
             self.steps = 0
 
-        def spent(self):
+        def elapsed(self):
             return Elapsed(0.01 * self.steps)
 
     monkeypatch.setattr("stages.training.trainer.Clock", StepClock)
@@ -208,7 +209,7 @@ def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its
         t.run(start)
     second, start = small_problem(tmp_path, "parts", steps=40)
     second.run(start)
-    seconds = [spent.seconds for spent in second.times]
+    seconds = [elapsed.seconds for elapsed in second.times]
     assert len(second.times) == len(second.history) == EVALUATIONS
     assert seconds == sorted(seconds)
     assert 0 < seconds[4] < 100 < seconds[5]
@@ -245,8 +246,8 @@ def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
     where = camera(48, 36)
     seen = []
     report.preview = lambda draw: seen.append(draw(where))
-    trained = finished(t.run(start), 1, start, t.draw_settings)
-    settings = t.settings(t.schedule.sh_degree)
+    trained = splats_of(t.run(start), 1, start, t.draw_settings)
+    settings = t.raster_settings(t.schedule.sh_degree)
     image = render(trained, where, settings, backend="reference").image
     levels = np.rint(np.clip(image, 0, 1) * 255)
     assert np.abs(seen[-1] - levels).max() <= 1  # rounding of halves
@@ -297,13 +298,13 @@ def test_a_run_that_loses_every_splat_ends(tmp_path):
     faint = np.full(len(start), -12.0, np.float32)
     model = t.run(replace(start, opacity_logits=faint))
     assert len(model) == 0
-    assert len(finished(model, 1, start, t.draw_settings)) == 0
+    assert len(splats_of(model, 1, start, t.draw_settings)) == 0
     assert t.history[-1]["splats"] == 0
 
 
 def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
     t, start = small_problem(tmp_path, "none", steps=120)
-    monkeypatch.setattr(train, "make_trainer", lambda *_: t)
+    monkeypatch.setattr(build, "make_trainer", lambda *_: t)
     faint = replace(start, opacity_logits=np.full(len(start), -12.0, np.float32))
     with pytest.raises(SplatError) as error:
         train.run({"sfm": None, "seed": faint}, train.TrainSettings(), t.folder, Report())
@@ -394,18 +395,18 @@ def test_a_run_that_another_backend_goes_on_with_says_so(tmp_path):
 
     with pytest.raises(Interrupted):
         trained("cpu", stop_at=2)
-    assert not any("going on with" in label for label in labels)
+    assert not any("resuming with" in label for label in labels)
     report = trained("reference")
-    assert "going on with reference on what cpu began" in labels
-    assert [(maker["step"], maker["backend"]) for maker in report.metrics["makers"]] == [
+    assert "resuming with reference what cpu began" in labels
+    assert [(entry["step"], entry["backend"]) for entry in report.metrics["provenance"]] == [
         (0, "cpu"),
         (3, "reference"),
     ]
-    assert report.metrics["made_by"] == "cpu (cpu) to step 3, then reference (cpu)"
-    assert "then reference" in dict(report.warnings)["train-several-makers"]
+    assert report.metrics["trained_by"] == "cpu (cpu) to step 3, then reference (cpu)"
+    assert "then reference" in dict(report.warnings)["train-several-backends"]
     told = headline(cast(Any, SimpleNamespace(stage="train", metrics=report.metrics)))
-    assert "made by cpu (cpu) to step 3" in told
-    assert "train-several-makers" not in dict(trained("cpu").warnings)
+    assert "trained by cpu (cpu) to step 3" in told
+    assert "train-several-backends" not in dict(trained("cpu").warnings)
 
 
 def test_a_cap_that_was_asked_for_is_told_as_that(tmp_path):

@@ -44,8 +44,7 @@ def trainer(folder, contradicting, report=None, patience_db=0.05, views=4):
         folder,
         report or Report(),
         backend="cpu",
-        validation=(VALIDATION,),
-        patience_db=patience_db,
+        early_stopping=EarlyStopping(patience_db, (VALIDATION,)),
     )
     return made, start
 

@@ -52,7 +52,7 @@ class Worker(threading.Thread):
         while not self.stop.wait(0.002):
             step += 1
             self.page.progressed("training", step, 10**6, {"splats": 10, "loss": 0.5})
-            self.page.pictures.offer(self.draw, step)
+            self.page.frames.offer(self.draw, step)
 
     def draw(self, camera: Camera) -> np.ndarray:
         return np.rint(np.clip(render(self.splats, camera).image, 0, 1) * 255).astype(np.uint8)
@@ -190,13 +190,13 @@ def test_the_picture_follows_training_untouched_and_the_end_is_told(
     assert psnr(now, ours(worker.splats, camera)) > LIVE_PICTURE_DB
     worker.stop.set()
     worker.join()
-    worker.page.pictures.offer_last(worker.draw, 1_000_000)
+    worker.page.frames.offer_last(worker.draw, 1_000_000)
     worker.page.ended("finished")
     until(browser, "splatLive.picture.step === 1000000 && splatLive.state.end")
     message = browser.run("document.getElementById('message').textContent")
     assert "Training has finished" in message
     deadline = time.monotonic() + WAIT_S
-    while not worker.page.told:
+    while not worker.page.end_delivered:
         assert time.monotonic() < deadline
         time.sleep(0.01)
 

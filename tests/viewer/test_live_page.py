@@ -51,7 +51,7 @@ class Trainer(threading.Thread):
             self.steps += 1
             self.page.progressed("training", self.steps, 10**6, {"splats": 5, "loss": float("nan")})
             start = time.monotonic()
-            self.page.pictures.offer(self.draw, self.steps)
+            self.page.frames.offer(self.draw, self.steps)
             self.longest_s = max(self.longest_s, time.monotonic() - start)
 
     def draw(self, camera: Camera) -> np.ndarray:
@@ -149,7 +149,7 @@ def test_requests_that_make_no_sense_are_refused_undrawn(
         picture_at(place="2,0,0,0,0,2,0,0,0,0,2,0"),
     ):
         assert ask(server, address)[0] == 400, address
-    assert not page.pictures.watched()
+    assert not page.frames.is_watched()
 
 
 def test_a_page_elsewhere_cannot_make_the_trainer_draw(page: LivePage, server: LocalServer) -> None:
@@ -158,18 +158,18 @@ def test_a_page_elsewhere_cannot_make_the_trainer_draw(page: LivePage, server: L
             host = f"Host: 127.0.0.1:{server.server_port}\r\nSec-Fetch-Site: {site}\r\n"
             client.sendall(f"GET {picture_at()} HTTP/1.0\r\n{host}\r\n".encode())
             assert client.recv(100).split()[1] == b"403"
-    assert not page.pictures.watched()
+    assert not page.frames.is_watched()
     assert ask(server, picture_at(), host="evil.example")[0] == 403
 
 
 def test_the_end_is_told_and_remembered_to_have_been(page: LivePage, server: LocalServer) -> None:
     page.progressed("training", 7, 10, {})
     page.ended("stopped")
-    assert not page.told
+    assert not page.end_delivered
     state = json.loads(ask(server, "/state")[1])
     assert (state["end"], state["done"]) == ("stopped", 7)
     assert json.loads(ask(server, picture_at())[1]) == {}
-    assert page.told
+    assert page.end_delivered
 
 
 def test_time_left_counts_from_where_training_was_resumed() -> None:

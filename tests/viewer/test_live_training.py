@@ -1,4 +1,4 @@
-"""`--view` between the pipeline and the page."""
+"""`--view`: the listener between the pipeline and the page."""
 
 from __future__ import annotations
 
@@ -15,27 +15,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatcli import console, live_view
 from stages.scene import Camera
+from stages.viewer import live_training
 from tests.small_scene import small_scene
 
 TRAIN, PRUNE = (SimpleNamespace(name=name) for name in ("train", "prune"))
 
 
 @pytest.fixture
-def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    lines: list[str] = []
-    monkeypatch.setattr(console, "note", lambda text, style="": lines.append(text))
-    monkeypatch.setattr(live_view, "open_page", lambda address: False)
-    return lines
+def said() -> list[str]:
+    """The addresses that were announced, and the warnings."""
+    return []
 
 
 @pytest.fixture
-def watcher(tmp_path: Path, said: list[str]) -> live_view.LiveTraining:
+def watcher(tmp_path: Path, said: list[str]) -> live_training.LiveTraining:
     scene = small_scene(tmp_path, views=3)
     outputs = {"sfm": scene.reconstruction, "seed": scene.splats}
     pipeline: Any = SimpleNamespace(load=outputs.__getitem__, run_folder=tmp_path / "run")
-    return live_view.LiveTraining(pipeline, as_json=False)
+    return live_training.LiveTraining(pipeline, said.append, said.append)
 
 
 def get(address: str) -> Any:

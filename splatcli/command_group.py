@@ -1,4 +1,4 @@
-"""A command line that cannot be understood: said as every other error is, exit status 2."""
+"""Reports a command line that cannot be parsed as every other error; exit status 2."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typer.core import TyperGroup
 from splatcli import console
 from stages.base.errors import Family, SplatError
 
-_UsageError: Any = typer.BadParameter.__base__  # typer names it in no place of its own
+_UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
 
-class Commands(TyperGroup):
-    """The commands, with a wrong word told in our words instead of the parser's."""
+class CommandGroup(TyperGroup):
+    """The commands. The parser's errors become `SplatError` "command-line"."""
 
     def main(
         self,
@@ -40,13 +40,13 @@ class Commands(TyperGroup):
             if type(error).__name__ == "NoArgsIsHelpError":  # it has shown the help
                 status = int(Family.USAGE)
             else:
-                status = console.show_error(_explained(error), "--json" in words)
+                status = console.show_error(_as_splat_error(error), "--json" in words)
         if standalone_mode:
             sys.exit(status)
         return status
 
 
-def _explained(error: Any) -> SplatError:
+def _as_splat_error(error: Any) -> SplatError:
     command = error.ctx.command_path if error.ctx is not None else "splat"
     hint = f"`{command} --help` lists what there is."
     kind = type(error).__name__
@@ -59,7 +59,7 @@ def _explained(error: Any) -> SplatError:
     elif kind == "MissingParameter":
         given = f"{command} needs a {error.param.name}, and none is named."
     else:
-        given, hint = _in_our_words(command, error.format_message(), hint)
+        given, hint = _reworded(command, error.format_message(), hint)
     return SplatError(
         "command-line",
         given=given,
@@ -69,14 +69,14 @@ def _explained(error: Any) -> SplatError:
     )
 
 
-def _in_our_words(command: str, said: str, hint: str) -> tuple[str, str]:
-    """(given, hint) of what the parser tells only as a sentence; its own where that is another."""
-    if found := re.fullmatch(r"No such command '(.+?)'\.(?: Did you mean (.+)\?)?", said):
+def _reworded(command: str, message: str, hint: str) -> tuple[str, str]:
+    """(given, hint) for a parser's message; the message itself if it is not a known one."""
+    if found := re.fullmatch(r"No such command '(.+?)'\.(?: Did you mean (.+)\?)?", message):
         likely = f"Did you mean {found[2].replace(chr(39), '')}? " if found[2] else ""
         return f"{command} has no command {found[1]}.", likely + hint
-    if found := re.fullmatch(r"Got unexpected extra argument(?:s|\(s\))? \((.+)\)", said):
+    if found := re.fullmatch(r"Got unexpected extra argument(?:s|\(s\))? \((.+)\)", message):
         return (
-            f"{command} has no use for {found[1]}.",
+            f"{command} does not accept {found[1]}.",
             f"Put quotes around a path with spaces, and give each option all of its values. {hint}",
         )
-    return said, hint
+    return message, hint

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 import threading
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from splatcli import console
-from splatcli.commands.view import open_page
 from stages.base.stage import DrawView, Numbers, Stage
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Listener, Pipeline
@@ -17,23 +15,31 @@ if TYPE_CHECKING:
     from stages.viewer.live_page import LivePage
     from stages.viewer.server import LocalServer
 
-WATCHED = "train"
-_FAREWELL_S = 5.0  # for an open page to hear how it ended; it asks twice a second, a busy one less
+_STAGE = "train"
+_GRACE_PERIOD_S = 5.0  # for an open page to fetch the last state; it polls about twice a second
 
 
 class LiveTraining(Listener):
-    """Serves the page from the start of training to the end of the run."""
+    """Serves the page from the start of training to the end of the run.
 
-    def __init__(self, pipeline: Pipeline, as_json: bool) -> None:
+    Args:
+        announce: called with the page's address once it is served.
+        warn: called with a sentence if the page cannot be served or there is nothing to show.
+    """
+
+    def __init__(
+        self, pipeline: Pipeline, announce: Callable[[str], None], warn: Callable[[str], None]
+    ) -> None:
         self._pipeline = pipeline
-        self._as_json = as_json
+        self._announce = announce
+        self._warn = warn
         self._server: LocalServer | None = None
         self._page: LivePage | None = None
         self._end = "stopped"
         self._progress = (0, 0)
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        if stage.name != WATCHED:
+        if stage.name != _STAGE:
             return
         from stages.formats.page.cameras import page_cameras
         from stages.viewer.live_page import LivePage
@@ -46,21 +52,14 @@ class LiveTraining(Listener):
         )
         try:
             self._server = LocalServer(self._page.items)
-        except OSError as error:  # looking on is no reason not to train
-            console.note(f"--view: no port of this machine can be listened on: {error}", "yellow")
+        except OSError as error:  # training goes on without the page
+            self._warn(f"--view: no port of this machine can be listened on: {error}")
             return
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
         self._announce(self._server.address)
 
-    def _announce(self, address: str) -> None:
-        if self._as_json:
-            console.emit("view", address=address)
-        else:
-            console.note(f"Watch it train at {address}", "bold")
-        open_page(address)
-
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        if self._page is not None and stage.name == WATCHED:
+        if self._page is not None and stage.name == _STAGE:
             self._progress = (done, total)
             self._page.progressed(label, done, total, numbers)
 
@@ -69,31 +68,32 @@ class LiveTraining(Listener):
             return
         done, total = self._progress
         if done < total:
-            self._page.pictures.offer(draw, done)
+            self._page.frames.offer(draw, done)
         else:
-            self._page.pictures.offer_last(draw, done)
+            self._page.frames.offer_last(draw, done)
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        if self._page is not None and stage.name == WATCHED:
+        if self._page is not None and stage.name == _STAGE:
             self._end = "finished"
             self._page.ended(self._end)
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        if stage.name == WATCHED:
-            look = shlex.join(["splat", "view", str(self._pipeline.run_folder)])
-            what = "Training was finished before: there is nothing to watch."
-            console.note(f"{what} Look at the result with: {look}")
+        if stage.name == _STAGE:
+            self._warn(
+                "--view: training had finished before, so there is nothing to watch. "
+                f"See the result with: splat view {self._pipeline.run_folder}"
+            )
 
     def ended(self) -> None:
         if self._server is None or self._page is None:
             return
         if self._end == "stopped":
             self._page.ended(self._end)
-        self._wait_for_the_page(self._page)
+        self._wait_for_page(self._page)
         self._server.shutdown()
         self._server.server_close()
 
-    def _wait_for_the_page(self, page: LivePage) -> None:
-        deadline = time.monotonic() + _FAREWELL_S
-        while page.pictures.watched() and not page.told and time.monotonic() < deadline:
+    def _wait_for_page(self, page: LivePage) -> None:
+        deadline = time.monotonic() + _GRACE_PERIOD_S
+        while page.frames.is_watched() and not page.end_delivered and time.monotonic() < deadline:
             time.sleep(0.05)

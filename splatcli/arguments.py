@@ -1,0 +1,99 @@
+"""Arguments and options that several commands share, in the form that typer reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from splatcli.options import option
+from stages.base.distribution import install_command
+from stages.base.settings import Setting
+from stages.formats import FORMATS
+from stages.raster.backends import CHOICES
+from stages.raster.torch_device import DEVICES
+
+_INSTALL_RAY = install_command("cluster").replace("[", r"\[")  # in rich markup
+
+ENDINGS = ", ".join(f".{ending}" for ending in FORMATS)
+
+Photos = Annotated[
+    Path | None,
+    typer.Argument(help="Folder of photographs; a run folder, or nothing, continues that run."),
+]
+Run = Annotated[
+    Path | None, typer.Argument(help="Run folder; by default the one in the current folder.")
+]
+RunOrFile = Annotated[
+    Path | None, typer.Argument(help="Run folder or splat file; by default the run here.")
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        "-o",
+        help="Run folder to make or continue.",
+        show_default="run",
+        rich_help_panel="Output",
+    ),
+]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", help="Print only warnings and results.", rich_help_panel="Output"
+    ),
+]
+AsJson = Annotated[
+    bool,
+    typer.Option(
+        "--json", help="Print events and results as lines of JSON.", rich_help_panel="Output"
+    ),
+]
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose",
+        help="Write a log for a bug report: versions, machine, settings, warnings, tracebacks.",
+        rich_help_panel="Output",
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Ray cluster that executes runs, or the blocks and matching of one run (HOST:PORT, "
+        "ray://HOST:PORT, auto), or local:N for N workers on this machine. It needs "
+        f"{_INSTALL_RAY}.",
+        show_default="this process",
+        rich_help_panel="Advanced",
+    ),
+]
+Backend = Annotated[
+    str | None,
+    option(
+        Setting(
+            "backend",
+            "--backend",
+            str,
+            choices=CHOICES,
+            help=f"Rendering backend: {', '.join(CHOICES)}; by default the one of the training.",
+            panel="Advanced",
+        ),
+        shown=False,
+    ),
+]
+Device = Annotated[
+    str | None,
+    option(
+        Setting(
+            "device",
+            "--device",
+            str,
+            choices=DEVICES,
+            help=f"Torch device for --backend reference: {', '.join(DEVICES)}.",
+            panel="Advanced",
+        ),
+        shown=False,
+    ),
+]

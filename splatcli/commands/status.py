@@ -1,0 +1,54 @@
+"""`splat status`: what is finished in a run folder, and what would run again."""
+
+from __future__ import annotations
+
+from splatcli import console, summary
+from splatcli.arguments import AsJson, Run
+from splatcli.folders import find_run_folder
+from stages.run.pipeline import Pipeline, Step
+
+
+def status(run: Run = None, as_json: AsJson = False) -> None:
+    """Say what is finished, what would run again, and why."""
+    pipeline = Pipeline(find_run_folder(run))
+    steps, busy = pipeline.status(), pipeline.busy()
+    if as_json:
+        rows = [
+            {
+                "stage": s.stage.name,
+                "state": _state(s, busy),
+                "reason": s.reason or None,
+                "warnings": s.manifest.warnings if s.manifest else [],
+            }
+            for s in steps
+        ]
+        console.emit("status", run_folder=str(pipeline.run_folder), busy=busy, stages=rows)
+        return
+    console.table(
+        ("stage", "state", "time", "peak memory", ""),
+        [
+            (
+                f"{s.number}-{s.stage.name}",
+                _state(s, busy),
+                summary.time_of(s.manifest) if s.manifest else "-",
+                f"{s.manifest.peak_memory_mib:,.0f} MiB" if s.manifest else "-",
+                s.reason or (summary.headline(s.manifest) if s.manifest else ""),
+            )
+            for s in steps
+        ],
+        title=str(pipeline.run_folder),
+    )
+    if busy:
+        console.out.print(f"\nProcess {busy} is working on it now.")
+
+
+def _state(step: Step, busy: int | None) -> str:
+    if busy and step.interrupted:
+        return "running"
+    if not step.will_run:
+        return "finished"
+    if step.failed:
+        return "failed"
+    if step.manifest is not None:
+        return "runs again"
+    return "interrupted" if step.interrupted else "to do"

@@ -1,0 +1,134 @@
+"""The settings of a run: presets, options, and what a run folder recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from inspect import Parameter
+from typing import Any
+
+import typer
+
+from splatcli import console, options
+from stages import STAGE_NAMES, load_stage
+from stages.base.settings import Setting, settings_of
+from stages.raster.backends import backend_of, backend_of_settings
+
+DEFAULT_PRESET = "standard"
+
+# Options that describe one capture: a batch gives the same options to all of its runs.
+_OF_ONE_CAPTURE = ("masks", "cameras", "split", "refine_cameras", "scale", "blocks", "view")
+
+
+def presets() -> Mapping[str, Any]:
+    """Training settings by preset name."""
+    from stages.train import PRESETS
+
+    found: Mapping[str, Any] = PRESETS
+    return found
+
+
+def process_parameters() -> list[Parameter]:
+    """The options of `splat process`: the settings with a panel. One that several stages have is
+    listed once and given to all of them."""
+    found: dict[str, Parameter] = {}
+    for name in STAGE_NAMES:
+        kind = load_stage(name).settings_type
+        for parameter in options.parameters(kind, _shown, only_in_process=True):
+            found.setdefault(parameter.name, parameter)
+    shown = f"{DEFAULT_PRESET}; as before where a run goes on"
+    return [_preset_parameter(shown), *found.values(), _view_parameter()]
+
+
+def batch_parameters() -> list[Parameter]:
+    """The options of `process` that can apply to many captures."""
+    return [p for p in process_parameters() if p.name not in _OF_ONE_CAPTURE]
+
+
+def stage_parameters(name: str) -> list[Parameter]:
+    """All settings of one stage; for training also the preset and --view."""
+    kind = load_stage(name).settings_type
+    if name == "ingest":
+        return options.parameters(kind)
+    own = options.parameters(kind, shown=_shown_or_recorded)
+    if name != "train":
+        return own
+    return [_preset_parameter(f"as before, else {DEFAULT_PRESET}"), *own, _view_parameter()]
+
+
+def _preset_parameter(shown: str) -> Parameter:
+    setting = Setting(
+        "preset",
+        "--preset",
+        str,
+        choices=tuple(presets()),
+        help="How much training: preview (minutes), standard, or best (the full recipe).",
+        panel="Quality and time",
+    )
+    return options.keyword("preset", str | None, options.option(setting, shown))
+
+
+def _view_parameter() -> Parameter:
+    option = typer.Option(
+        "--view",
+        help="Show the scene in the browser while it is trained.",
+        rich_help_panel="Output",
+    )
+    return options.keyword("view", bool, option, default=False)
+
+
+def _shown(setting: Setting) -> str | bool:
+    """The default for the help; "by preset" where presets differ in it."""
+    values = {getattr(preset, setting.name, setting.default) for preset in presets().values()}
+    return options.shown_default(setting) if len(values) == 1 else "by preset"
+
+
+def _shown_or_recorded(setting: Setting) -> str | bool:
+    """The default for the help of a command that takes recorded settings first."""
+    shown = _shown(setting)
+    return f"as before, else {shown}" if shown else "as before"
+
+
+def defaults() -> dict[str, Any]:
+    """Settings by stage name, with the default preset."""
+    fresh = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
+    return {**fresh, "train": presets()[DEFAULT_PRESET]}
+
+
+def combined(
+    base: Mapping[str, Any], given: Mapping[str, Any], preset: str | None
+) -> dict[str, Any]:
+    """`base` (settings by stage name) changed by a preset, then by the given options.
+
+    Raises SplatError for a value or a combination that is not allowed, and for a backend that is
+    not available here.
+    """
+    chosen = dict(base)
+    if preset is not None and "train" in chosen:
+        chosen["train"] = presets()[preset]
+    found = {name: options.changed(settings, given) for name, settings in chosen.items()}
+    if given.keys() & {"backend", "device"}:  # an error now, not after an hour of other work
+        with_backend = [settings for settings in found.values() if hasattr(settings, "backend")]
+        for name in {backend_of_settings(settings) for settings in with_backend}:
+            backend_of(name).require()
+    return found
+
+
+def of_new_run(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by stage name of a new run with the given options, "preset" included. Raises
+    SplatError."""
+    others = {name: value for name, value in given.items() if name != "preset"}
+    return combined(defaults(), others, given.get("preset"))
+
+
+def training_summary(settings: Any, given: Mapping[str, Any], preset: str | None) -> str:
+    """One sentence with the training settings of a resumed run, and where each comes from."""
+    by_origin: dict[str, list[str]] = {}
+    recorded = f"preset {preset}" if preset else "as recorded in the run"
+    for setting in settings_of(type(settings)):
+        name = setting.name
+        if name in given or _shown(setting) == "by preset":
+            origin = "as given" if name in given else recorded
+            value = f"{console.label(name)} {console.figure(name, getattr(settings, name))}"
+            by_origin.setdefault(origin, []).append(value)
+    parts = [f"{', '.join(values)} ({origin})" for origin, values in by_origin.items()]
+    return f"Training: {'; '.join(parts)}."

@@ -1,0 +1,137 @@
+"""Runs of many captures: their names, and the table of their results."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import astuple, dataclass, fields, replace
+from pathlib import Path
+
+from stages import STAGE_NAMES
+from stages.base.atomic import replacing
+from stages.base.errors import Family, SplatError
+from stages.distributed import remote
+from stages.distributed.tasks import Location, TaskResult
+from stages.run.manifest import Manifest
+
+FILE_NAME = "batch.csv"
+WAITING, DONE = "waiting", "done"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of batch.csv; figures are "" where they are not known.
+
+    status: "waiting", "done", or the code of the error. seconds: of all stages, whenever they ran.
+    psnr_db: of the exported splats on held-out views. size_bytes: of the exported files. warnings:
+    their codes.
+    """
+
+    capture: str
+    status: str = WAITING
+    seconds: float | str = ""
+    psnr_db: float | str = ""
+    size_bytes: int | str = ""
+    splats: int | str = ""
+    warnings: str = ""
+
+
+def run_names(captures: Sequence[Location]) -> dict[str, Location]:
+    """Captures by the name of their run folder: the name of the folder or of the video. Raises
+    SplatError "batch-same-name"."""
+    found: dict[str, Location] = {}
+    taken: dict[str, Location] = {}
+    for location in captures:
+        name = remote.capture_name(location)
+        if not name or name.casefold() in taken:
+            other = taken.get(name.casefold(), location)
+            raise SplatError(
+                "batch-same-name",
+                given=f"{other} and {location} would both be the run {name or 'without a name'}.",
+                wanted="Captures of different names: each gives its run folder its own.",
+                hint="Name the folders above them (captures/*), or rename one.",
+                family=Family.USAGE,
+            )
+        found[name] = taken[name.casefold()] = location
+    return found
+
+
+class BatchTable:
+    """The results of all runs, kept in batch.csv.
+
+    Args:
+        folder: a local folder with the run folders, or with copies of their manifests.
+        runs: the location of the run folders.
+        names: of the run folders.
+    """
+
+    def __init__(self, folder: Path, runs: Location, names: Sequence[str]) -> None:
+        self.folder, self.runs = folder, runs
+        self.rows = [Row(name) for name in names]
+        self.worst_status = 0
+        self.write()
+
+    @property
+    def location(self) -> Location:
+        """Of batch.csv."""
+        return remote.joined(self.runs, FILE_NAME)
+
+    def ended(self, number: int, result: TaskResult) -> None:
+        """Record the result of a run."""
+        name = self.rows[number].capture
+        with suppress(SplatError):  # the figures stay blank
+            remote.fetch_manifests(self.runs, name, self.folder)
+        row = row_of(self.folder / name)
+        self.rows[number] = replace(row, status=result.code or DONE)
+        self.worst_status = max(self.worst_status, result.status)
+        with suppress(SplatError):  # a full disk makes the runs fail; the batch goes on
+            self.write()
+
+    def write(self) -> None:
+        """Write batch.csv, whole or not at all. Raises SplatError."""
+        path = self.folder / FILE_NAME
+        with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(field.name for field in fields(Row))
+            writer.writerows(map(astuple, self.rows))
+        if isinstance(self.runs, str):
+            remote.RemoteFolder.at(self.runs).put(self.folder, [FILE_NAME])
+
+    def counts(self) -> str:
+        """ "2 waiting, 1 done, 1 failed"."""
+        kinds = (row.status if row.status in (WAITING, DONE) else "failed" for row in self.rows)
+        return ", ".join(f"{count} {kind}" for kind, count in Counter(kinds).items())
+
+
+def row_of(run_folder: Path) -> Row:
+    """The figures in the manifests of a run folder; blank where one is missing or unreadable."""
+    found: dict[str, Manifest] = {}
+    for number, name in enumerate(STAGE_NAMES, start=1):
+        with suppress(SplatError):
+            manifest = Manifest.read(run_folder / f"{number}-{name}")
+            if manifest is not None:
+                found[name] = manifest
+    row = Row(run_folder.name)
+    if found:
+        codes = (code for manifest in found.values() for code, _ in manifest.warnings)
+        seconds = round(sum(manifest.seconds for manifest in found.values()), 1)
+        row = replace(row, seconds=seconds, warnings=" ".join(dict.fromkeys(codes)))
+    quantise, export = found.get("quantise"), found.get("export")
+    if quantise is not None and quantise.metrics.get("measured_on") == "held out":
+        row = replace(row, psnr_db=round(quantise.metrics["psnr_kept_db"], 3))
+    if export is not None:
+        sizes = [f["size_bytes"] for f in export.metrics.get("formats", {}).values()]
+        row = replace(row, size_bytes=sum(sizes), splats=export.metrics.get("splats", ""))
+    return row
+
+
+def running_stage(run_folder: Path) -> tuple[str, float] | None:
+    """(the stage that has a working folder, seconds since that was made), if there is one."""
+    for number, name in enumerate(STAGE_NAMES, start=1):
+        with suppress(OSError):
+            begun = (run_folder / f".{number}-{name}.partial").stat()
+            return name, max(0.0, time.time() - begun.st_ctime)
+    return None

@@ -1,0 +1,112 @@
+"""The splats, cameras and figures that a run folder holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stages.base.errors import Family, SplatError
+from stages.run import runfolder
+from stages.run.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from stages.scene import Splats, View
+
+_STAGES_WITH_SPLATS = ("seed", "train", "prune", "quantise")
+
+
+def newest_stage_with_splats(pipeline: Pipeline) -> str:
+    """The last finished stage whose output is splats. Raises SplatError (no-splats-yet)."""
+    for name in reversed(_STAGES_WITH_SPLATS):
+        if pipeline.manifest(name) is not None:
+            return name
+    raise SplatError(
+        "no-splats-yet",
+        given=f"No stage of {pipeline.run_folder} has made splats yet.",
+        wanted="A run in which at least `seed` has finished.",
+        hint="Run `splat process` to go on.",
+        family=Family.USAGE,
+    )
+
+
+def newest_splats(pipeline: Pipeline) -> Splats:
+    """The splats of the last finished stage that has any. Raises SplatError (no-splats-yet)."""
+    name = newest_stage_with_splats(pipeline)
+    output = pipeline.load(name)
+    splats: Splats = output.splats if name in ("train", "quantise") else output
+    return splats
+
+
+def final_splats(pipeline: Pipeline) -> Splats:
+    """The splats of a finished run, whose stages were made from each other as they lie there.
+
+    Raises SplatError (stage-not-finished, run-half-anew).
+    """
+    digests: dict[str, str] = {}
+    for name in ("sfm", *_STAGES_WITH_SPLATS):
+        manifest = pipeline.manifest(name)
+        if manifest is None:
+            pipeline.load(name)  # raises stage-not-finished
+            raise AssertionError(name)
+        for source, digest in digests.items():
+            if manifest.inputs.get(source, digest) != digest:
+                raise SplatError(
+                    "run-half-anew",
+                    given=f"In {pipeline.run_folder}, {source} was made again, and {name} was not.",
+                    wanted="A run whose stages belong together.",
+                    hint="Run `splat process` to finish it.",
+                    family=Family.USAGE,
+                )
+        digests[name] = manifest.output_digest
+    splats: Splats = pipeline.load("quantise").splats
+    return splats
+
+
+def exported_formats(pipeline: Pipeline) -> dict[str, dict[str, Any]]:
+    """The figures of each exported file by format; empty if export has not finished, or exported
+    other splats than quantise has now."""
+    quantised, exported = pipeline.manifest("quantise"), pipeline.manifest("export")
+    if quantised is None or exported is None:
+        return {}
+    if exported.inputs.get("quantise") != quantised.output_digest:
+        return {}
+    return dict(exported.metrics.get("formats", {}))
+
+
+def views_of(pipeline: Pipeline | None) -> tuple[View, ...]:
+    """The capture's views, sorted by name; empty without a finished reconstruction."""
+    if pipeline is None or pipeline.manifest("sfm") is None:
+        return ()
+    return tuple(sorted(pipeline.load("sfm").views, key=lambda view: view.name))
+
+
+def run_around(file: Path | None) -> Pipeline | None:
+    """The run whose export folder a file lies in: its cameras fit the file."""
+    if file is None or not runfolder.is_run_folder(file.absolute().parent.parent):
+        return None
+    return Pipeline(file.absolute().parent.parent)
+
+
+def read_file(file: Path, strict: bool = True) -> Splats:
+    """The splats of a file. A file in a run's export folder gets that run's draw settings.
+
+    strict: whether a value that is not finite makes the file unreadable. Raises SplatError.
+    """
+    from stages.formats import read
+    from stages.scene import draw_settings_of
+
+    splats = read(file, strict=strict)
+    views = views_of(run_around(file))
+    return replace(splats, draw_settings=draw_settings_of(views)) if views else splats
+
+
+def backend_of_run(pipeline: Pipeline | None) -> str:
+    """The backend that was requested for training the run; "auto" without a run, and on a machine
+    that cannot use that backend."""
+    from stages.raster.backends import AUTO, backend_of_settings, runs_here
+
+    if pipeline is None:
+        return AUTO
+    requested = backend_of_settings(pipeline.recorded_settings()["train"])
+    return requested if runs_here(requested) else AUTO

@@ -1,0 +1,91 @@
+"""The trainer of a run, made from its settings."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.base.stage import Report
+from stages.base.text import counted
+from stages.measure.evaluation import load_evaluation_views
+from stages.raster.backends import backend_of_settings
+from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
+from stages.scene.light import NOISE_EV, spread_ev
+from stages.training.cap import cap_for, splats_determined
+from stages.training.schedule import Schedule
+from stages.training.trainer import Trainer
+from stages.training.validation import EarlyStopping, validation_rows
+from stages.training.views import load_views
+
+if TYPE_CHECKING:
+    from stages.train import TrainSettings
+
+
+def make_trainer(
+    reconstruction: Reconstruction,
+    n_start: int,
+    settings: TrainSettings,
+    folder: Path,
+    report: Report,
+) -> Trainer:
+    """Load the training views and choose the cap of splats. n_start: splats at the start. Raises
+    SplatError."""
+    began = time.monotonic()
+    kept, held = split_held_out(reconstruction.views)
+    light = corrects_light(reconstruction, settings.light, report)
+    train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
+    draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light)
+    held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
+    sides = [max(v.camera.width, v.camera.height) for v in reconstruction.views]
+    if smaller := sum(side < settings.train_side for side in sides):
+        report.warn(
+            "train-photographs-smaller",
+            f"Used at their own size, smaller than --train-side {settings.train_side}: "
+            f"{counted(smaller, 'photograph')}. --max-side sets how large ingest keeps them.",
+        )
+    determined = splats_determined([view.levels[-1].camera for view in train], settings.sh_degree)
+    cap = cap_for(folder, settings.max_splats, determined)
+    report.metric("splat_cap", cap.splats)
+    report.metric("splat_cap_from", cap.origin)
+    report.metric("splat_cap_free_mib", cap.free_mib)
+    validation = validation_rows(len(train)) if settings.patience else ()
+    seconds = settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0)
+    return Trainer(
+        schedule=Schedule(
+            steps=settings.steps,
+            extent=training_extent(reconstruction),
+            sh_degree=settings.sh_degree,
+            n_start=min(n_start, cap.splats),
+            seed=settings.seed,
+        ),
+        train=train,
+        held_out=held_out,
+        draw_settings=draw_settings,
+        cap=cap.splats,
+        folder=folder,
+        report=report,
+        smooth=settings.smooth,
+        random_background=settings.background == "any",
+        backend=backend_of_settings(settings),
+        early_stopping=EarlyStopping(settings.patience, validation),
+        seconds=seconds,
+        within=settings.within,
+    )
+
+
+def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
+    """Whether the views are brought to their median exposure and white balance. choice: "auto",
+    "on" or "off", see `TrainSettings.light`."""
+    lights = [view.light for view in reconstruction.views]
+    spread = spread_ev(lights)
+    corrects = choice == "on" or (choice == "auto" and spread > NOISE_EV)
+    report.metric("light_spread_ev", round(spread, 4))
+    report.metric("light_corrected", corrects and any(light is not None for light in lights))
+    if corrects and choice == "auto":
+        report.warn(
+            "train-light-evened",
+            f"Exposure or white balance differ between photographs (typically by {spread:.2f} EV): "
+            "they are brought to the median photograph's. Lock both in the camera to lose nothing.",
+        )
+    return corrects

@@ -1,0 +1,98 @@
+"""The final evaluation of a run: metrics, a table, a plot and a contact sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.base.atomic import replacing
+from stages.base.stage import Report
+from stages.measure.evaluation import (
+    EvaluationView,
+    ImageRenderer,
+    Score,
+    evaluate,
+    evaluation_subset,
+    psnr_as_taken_db,
+    psnr_inside_masks_db,
+)
+from stages.scene import DrawSettings, Reconstruction, split_held_out
+from stages.training.charts import contact_sheet, training_plot
+from stages.training.clock import Elapsed
+
+
+def write_quality(
+    render: ImageRenderer,
+    views: Sequence[EvaluationView],
+    draw_settings: DrawSettings,
+    reconstruction: Reconstruction,
+    folder: Path,
+    report: Report,
+) -> None:
+    """Evaluate the held-out `views`: metrics go into the report, the contact sheet `held_out.png`
+    with its legend into the folder.
+
+    Args:
+        render: draws the trained splats.
+        draw_settings: they are drawn with.
+        reconstruction: the held-out views come from.
+    """
+    scores = evaluate(render, views, with_flip=True)
+    if scores:
+        _report_scores(scores, report)
+    else:
+        report.warn(
+            "train-nothing-held-out",
+            "Too few photographs to hold one out: quality was not measured.",
+        )
+    if draw_settings.light and scores:
+        _, held = split_held_out(reconstruction.views)
+        plain, adapted = psnr_as_taken_db(render, reconstruction.folder, held, draw_settings)
+        report.metric("psnr_as_taken_db", round(plain, 3))
+        report.metric("psnr_adapted_db", round(adapted, 3))
+    inside = psnr_inside_masks_db(render, views)
+    if inside is not None:
+        report.metric("psnr_inside_db", round(inside, 3))
+    report.metric("held_out", [asdict(score) for score in scores])
+    sides = (max(view.pixels.shape[:2]) for view in views)
+    report.metric("evaluated_side_px", max(sides, default=0))
+    rows = []
+    worst = min(range(len(scores)), key=lambda i: scores[i].psnr_db, default=0)
+    for i in sorted({*evaluation_subset(len(scores)), worst}) if scores else ():
+        image = np.clip(render(views[i].camera), 0.0, 1.0)
+        rows.append((views[i].name, scores[i].psnr_db, image, views[i].image))
+    contact_sheet(folder / "held_out.png", rows)
+
+
+def write_history(
+    history: Sequence[dict[str, Any]], times: Sequence[Elapsed], folder: Path, report: Report
+) -> None:
+    """The evaluations during the run as `history.csv` and as a plot. The times, which differ
+    between equal runs, go only into the report."""
+    lines = ["step,splats,psnr_db,ssim"]
+    for entry in history:
+        lines.append(
+            f"{entry['step']},{entry['splats']},{entry.get('psnr_db', float('nan')):.4f},"
+            f"{entry.get('ssim', float('nan')):.5f}"
+        )
+    with replacing(folder / "history.csv") as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    training_plot(folder / "training.png", history)
+    both = zip(history, times, strict=True)
+    report.metric("history", [entry | asdict(elapsed) for entry, elapsed in both])
+
+
+def _report_scores(scores: Sequence[Score], report: Report) -> None:
+    values = [score.psnr_db for score in scores]
+    worst = min(scores, key=lambda score: score.psnr_db)
+    flips = [score.flip for score in scores if score.flip is not None]
+    report.metric("psnr_db", round(float(np.mean(values)), 3))
+    report.metric("psnr_worst_db", round(worst.psnr_db, 3))
+    report.metric("psnr_worst_view", worst.name)
+    report.metric("psnr_spread_db", round(float(np.std(values)), 3))
+    report.metric("ssim", round(float(np.mean([score.ssim for score in scores])), 4))
+    report.metric("flip", round(float(np.mean(flips)), 4))

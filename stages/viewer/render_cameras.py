@@ -1,0 +1,166 @@
+"""The cameras of a rendering: one view's camera, or one camera for each frame of a path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.base.errors import Family, SplatError
+from stages.base.text import counted
+
+if TYPE_CHECKING:
+    from stages.scene import Camera, Splats, View
+
+_TURN_S = 8.0  # the default duration of one turn around the scene
+_SHORTEST_S, _LONGEST_S = 4.0, 40.0  # default durations of other paths
+_SMOOTHING_S = 0.3  # standard deviation of the smoothing of hand-held cameras
+
+
+@dataclass(frozen=True)
+class Duration:
+    """How long a path lasts: `frames`, or else `seconds`, or else the path's default."""
+
+    frames: int | None = None
+    seconds: float | None = None
+    frames_per_second: float = 30.0
+
+    @property
+    def is_default(self) -> bool:
+        return self.frames is None and self.seconds is None
+
+    def frames_or(self, default_s: float) -> int:
+        """The number of frames. default_s: the path's default duration, seconds."""
+        seconds = default_s if self.seconds is None else self.seconds
+        return self.frames or max(1, round(seconds * self.frames_per_second))
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """cameras: one for each frame. keeps_size: whether the cameras' picture sizes come from a
+    camera file. notes: sentences for the user."""
+
+    cameras: list[Camera]
+    keeps_size: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def camera_of_view(splats: Splats, views: Sequence[View], name: str | None) -> Camera:
+    """The camera of a view.
+
+    Args:
+        views: sorted by name; may be empty.
+        name: the view's name, the last part of its name, or its number; None for the first view,
+            or for a camera in front of the splats if there are no views.
+
+    Raises SplatError "render-camera".
+    """
+    from stages.scene.framing import front_camera
+
+    if name is None:
+        return views[0].camera if views else front_camera(splats)
+    for candidates in (
+        [view.camera for view in views if view.name == name],
+        [view.camera for view in views if view.name.rpartition("/")[2] == name],
+    ):
+        if len(candidates) == 1:
+            return candidates[0]
+    if name.isdigit() and int(name) < len(views):
+        return views[int(name)].camera
+    known = f"{views[0].name} ... {views[-1].name}" if views else "none: a file has no cameras"
+    raise SplatError(
+        "render-camera",
+        given=f"There is no camera {name}.",
+        wanted=f"A photograph's name, or a number from 0 to {max(0, len(views) - 1)} ({known}).",
+        hint="Leave --camera away, or name a run folder whose photographs you want to see.",
+        family=Family.USAGE,
+    )
+
+
+def path_cameras(
+    path: str, splats: Splats, views: Sequence[View], duration: Duration
+) -> CameraPath:
+    """The cameras along a path.
+
+    Args:
+        path: "orbit", "capture" (past the views' cameras), or a camera file: its cameras, or a
+            smooth path through them if a duration is given.
+
+    Raises SplatError (render-no-capture, render-path, and what reading a camera file raises).
+    """
+    cameras = [view.camera for view in views]
+    if path == "orbit":
+        return _orbit(cameras, splats, duration)
+    if path == "capture":
+        return CameraPath(_past_views(cameras, splats, duration))
+    cameras, notes = _read_cameras(path)
+    if not duration.is_default:
+        cameras = _interpolated(cameras, splats, duration)
+    return CameraPath(cameras, True, notes)
+
+
+def _orbit(cameras: list[Camera], splats: Splats, duration: Duration) -> CameraPath:
+    from stages.scene.framing import front_camera
+    from stages.viewer import orbit
+
+    cameras = cameras or [front_camera(splats)]
+    half = orbit.arc_seen(cameras, splats)[1]
+    notes: tuple[str, ...] = ()
+    if half < math.pi:
+        notes = (
+            f"The photographs see {2 * math.degrees(half):.0f} degrees of the turn: the path goes "
+            "to and fro there.",
+        )
+    # Going to and fro is fastest in the middle of the arc: at most as fast as a turn.
+    default_s = _TURN_S * (1.0 if half >= math.pi else max(1.0, half))
+    made = orbit.orbit(cameras, splats, duration.frames_or(default_s))
+    return CameraPath(list(made), notes=notes)
+
+
+def _past_views(cameras: list[Camera], splats: Splats, duration: Duration) -> list[Camera]:
+    from stages.viewer import camera_paths
+
+    if not cameras:
+        raise SplatError(
+            "render-no-capture",
+            given="--path capture needs the photographs' cameras, and there are none.",
+            wanted="A run folder in which `sfm` has finished, or a file in its 7-export.",
+            hint="Name the run folder, or choose --path orbit.",
+            family=Family.USAGE,
+        )
+    cameras = [cameras[i] for i in camera_paths.tour(cameras, splats)]
+    frames = _SMOOTHING_S * duration.frames_per_second
+    smooth = camera_paths.smoothed(_interpolated(cameras, splats, duration), frames)
+    return [camera_paths.levelled(camera) for camera in smooth]
+
+
+def _interpolated(cameras: list[Camera], splats: Splats, duration: Duration) -> list[Camera]:
+    from stages.viewer import camera_paths
+
+    default_s = _TURN_S * camera_paths.length_in_turns(cameras, splats)
+    frames = duration.frames_or(min(max(default_s, _SHORTEST_S), _LONGEST_S))
+    return list(camera_paths.interpolated(cameras, splats, frames))
+
+
+def _read_cameras(path: str) -> tuple[list[Camera], tuple[str, ...]]:
+    """(the cameras of a file, notes). Raises SplatError."""
+    from stages.cameras.table import read_cameras
+
+    if not Path(path).exists():
+        raise SplatError(
+            "render-path",
+            given=f"--path {path} is neither a known path nor a file.",
+            wanted="orbit, capture, a transforms.json or a folder with a COLMAP model.",
+            hint="Leave --path away to go around the scene once.",
+            family=Family.USAGE,
+        )
+    found = read_cameras(Path(path))
+    notes: tuple[str, ...] = ()
+    if found.distorted:
+        notes = (
+            f"Warning: in {path} are {counted(found.distorted, 'camera')} whose lens distorts; "
+            "the pictures are drawn as pinhole cameras see them.",
+        )
+    return [view.camera for view in found.views], notes
