@@ -37,7 +37,7 @@ from stages.scene import Camera, Splats
 from stages.training.gpu_step import GpuStep
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.reference_step import photograph_loss
+from stages.training.reference_step import reference_loss
 from stages.training.views import Level
 from tests.benchmarks.scenes import random_scene, view
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
@@ -162,7 +162,7 @@ def theirs(splats: Splats, where: Camera, rounds: int, packed: bool) -> dict[str
 
     def step() -> None:
         adam.zero_grad()
-        torch.autograd.backward(photograph_loss(draw()[0].permute(2, 0, 1), target))
+        torch.autograd.backward(reference_loss(draw()[0].permute(2, 0, 1), target))
         adam.step()
 
     with torch.no_grad():
