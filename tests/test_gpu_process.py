@@ -18,7 +18,7 @@ WORDS = ("--steps", "40", "--train-side", "64", "--max-splats", "40", "--backend
 
 def test_a_run_on_the_gpu_backend_ends_with_verified_assets(sample_run: Path, tmp_path: Path):
     shutil.copytree(sample_run / "run", tmp_path / "run")
-    # Asked for once, kept for all that follows: each round looks at every photograph.
+    # These settings are kept for all later commands: each round renders every view.
     few = ("--rounds", "1", "--finetune-steps", "2")
     sample.events(sample.splat("prune", *few, "--json", folder=tmp_path))
     formats = ("--format", "ply", "--format", "glb")

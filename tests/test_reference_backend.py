@@ -1,4 +1,4 @@
-"""A run that asks for the reference gets nothing else, from training to the last proof."""
+"""A run with the reference backend uses no other, from training to the last verification."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ try:
 except SystemExit as end:
     assert not end.code, end.code
 loaded = [name for name in sys.modules if name.startswith("stages.raster.cpu.")]
-from stages.training.loss_kernels import loss_bands
+from stages.training.loss_kernels import loss_strips
 from stages.training.optimiser import adam_step
-called = [k.__name__ for k in (loss_bands, adam_step) if k.signatures]
+called = [k.__name__ for k in (loss_strips, adam_step) if k.signatures]
 print(json.dumps({"event": "kernels", "loaded": loaded, "called": called}))
 """
 _TINY = (

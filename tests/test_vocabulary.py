@@ -50,7 +50,7 @@ WORDS = (
     Word(
         '(?<!loss_)(?<!")bands?(?!")',
         "SH coefficients, SH degree",
-        reason='loss_bands: rows of a picture; "bands": a key of SOG',
+        reason='loss_strips: rows of a picture; "bands": a key of SOG',
     ),
     Word("passed[ _]on", "generalisation ratio"),
     Word("hands", "executor; a verb: sends, gives"),

@@ -1,8 +1,8 @@
 """The loss and Adam on the GPU. Definitions as in `loss_kernels` and `optimiser`.
 
-L1 + SSIM takes four passes over the picture: along rows and across them for the maps of both
-pictures, and again for the slopes that the gradient adds up. A pass reads 11 neighbours, which the
-cache holds.
+L1 + SSIM takes four passes over the image: along rows and across them for the statistics of both
+images, and again for the derivatives that the gradient sums. A pass reads 11 neighbours from the
+cache.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.raster.kernels.pool import Pool
-from stages.training.loss_kernels import band_count, loss_bands
+from stages.training.loss_kernels import loss_strips, strip_count
 
 SSIM_WEIGHT = 0.2  # Kerbl et al. 2023
 
@@ -49,7 +49,7 @@ def image_loss(
     """
     _, height, width = target.shape
     means = channel_means(target) if means is None else means
-    sums = np.zeros((3 * band_count(height), 2))
-    pool.share(loss_bands, image, target, _scale(target), means, ssim_weight, v_image, sums)
+    sums = np.zeros((3 * strip_count(height), 2))
+    pool.share(loss_strips, image, target, _scale(target), means, ssim_weight, v_image, sums)
     l1, ssim = (float(s) for s in sums.sum(0) / (3 * height * width))
     return Loss((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim, v_image)

@@ -1,17 +1,18 @@
 """0.8 L1 + 0.2 (1 - SSIM) and its gradient, in one pass over the rows of a picture.
 
 SSIM as Wang et al. 2004 (Gaussian window 11x11, sigma 1.5, K1 = 0.01, K2 = 0.03, data range 1),
-per channel, averaged over pixels and channels. Beyond the rim both pictures are taken to have the
-target's mean, which is subtracted from them first.
+per channel, averaged over pixels and channels. Outside the image both images have the
+target's mean, which is subtracted first.
 
-Everything is computed from the image x and the difference d = x - y, and squares are taken of
-offsets from the window's middle (along a row from its middle pixel, across rows of their means from
-the middle row's). E[x^2] - E[x]^2 would not do in float32: a picture half light, half dark has 0.2
-of square and 1e-4 of variance; pictures that are nearly alike differ by less than their roundings.
+All statistics are computed from the image x and the difference d = x - y. Squares are taken of
+offsets from the centre of the window: within a row from its centre pixel, and between rows of their
+means from the centre row's. E[x^2] - E[x]^2 is not accurate enough in float32: in an image half
+light, half dark the squares are 0.2 and the variance 1e-4, and nearly equal images differ by less
+than the rounding errors.
 
-A band of rows streams through two rings of 11 filtered rows each, so that the working set stays in
-the cache and no map of the size of the picture is ever made. Rows of flat arrays are named by where
-they begin, never sliced: a slice counts references, and threads would fight over the counter.
+A strip of rows passes through two ring buffers of 11 filtered rows each, so that the working set
+stays in the cache and no map of the size of the image is stored. Rows of flat arrays are given by
+their first index and are not sliced, because a slice has a reference count that all threads update.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from stages.raster.kernels.simd import (
 
 RADIUS = 5
 TAPS = 2 * RADIUS + 1
-BAND = 108  # rows a ticket, about; each also filters 2 RADIUS rows on either side
+STRIP = 108  # rows of a ticket, about; each also filters 2 RADIUS rows on either side
 PAD = 16  # floats before a row's first pixel, so that taps to its left read zeros
 _F = np.float32
 C1, C2 = _F(0.01**2), _F(0.03**2)
@@ -51,15 +52,15 @@ SLOPES = 3  # derivatives, as the gradient takes them together: F0 + x F1 - d F2
 
 
 @kernel
-def band_count(height):
-    """Into how many bands of about BAND rows a picture is cut."""
-    return max(1, (height + BAND // 2) // BAND)
+def strip_count(height):
+    """Number of strips of about STRIP rows in an image."""
+    return max(1, (height + STRIP // 2) // STRIP)
 
 
 @kernel
 def _load_row(image, target, scale, channel, y, mean, xs, ds, at):
     """Row y of the image, less the mean, into xs[at + PAD :]; the image less `scale` x the target
-    into ds. Zero beyond the rim."""
+    into ds. Zero outside the image."""
     height, width = target.shape[1], target.shape[2]
     whole = width // 16 * 16
     start, level = (channel * height + y) * width, splat16(mean)
@@ -211,11 +212,11 @@ def _gradient_row(ring, starts, padded, xs, ds, own, weight, scratch, v_image, c
             absolute,
             vselect(vgt(zero, difference), zero - absolute, zero),
         )
-        total = total + vabs(difference)  # beyond the rim both are zero
+        total = total + vabs(difference)  # outside the image both are zero
         if x + 16 <= width:
             vstore(v_image, to + x, gradient + sign)
         else:
-            spare = SLOPES * padded  # the rims of what stands before it stay zero
+            spare = SLOPES * padded  # the borders before it stay zero
             vstore(scratch, spare, gradient + sign)
             for k in range(width - x):
                 v_image[channel, y, x + k] = scratch[spare + k]
@@ -230,16 +231,16 @@ def _filter_picture_row(image, target, scale, channel, y, mean, padded, xs, ds, 
 
 
 @kernel
-def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
-    """Gradient of H x W x loss into v_image [3, H, W]; sums [tickets, 2]: L1 and SSIM, per band.
+def loss_strips(ticket, image, target, scale, means, weight, v_image, sums):
+    """Gradient of H x W x loss into v_image [3, H, W]; sums [tickets, 2]: L1 and SSIM, per strip.
 
     image [>= 3, H, W] float32; target [3, H, W] float32 or bytes, in units of `scale`; means [3] of
-    the target (or near them); weight of the SSIM part. A ticket is a band of one channel; sums are
+    the target (or near them); weight of the SSIM part. A ticket is a strip of one channel; sums are
     added up in order by the caller.
     """
     height, width = target.shape[1], target.shape[2]
-    bands = band_count(height)
-    band = (height + bands - 1) // bands
+    strips = strip_count(height)
+    strip = (height + strips - 1) // strips
     padded = 2 * PAD + (width + 15) // 16 * 16
     xs, ds = np.zeros(TAPS * padded, np.float32), np.zeros(TAPS * padded, np.float32)
     maps = np.zeros(TAPS * MAPS * padded, np.float32)
@@ -248,10 +249,10 @@ def loss_bands(ticket, image, target, scale, means, weight, v_image, sums):
     starts = np.zeros(TAPS, np.int64)
     while True:
         number = take_ticket(ticket)
-        if number >= 3 * bands:
+        if number >= 3 * strips:
             break
-        channel, top = number // bands, (number % bands) * band
-        bottom = min(top + band, height)
+        channel, top = number // strips, (number % strips) * strip
+        bottom = min(top + strip, height)
         mean = means[channel]
         l1, ssim = 0.0, 0.0
         for y in range(top - 2 * RADIUS, bottom + 2 * RADIUS):
