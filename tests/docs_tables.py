@@ -114,7 +114,7 @@ def cameras() -> str:
     for row in CAMERA_FILES:
         module = importlib.import_module(f"stages.cameras.{row.module}")
         points = "yes" if hasattr(module, "read_points") else "no"
-        rows.append((row.what, points, f"`stages/cameras/{row.module}.py`"))
+        rows.append((row.description, points, f"`stages/cameras/{row.module}.py`"))
     return _table(("file", "sparse points", "read by"), rows)
 
 

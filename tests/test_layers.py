@@ -1,8 +1,10 @@
-"""Imports run downward only. Read from the source, imports inside functions included."""
+"""Imports run downward only. They are read from the source: imports inside functions and names of
+modules in strings count, too."""
 
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -10,12 +12,13 @@ import pytest
 from tests.layers import LAYERS, STAGE_FILES
 
 ROOT = Path(__file__).parent.parent
+OURS = ("stages", "splatcli")
 
 
 def sources() -> dict[str, Path]:
     """Path by module name."""
     found = {}
-    for top in ("stages", "splatcli"):
+    for top in OURS:
         for path in sorted((ROOT / top).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
@@ -25,8 +28,10 @@ def sources() -> dict[str, Path]:
 MODULES = sources()
 
 
-def imports_of(name: str, source: str, when: str = "ever") -> set[str]:
+def imports_of(name: str, source: str, when: str = "ever", strings: bool = True) -> set[str]:
     """Our own modules that `source` imports, by absolute name.
+
+    strings: whether a string that names one of them, with or without ":attribute", counts.
 
     when: "ever" (anywhere) or "running" (not those for type checkers alone).
     """
@@ -40,7 +45,10 @@ def imports_of(name: str, source: str, when: str = "ever") -> set[str]:
     for node in ast.walk(tree):
         if node in skipped:
             continue
-        if isinstance(node, ast.Import):
+        if strings and isinstance(node, ast.Constant) and isinstance(node.value, str):
+            named = re.fullmatch(r"((?:stages|splatcli)(?:\.\w+)+)(?::\w+)?", node.value)
+            found |= {named[1]} & MODULES.keys() if named else set()
+        elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{name}: relative imports hide where they lead"
@@ -48,7 +56,7 @@ def imports_of(name: str, source: str, when: str = "ever") -> set[str]:
             for alias in node.names:
                 whole = f"{base}.{alias.name}"
                 found.add(whole if whole in MODULES else base)
-    return {module for module in found if module.split(".")[0] in ("stages", "splatcli")}
+    return {module for module in found if module.split(".")[0] in OURS}
 
 
 def package_of(module: str) -> str:
@@ -84,10 +92,11 @@ def left_in_cycles(graph: dict[str, set[str]]) -> set[str]:
 
 
 def test_modules_have_no_cycles_inside_functions_either() -> None:
+    """A registry may name modules of its own package that read it: strings do not count here."""
     graph = {
         name: {
             other
-            for other in imports_of(name, path.read_text(encoding="utf-8"), "running")
+            for other in imports_of(name, path.read_text("utf-8"), "running", strings=False)
             if not name.startswith(other + ".")  # a package is loaded before its modules
         }
         for name, path in MODULES.items()
@@ -111,7 +120,7 @@ def test_cycle_is_found() -> None:
 def test_no_package_holds_more_than_its_share_of_the_lines() -> None:
     """Vendored files do not count; what a page is made of does."""
     lines: dict[str, int] = {}
-    for top in ("stages", "splatcli"):
+    for top in OURS:
         for path in (ROOT / top).rglob("*"):
             if path.suffix in (".py", ".js", ".css", ".html") and "vendor" not in path.parts:
                 package = package_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
@@ -137,3 +146,39 @@ def test_nothing_below_imports_the_command() -> None:
 def test_reader_sees_imports_inside_functions() -> None:
     source = "def f():\n    from stages.scene import Camera\n    import stages.raster.draw\n"
     assert imports_of("x", source) == {"stages.scene", "stages.raster.draw"}
+
+
+def test_reader_sees_names_in_strings() -> None:
+    source = 'A = "stages.raster.draw:render"\nB = "stages.scene"\nC = "stages.no.such"\n'
+    assert imports_of("x", source) == {"stages.scene", "stages.raster.draw"}
+    assert imports_of("x", '"""Says stages.raster.draw."""') == set()
+
+
+def private_names(source: str) -> set[str]:
+    """Names with a leading underscore that `source` takes from another of our modules."""
+    tree = ast.parse(source)
+    found, modules = set(), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in OURS:
+            for alias in node.names:
+                if f"{node.module}.{alias.name}" in MODULES:
+                    modules.add(alias.asname or alias.name)
+                elif alias.name.startswith("_"):
+                    found.add(alias.name)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            private = node.attr.startswith("_") and not node.attr.startswith("__")
+            if private and node.value.id in modules:
+                found.add(node.attr)
+    return found
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_no_module_uses_a_private_name_of_another(name: str) -> None:
+    assert not private_names(MODULES[name].read_text("utf-8"))
+
+
+def test_a_private_name_is_found() -> None:
+    assert private_names("from stages.raster.draw import _x as y") == {"_x"}
+    assert private_names("from stages.raster import draw\ndraw._x()") == {"_x"}
+    assert private_names("from stages.raster import draw\ndraw.x(draw.__doc__)") == set()

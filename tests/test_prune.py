@@ -1,4 +1,4 @@
-"""Pruning: what does not pay goes, and what hangs before a camera; the pictures stay."""
+"""Pruning removes floaters and splats that contribute little; the pictures stay."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -61,16 +61,16 @@ def scene(tmp_path_factory) -> SmallScene:
     ("view", "counted_as"),
     [(4, "floaters_removed"), (1, "unneeded_removed")],  # seen from afar by 1 and by 3 others
 )
-def test_a_splat_close_before_one_camera_goes(scene, tmp_path, view, counted_as) -> None:
+def test_a_splat_close_to_one_camera_is_removed(scene, tmp_path, view, counted_as) -> None:
     floater = floater_before(scene, view)
-    _, usual = run(scene, scene.splats, tmp_path, max_loss_db=0)
+    _, reference = run(scene, scene.splats, tmp_path, max_loss_db=0)
     result, report = run(scene, join(scene.splats, floater), tmp_path, max_loss_db=0)
     assert not rows_of(floater, result).any()
-    assert report.metrics[counted_as] > usual.metrics[counted_as]
+    assert report.metrics[counted_as] > reference.metrics[counted_as]
     assert report.metrics["psnr_change_db"] >= -0.05
 
 
-def test_splats_that_no_photograph_sees_go(scene, tmp_path) -> None:
+def test_splats_that_no_view_shows_are_removed(scene, tmp_path) -> None:
     lost = unseen(12)
     result, report = run(scene, join(scene.splats, lost), tmp_path, max_loss_db=0)
     assert not rows_of(lost, result).any()
@@ -82,13 +82,13 @@ def test_splats_that_no_photograph_sees_go(scene, tmp_path) -> None:
     assert removed == report.metrics["splats_before"] - len(result)
 
 
-def test_no_loss_allowed_is_no_loss_of_the_photographs_that_decide(scene, tmp_path) -> None:
+def test_with_no_loss_allowed_the_training_views_lose_nothing(scene, tmp_path) -> None:
     trained = join(scene.splats, floater_before(scene, 1), unseen(20))
     result, _ = run(scene, trained, tmp_path, max_loss_db=0.0)
     assert training_db(scene, result) >= training_db(scene, trained)
 
 
-def test_the_loss_allowed_is_kept_and_the_price_moves_it(scene, tmp_path) -> None:
+def test_the_loss_stays_below_what_the_strength_allows(scene, tmp_path) -> None:
     start, sizes = training_db(scene, scene.splats), []
     for strength in (1.0, 20.0):
         result, report = run(scene, scene.splats, tmp_path, strength=strength, rounds=10)
@@ -100,35 +100,35 @@ def test_the_loss_allowed_is_kept_and_the_price_moves_it(scene, tmp_path) -> Non
     assert sizes[1] < sizes[0]
 
 
-def test_what_is_learnt_by_heart_may_lose_more_of_it(scene, tmp_path) -> None:
+def test_an_overfitted_model_may_lose_more_of_its_training_views(scene, tmp_path) -> None:
     plain, _ = run(scene, scene.splats, tmp_path, overfitted=False, max_loss_db=0.02)
     heart, _ = run(scene, scene.splats, tmp_path, overfitted=True, max_loss_db=0.02)
     assert len(heart) < len(plain)
 
 
-def test_at_a_low_price_nothing_goes_that_the_photographs_show(scene, tmp_path) -> None:
+def test_at_low_strength_nothing_is_removed_that_the_views_show(scene, tmp_path) -> None:
     result, report = run(scene, scene.splats, tmp_path, strength=0.001, max_loss_db=100)
     assert report.metrics["stopped_by"] == "rate_distortion"
     assert training_db(scene, result) >= training_db(scene, scene.splats) - 0.02
     assert len(result) > 0.8 * len(scene.splats)
 
 
-def test_what_a_round_costs_is_foretold(scene, tmp_path) -> None:
+def test_the_loss_of_a_round_is_predicted(scene, tmp_path) -> None:
     _, report = run(scene, scene.splats, tmp_path, max_splats=230)
     first = report.metrics["rounds"][0]
     assert first["removed"] == 20
     assert first["measured_sse"] == pytest.approx(first["predicted_sse"], rel=0.1, abs=0.05)
 
 
-def test_fine_tuning_buys_back_what_cutting_lost(scene, tmp_path) -> None:
-    cut, _ = run(scene, scene.splats, tmp_path, max_splats=150, rounds=0)
-    tuned, report = run(scene, scene.splats, tmp_path, max_splats=150, finetune_steps=20)
-    assert len(cut) == len(tuned) == 150
-    assert training_db(scene, tuned) > training_db(scene, cut) + 0.5
+def test_finetuning_recovers_a_part_of_the_loss(scene, tmp_path) -> None:
+    pruned, _ = run(scene, scene.splats, tmp_path, max_splats=150, rounds=0)
+    finetuned, report = run(scene, scene.splats, tmp_path, max_splats=150, finetune_steps=20)
+    assert len(pruned) == len(finetuned) == 150
+    assert training_db(scene, finetuned) > training_db(scene, pruned) + 0.5
     assert report.metrics["finetune_steps"] <= 8 * 20
 
 
-def test_bands_that_were_cut_stay_cut_while_the_rest_learns(scene, tmp_path) -> None:
+def test_removed_sh_coefficients_stay_zero_in_finetuning(scene, tmp_path) -> None:
     result, report = run(scene, scene.splats, tmp_path, strength=20, finetune_steps=10)
     degrees = np.floor(np.sqrt(np.arange(result.sh.shape[1])))
     above = degrees[None] > result.sh_degrees[:, None]
@@ -163,18 +163,20 @@ def test_a_psnr_is_met_and_no_better_than_needed(scene, tmp_path) -> None:
         ({"max_splats": 60, "min_psnr": 30}, "prune-targets-contradict", "--min-psnr 18"),
     ],
 )
-def test_what_cannot_be_met_is_refused_with_what_can(scene, tmp_path, settings, code, named):
+def test_targets_that_cannot_be_met_are_refused_with_what_can_be_met(
+    scene, tmp_path, settings, code, named
+):
     with pytest.raises(SplatError) as caught:
         run(scene, scene.splats, tmp_path, rounds=0, **settings)
     assert caught.value.code == code
     assert named in str(caught.value)
 
 
-def test_the_report_says_what_was_cut_and_why(scene, tmp_path) -> None:
+def test_the_report_says_what_was_removed_and_why(scene, tmp_path) -> None:
     _, report = run(scene, scene.splats, tmp_path, max_loss_db=0.02)
-    price, cut, why = report.metrics["summary"]
-    assert "independent" in price
-    assert f"of {len(scene.splats):,}" in cut
+    cost, removed, why = report.metrics["summary"]
+    assert "independent" in cost
+    assert f"of {len(scene.splats):,}" in removed
     assert "more than is allowed" in why
 
 
@@ -185,24 +187,22 @@ def test_no_rounds_remove_nothing(scene, tmp_path) -> None:
     assert report.metrics["psnr_change_db"] == 0
 
 
-def test_where_few_of_many_photographs_decide_about_as_much_goes_at_no_more_cost(
+def test_measuring_a_part_of_the_views_removes_about_as_much_at_no_more_loss(
     scene, tmp_path, monkeypatch
 ) -> None:
     trained = join(scene.splats, unseen(5), floater_before(scene, 1))
-    usual, _ = run(scene, trained, tmp_path)
+    reference, _ = run(scene, trained, tmp_path)
     monkeypatch.setattr(pruning, "MAX_VIEWS", 4)
     result, report = run(scene, trained, tmp_path)
-    assert len(result) == pytest.approx(len(usual), rel=0.15)
-    assert training_db(scene, result) > training_db(scene, usual) - 0.3
+    assert len(result) == pytest.approx(len(reference), rel=0.15)
+    assert training_db(scene, result) > training_db(scene, reference) - 0.3
     assert not rows_of(unseen(5), result).any()
-    # what is foretold, of all photographs, and measured, on those that decide
-    told = [one for one in report.metrics["rounds"] if one["predicted_sse"] > 1]
-    assert all(0.4 < one["measured_sse"] / one["predicted_sse"] < 2.5 for one in told)
+    # predictions are about all views, measurements come from some of them
+    significant = [one for one in report.metrics["rounds"] if one["predicted_sse"] > 1]
+    assert all(0.4 < one["measured_sse"] / one["predicted_sse"] < 2.5 for one in significant)
 
 
-def test_what_only_a_photograph_sees_that_does_not_decide_stays(
-    scene, tmp_path, monkeypatch
-) -> None:
+def test_what_only_an_unmeasured_view_shows_stays(scene, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(pruning, "MAX_VIEWS", 1)  # of nine, the first
     result, _ = run(scene, scene.splats, tmp_path)
     far = scene.reconstruction.views[5].camera
@@ -227,22 +227,22 @@ def test_the_origin_stays(scene, tmp_path) -> None:
     assert (result.origin == origin).all()
 
 
-def worth_of(photographs, sse_change, scene_depth=(4.0,)) -> Contributions:
-    """A Worth with what the rules read; a splat in no photograph has no weight."""
-    seen = np.asarray(photographs, np.int32)
+def contributions_of(view_counts, sse_change, scene_depth=(4.0,)) -> Contributions:
+    """What the rules read of contributions; a splat in no view has no weight."""
+    seen = np.asarray(view_counts, np.int32)
     weight = (seen > 0).astype(np.float64)
     change, depth = np.asarray(sse_change, np.float64), np.asarray(scene_depth, np.float64)
-    bands = np.zeros((len(seen), 0))
+    no_sh = np.zeros((len(seen), 0))
     return Contributions(
-        change, change, weight, weight, seen, 1.0, depth, bands, bands, bands, depth
+        change, change, weight, weight, seen, 1.0, depth, no_sh, no_sh, no_sh, depth
     )
 
 
 def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
     """One camera at the origin that sees its scene 4 away: close is nearer than 1."""
     scene = splats([[0, 0, 0.9], [0, 0, 1.1], [0, 0, 0.9], [0, 0.9, 0.0], [0, 0, 0.5]])
-    worth = worth_of([1, 1, 3, 2, 0], [1.0] * 5)
-    assert near_camera_floaters(scene, worth, [camera()]).tolist() == [
+    contributions = contributions_of([1, 1, 3, 2, 0], [1.0] * 5)
+    assert near_camera_floaters(scene, contributions, [camera()]).tolist() == [
         True,
         False,
         False,
@@ -252,11 +252,11 @@ def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:
 
 
 def test_a_camera_that_sees_nothing_solid_makes_no_floaters() -> None:
-    worth = worth_of([1], [1.0], scene_depth=[np.inf])
-    assert not near_camera_floaters(splats([[0, 0, 0.1]]), worth, [camera()]).any()
+    contributions = contributions_of([1], [1.0], scene_depth=[np.inf])
+    assert not near_camera_floaters(splats([[0, 0, 0.1]]), contributions, [camera()]).any()
 
 
-def test_beside_a_picture_is_a_quarter_of_its_longer_side_beyond_the_rim() -> None:
+def test_near_a_frustum_is_a_quarter_of_the_longer_side_beyond_the_edge() -> None:
     """A camera of 64 x 48 pixels and focal length 60 sees x of -0.53 to 0.53 at depth 1."""
     scene = splats([[0, 0, 1], [0.75, 0, 1], [0.85, 0, 1], [0, 0, -1]])
     assert near_view_frusta(scene, [camera()]).tolist() == [True, True, False, False]

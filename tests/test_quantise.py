@@ -40,7 +40,7 @@ def decide(
     return result, report.metrics
 
 
-def test_matt_splats_lose_their_bands_and_shiny_ones_keep_them(
+def test_matt_splats_lose_their_sh_degrees_and_shiny_ones_keep_them(
     scene: SmallScene, tmp_path: Path
 ) -> None:
     result, metrics = decide(scene, tmp_path)
@@ -56,7 +56,7 @@ def test_matt_splats_lose_their_bands_and_shiny_ones_keep_them(
     ]
 
 
-def test_the_cost_of_8_bits_without_view_dependence_is_told(
+def test_the_cost_of_8_bits_without_view_dependence_is_reported(
     scene: SmallScene, tmp_path: Path
 ) -> None:
     _, metrics = decide(scene, tmp_path)
@@ -64,7 +64,9 @@ def test_the_cost_of_8_bits_without_view_dependence_is_told(
     assert 32 < metrics["psnr_raw_db"] < 36  # noise of 0.02 is 34.0 dB
 
 
-def test_a_scene_without_view_dependence_keeps_no_bands(scene: SmallScene, tmp_path: Path) -> None:
+def test_a_scene_without_view_dependence_keeps_sh_degree_0(
+    scene: SmallScene, tmp_path: Path
+) -> None:
     matt = replace(scene.splats.with_sh_degree(0).with_sh_degree(2))
     flat = SmallScene(matt, scene.reconstruction)
     result, metrics = decide(flat, tmp_path)
@@ -118,7 +120,7 @@ def test_the_report_says_what_finetuning_to_a_format_gained(
     assert set(metrics["formats"]["splat"]) == {"rounded_db", "finetuned_db"}
 
 
-def test_too_few_photographs_to_hold_out_are_measured_on_themselves(
+def test_without_held_out_views_the_training_views_are_measured(
     tmp_path: Path, scene: SmallScene
 ) -> None:
     few = replace(scene.reconstruction, views=scene.reconstruction.views[:3])
@@ -171,9 +173,9 @@ def test_truncation_rms_is_what_colours_lose_over_all_directions() -> None:
         channel = np.square(tail).max(axis=1)  # the bound takes the worst channel of each term
         seen = np.array([colour(tail, d) - 0.5 for d in directions[:4000]])
         measured = np.sqrt(np.mean(seen**2, axis=0)).max()
-        told = truncation_rms(splats)[3, degree - 1]
-        assert told == pytest.approx(np.sqrt(channel.sum() / (4 * np.pi)), rel=1e-6)
-        assert 0.97 * measured <= told <= 2.0 * measured
+        rms = truncation_rms(splats)[3, degree - 1]
+        assert rms == pytest.approx(np.sqrt(channel.sum() / (4 * np.pi)), rel=1e-6)
+        assert 0.97 * measured <= rms <= 2.0 * measured
 
 
 def test_truncation_drops_whole_degrees_and_no_others() -> None:
@@ -201,7 +203,7 @@ def test_colours_without_view_dependence_are_the_means_of_what_is_seen(
     np.testing.assert_array_equal(loaded.flat_dc, result.flat_dc)
 
 
-def test_a_sog_is_told_in_no_more_bits_than_show(scene: SmallScene, tmp_path: Path) -> None:
+def test_a_sog_gets_no_more_bits_than_its_views_show(scene: SmallScene, tmp_path: Path) -> None:
     for name, allowed in (("a", 0.02), ("b", 2.0)):
         (tmp_path / name).mkdir()
         _, metrics = decide(scene, tmp_path / name, sog_loss_db=allowed)

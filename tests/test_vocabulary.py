@@ -17,7 +17,6 @@ ROOT = Path(__file__).parent.parent
 CODE = ("stages", "splatcli")
 EVERYWHERE = (*CODE, "docs", "README.md")
 TRAINING = ("stages/training", "stages/train.py", "stages/capacity", "stages/prune.py")
-DISTRIBUTED = ("stages/structure", "stages/distributed")
 SUFFIXES = (".py", ".md", ".js", ".html", ".css")
 
 
@@ -40,18 +39,26 @@ WORDS = (
     Word("by[ _-]heart", "overfitting, overfitted"),
     Word("(sits?|sat|sitting)[ _]out|resting", "dropout, dropped"),
     Word("open[ _]air", "floaters, free space"),
-    Word("(?<!RANSAC )trials?", "validation probe", reason="RANSAC has trials"),
+    Word("(?<!RANSAC )trials?", "validation probe", (*TRAINING, "docs"), "RANSAC has trials"),
     Word("answers?|answered", "result of the validation probe", TRAINING, "a server may answer"),
     Word("doubts?|doubtful", "a threshold with a name, a warning"),
     Word("way (back|there)", "backward pass, forward pass"),
     Word("forwards|backwards", "forward pass, backward pass"),
     Word("pull(s|ed|ing)?(?! request)", "gradient"),
-    Word("strides?", "step size, learning rate", (*TRAINING, "docs"), "arrays elsewhere have them"),
+    Word("strides", "step size, learning rate", (*TRAINING, "docs"), "an array has one as well"),
     Word("how far", "step size, progress, distance", TRAINING),
-    Word("(?<!loss_)bands?", "SH coefficients, SH degree", reason="loss_bands: rows of a picture"),
+    Word(
+        '(?<!loss_)(?<!")bands?(?!")',
+        "SH coefficients, SH degree",
+        reason='loss_bands: rows of a picture; "bands": a key of SOG',
+    ),
     Word("passed[ _]on", "generalisation ratio"),
     Word("hands", "executor; a verb: sends, gives"),
-    Word("(?<!each )shares(?! no code)", "chunks", (*DISTRIBUTED, "docs")),
+    Word(
+        "in shares|shares? of (features|match|structure|its|it|one)",
+        "chunks",
+        reason="a share is a fraction, too",
+    ),
     Word("placing", "registration"),
     Word("makers?", "provenance, backends"),
     Word("told(?! apart)", "reported, given, known", reason="`compare` tells two runs apart"),
@@ -63,7 +70,7 @@ WORDS = (
     Word("pays? (for )?(its|their|his) way", "contribution"),
     Word("worth", "contribution; or the figure itself"),
     Word("ground floor|house|floors", "layer, architecture"),
-    Word("rooms|(this|that|every|a) room", "package", CODE, "docs speak of photographed rooms"),
+    Word("rooms|(this|that|every) room", "package", CODE, "docs speak of photographed rooms"),
     Word(r"(base|editing|capacity|structure|tradeoff)[./](thin_)?words", "text, syntax, summary"),
     Word("rungs?|climb(s|ed|ing)?|ladder", "fallback, attempt"),
     Word(r"(class |: |\[|-> )Photograph\b", "the view types of `scene`", CODE, exact=True),
@@ -75,9 +82,9 @@ WORDS = (
     Word(r"distributed[./]far|FarRun", "remote", CODE),
     Word(r"class Place\b", "Location", CODE, exact=True),
     Word("witness(es)?", "visibility constraints"),
-    Word("(?<!fine)(?<!fine-)tun(ed|er|ing)", "fine-tuned, fine-tuning"),
-    Word("fitted", "fine-tuned", (*TRAINING, "stages/export.py", "stages/quantise.py")),
-    Word(r"\b(Aim|Shrinking|class Cut|Outcome)\b", "Targets, Pruner, Removal", CODE, exact=True),
+    Word("(?<!fine)(?<!fine[-_ ])tun(ed|er|ing)", "fine-tuned, fine-tuning"),
+    Word(r"(?<![._])fitted", "fine-tuned", TRAINING, "Camera.fitted changes its size"),
+    Word(r"\b(Aim|Shrinking|Outcome)\b", "Targets, Pruner, PruningResult", CODE, exact=True),
     Word("census|curiosit(y|ies)", "statistics"),
     Word("chains? of operations", "operations"),
     Word(r"\bTyped\b", "ParsedOperation", CODE, exact=True),

@@ -144,7 +144,7 @@ def _video_codecs() -> list[str]:
 def _camera_files() -> list[str]:
     from stages.cameras.table import CAMERA_FILES
 
-    return [row.what for row in CAMERA_FILES]
+    return [row.description for row in CAMERA_FILES]
 
 
 def _backend(backend: Backend) -> Check:

@@ -15,15 +15,15 @@ from stages.cameras.camera_file import CameraFile, FilePoints
 _SPLITS = ("train", "val", "test")
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """The folder, if it holds transforms_train.json."""
     return path if _part(path, "train").is_file() else None
 
 
 def read(folder: Path) -> CameraFile:
-    """The cameras of all files that are there; a view's role is its file's. Pictures that are not
-    there, as the validation part's often are not, are taken to be as large as the first for
-    training. Raises SplatError "cameras-unreadable"."""
+    """The cameras of all files that exist; the role of a view is its split. Pictures that are
+    missing, as those of the validation split often are, get the size of the first training picture.
+    Raises SplatError "cameras-unreadable"."""
     first = nerfstudio.read(_part(folder, "train"))
     size = first.views[0].camera.width, first.views[0].camera.height
     others = [name for name in _SPLITS[1:] if _part(folder, name).is_file()]
@@ -38,7 +38,7 @@ def read(folder: Path) -> CameraFile:
 
 
 def read_points(folder: Path) -> FilePoints | None:
-    """Those that the training part names, if any. Raises SplatError "cameras-unreadable"."""
+    """The points that the training file names, if any. Raises SplatError "cameras-unreadable"."""
     return nerfstudio.read_points(_part(folder, "train"))
 
 

@@ -1,7 +1,7 @@
 """Bundler's bundle.out: https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html
 
-World to camera, x right, y up, z backward; the principal point in the middle of the picture;
-x = f (1 + k1 r^2 + k2 r^4) p, from there. A list of pictures beside it (list.txt) names them.
+World to camera, x right, y up, z backward. The principal point is the middle of the picture, and
+pixels relative to it are f (1 + k1 r^2 + k2 r^4) p. A file beside it (list.txt) lists the pictures.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from stages.cameras.camera_file import (
 from stages.cameras.lens import Lens
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
-_LINES = 5  # a camera's
+_CAMERA_LINES = 5
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """The path itself, if it is an .out file."""
     return path if path.suffix.lower() == ".out" else None
 
 
 def read(path: Path) -> CameraFile:
-    """The cameras that were placed. Raises SplatError "cameras-unreadable"."""
+    """The cameras that were registered. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         cameras, _ = _numbers(path)
         names = _names(path)
         if len(names) != len(cameras):
             raise BadFileError(f"it has {len(cameras)} cameras, and its list {len(names)} pictures")
-        placed = cameras[:, 0] != 0  # a focal length of 0 is Bundler's word for one that was not
-        names = [name for name, there in zip(names, placed, strict=True) if there]
-        cameras = cameras[placed]
+        registered = cameras[:, 0] != 0  # Bundler writes a focal length of 0 for the others
+        names = [name for name, there in zip(names, registered, strict=True) if there]
+        cameras = cameras[registered]
         sizes = np.array(
             [size_of_picture(path.parent, name) for name in names], np.float64
         ).reshape(-1, 2)
@@ -73,11 +73,14 @@ def _numbers(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     text = content_of(path).decode("utf-8")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     views, count = (int(word) for word in lines[0].split()[:2])
-    if views < 0 or count < 0 or len(lines) < 1 + _LINES * views + 3 * count:
-        raise BadFileError("it was cut short")
-    flat = [" ".join(lines[1 + _LINES * i : 1 + _LINES * (i + 1)]).split() for i in range(views)]
+    if views < 0 or count < 0 or len(lines) < 1 + _CAMERA_LINES * views + 3 * count:
+        raise BadFileError("it is truncated")
+    flat = [
+        " ".join(lines[1 + _CAMERA_LINES * i : 1 + _CAMERA_LINES * (i + 1)]).split()
+        for i in range(views)
+    ]
     cameras = np.array(flat, np.float64).reshape(-1, 15)
-    start = 1 + _LINES * views
+    start = 1 + _CAMERA_LINES * views
     rows = []
     for i in range(start, start + 3 * count, 3):
         seen = lines[i + 2].split()[0]
@@ -86,11 +89,11 @@ def _numbers(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _names(path: Path) -> list[str]:
-    """Of the list of pictures: a line each, the name its first word."""
+    """The first word of each line of the list of pictures."""
     near = (path.with_suffix(".txt"), path.parent / "list.txt", path.parent.parent / "list.txt",
             path.with_name(f"{path.name}.list.txt"))  # fmt: skip
-    found = next((place for place in near if place.is_file()), None)
+    found = next((file for file in near if file.is_file()), None)
     if found is None:
-        raise BadFileError(f"no list of pictures (list.txt) lies beside {path.name}")
+        raise BadFileError(f"there is no list of pictures (list.txt) beside {path.name}")
     lines = found.read_text(encoding="utf-8").splitlines()
     return [line.split()[0] for line in lines if line.strip()]

@@ -1,7 +1,7 @@
-"""What a file of cameras holds, and what all of them must pass.
+"""The content of a camera file of any format, and the checks that all formats share.
 
-What is read comes in our own conventions: world to camera, x right, y down, z forward. The world
-is the file's own; see each module for what it does to it.
+Cameras are in our conventions: world to camera, x right, y down, z forward. The world coordinates
+are the file's own; each module says what it changes.
 """
 
 from __future__ import annotations
@@ -18,21 +18,26 @@ from stages.base.bad_files import BadFileError
 from stages.cameras.lens import Lens
 from stages.scene import Camera, View
 
-LARGEST_FILE = 1 << 30  # bytes; cameras and points of thousands of photographs have fewer
-LARGEST_SIDE = 100_000  # pixels; no lens shows more
-FARTHEST = 1e12  # world units; squares of it are still far from overflowing
-ROTATION_TOLERANCE = 1e-3  # of R^T R: three decimals of text; beyond, it is not a rotation
-_ROUNDED = 1e-9  # of R^T R: more than float64 leaves
+MAX_FILE_BYTES = 1 << 30  # cameras and points of thousands of photographs take less
+MAX_SIDE_PX = 100_000
+MAX_DISTANCE = 1e12  # world units; its square is far from overflowing
+ROTATION_TOLERANCE = 1e-3  # of R^T R, for text with three decimals
+_EXACT = 1e-9  # of R^T R: a larger error is not rounding of float64
 
 
 @dataclass(frozen=True)
 class Georeference:
-    """What a file says of its world. metres: of one unit; 0 where it does not say. axes [3, 3]:
-    rows point east, north and up in it; None likewise. said_by: in words."""
+    """What a file says of the scale and orientation of its world.
 
-    metres: float = 0.0
+    Args:
+        metres_per_unit: 0 where it does not say.
+        axes: [3, 3] rows that point east, north and up; None where it does not say.
+        source: which part of the file says it, in words.
+    """
+
+    metres_per_unit: float = 0.0
     axes: NDArray[np.float64] | None = None
-    said_by: str = ""
+    source: str = ""
 
 
 NO_GEOREFERENCE = Georeference()
@@ -40,13 +45,19 @@ NO_GEOREFERENCE = Georeference()
 
 @dataclass(frozen=True)
 class CameraFile:
-    """views: pinhole cameras, in the file's order; their role is that in the file's own split.
-    folder: where `View.image` starts. lenses [V]: what bends each picture besides."""
+    """The cameras of a file.
+
+    Args:
+        views: V pinhole cameras in the file's order, with their role in the file's own split.
+        folder: that `View.image` is relative to.
+        lenses: V lenses, the distortion of each view.
+        georeference: of the file's world.
+    """
 
     views: tuple[View, ...]
     folder: Path
     lenses: tuple[Lens, ...]
-    ground: Georeference = NO_GEOREFERENCE
+    georeference: Georeference = NO_GEOREFERENCE
 
     @property
     def distorted(self) -> int:
@@ -56,8 +67,14 @@ class CameraFile:
 
 @dataclass(frozen=True)
 class FilePoints:
-    """A camera file's sparse points, in the world of its cameras. points [P, 3], colours [P, 3]
-    uint8, errors_px [P], tracks [P] views that see each; 0 where the file does not say."""
+    """A camera file's sparse points, in the world of its cameras.
+
+    Args:
+        points: [P, 3].
+        colours: [P, 3] uint8.
+        errors_px: [P] reprojection errors; 0 where the file does not say.
+        tracks: [P] views that see each; 0 where the file does not say.
+    """
 
     points: NDArray[np.float64]
     colours: NDArray[np.uint8]
@@ -72,26 +89,35 @@ def make_views(
     world_to_camera: NDArray[np.float64],
     images: Sequence[str] | None = None,
 ) -> tuple[View, ...]:
-    """Views of plain arrays. names [V]; images [V], if they differ; sizes [V, 2] width and height;
-    intrinsics [V, 4] fx, fy, cx, cy; world_to_camera [V, 3 or 4, 4], rounding in its rotation
-    taken out. Raises BadFileError for what no camera can be."""
+    """Checked views from plain arrays.
+
+    Args:
+        names: V names.
+        sizes: [V, 2] width and height, pixels.
+        intrinsics: [V, 4] fx, fy, cx, cy, pixels.
+        world_to_camera: [V, 3 or 4, 4]; rounded rotations are made orthogonal.
+        images: V paths of pictures, if they differ from the names.
+
+    Raises:
+        BadFileError: there is no camera, or one is invalid.
+    """
     if not len(names):
         raise BadFileError("it holds no camera")
     poses = np.asarray(world_to_camera, np.float64)[:, :3]
-    _refuse(names, ~((sizes >= 1) & (sizes <= LARGEST_SIDE)).all(1), "a size in pixels")
+    _refuse(names, ~((sizes >= 1) & (sizes <= MAX_SIDE_PX)).all(1), "a size in pixels")
     bad = ~np.isfinite(intrinsics).all(1) | (intrinsics[:, :2] <= 0).any(1)
     _refuse(names, bad, "a focal length and a principal point")
-    _refuse(names, ~(np.abs(poses) < FARTHEST).all((1, 2)), "a position and a direction")
+    _refuse(names, ~(np.abs(poses) < MAX_DISTANCE).all((1, 2)), "a position and a direction")
     rotations = poses[:, :, :3]
     error = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
     _refuse(
         names, (error > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0), "a rotation matrix"
     )
-    rough = error > _ROUNDED
-    left, _, right = np.linalg.svd(rotations[rough])
+    inexact = error > _EXACT
+    left, _, right = np.linalg.svd(rotations[inexact])
     matrices = np.tile(np.eye(4), (len(names), 1, 1))
     matrices[:, :3] = poses
-    matrices[rough, :3, :3] = left @ right
+    matrices[inexact, :3, :3] = left @ right
     return tuple(
         View(
             name=name,
@@ -104,25 +130,32 @@ def make_views(
     )
 
 
+def poses_of(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, 3, 4] world to camera, from its rotations [V, 3, 3] and the cameras' centres [V, 3]."""
+    with np.errstate(all="ignore"):  # `make_views` checks the result
+        translations = -np.einsum("vij,vj->vi", rotations, centres)
+    return np.concatenate([rotations, translations[:, :, None]], axis=2)
+
+
 def content_of(path: Path) -> bytes:
-    """All of a file, unless it is too large for any cameras: a parser would want many times that
-    much memory. Raises BadFileError."""
+    """The content of a file. Raises BadFileError if it is too large for a camera file, because a
+    parser would need many times its size in memory."""
     size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise BadFileError(f"it has {size / 1e9:.1f} GB, and no cameras take more than 1.1")
+    if size > MAX_FILE_BYTES:
+        raise BadFileError(f"it has {size / 1e9:.1f} GB; a camera file has 1.1 at most")
     return path.read_bytes()
 
 
 def size_of_picture(folder: Path, name: str) -> tuple[int, int]:
-    """(width, height) of a picture near a file of cameras in `folder` that does not say it. Raises
-    BadFileError."""
+    """(width, height) of a picture near a camera file in `folder`, for formats that do not say it.
+    Raises BadFileError if it is not found."""
     from PIL import Image
 
-    for place in (folder, folder / "images", folder.parent, folder.parent / "images"):
-        if (place / name).is_file():
-            with Image.open(place / name) as picture:
+    for near in (folder, folder / "images", folder.parent, folder.parent / "images"):
+        if (near / name).is_file():
+            with Image.open(near / name) as picture:
                 return picture.size
-    raise BadFileError(f"{name[:80]} is not there, and its size is needed")
+    raise BadFileError(f"{name[:80]} is not found, and its size is needed")
 
 
 def _refuse(names: Sequence[str], bad: Any, wanted: str) -> None:

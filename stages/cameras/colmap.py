@@ -1,8 +1,8 @@
 """COLMAP's sparse model: cameras, images and points, read as binary or text, written as binary.
 
 Layout: https://colmap.github.io/format.html (binary files hold the same fields as the text files,
-little-endian). Records are written in order of id, so that equal models give equal bytes. The axes
-are ours; so is the world, as long as nobody turned it.
+little-endian). Records are written in order of id, so that equal models give equal bytes. Axes and
+world are ours.
 """
 
 from __future__ import annotations
@@ -29,9 +29,15 @@ _PINHOLE = 1
 class ColmapModel:
     """Pinhole views and points. Ids in the files are positions + 1.
 
-    names [V] picture paths, from the folder of pictures. cameras [V]: the pose of each view; views
-    with equal intrinsics share one camera. points [P, 3], colours [P, 3] uint8, errors_px [P].
-    observed_points [O], observing_views [O], observed_px [O, 2]; sorted by point, then view.
+    Args:
+        names: V picture paths, relative to the folder of pictures.
+        cameras: of the V views; views with equal intrinsics share one camera in the file.
+        points: [P, 3].
+        colours: [P, 3] uint8.
+        errors_px: [P] reprojection errors.
+        observed_points: [O] the point of each observation; sorted by point, then view.
+        observing_views: [O] the view of each observation.
+        observed_px: [O, 2] where that view observes the point.
     """
 
     names: tuple[str, ...]
@@ -45,7 +51,7 @@ class ColmapModel:
 
 
 def write_colmap_model(folder: Path, model: ColmapModel) -> None:
-    """Write the three files into `folder`, which is made. Raises SplatError when it cannot be."""
+    """Write the three files into `folder`, which is created. Raises SplatError if it cannot be."""
     folder.mkdir(parents=True, exist_ok=True)
     intrinsics = [_intrinsics(camera) for camera in model.cameras]
     distinct = sorted(set(intrinsics), key=intrinsics.index)
@@ -95,7 +101,7 @@ def _intrinsics(camera: Camera) -> tuple[int, int, float, float, float, float]:
 
 
 def locate(path: Path) -> Path | None:
-    """Where the model lies: `path` itself, or inside as COLMAP and its users lay it out."""
+    """The folder of the model: `path` itself, or one of the usual places inside."""
     for folder in (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0"):
         if any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
             return folder
@@ -103,8 +109,8 @@ def locate(path: Path) -> Path | None:
 
 
 def read(folder: Path) -> CameraFile:
-    """The cameras of a model, in the order of the file. The pictures are looked for in a folder
-    `images` beside the model. Raises SplatError "cameras-unreadable"."""
+    """The cameras of a model, in the order of the file; pictures are in a folder `images` near the
+    model. Raises SplatError "cameras-unreadable"."""
     return _read(folder)[0]
 
 
@@ -150,7 +156,7 @@ def read_points(folder: Path) -> FilePoints | None:
 
 
 def _part(folder: Path, name: str) -> tuple[Path, bool]:
-    """(the file, whether it is text); the binary one where there are both, as COLMAP does."""
+    """(the file, whether it is text); the binary one if both exist, as COLMAP does."""
     binary = folder / f"{name}.bin"
     text = folder / f"{name}.txt"
     return (text, True) if text.is_file() and not binary.is_file() else (binary, False)
@@ -168,7 +174,7 @@ def _read(folder: Path) -> tuple[CameraFile, list[Image]]:
             raise BadFileError(f"there is no camera {min(missing)}")
         numbers = np.array([optics[image.camera].numbers for image in images]).reshape(-1, 6)
         poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
-        with np.errstate(invalid="ignore"):  # `make_views` refuses a quaternion of length 0
+        with np.errstate(invalid="ignore"):  # `make_views` rejects a quaternion of length 0
             rotations = matrices_of(poses[:, :4])
         views = make_views(
             [image.name for image in images],

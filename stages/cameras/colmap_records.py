@@ -1,8 +1,8 @@
 """The records of COLMAP's model files, binary and text: https://colmap.github.io/format.html.
 
-Read here and not by pycolmap (4.2), which never comes back from a points file that was cut short,
-and takes whatever lies in memory for the lens if the cameras file was. Nothing is allocated by a
-count that the file claims.
+They are not read by pycolmap (4.2), which never returns from a truncated points file, and reads the
+lens of a truncated cameras file from uninitialised memory. Nothing is allocated by a count that the
+file claims.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 @dataclass(frozen=True)
 class Image:
-    """camera: its number. pose [7]: quaternion w, x, y, z and translation. seen [n]: 2D points of
-    type `POINT2D`; point -1 is none."""
+    """camera: its id. pose [7]: quaternion w, x, y, z and translation. seen [n]: 2D points of type
+    `POINT2D`; point -1 is none."""
 
     name: str
     camera: int
@@ -82,8 +82,8 @@ def _lens(model: str, k: tuple[float, ...]) -> Lens:
     if model in ("OPENCV", "FULL_OPENCV"):
         return Lens(kind, (*k[:2], *k[4:5]), k[5:], tangential=(k[2], k[3]))
     if model in ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM"):
-        straight = not k[0]  # of FOV this is the limit; the formula divides by it
-        return Lens() if straight else Lens(model.removeprefix("SIMPLE_").lower(), own=k)
+        pinhole = not k[0]  # the limit of FOV, whose formula divides by it
+        return Lens() if pinhole else Lens(model.removeprefix("SIMPLE_").lower(), parameters=k)
     return Lens(kind, k)
 
 
@@ -93,7 +93,7 @@ def binary_cameras(path: Path) -> Iterator[tuple[int, Optics]]:
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, kind, width, height = struct.unpack_from("<IiQQ", data, at)
         if kind not in _MODELS:
-            raise BadFileError(f"its camera model {kind} is none that is known")
+            raise BadFileError(f"its camera model {kind} is not known")
         model, count = _MODELS[kind]
         yield number, _optics(model, width, height, struct.unpack_from(f"<{count}d", data, at + 24))
         at += 24 + 8 * count
@@ -118,7 +118,7 @@ def binary_points(path: Path) -> Iterator[tuple[float, ...]]:
         *row, track = struct.unpack_from("<Q3d3BdQ", data, at)
         at += 51 + 8 * track
         if at > len(data):
-            raise BadFileError("it was cut short")
+            raise BadFileError("it is truncated")
         yield tuple(row)
 
 
@@ -133,7 +133,7 @@ def text_cameras(path: Path) -> Iterator[tuple[int, Optics]]:
     for line in filter(str.strip, _lines(path)):
         number, model, width, height, *params = line.split()
         if counts.get(model) != len(params):
-            raise BadFileError(f"its camera model {model[:40]} is none that is known")
+            raise BadFileError(f"its camera model {model[:40]} is not known")
         yield int(number), _optics(model, int(width), int(height), tuple(map(float, params)))
 
 

@@ -1,8 +1,8 @@
-"""Lenses that bend straight lines: where on the image plane a direction is seen.
+"""Lens distortion: the camera models of COLMAP, and their inverse.
 
-Image-plane coordinates: u = X / Z, v = Y / Z of a pinhole camera; a lens moves them before focal
-length and principal point make pixels of them. The models are those of COLMAP
-(https://colmap.github.io/cameras.html), of which those of other programs are special cases.
+Coordinates are u = X / Z, v = Y / Z of a pinhole camera. A lens distorts them before focal length
+and principal point turn them into pixels. The models are those of
+https://colmap.github.io/cameras.html; those of other programs are special cases.
 """
 
 from __future__ import annotations
@@ -12,91 +12,103 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-WIDEST = 1.5  # radians from the axis; a pinhole camera sees less than pi / 2
-_ROUNDS = 60
+MAX_ANGLE = 1.5  # radians from the axis; a pinhole camera sees less than pi / 2
+_ITERATIONS = 60
 _STEP = 1e-6
-_CLOSE = 1e-9
+_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class Lens:
-    """kind: "perspective", "fisheye" (angle from the axis in place of its tangent), "prism fisheye"
-    (the same, tangential terms after the radial ones), "fov", "division" or "eucm".
+    """A lens model and its parameters.
 
-    radial: factors of r^2, r^4, ... in 1 + ...; below: the same in the denominator. tangential: p1
-    and p2 in OpenCV's order. prism: what r^2 and r^4 add to u, then to v. own: parameters of the
-    last three kinds. skew: of the other kinds, how much of v is added to u at the end.
+    Args:
+        kind: "perspective", "fisheye" (angle from the axis instead of its tangent), "prism fisheye"
+            (the same, tangential terms after the radial ones), "fov", "division" or "eucm".
+        radial: factors of r^2, r^4, ... in 1 + ...
+        denominator: the same in the denominator.
+        tangential: p1 and p2 in OpenCV's order.
+        prism: factors of r^2 and r^4 that are added to u, then to v.
+        parameters: of the last three kinds.
+        skew: of the other kinds, the share of v that is added to u at the end.
     """
 
     kind: str = "perspective"
     radial: tuple[float, ...] = ()
-    below: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    own: tuple[float, ...] = ()
+    parameters: tuple[float, ...] = ()
     skew: float = 0.0
 
     @property
     def distorts(self) -> bool:
         """Whether it differs from a pinhole."""
-        terms = (*self.radial, *self.below, *self.tangential, *self.prism, *self.own, self.skew)
+        terms = (
+            *self.radial,
+            *self.denominator,
+            *self.tangential,
+            *self.prism,
+            *self.parameters,
+            self.skew,
+        )
         return "fisheye" in self.kind or any(terms)
 
     def distort(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[..., 2] where the lens shows what a pinhole camera has at `uv` [..., 2]."""
+        """[..., 2] distorted coordinates of `uv` [..., 2]."""
         if "fisheye" not in self.kind:
-            return self._moved(uv)
+            return self._distorted(uv)
         radius = np.linalg.norm(uv, axis=-1, keepdims=True)
-        return self._moved(uv * _ratio(np.arctan(radius), radius))
+        return self._distorted(uv * _ratio(np.arctan(radius), radius))
 
     def undistort(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 2] the inverse of `distort`, on the part around the axis where it is one to one; NaN
-        beyond it, and beyond `WIDEST`."""
+        """[N, 2] the inverse of `distort` by Newton's method, in the region around the axis where
+        `distort` is injective; NaN outside it, and beyond `MAX_ANGLE`."""
         at = seen.copy()
         with np.errstate(all="ignore"):
-            for _ in range(_ROUNDS):
-                off = self._moved(at) - seen
-                step = np.einsum("nij,nj->ni", _inverse(self._slopes(at)), off)
+            for _ in range(_ITERATIONS):
+                off = self._distorted(at) - seen
+                step = np.einsum("nij,nj->ni", _inverse(self._jacobian(at)), off)
                 length = np.linalg.norm(step, axis=1, keepdims=True)
                 at = at - step * np.minimum(1.0, 0.3 / np.maximum(length, 1e-12))
-            found = np.abs(self._moved(at) - seen).max(axis=1) < _CLOSE
-            # Steps may jump over a fold: along the way from the axis the slope stays positive.
+            found = np.abs(self._distorted(at) - seen).max(axis=1) < _TOLERANCE
+            # A step may jump over a fold: from the axis on, the determinant must stay positive.
             for share in np.linspace(0.0, 1.0, 17):
-                found &= np.linalg.det(self._slopes(share * at)) > 0
+                found &= np.linalg.det(self._jacobian(share * at)) > 0
             if "fisheye" in self.kind:
                 angle = np.linalg.norm(at, axis=1, keepdims=True)
-                found &= angle[:, 0] < WIDEST
+                found &= angle[:, 0] < MAX_ANGLE
                 at = at * _ratio(np.tan(angle), angle)
         return np.where(found[:, None], at, np.nan)
 
-    def _slopes(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N, 2, 2] derivatives of `_moved`."""
+    def _jacobian(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 2, 2] derivatives of `_distorted`."""
         columns = [
-            (self._moved(at + step) - self._moved(at - step)) / (2 * _STEP)
+            (self._distorted(at + step) - self._distorted(at - step)) / (2 * _STEP)
             for step in _STEP * np.eye(2)
         ]
         return np.stack(columns, axis=-1)
 
-    def _moved(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What comes after a fisheye's angles."""
+    def _distorted(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The distortion, after a fisheye's mapping of angles."""
         r2 = np.sum(uv**2, axis=-1, keepdims=True)
         if self.kind == "fov":
-            (omega,) = self.own
+            (omega,) = self.parameters
             r = np.sqrt(r2)
             return uv * _ratio(np.arctan(2 * r * np.tan(omega / 2)) / omega, r)
         if self.kind == "division":
-            (k,) = self.own
+            (k,) = self.parameters
             with np.errstate(invalid="ignore"):
                 return np.asarray(uv * (2.0 / (1.0 + np.sqrt(1.0 - 4.0 * k * r2))))
         if self.kind == "eucm":
-            alpha, beta = self.own
+            alpha, beta = self.parameters
             return np.asarray(uv / (alpha * np.sqrt(beta * r2 + 1.0) + 1.0 - alpha))
-        scaled = uv * (_polynomial(self.radial, r2) / _polynomial(self.below, r2))
+        scaled = uv * (_polynomial(self.radial, r2) / _polynomial(self.denominator, r2))
         moved = scaled + self._shift(scaled if self.kind == "prism fisheye" else uv)
         return moved + moved[..., 1:] * (self.skew, 0.0) if self.skew else moved
 
     def _shift(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of the tangential and prism terms."""
+        """The tangential and prism terms."""
         if not any((*self.tangential, *self.prism)):
             return np.zeros_like(uv)
         (p1, p2), (s1, s2, s3, s4) = self.tangential, self.prism

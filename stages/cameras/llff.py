@@ -1,8 +1,8 @@
 """poses_bounds.npy of LLFF: https://github.com/Fyusion/LLFF#using-your-own-poses-without-running-colmap
 
-A row of 17 numbers a picture, in order of the pictures' names: a matrix [3, 5] and the nearest and
-farthest depth. The matrix's columns are where the camera's down, right and backward point, its
-position, and height, width and focal length in pixels.
+Each row has 17 numbers, in the order of the pictures' names: a matrix [3, 5], and the nearest and
+farthest depth. The columns of the matrix are the camera's down, right and backward directions, its
+position, and the height, width and focal length in pixels.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, content_of, make_views
+from stages.cameras.camera_file import CameraFile, content_of, make_views, poses_of
 from stages.cameras.lens import PINHOLE
 
 _NAME = "poses_bounds.npy"
@@ -23,7 +23,7 @@ _COLUMNS = 17
 _PICTURES = (".jpg", ".jpeg", ".png")
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """The file itself, or in the folder `path`."""
     if path.suffix.lower() == ".npy":
         return path
@@ -31,25 +31,23 @@ def recognised(path: Path) -> Path | None:
 
 
 def read(path: Path) -> CameraFile:
-    """The cameras of the pictures in a folder beside the file that begins with "images" (the
-    largest ones), or beside the file itself. Raises SplatError "cameras-unreadable"."""
+    """The cameras of the pictures in a folder "images..." beside the file (that with the shortest
+    name), or beside the file itself. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         rows = _rows(content_of(path))
         names = _names(path.parent, len(rows))
         matrices = rows[:, :15].reshape(-1, 3, 5)
-        down, right, backward, centre, sizes = np.moveaxis(matrices, 2, 0)
+        down, right, backward, centre, camera = np.moveaxis(matrices, 2, 0)
         rotations = np.stack([right, down, -backward], axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):
-            shifts = -np.einsum("vij,vj->vi", rotations, centre)
-        height, width, focal = sizes.T
+        height, width, focal = camera.T
         lens = np.stack([focal, focal, width / 2, height / 2], axis=1)
-        poses = np.concatenate([rotations, shifts[:, :, None]], axis=2)
-        views = make_views(names, np.stack([width, height], axis=1), lens, poses)
+        sizes = np.stack([width, height], axis=1)
+        views = make_views(names, sizes, lens, poses_of(rotations, centre))
         return CameraFile(views, path.parent, (PINHOLE,) * len(views))
 
 
 def _rows(data: bytes) -> NDArray[np.float64]:
-    """[V, 17] of the file. Not by `np.load`, which allocates what a header claims."""
+    """[V, 17] of the file. `np.load` is not used because it allocates what a header claims."""
     file = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(file)
@@ -60,19 +58,21 @@ def _rows(data: bytes) -> NDArray[np.float64]:
     except (tokenize.TokenError, SyntaxError) as error:
         raise BadFileError(f"its header is damaged ({error})") from error
     if len(shape) != 2 or shape[1] != _COLUMNS or dtype.kind != "f":
-        raise BadFileError(f"it is no table of {_COLUMNS} numbers a picture")
+        raise BadFileError(f"it is not a table of {_COLUMNS} columns")
     count = shape[0] * _COLUMNS
     if count * dtype.itemsize > len(data) - file.tell():
-        raise BadFileError("it was cut short")
+        raise BadFileError("it is truncated")
     rows = np.frombuffer(data, dtype, count, file.tell())
     return rows.reshape(shape, order="F" if by_columns else "C").astype(np.float64)
 
 
 def _names(folder: Path, count: int) -> list[str]:
-    """From `folder`; of all folders that hold as many pictures, the one with the shortest name."""
+    """The pictures of the first folder that holds `count` of them, by length of its name."""
     folders = [child for child in folder.glob("images*") if child.is_dir()]
-    for place in [*sorted(folders, key=lambda child: (len(child.name), child.name)), folder]:
-        pictures = sorted(p for p in place.iterdir() if p.suffix.lower() in _PICTURES)
+    for near in [*sorted(folders, key=lambda child: (len(child.name), child.name)), folder]:
+        pictures = sorted(p for p in near.iterdir() if p.suffix.lower() in _PICTURES)
         if len(pictures) == count:
             return [picture.relative_to(folder).as_posix() for picture in pictures]
-    raise BadFileError(f"it speaks of {count} pictures, and no folder of images beside it has them")
+    raise BadFileError(
+        f"it has {count} cameras, and no folder of images beside it has as many pictures"
+    )

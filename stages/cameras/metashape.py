@@ -1,10 +1,10 @@
 """Metashape's cameras ("Export Cameras", Agisoft XML); its manual's appendix "Camera models".
 
 A camera's transform is camera to world with our axes; the world is the chunk's own. Principal
-points are counted from the middle of the picture; P1 and P2 are OpenCV's p2 and p1.
+points are relative to the middle of the picture; P1 and P2 are OpenCV's p2 and p1.
 
-The chunk's transform, if it has one, leads to metres from the centre of the earth, or to local
-coordinates whose unit the chunk's reference names, z up. One that changes nothing says nothing.
+The chunk's transform, if it has one, leads to geocentric coordinates in metres, or to local
+coordinates (z up) whose unit the chunk's reference names. An identity transform says nothing.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from stages.cameras.camera_file import (
     Georeference,
     content_of,
     make_views,
+    poses_of,
 )
 from stages.cameras.lens import Lens
 
-_EARTH = (6.2e6, 6.5e6)  # metres from its centre to where people take photographs
-_SAID_BY = "the chunk's transform"
+_EARTH_RADII = (6.2e6, 6.5e6)  # metres, of places where photographs are taken
+_SOURCE = "the chunk's transform"
 _KINDS = {"frame": "perspective", "fisheye": "fisheye"}
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """The path itself, if it is an .xml file."""
     return path if path.suffix.lower() == ".xml" else None
 
 
 def read(path: Path) -> CameraFile:
-    """The cameras that were placed. Raises SplatError "cameras-unreadable"."""
+    """The cameras that were aligned. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         root = _parsed(path)
         optics = {
@@ -47,56 +48,54 @@ def read(path: Path) -> CameraFile:
             for sensor in root.iter("sensor")
             if sensor.find("calibration") is not None
         }
-        placed = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
-        missing = {camera.get("sensor_id", "") for camera in placed} - optics.keys()
+        aligned = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
+        missing = {camera.get("sensor_id", "") for camera in aligned} - optics.keys()
         if missing:
             raise BadFileError(f"there is no calibrated sensor {min(missing)[:80]!r}")
-        mine = [optics[camera.get("sensor_id", "")] for camera in placed]
-        words = [(camera.findtext("transform") or "").split() for camera in placed]
-        poses = np.array(words, np.float64).reshape(-1, 4, 4)
-        turns = poses[:, :3, :3].transpose(0, 2, 1)
-        with np.errstate(over="ignore", invalid="ignore"):
-            shifts = -np.einsum("vij,vj->vi", turns, poses[:, :3, 3])
+        mine = [optics[camera.get("sensor_id", "")] for camera in aligned]
+        texts = [(camera.findtext("transform") or "").split() for camera in aligned]
+        poses = np.array(texts, np.float64).reshape(-1, 4, 4)
+        rotations = poses[:, :3, :3].transpose(0, 2, 1)
         numbers = np.array([values for values, _ in mine], np.float64).reshape(-1, 6)
         views = make_views(
-            [camera.get("label", "") for camera in placed],
+            [camera.get("label", "") for camera in aligned],
             numbers[:, :2],
             numbers[:, 2:],
-            np.concatenate([turns, shifts[:, :, None]], axis=2),
+            poses_of(rotations, poses[:, :3, 3]),
         )
-        return CameraFile(views, path.parent, tuple(lens for _, lens in mine), _ground(root))
+        return CameraFile(views, path.parent, tuple(lens for _, lens in mine), _georeference(root))
 
 
-def _ground(root: Element) -> Georeference:
-    """Of the only transform of a chunk or component; of several, none is everyone's."""
+def _georeference(root: Element) -> Georeference:
+    """From the transform of a chunk or component, if there is exactly one."""
     every = [e for e in root.iter("transform") if e.find("scale") is not None]
     if len(every) != 1:
         return NO_GEOREFERENCE
     turn = _numbers(every[0], "rotation", 9).reshape(3, 3)
     shift, (scale,) = _numbers(every[0], "translation", 3), _numbers(every[0], "scale", 1)
     if scale <= 0 or np.abs(turn @ turn.T - np.eye(3)).max() > ROTATION_TOLERANCE:
-        raise BadFileError("the chunk's transform is no rotation and scale")
-    if _EARTH[0] < np.linalg.norm(shift) < _EARTH[1]:
-        return Georeference(float(scale), _east_north_up(shift) @ turn, _SAID_BY)
+        raise BadFileError("the chunk's transform is not a rotation and scale")
+    if _EARTH_RADII[0] < np.linalg.norm(shift) < _EARTH_RADII[1]:
+        return Georeference(float(scale), _east_north_up(shift) @ turn, _SOURCE)
     reference = (root.findtext(".//chunk/reference") or root.findtext("reference") or "").strip()
     unit = re.search(r'UNIT\["[^"]*",\s*([0-9.]+)', reference)
     changes = scale != 1.0 or shift.any() or (turn != np.eye(3)).any()
     if not (reference.startswith("LOCAL_CS") and unit and changes):
         return NO_GEOREFERENCE
-    return Georeference(float(scale) * float(unit[1]), turn, _SAID_BY)
+    return Georeference(float(scale) * float(unit[1]), turn, _SOURCE)
 
 
 def _numbers(transform: Element, name: str, count: int) -> NDArray[np.float64]:
     values = np.array((transform.findtext(name) or "").split(), np.float64)
     if len(values) != count or not np.isfinite(values).all():
-        raise BadFileError(f"the {name} of its chunk has not {count} numbers")
+        raise BadFileError(f"the {name} of its chunk does not have {count} numbers")
     return values
 
 
-def _east_north_up(place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3, 3] rows, at a place counted from the centre of the earth; up away from that centre, which
-    is a fifth of a degree off at most."""
-    up = place / np.linalg.norm(place)
+def _east_north_up(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3, 3] rows at a geocentric position [3]. Up is away from the centre of the earth, which
+    differs from the vertical by a fifth of a degree at most."""
+    up = position / np.linalg.norm(position)
     east = np.cross([0.0, 0.0, 1.0], up)
     east = east / max(float(np.linalg.norm(east)), 1e-9)
     return np.stack([east, np.cross(up, east), up])
@@ -104,7 +103,7 @@ def _east_north_up(place: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _parsed(path: Path) -> Element:
     data = content_of(path)
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # an entity may stand for gigabytes
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # an entity may expand to gigabytes
         raise BadFileError("it declares entities, which Metashape does not")
     try:
         return ElementTree.fromstring(data)
@@ -113,13 +112,14 @@ def _parsed(path: Path) -> Element:
 
 
 def _optics(sensor: Element) -> tuple[list[float], Lens]:
-    """(width, height, fx, fy, cx, cy in pixels; the lens), adjusted if both are there."""
+    """(width, height, fx, fy, cx, cy in pixels; the lens) of the adjusted calibration, if there is
+    one."""
     every = sensor.findall("calibration")
     calibration = next((c for c in every if c.get("class") == "adjusted"), every[0])
     resolution = calibration.find("resolution")
     kind = sensor.get("type", "frame")
     if kind not in _KINDS or resolution is None:
-        raise BadFileError(f"a sensor of type {kind[:40]} has no lens that is known")
+        raise BadFileError(f"a sensor of type {kind[:40]} has no known lens model")
 
     def value(name: str) -> float:
         return float(calibration.findtext(name) or 0.0)
@@ -129,7 +129,7 @@ def _optics(sensor: Element) -> tuple[list[float], Lens]:
     if not np.isfinite(terms).all():
         raise BadFileError("a lens has a parameter that is not a number")
     if value("p3") or value("p4"):
-        raise BadFileError("a lens has terms p3 and p4, which are not known here")
+        raise BadFileError("a lens has terms p3 and p4, which are not supported")
     k1, k2, k3, k4, p1, p2 = terms
     focal = value("f")
     across = focal + value("b1")

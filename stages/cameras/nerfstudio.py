@@ -1,12 +1,12 @@
-"""nerfstudio's transforms.json.
+"""nerfstudio's and instant-ngp's transforms.json.
 
 Layout: https://docs.nerf.studio/quickstart/data_conventions.html. A frame's `transform_matrix` is
 camera to world with OpenGL's axes: x right, y up, z backward.
 
-The world: z up. We write our y-down world turned by `applied_transform` (x, z, -y), the same turn
-as nerfstudio's own import from COLMAP makes, so that what it exports with the turn undone is in
-our world again. Reading undoes `applied_scale` and `applied_transform`; a file without them is
-taken to be in the world that it was made for. A frame without a size has its picture's.
+The world is z up. We write our y-down world rotated by `applied_transform` (x, z, -y), as
+nerfstudio's own import from COLMAP does. So what nerfstudio exports with that transform undone is
+in our world again. Reading undoes `applied_scale` and `applied_transform`; a file without them is
+read as it is. A frame without a size has that of its picture.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, FilePoints, content_of, make_views
+from stages.cameras.camera_file import CameraFile, FilePoints, content_of, make_views, poses_of
 from stages.cameras.lens import Lens
 from stages.scene import View
 
 OPENGL_FROM_OURS = np.diag([1.0, -1.0, -1.0])
-SAVED_FROM_OURS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+APPLIED_TRANSFORM = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = "OPENCV_FISHEYE"
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # of pictures that are named without one
@@ -45,15 +45,20 @@ def write(
     points: NDArray[np.float64] | None = None,
     colours: NDArray[np.uint8] | None = None,
 ) -> None:
-    """Write the views; what `View.image` names starts from `pictures`, and is named from the
-    file's own folder. points [P, 3] and colours [P, 3], where there are any, go into a .ply of
-    the same name beside it, where nerfstudio finds its first splats.
+    """Write the views, and the points into a .ply of the same name beside the file, from which
+    nerfstudio initialises splats. Raises SplatError if a file cannot be written.
 
-    Raises SplatError when a file cannot be written.
+    Args:
+        path: of transforms.json.
+        views: to write.
+        pictures: folder that `View.image` is relative to; the file names pictures relative to its
+            own folder.
+        points: [P, 3].
+        colours: [P, 3].
     """
     data: dict[str, Any] = {
         "camera_model": "PINHOLE",
-        "applied_transform": np.hstack([SAVED_FROM_OURS, np.zeros((3, 1))]).tolist(),
+        "applied_transform": np.hstack([APPLIED_TRANSFORM, np.zeros((3, 1))]).tolist(),
     }
     lenses = [_lens(view) for view in views]
     shared = all(lens == lenses[0] for lens in lenses)
@@ -61,7 +66,7 @@ def write(
         data |= lenses[0]
     if points is not None and colours is not None and len(points):
         beside = path.with_suffix(".ply")
-        _write_points(beside, points @ SAVED_FROM_OURS.T, colours)
+        _write_points(beside, points @ APPLIED_TRANSFORM.T, colours)
         data["ply_file_path"] = beside.name
     data["frames"] = [
         {
@@ -75,14 +80,14 @@ def write(
         partial.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """The path itself, if it is a .json file."""
     return path if path.suffix.lower() == ".json" else None
 
 
 def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
-    """The cameras of a file; `file_path` gives their names. size: of pictures that are not there,
-    where the file does not say it either. Raises SplatError "cameras-unreadable"."""
+    """The cameras of a file, named by `file_path`. size: of pictures that are not found and whose
+    size the file does not say. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         data = json.loads(content_of(path).decode("utf-8"))
         if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
@@ -98,8 +103,8 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
             raise BadFileError("a size or focal length is not a number")
         saved = np.zeros((len(frames), 3, 4))
         for row, frame in zip(saved, frames, strict=True):
-            row[:] = np.array(_wanted(frame, "transform_matrix"), np.float64)[:3]
-        names = [str(_wanted(frame, "file_path")) for frame in frames]
+            row[:] = np.array(_required(frame, "transform_matrix"), np.float64)[:3]
+        names = [str(_required(frame, "file_path")) for frame in frames]
         views = make_views(names, numbers[:, :2], numbers[:, 2:], _our_poses(data, saved))
         lenses = tuple(_read_lens(ChainMap(frame, data)) for frame in frames)
         return CameraFile(_with_roles(views, data), path.parent, lenses)
@@ -127,26 +132,25 @@ def _with_roles(views: tuple[View, ...], data: dict[str, Any]) -> tuple[View, ..
 
 
 def _saved_pose(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[4, 4] OpenGL camera to saved world."""
+    """[4, 4] `transform_matrix` of a camera."""
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     pose = np.eye(4)
-    pose[:3, :3] = SAVED_FROM_OURS @ rotation.T @ OPENGL_FROM_OURS
-    pose[:3, 3] = SAVED_FROM_OURS @ (-rotation.T @ translation)
+    pose[:3, :3] = APPLIED_TRANSFORM @ rotation.T @ OPENGL_FROM_OURS
+    pose[:3, 3] = APPLIED_TRANSFORM @ (-rotation.T @ translation)
     return pose + 0.0  # no -0.0
 
 
 def _our_poses(data: dict[str, Any], saved: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 4] world to camera of OpenGL camera-to-world matrices [V, 3, 4]."""
     turn, shift, scale = _applied(data)
-    with np.errstate(over="ignore", invalid="ignore"):  # `make_views` looks at what comes out
+    with np.errstate(over="ignore", invalid="ignore"):  # `make_views` checks the result
         centres = (saved[:, :, 3] / scale - shift) @ turn
         rotations = OPENGL_FROM_OURS @ saved[:, :, :3].transpose(0, 2, 1) @ turn
-        shifts = -np.einsum("vij,vj->vi", rotations, centres)
-    return np.concatenate([rotations, shifts[:, :, None]], axis=2)
+    return poses_of(rotations, centres)
 
 
 def _applied(data: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Turn [3, 3], shift [3] and scale that took the file's own world to the saved one."""
+    """Rotation [3, 3], translation [3] and scale that were applied to the original world."""
     applied = np.array(data.get("applied_transform", np.eye(4)[:3]), np.float64)[:3]
     scale = float(data.get("applied_scale", 1.0))
     turn = applied[:, :3] if applied.shape == (3, 4) else np.zeros((3, 3))
@@ -168,12 +172,12 @@ def _lens(view: View) -> dict[str, float]:
 def _read_numbers(
     merged: Mapping[str, Any], folder: Path, size: tuple[int, int] | None
 ) -> list[float]:
-    """w, h, fl_x, fl_y, cx, cy: the frame's own, or the file's. Those that may be missing have
-    instant-ngp's defaults."""
+    """w, h, fl_x, fl_y, cx, cy of the frame or the file, with instant-ngp's defaults for those that
+    may be missing."""
     if "w" in merged and "h" in merged:
         width, height = float(merged["w"]), float(merged["h"])
     else:
-        width, height = _picture_size(folder, str(_wanted(merged, "file_path")), size)
+        width, height = _picture_size(folder, str(_required(merged, "file_path")), size)
     fx = _focal(merged, "x", width, None)
     return [
         width,
@@ -186,18 +190,18 @@ def _read_numbers(
 
 
 def _focal(merged: Mapping[str, Any], axis: str, side: float, otherwise: float | None) -> float:
-    """fl_x or fl_y, or what the angle of view gives."""
+    """fl_x or fl_y, given directly or by camera_angle_x or _y."""
     angle_key = f"camera_angle_{axis}"
     if f"fl_{axis}" not in merged and angle_key in merged:
         angle = float(merged[angle_key])
         return 0.5 * side / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
     if otherwise is not None and f"fl_{axis}" not in merged:
         return otherwise
-    return float(_wanted(merged, f"fl_{axis}"))
+    return float(_required(merged, f"fl_{axis}"))
 
 
 def _picture_size(folder: Path, name: str, otherwise: tuple[int, int] | None) -> tuple[int, int]:
-    """Width and height of the picture itself, whose suffix may have been left out."""
+    """Width and height of the picture itself, whose suffix may be missing from its name."""
     from PIL import Image
 
     for path in (folder / f"{name}{suffix}" for suffix in ("", *_SUFFIXES)):
@@ -206,15 +210,15 @@ def _picture_size(folder: Path, name: str, otherwise: tuple[int, int] | None) ->
                 return picture.size
     if otherwise is not None:
         return otherwise
-    raise BadFileError(f"a frame has no w and h, and {name[:80]} is not there to be measured")
+    raise BadFileError(f"a frame has no w and h, and its picture {name[:80]} is not found")
 
 
 def _read_lens(merged: Mapping[str, Any]) -> Lens:
-    """What bends the picture: nerfstudio's models, of which instant-ngp's are a part."""
+    """The distortion, by nerfstudio's camera models, which include instant-ngp's."""
     model = str(merged.get("camera_model", "OPENCV"))
     fisheye = model == _FISHEYE or bool(merged.get("is_fisheye", False))
     if not fisheye and model not in _PERSPECTIVE:
-        raise BadFileError(f"its camera model is {model[:40]}, which is no lens that is known")
+        raise BadFileError(f"its camera model {model[:40]} is not known")
     k1, k2, k3, k4, p1, p2 = values = [
         float(merged.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     ]
@@ -223,7 +227,7 @@ def _read_lens(merged: Mapping[str, Any]) -> Lens:
     return Lens("fisheye" if fisheye else "perspective", (k1, k2, k3, k4), tangential=(p1, p2))
 
 
-def _wanted(values: Mapping[str, Any], key: str) -> Any:
+def _required(values: Mapping[str, Any], key: str) -> Any:
     if key not in values:
         raise BadFileError(f"a frame has no {key}")
     return values[key]

@@ -1,9 +1,9 @@
 """OpenSfM's reconstruction.json, which ODM writes too: https://opensfm.org/docs/dataset.html
 
-Rotations are axis and angle, world to camera, with our axes. Focal lengths and principal points
-are in units of the longer side, the latter from the picture's centre. The largest of several
-reconstructions counts. With a reference of latitude and longitude, its world is metres east, north
-and up of that, as far as GPS goes; without, the reference is 0, 0.
+Rotations are axis-angle vectors, world to camera, with our axes. Focal lengths and principal points
+are in units of the longer side, the latter relative to the picture's centre. Of several
+reconstructions the largest is read. If reference_lla has a latitude and longitude, the world is in
+metres east, north and up of it, as far as GPS is right; without GPS the reference is 0, 0.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from stages.scene.rotations import matrices_of
 _NAME = "reconstruction.json"
 _PERSPECTIVE = ("perspective", "simple_radial", "radial", "brown")
 _FISHEYE = ("fisheye", "fisheye_opencv")
-_WORST_DOP = 1e4  # metres; OpenSfM's word for no GPS is 999,999
-_WORST_RESIDUAL = 0.15  # of how far the cameras spread, as for GPS in photographs
-_FEWEST_GPS = 3
+_MAX_DOP = 1e4  # metres; OpenSfM writes 999,999 for no GPS
+_MAX_RESIDUAL = 0.15  # of the spread of the cameras, as for GPS in Exif
+_MIN_GPS = 3
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """A .json that holds a list, itself or in the folder `path` or ODM's project `path`."""
     if path.is_dir():
         near = (path / _NAME, path / "opensfm" / _NAME)
-        return next((place for place in near if place.is_file()), None)
+        return next((file for file in near if file.is_file()), None)
     if path.suffix.lower() != ".json" or not path.is_file():
         return None
     with path.open("rb") as file:
@@ -61,30 +61,30 @@ def read(path: Path) -> CameraFile:
         numbers = np.array([optics[shot["camera"]][0] for shot in shots.values()]).reshape(-1, 6)
         turns = np.array([shot["rotation"] for shot in shots.values()], np.float64).reshape(-1, 3)
         shifts = np.array([shot["translation"] for shot in shots.values()], np.float64)
-        with np.errstate(all="ignore"):  # `make_views` looks at what comes out
+        with np.errstate(all="ignore"):  # `make_views` checks the result
             rotations = _rotations(turns)
         poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
         views = make_views(list(shots), numbers[:, :2], numbers[:, 2:], poses)
         lenses = tuple(optics[shot["camera"]][1] for shot in shots.values())
-        return CameraFile(views, path.parent / "images", lenses, _ground(data, views))
+        return CameraFile(views, path.parent / "images", lenses, _georeference(data, views))
 
 
-def _ground(data: Mapping[str, Any], views: tuple[View, ...]) -> Georeference:
-    """Metres, if there is a reference and what GPS said of the shots agrees with where they are."""
+def _georeference(data: Mapping[str, Any], views: tuple[View, ...]) -> Georeference:
+    """In metres, if there is a reference and the GPS positions of shots agree with the cameras."""
     reference = data.get("reference_lla")
     if not isinstance(reference, dict):
         return NO_GEOREFERENCE
     if not (reference.get("latitude") or reference.get("longitude")):
         return NO_GEOREFERENCE
     shots = list(data["shots"].values())
-    told = [i for i, s in enumerate(shots) if float(s.get("gps_dop", 0.0)) < _WORST_DOP]
-    rows = [i for i in told if "gps_position" in shots[i]]
+    with_gps = [i for i, s in enumerate(shots) if float(s.get("gps_dop", 0.0)) < _MAX_DOP]
+    rows = [i for i in with_gps if "gps_position" in shots[i]]
     if rows:
         there = np.array([shots[i]["gps_position"] for i in rows], np.float64).reshape(-1, 3)
         here = np.array([views[i].camera.centre for i in rows])
         apart = np.median(np.linalg.norm((there - here)[:, :2], axis=1))
         spread = np.linalg.norm((there - there.mean(axis=0))[:, :2], axis=1).mean()
-        if len(rows) < _FEWEST_GPS or not apart <= _WORST_RESIDUAL * spread:
+        if len(rows) < _MIN_GPS or not apart <= _MAX_RESIDUAL * spread:
             return NO_GEOREFERENCE
     return Georeference(1.0, np.eye(3), "the file's GPS reference")
 
@@ -121,7 +121,9 @@ def _optics(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
     width, height = float(camera["width"]), float(camera["height"])
     kind = str(camera.get("projection_type", "perspective"))
     if kind not in _PERSPECTIVE + _FISHEYE:
-        raise BadFileError(f"its projection type is {kind[:40]}, which no pinhole comes near")
+        raise BadFileError(
+            f"its projection type {kind[:40]} cannot be undistorted to a pinhole camera"
+        )
     side = max(width, height)
     fx = float(camera["focal_x"] if "focal_x" in camera else camera["focal"])
     fy = float(camera.get("focal_y", fx))
@@ -130,14 +132,14 @@ def _optics(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
     p = float(camera.get("p1", 0.0)), float(camera.get("p2", 0.0))
     if not np.isfinite([*k, *p]).all():
         raise BadFileError("a lens has a parameter that is not a number")
-    # Pixels are counted here from the first one's corner, there from its centre.
+    # Here pixel coordinates start at the corner of the first pixel, there at its centre.
     centre = (width / 2 + side * cx, height / 2 + side * cy)
     lens = Lens("fisheye" if kind in _FISHEYE else "perspective", tuple(k), tangential=p)
     return [width, height, side * fx, side * fy, *centre], lens
 
 
 def _rotations(turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V, 3, 3] of axes times angles [V, 3]."""
+    """[V, 3, 3] of axis-angle vectors [V, 3]."""
     angles = np.linalg.norm(turns, axis=1, keepdims=True)
     axes = turns / np.where(angles > 0, angles, 1.0)
     return matrices_of(np.concatenate([np.cos(angles / 2), np.sin(angles / 2) * axes], axis=1))

@@ -1,9 +1,9 @@
 """RealityScan's (RealityCapture's) "Internal/External camera parameters" as .csv.
 
-z is up. Heading, pitch and roll in degrees: a camera at 0, 0, 0 looks straight down, the top of its
-picture to the north (+y); heading and pitch say where that top points, clockwise from north and
-above the horizon, and roll turns the camera about it. f, px and py are of a picture whose longer
-side is 36 wide, the principal point from the middle. k1 to k4, t1 and t2 are taken as OpenCV's.
+z is up. Heading, pitch and roll are in degrees. A camera at 0, 0, 0 looks straight down, with the
+top of its picture to the north (+y). Heading (clockwise from north) and pitch (above the horizon)
+say where that top points, and roll turns the camera about it. f, px and py are in units of 1/36 of
+the longer side, the principal point relative to the middle. k1 to k4, t1 and t2 are OpenCV's.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, content_of, make_views, size_of_picture
+from stages.cameras.camera_file import CameraFile, content_of, make_views, poses_of, size_of_picture
 from stages.cameras.lens import Lens
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
-_WIDTH = 36.0  # of the longer side, in the file's own measure
+_LONGER_SIDE = 36.0  # in the file's own unit
 _NEEDED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 
 
-def recognised(path: Path) -> Path | None:
+def locate(path: Path) -> Path | None:
     """The path itself, if it is a .csv file."""
     return path if path.suffix.lower() == ".csv" else None
 
 
 def read(path: Path) -> CameraFile:
-    """The cameras of all rows; their pictures lie beside the file, or in images/ there. Raises
+    """The cameras of all rows; their pictures are beside the file, or in images/ there. Raises
     SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         rows = _rows(path)
@@ -41,13 +41,11 @@ def read(path: Path) -> CameraFile:
         if not (np.isfinite(found).all() and np.isfinite(lens).all()):
             raise BadFileError("it holds a value that is not a number")
         sizes = np.array([size_of_picture(path.parent, name) for name in names], np.float64)
-        scale = sizes.max(axis=1, keepdims=True) / _WIDTH
+        scale = sizes.max(axis=1, keepdims=True) / _LONGER_SIDE
         centres = sizes / 2 + lens[:, :2] * scale
         focal = found[:, 6:] * scale
         rotations = np.array([_world_to_camera(*row) for row in np.radians(found[:, 3:6])])
-        with np.errstate(all="ignore"):
-            shifts = -np.einsum("vij,vj->vi", rotations, found[:, :3])
-        poses = np.concatenate([rotations, shifts[:, :, None]], axis=2)
+        poses = poses_of(rotations, found[:, :3])
         views = make_views(names, sizes, np.hstack([focal, focal, centres]), poses)
         lenses = tuple(
             Lens(radial=tuple(row[2:6].tolist()), tangential=(float(row[6]), float(row[7])))
@@ -69,7 +67,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
     except csv.Error as error:
         raise BadFileError(f"it is damaged ({error})") from error
     if any(None in row or None in row.values() for row in rows):
-        raise BadFileError("a row breaks off")
+        raise BadFileError("a row is incomplete")
     if not rows:
         raise BadFileError("it holds no camera")
     return rows

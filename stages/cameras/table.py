@@ -1,8 +1,13 @@
 """The camera files of other programs that can be read, in one list.
 
-A new one is a module here with `recognised(path)`, which gives the path to read where `path` is
-such a file and None where it is not, and `read(path)`, which gives a `CameraFile` through
-`camera_file.make_views`; a line in `CAMERA_FILES`; and `read_points(path)` if it has points.
+To add one:
+
+1. Write a module here with `locate(path)`, which returns the path to read, or None if `path` is not
+   such a file.
+2. Give it `read(path)`, which returns a `CameraFile` made by `camera_file.make_views`.
+3. Give it `read_points(path)` if the file has sparse points.
+4. Add a row to `CAMERA_FILES`; the first format that locates a file reads it.
+5. Add a writer to `tests/cameras/drawn.py`: the tests run over all of them.
 """
 
 from __future__ import annotations
@@ -18,10 +23,10 @@ from stages.cameras.camera_file import CameraFile, FilePoints
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """module: of this room. what: in words, for errors and help."""
+    """A row of the list. module: in this package. description: for errors and help."""
 
     module: str
-    what: str
+    description: str
 
 
 CAMERA_FILES = (
@@ -34,47 +39,46 @@ CAMERA_FILES = (
     CameraFormat("metashape", "Metashape's cameras as .xml"),
     CameraFormat("realityscan", "RealityScan's camera parameters as .csv"),
 )
-_READ_WITH_IT = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cameras
+_READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cameras
 
 
 def read_cameras(path: Path) -> CameraFile:
-    """The cameras of any file in the list. Raises SplatError "cameras-unknown" or
+    """The cameras of a file of any listed format. Raises SplatError "cameras-unknown" or
     "cameras-unreadable"."""
-    module, place = _reader(path)
-    found: CameraFile = module.read(place)
+    module, source = _reader(path)
+    found: CameraFile = module.read(source)
     return found
 
 
 def read_points(path: Path) -> FilePoints | None:
-    """The sparse points that go with the cameras, if the file has any. Raises as `read_cameras`."""
-    module, place = _reader(path)
+    """The sparse points of the file, if it has any. Raises as `read_cameras`."""
+    module, source = _reader(path)
     if not hasattr(module, "read_points"):
         return None
-    found: FilePoints | None = module.read_points(place)
+    found: FilePoints | None = module.read_points(source)
     return found
 
 
 def files_of(path: Path) -> list[Path]:
-    """The files that cameras are read from: what has to stay for them to stay. Raises
-    SplatError."""
-    place = _reader(path)[1]
-    folder = place if place.is_dir() else place.parent
-    suffixes = _READ_WITH_IT if place.is_dir() else (".ply",)
+    """All files that the cameras are read from. Raises SplatError."""
+    source = _reader(path)[1]
+    folder = source if source.is_dir() else source.parent
+    suffixes = _READ_TOGETHER if source.is_dir() else (".ply",)
     beside = [child for child in sorted(folder.iterdir()) if child.suffix.lower() in suffixes]
-    return [*beside, *([] if place.is_dir() else [place])]
+    return [*beside, *([] if source.is_dir() else [source])]
 
 
 def _reader(path: Path) -> tuple[ModuleType, Path]:
     """(the format's module, what it reads)."""
     for row in CAMERA_FILES:
         module = importlib.import_module(f"stages.cameras.{row.module}")
-        place = module.recognised(path)
-        if place is not None:
-            return module, place
+        located = module.locate(path)
+        if located is not None:
+            return module, located
     raise SplatError(
         "cameras-unknown",
-        given=f"{path} is no file of cameras that is known here.",
-        wanted=f"{'; or '.join(row.what for row in CAMERA_FILES)}.",
+        given=f"{path} is not a known camera file.",
+        wanted=f"{'; or '.join(row.description for row in CAMERA_FILES)}.",
         hint="Check the path; a run's cameras are written by `splat cameras RUN OUT`.",
         family=Family.USAGE,
     )

@@ -17,13 +17,14 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import rasteriser_of
-from stages.raster.definition import NO_SMOOTHING, RasterSettings, splat_arrays
+from stages.raster.definition import NO_SMOOTHING, RasterSettings
 from stages.raster.draw import raster_settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
+from stages.training.conversion import model_of
 from stages.training.dropout import Dropout
-from stages.training.optimiser import LearningRates, Model, new_model
+from stages.training.optimiser import LearningRates, Model
 from stages.training.steps import step_of
 from stages.training.views import Level
 
@@ -77,7 +78,7 @@ class FineTuner:
         """
         if not steps or not len(splats):
             return splats
-        model = new_model(*(np.array(a, np.float32, order="C") for a in splats.arrays))
+        model = model_of(splats)
         model.sh_degrees[:], model.gradient_count[:] = splats.sh_degrees, view_counts
         self._stepper.load(model)
         settings = replace(raster_settings_of(splats), sh_degree=splats.sh_degree)
@@ -97,7 +98,7 @@ class FineTuner:
         return found
 
     def _refit_colours(self, splats: Splats, settings: RasterSettings, only_dc: bool) -> Splats:
-        model = new_model(*splat_arrays(splats))
+        model = model_of(splats)
         model.sh_degrees[:] = 0 if only_dc else splats.sh_degrees
         refit = ColourRefit(
             self._rasteriser, settings, lambda: map(_level_of, self.views), NO_SMOOTHING

@@ -1,4 +1,4 @@
-"""What files of cameras say of their world's size and north, and what they do not say."""
+"""Scale and orientation that camera files state for their world."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def transformed(
     said = CHUNK.replace("0 -1 0 1 0 0 0 0 1", words[0]).replace("1 2 3", words[1])
     said = said.replace(">0.5<", f">{scale}<").replace(LOCAL, reference)
     path.write_text(path.read_text().replace(CHUNK, said))
-    return read_cameras(path).ground
+    return read_cameras(path).georeference
 
 
-def test_a_chunk_that_lies_on_the_earth_is_metric_and_knows_north(tmp_path: Path) -> None:
+def test_a_geocentric_chunk_is_metric_and_has_axes(tmp_path: Path) -> None:
     """By hand: at latitude 0, longitude 90 east, up is y, east is -x, north is z."""
     ground = transformed(tmp_path, TURN, (0.0, 6_378_137.0, 0.0), 12.5)
-    assert ground.metres == 12.5
+    assert ground.metres_per_unit == 12.5
     assert ground.axes is not None
     east, north, up = np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]]) @ TURN
     np.testing.assert_allclose(ground.axes, [east, north, up], atol=1e-12)
@@ -40,28 +40,28 @@ def test_a_chunk_that_lies_on_the_earth_is_metric_and_knows_north(tmp_path: Path
 
 def test_a_chunk_in_local_metres_or_feet_is_metric(tmp_path: Path) -> None:
     ground = transformed(tmp_path, TURN, (1.0, 2.0, 3.0), 0.5, LOCAL)
-    assert ground.metres == 0.5
+    assert ground.metres_per_unit == 0.5
     np.testing.assert_array_equal(ground.axes, TURN)
     feet = LOCAL.replace('"metre",1', '"foot",0.3048')
     found = transformed(tmp_path / "feet", TURN, (1.0, 2.0, 3.0), 0.5, feet)
-    assert found.metres == pytest.approx(0.1524)
+    assert found.metres_per_unit == pytest.approx(0.1524)
 
 
 @pytest.mark.parametrize(
     ("shift", "scale", "reference"),
     [((0, 0, 0), 1.0, LOCAL), ((1, 2, 3), 2.0, ""), ((1, 2, 3), 2.0, 'GEOGCS["WGS 84"]')],
 )
-def test_a_chunk_that_says_no_unit_is_arbitrary(
+def test_a_chunk_without_a_unit_is_arbitrary(
     tmp_path: Path, shift: tuple[float, ...], scale: float, reference: str
 ) -> None:
     ground = transformed(tmp_path, np.eye(3), shift, scale, reference)
-    assert (ground.metres, ground.axes) == (0.0, None)
+    assert (ground.metres_per_unit, ground.axes) == (0.0, None)
 
 
 def referenced(
     folder: Path, latitude: float, gps: np.ndarray | None, dop: float = 5.0
 ) -> Georeference:
-    """Of OpenSfM's reconstruction of cameras at EYES; gps [V, 3]: what each shot was told."""
+    """Of OpenSfM's reconstruction of cameras at EYES; gps [V, 3]: GPS position of each shot."""
     path = opensfm(folder)
     data: list[dict[str, Any]] = json.loads(path.read_text())
     part = max(data, key=lambda part: len(part["shots"]))
@@ -70,19 +70,19 @@ def referenced(
         for shot, place in zip(part["shots"].values(), gps, strict=True):
             shot["gps_position"], shot["gps_dop"] = place.tolist(), dop
     path.write_text(json.dumps(data))
-    return read_cameras(path).ground
+    return read_cameras(path).georeference
 
 
 def test_opensfm_with_a_reference_is_in_metres_as_far_as_gps_agrees(tmp_path: Path) -> None:
     ground = referenced(tmp_path / "a", 48.1, EYES + 0.1)
-    assert ground.metres == 1.0
+    assert ground.metres_per_unit == 1.0
     np.testing.assert_array_equal(ground.axes, np.eye(3))
-    assert referenced(tmp_path / "b", 48.1, None).metres == 1.0
-    assert referenced(tmp_path / "c", 0.0, EYES).metres == 0.0
-    assert referenced(tmp_path / "d", 48.1, 5 * EYES).metres == 0.0
+    assert referenced(tmp_path / "b", 48.1, None).metres_per_unit == 1.0
+    assert referenced(tmp_path / "c", 0.0, EYES).metres_per_unit == 0.0
+    assert referenced(tmp_path / "d", 48.1, 5 * EYES).metres_per_unit == 0.0
 
 
 @pytest.mark.parametrize("name", sorted(MADE.keys() - {"opensfm", "metashape"}))
 def test_formats_that_do_not_say_are_arbitrary(tmp_path: Path, name: str) -> None:
-    ground = read_cameras(MADE[name](tmp_path)).ground
-    assert (ground.metres, ground.axes) == (0.0, None)
+    ground = read_cameras(MADE[name](tmp_path)).georeference
+    assert (ground.metres_per_unit, ground.axes) == (0.0, None)

@@ -24,7 +24,7 @@ LENSES = {
     "barrel": Lens(radial=(-0.2, 0.03)),
     "pincushion": Lens(radial=(0.15,), tangential=(0.01, -0.005)),
     "fisheye": Lens("fisheye", (0.02, -0.01)),
-    "division": Lens("division", own=(-0.2,)),
+    "division": Lens("division", parameters=(-0.2,)),
 }
 
 

@@ -1,6 +1,6 @@
-"""From what blending leaves of each (splat, tile) to the gradients of the splats' parameters.
+"""Gradients of the splats' parameters, from the sums that blending writes for each (splat, tile).
 
-The same chain rule as in `cpu.projection` and `cpu.splat_kernels`, where it is explained.
+The chain rule is that of `cpu.projection` and `cpu.splat_kernels`, where it is explained.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from stages.raster.gpu.project import (
     opacity_of,
 )
 
-LARGEST_KEPT = tl.constexpr(3.4e38)  # no gradient is handed on as infinite
-BRIGHTEST = tl.constexpr(1.0000000200408773e20)  # COLOUR_MAX as a record keeps it
+LARGEST_KEPT = tl.constexpr(3.4e38)  # no gradient becomes infinite
+BRIGHTEST = tl.constexpr(1.0000000200408773e20)  # COLOUR_MAX in float32
 
 
 @triton.jit
@@ -65,8 +65,8 @@ def sum_kernel(
 ):
     """sums [n, WIDTH] REAL: each splat's rows of raw [entries, WIDTH], added up in a fixed order.
 
-    firsts [n]: where they begin; counts [n]: how many they are. entries: for how many there was
-    room.
+    firsts [n], counts [n]: first row and number of rows of each splat. entries: rows that `raw`
+    has room for.
     """
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     first = tl.load(firsts + i, mask=i < n, other=0)
@@ -83,7 +83,7 @@ def sum_kernel(
 
 
 @inner
-def give(out, k, mask, value):
+def store_gradient(out, k, mask, value):
     value = tl.minimum(tl.maximum(value, -LARGEST_KEPT), LARGEST_KEPT)
     tl.store(out + k, value.to(tl.float32), mask=mask)
 
@@ -99,7 +99,7 @@ def axis_gradient(v0, v1, d0, d1, g_var_x, g_var_y, g_cov, g_minors):
 @inner
 def scale_gradient(out, k, mask, by_size, by_opacity, ratio):
     kept = ratio * ratio
-    give(out, LOG_SCALE + k, mask, by_size * kept + by_opacity * (1.0 - kept))
+    store_gradient(out, LOG_SCALE + k, mask, by_size * kept + by_opacity * (1.0 - kept))
 
 
 @inner
@@ -110,17 +110,17 @@ def rotation_gradient(out, mask, q0, q1, q2, q3, norm, r00, r10, r20, r01, r11, 
     n2 = 2.0 * (q1 * (r01 + r10) + q3 * (r12 + r21) + q0 * (r02 - r20)) - 4.0 * q2 * (r00 + r22)
     n3 = 2.0 * (q1 * (r02 + r20) + q2 * (r12 + r21) + q0 * (r10 - r01)) - 4.0 * q3 * (r00 + r11)
     along = n0 * q0 + n1 * q1 + n2 * q2 + n3 * q3
-    give(out, ROTATION, mask, (n0 - along * q0) / norm)
-    give(out, ROTATION + 1, mask, (n1 - along * q1) / norm)
-    give(out, ROTATION + 2, mask, (n2 - along * q2) / norm)
-    give(out, ROTATION + 3, mask, (n3 - along * q3) / norm)
+    store_gradient(out, ROTATION, mask, (n0 - along * q0) / norm)
+    store_gradient(out, ROTATION + 1, mask, (n1 - along * q1) / norm)
+    store_gradient(out, ROTATION + 2, mask, (n2 - along * q2) / norm)
+    store_gradient(out, ROTATION + 3, mask, (n3 - along * q3) / norm)
 
 
 @inner
 def colour_gradient(
     cam, rows, at, mask, record, sums, out, BANDS: tl.constexpr, REAL: tl.constexpr
 ):
-    """SH gradients into `out`; (x, y, z) what the directions add to the means'."""
+    """SH gradients into `out`; returns what the viewing directions add to the mean's gradient."""
     x, y, z, distance = direction(cam, rows, at, mask, REAL)
     g_r = shown_colour(record, sums, 0, mask)
     g_g = shown_colour(record, sums, 1, mask)
@@ -128,9 +128,9 @@ def colour_gradient(
     gx, gy, gz = x * 0.0, x * 0.0, x * 0.0
     for k in tl.static_range(BANDS):
         value = basis(k, x, y, z)
-        give(out, SH + 3 * k, mask, g_r * value)
-        give(out, SH + 3 * k + 1, mask, g_g * value)
-        give(out, SH + 3 * k + 2, mask, g_b * value)
+        store_gradient(out, SH + 3 * k, mask, g_r * value)
+        store_gradient(out, SH + 3 * k + 1, mask, g_g * value)
+        store_gradient(out, SH + 3 * k + 2, mask, g_b * value)
         if k > 0:
             weight = g_r * column(rows, at, mask, SH + 3 * k, REAL)
             weight += g_g * column(rows, at, mask, SH + 3 * k + 1, REAL)
@@ -145,7 +145,7 @@ def colour_gradient(
 
 @inner
 def shown_colour(record, sums, channel, mask):
-    """The gradient of a colour; one that is clamped passes nothing on."""
+    """The gradient of a colour; 0 where the colour is clamped."""
     value = tl.load(record + COLOUR + channel, mask=mask, other=0.0)
     g = tl.load(sums + S_RED + channel, mask=mask, other=0.0)
     return tl.where((value > 0.0) & (value < BRIGHTEST), g, 0.0)
@@ -199,8 +199,9 @@ def covariance_gradient(
     ANTIALIAS: tl.constexpr,
     REAL: tl.constexpr,
 ):
-    """(gradients of both variances, of the covariance, of the minors, what antialiasing adds to
-    that of ln(1 / z)) from those of the exponent and of the logarithm of the opacity drawn."""
+    """(gradients of both variances, of the covariance and of the minors; what antialiasing adds to
+    the gradient of ln(1 / z)) from those of the exponent and of the logarithm of the drawn
+    opacity."""
     e, major, wide = number(cam, DILATION, REAL), tl.maximum(a, c), a >= c
     g_major = 0.5 * g_b / det - (0.5 * g_a + g_k * b) / (major * major)
     g_cov, g_det = g_k / major, -0.5 * g_b * major / (det * det)
@@ -242,7 +243,7 @@ def shape_gradient(
     SMOOTH: tl.constexpr,
     REAL: tl.constexpr,
 ):
-    """Gradients of scales and rotation into `out`; (of the Jacobian's last column)."""
+    """Gradients of scales and rotation into `out`; returns those of the Jacobian's last column."""
     m0, m1, m2 = cross(x0, x1, x2, y0, y1, y2)
     d0, d1, d2 = cross(y0, y1, y2, m0, m1, m2)
     e0, e1, e2 = cross(m0, m1, m2, x0, x1, x2)
@@ -290,8 +291,8 @@ def splat_gradient_kernel(
     REAL: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """out [n, OUT_COLUMNS], means2d [n, 2]: gradients of the visible rows; others are not touched,
-    nor are columns beyond those in use."""
+    """out [n, OUT_COLUMNS], means2d [n, 2]: gradients of the visible rows. Other rows and columns
+    beyond those in use are left as they are."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
     mask = mask & (tl.load(keys + i, mask=mask, other=float("inf")) < float("inf"))
@@ -309,43 +310,23 @@ def splat_gradient_kernel(
     )
     tl.store(means2d + i * 2, g_x.to(tl.float32), mask=mask)
     tl.store(means2d + i * 2 + 1, g_y.to(tl.float32), mask=mask)
-    g_drawn = -s_1  # by the logarithm of the opacity drawn
-    give(out, OPACITY, mask, g_drawn * (1.0 - opacity_of(rows, at, mask, REAL)))
+    g_drawn = -s_1  # gradient of the logarithm of the drawn opacity
+    store_gradient(out, OPACITY, mask, g_drawn * (1.0 - opacity_of(rows, at, mask, REAL)))
     g_var_x, g_var_y, g_cov, g_minors, nearer = covariance_gradient(
         cam, a, b, c, det, minors, kept, g_a, g_b, g_k, g_drawn, ANTIALIAS, REAL
     )
     g_near += nearer
     u, v, in_u, in_v = slopes(cam, x, y, z, REAL)
+    j00, j02, j11, j12 = fx / z, -fx * u / z, fy / z, -fy * v / z
     g02, g12 = shape_gradient(
-        cam,
-        rows,
-        at,
-        mask,
-        out,
-        width,
-        x0,
-        x1,
-        x2,
-        y0,
-        y1,
-        y2,
-        g_var_x,
-        g_var_y,
-        g_cov,
-        g_minors,
-        fx / z,
-        -fx * u / z,
-        fy / z,
-        -fy * v / z,
-        g_drawn,
-        SMOOTH,
-        REAL,
-    )
+        cam, rows, at, mask, out, width, x0, x1, x2, y0, y1, y2, g_var_x, g_var_y, g_cov, g_minors,
+        j00, j02, j11, j12, g_drawn, SMOOTH, REAL,
+    )  # fmt: skip
     # a slope inside its limits moves with the mean; a clamped one does not
     g_u, g_v = tl.where(in_u, -g02 * fx / z, 0.0), tl.where(in_v, -g12 * fy / z, 0.0)
     by_x, by_y = (g_x * fx + g_u) / z, (g_y * fy + g_v) / z
     mx, my, mz = turned_back(cam, by_x, by_y, -(g_near + g_u * u + g_v * v) / z, REAL)
     tx, ty, tz = colour_gradient(cam, rows, at, mask, record, sums, out, BANDS, REAL)
-    give(out, MEAN, mask, mx + tx)
-    give(out, MEAN + 1, mask, my + ty)
-    give(out, MEAN + 2, mask, mz + tz)
+    store_gradient(out, MEAN, mask, mx + tx)
+    store_gradient(out, MEAN + 1, mask, my + ty)
+    store_gradient(out, MEAN + 2, mask, mz + tz)
