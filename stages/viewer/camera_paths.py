@@ -56,8 +56,8 @@ def interpolated(cameras: Sequence[Camera], splats: Splats, frames: int) -> tupl
 
 
 def smoothed(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
-    """A hand-held path smoothed: positions and quaternions averaged with Gaussian weights of standard
-    deviation `frames`. The ends stay near their positions."""
+    """A smoothed hand-held path: positions and quaternions averaged with Gaussian weights whose
+    standard deviation is `frames`. The ends stay near their positions."""
     keys = _keys(cameras)
     _align_signs(keys)
     reach = min(int(np.ceil(3 * frames)), len(keys) - 1)
