@@ -27,7 +27,7 @@ _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
 _NO_CODES = {
     *("drop-floaters", "max-mb"),  # operations of `splat edit`
     *("utf-8", "utf-8-sig", "no-store", "same-origin"),  # encodings, headers
-    "keep-damage",  # an argument of the USD reader's process
+    "allow-nonfinite",  # an argument of the USD reader's process
     *("in-use", "peak-memory"),  # parts of file names
     *("no-rotation", "too-large"),  # flags of `splat info`
 }
@@ -87,8 +87,7 @@ def test_presets_are_those_of_the_code(page: str) -> None:
 
 def test_readme_names_every_format() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8").split("## Formats")[1]
-    endings = {"mesh" if row.is_mesh else row.ending for row in TABLE}
-    assert endings <= set(re.findall(r"`([\w.-]+)`", text))
+    assert {"mesh", *(row.ending for row in TABLE)} <= set(re.findall(r"`([\w.-]+)`", text))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
