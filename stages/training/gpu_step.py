@@ -98,9 +98,9 @@ class GpuStep:
     def model(self) -> Model:
         """See `step.TrainingStep`."""
         if self._on_host is None:
-            rows, bands = _host(self._scene.rows), self._scene.bands
+            rows, coefficients = _host(self._scene.rows), self._scene.coefficients
             means, quaternions, log_scales = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
-            sh = rows[:, SH : SH + 3 * bands].reshape(len(rows), bands, 3)
+            sh = rows[:, SH : SH + 3 * coefficients].reshape(len(rows), coefficients, 3)
             own = (means, quaternions, log_scales, rows[:, OPACITY], sh, self._sh_degrees)
             remembered = (self._moment1, self._moment2, self._steps)
             counted = (self._gradient_sum, self._gradient_count, self._smoothing)
@@ -152,7 +152,7 @@ class GpuStep:
         if dropout is not None:
             rows = rows.clone()
             rows[:, OPACITY].masked_fill_(dropped(dropout, self._gradient_count), INVISIBLE)
-        return Scene(rows, self._scene.bands, widths)
+        return Scene(rows, self._scene.coefficients, widths)
 
     def _resident(self, level: Level) -> GpuTarget:
         key = id(level.means)  # which stay the same object, however often a level is read
@@ -182,7 +182,7 @@ class GpuStep:
             *(0.5 * view.width / pixels, 0.5 * view.height / pixels),
             COLUMNS=columns,
             OUT_COLUMNS=out_columns,
-            ACTIVE=active_counts(view.bands(self._scene)),
+            ACTIVE=active_counts(view.coefficients(self._scene)),
             WIDTH=triton.next_power_of_2(out_columns),
             BLOCK=block,
         )
@@ -190,12 +190,14 @@ class GpuStep:
     def _own_columns(self, model: Model) -> Tensor | None:
         """[N, columns] 0 where a gradient is of a band above the splat's own degree, else 1; None
         where every splat has all bands."""
-        bands = model.sh.shape[1]
+        coefficients = model.sh.shape[1]
         own = (model.sh_degrees.astype(np.int64) + 1) ** 2
-        if (own >= bands).all():
+        if (own >= coefficients).all():
             return None
-        kept = np.ones((len(model), gradient_columns(bands)), np.float32)
-        kept[:, SH : SH + 3 * bands] = np.repeat(np.arange(bands) < own[:, None], 3, axis=1)
+        kept = np.ones((len(model), gradient_columns(coefficients)), np.float32)
+        kept[:, SH : SH + 3 * coefficients] = np.repeat(
+            np.arange(coefficients) < own[:, None], 3, axis=1
+        )
         return self._on_device(kept)
 
     def _on_device(self, array: NDArray[Any]) -> Tensor:

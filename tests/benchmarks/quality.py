@@ -43,7 +43,7 @@ from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_ou
 from stages.sfm import SfmSettings
 from stages.train import PRESETS, TrainSettings
 from stages.training.build import corrects_light
-from tests.benchmarks.sample_judges import judges_in, render_judges
+from tests.benchmarks.sample_test_views import judges_in, render_judges
 from tests.sample import PHOTOS
 
 SAMPLE = "sample"
