@@ -158,7 +158,7 @@ def test_only_finished_work_is_left(small: tuple[Reconstruction, Report, Path]) 
     ]
 
 
-def test_a_run_killed_after_its_end_says_the_same_again(
+def test_a_run_killed_after_its_end_reports_the_same_again(
     small: tuple[Reconstruction, Report, Path],
 ) -> None:
     _, first, folder = small
@@ -247,7 +247,9 @@ def test_a_plausible_model_that_is_wrong_is_refused(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_halves_that_one_weak_pair_joins_end_in_an_error_whatever_is_tried(tmp_path: Path) -> None:
+def test_halves_joined_by_one_weak_pair_end_in_an_error_in_every_configuration(
+    tmp_path: Path,
+) -> None:
     room_captures.weakly_linked(tmp_path / "photos")
     run = str(tmp_path / "run")
     subprocess.run(processes.splat("ingest", str(tmp_path / "photos"), "--out", run), check=True)
@@ -271,7 +273,7 @@ def test_zooming_has_no_parallax(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_scenes_are_told_apart_and_one_may_be_taken(
+def test_two_scenes_are_separated_and_one_may_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -293,7 +295,7 @@ def test_two_photographs_are_too_few(tmp_path: Path) -> None:
     assert failure(bad_captures.sample(2), tmp_path).code == "sfm-too-few-photographs"
 
 
-def test_time_that_is_up_is_said(tmp_path: Path) -> None:
+def test_a_time_limit_is_an_error(tmp_path: Path) -> None:
     error = failure(bad_captures.sample(4), tmp_path, max_minutes=0.001)
     assert error.code == "sfm-timed-out"
 
@@ -312,7 +314,7 @@ def test_stopping_leaves_work_to_go_on_with(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["points.npy", "reconstruction.json"])
 @pytest.mark.parametrize("how", ["missing", "cut", "garbage"])
-def test_damaged_folders_are_refused_in_words(
+def test_damaged_folders_are_refused(
     small: tuple[Reconstruction, Report, Path], tmp_path: Path, damage: str, how: str
 ) -> None:
     found, _, _ = small

@@ -180,7 +180,7 @@ def test_opengl_axes_are_refused_by_their_name(tmp_path: Path) -> None:
     assert "y and z of each camera are negated" in caught.value.hint
 
 
-def test_a_splits_test_photographs_judge_and_lend_no_points(tmp_path: Path) -> None:
+def test_the_test_photographs_of_a_split_are_held_out_and_give_no_points(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
     names = split_file(path)
     found, _ = reconstructed(tmp_path / "sfm", path, 6, split=True)

@@ -1,6 +1,6 @@
-"""One ellipsoid can be told in 24 ways: which of its axes is x, y and z, and which way they point.
+"""Axis permutations: an ellipsoid has 24 equivalent rotations, with its scales permuted to match.
 
-The way with the smallest turn needs fewer bytes: all rotations lie close to none.
+The smallest of them compresses best, because all rotations then lie near the identity.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from stages.scene.rotations import matrices_of
 
 
 def smallest_rotations(splats: Splats) -> Splats:
-    """The same splats, axes named so that each is turned least."""
+    """The same ellipsoids, each with the smallest of its 24 equivalent rotations."""
     quaternions = np.empty((len(splats), 4), np.float32)
     log_scales = np.empty_like(splats.log_scales)
-    ways = _ways()
-    # the column of a way's matrix says which old axis becomes the new one
-    axes = np.abs(matrices_of(ways)).argmax(axis=1)
+    cube = _cube_rotations()
+    # each column of a rotation matrix selects the old axis that becomes the new one
+    axes = np.abs(matrices_of(cube)).argmax(axis=1)
     for rows in blocks(len(splats)):
-        turned = unit_quaternions(splats.quaternions[rows]).astype(np.float64)
-        least = np.abs(turned @ (ways * (1, -1, -1, -1)).T).argmax(axis=1)
-        found = _product(turned, ways[least])
+        rotations = unit_quaternions(splats.quaternions[rows]).astype(np.float64)
+        least = np.abs(rotations @ (cube * (1, -1, -1, -1)).T).argmax(axis=1)
+        found = _product(rotations, cube[least])
         quaternions[rows] = np.where(found[:, :1] < 0, -found, found)
         log_scales[rows] = np.take_along_axis(splats.log_scales[rows], axes[least], axis=1)
     return replace(splats, quaternions=quaternions, log_scales=log_scales)
 
 
-def _ways() -> NDArray[np.float64]:
-    """[24, 4] the turns of a cube."""
+def _cube_rotations() -> NDArray[np.float64]:
+    """[24, 4] the rotations of a cube as unit quaternions."""
     found = []
     for ends in product((0, 1, -1), repeat=4):
         used = [end for end in ends if end]

@@ -1,4 +1,4 @@
-"""Many values told by few: a codebook of numbers, and a palette of vectors (both k-means)."""
+"""Vector quantisation by k-means: a codebook of scalars and a palette of vectors."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from stages.base.blocks import blocks, reported_blocks
 SIZE = 256
 _SCALAR_ROUNDS, _VECTOR_ROUNDS = 30, 6
 _COARSE = 128
-_SAMPLE = 1 << 15  # vectors that the coarse centres are found from
+_SAMPLE = 1 << 15  # vectors for the coarse clusters
 _ROWS_AT_ONCE = 1 << 14
-_LOOK = 2  # times as many vectors as a palette has rows: if they all differ, it is too small
+_DISTINCT_SAMPLE = 2  # times the palette size: if so many vectors all differ, it is too small
 
 
 def scalar_codebook(values: NDArray[np.floating], size: int = SIZE) -> NDArray[np.float64]:
-    """[size] rising: near the values [M] in the least squares sense; all of them if few."""
+    """[size] ascending codebook of the values [M] with small squared error (Lloyd's algorithm);
+    exact if there are at most `size` distinct values."""
     ordered = np.sort(values, axis=None)
     new = np.ones(len(ordered), bool)
     np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
@@ -25,13 +26,13 @@ def scalar_codebook(values: NDArray[np.floating], size: int = SIZE) -> NDArray[n
         distinct = ordered[new].astype(np.float64)
         padding = np.full(size - len(distinct), distinct[-1] if len(distinct) else 0.0)
         return np.concatenate([distinct, padding])
-    # Half of the first centres where the values are many, half spread evenly, for the far ones.
+    # Half of the initial centres at quantiles, half evenly spaced for the outliers.
     ranks = np.linspace(0, len(ordered) - 1, size // 2).astype(np.intp)
     even = np.linspace(ordered[0], ordered[-1], size - size // 2)
     centres = np.sort(np.concatenate([ordered[ranks], even]))
-    sums, squares = _running(ordered, 1), _running(ordered, 2)
+    sums, squares = _prefix_sums(ordered, 1), _prefix_sums(ordered, 2)
     for _ in range(_SCALAR_ROUNDS):
-        # looked up in the values' own type: NumPy would copy all of them into another
+        # in the type of the values, which NumPy would otherwise copy
         middles = ((centres[1:] + centres[:-1]) / 2).astype(ordered.dtype)
         ends = np.searchsorted(ordered, middles)
         ends = np.concatenate([[0], ends, [len(ordered)]])
@@ -39,7 +40,7 @@ def scalar_codebook(values: NDArray[np.floating], size: int = SIZE) -> NDArray[n
         used = np.flatnonzero(counts)
         means = np.diff(sums[ends])[used] / counts[used]
         errors = np.maximum(np.diff(squares[ends])[used] - counts[used] * means * means, 0)
-        # A centre without values goes to a cell whose values are far apart, and splits it.
+        # A centre without values splits the cell with the largest error.
         widest = np.argsort(-errors, kind="stable")[: size - len(used)]
         spread = np.sqrt(errors[widest] / counts[used][widest])
         extra = np.resize(means[widest] + spread, size - len(used))
@@ -47,8 +48,8 @@ def scalar_codebook(values: NDArray[np.floating], size: int = SIZE) -> NDArray[n
     return centres
 
 
-def _running(ordered: NDArray[np.floating], power: int) -> NDArray[np.float64]:
-    """[M + 1] sums of the first 0, 1, 2, ... values to a power of 1 or 2."""
+def _prefix_sums(ordered: NDArray[np.floating], power: int) -> NDArray[np.float64]:
+    """[M + 1] prefix sums of the values to the power 1 or 2."""
     sums = scratch.empty((len(ordered) + 1,), np.float64)
     sums[0] = 0
     for rows in blocks(len(ordered)):
@@ -59,7 +60,7 @@ def _running(ordered: NDArray[np.floating], power: int) -> NDArray[np.float64]:
 
 
 def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """The index of the entry nearest to each value, in the shape of `values`."""
+    """The index of the nearest codebook entry, in the shape of `values`."""
     middles = (codebook[1:] + codebook[:-1]) / 2
     indices = np.empty(values.shape, np.uint8)
     for rows in blocks(len(values)):
@@ -70,13 +71,13 @@ def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDAr
 def vector_palette(
     vectors: NDArray[np.float32], size: int, seed: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """(palette [at most `size`, D], which of its rows stands for each of `vectors` [N, D]).
+    """(palette [at most `size`, D], label of each of the `vectors` [N, D]).
 
-    In two levels, so that time grows with the square root of the palette: coarse clusters first,
-    and in each as many entries as its share of the vectors. Vectors of zeros stay zeros. All of
-    them, exactly, if few differ.
+    Hierarchical k-means, so that time grows with the square root of the palette: coarse clusters
+    first, then entries within each in proportion to its vectors. Zero vectors stay zero. Exact if
+    at most `size` vectors are distinct.
     """
-    if len(_distinct(vectors[: _LOOK * size])[0]) <= size:  # of millions, a part tells soon
+    if len(_distinct(vectors[: _DISTINCT_SAMPLE * size])[0]) <= size:  # a sample decides quickly
         first, which = _distinct(vectors)
         if len(first) <= size:
             order = np.lexsort(vectors[first].T)
@@ -91,7 +92,7 @@ def vector_palette(
     cluster = np.empty(len(rows), np.int32)
     for part in reported_blocks(len(rows)):
         cluster[part] = _assigned(vectors[rows[part]], coarse)
-    # the rows of one cluster after the other, in their order
+    # rows grouped by cluster, otherwise in their order
     rows = rows[np.argsort(cluster, kind="stable")]
     ends = np.cumsum(np.bincount(cluster, minlength=len(coarse)))
     used = 1
@@ -109,7 +110,7 @@ def vector_palette(
 
 
 def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(row of the first of each kind, of which kind each is), told apart by 64 bits of a sum."""
+    """(first row of each distinct vector, which one each row is), compared by a 64-bit hash."""
     factors = np.random.default_rng(1).integers(1, 1 << 63, vectors.shape[1], np.uint64) | 1
     sums = np.empty(len(vectors), np.uint64)
     for rows in reported_blocks(len(vectors)):
@@ -122,7 +123,7 @@ def _distinct(vectors: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[n
 def _centres(
     vectors: NDArray[np.float32], count: int, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """[at most count, D] by Lloyd's iterations from vectors drawn at random."""
+    """[at most count, D] cluster centres by Lloyd's algorithm from random vectors."""
     if len(vectors) <= count:
         return vectors
     centres = vectors[np.sort(rng.choice(len(vectors), count, replace=False))]
@@ -139,7 +140,7 @@ def _centres(
 
 
 def _assigned(vectors: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.intp]:
-    """[N] the nearest centre of each."""
+    """[N] the nearest centre of each vector."""
     labels = np.zeros(len(vectors), np.intp)
     lengths = np.square(centres).sum(axis=1)
     step = max(64, _ROWS_AT_ONCE * _COARSE // max(1, len(centres)))

@@ -1,10 +1,10 @@
-"""The packed .ply of the PlayCanvas tools (.compressed.ply): 16 bytes a splat, and 3 more for each
-SH coefficient above degree 0.
+"""The compressed .ply of the PlayCanvas tools (.compressed.ply): 16 bytes a splat, and 3 more for
+each SH coefficient above degree 0.
 
-Rows come in chunks of 256 that lie near each other. An element `chunk` holds the least and greatest
+Rows come in chunks of 256 neighbours. An element `chunk` holds the least and greatest
 position, scale logarithm and colour (0.5 + C0 dc) of each; `vertex` holds four uint a splat:
 packed_position and packed_scale, 11 + 10 + 11 bits of x, y, z within the chunk's range, x highest;
-packed_rotation, 2 bits that name the largest of w, x, y, z and 10 bits for each of the others;
+packed_rotation, 2 bits for the index of the largest of w, x, y, z and 10 bits for each other;
 packed_color, 8 bits each of red, green, blue (within the chunk's range) and opacity. `sh` holds
 f_rest_0.. as uchar, channel-major as in the .ply. Axes as in memory (y down).
 """
@@ -35,8 +35,8 @@ from stages.formats.values import (
 from stages.scene import SH_C0, Splats, morton
 
 CHUNK = 256
-# A flat splat's logarithm of -87 would take the precision of its whole chunk; what is smaller than
-# exp(-20) or larger than exp(20) units looks the same at the limit.
+# The logarithm -87 of a flat splat would take the precision of its whole chunk. Scales below
+# exp(-20) or above exp(20) units look the same at the limit.
 LOG_SCALE_LIMIT = 20.0
 SH_LIMIT = 4.0  # uchar 0..255 stand for -SH_LIMIT..SH_LIMIT
 _BLOCK = CHUNK * 256
@@ -53,8 +53,9 @@ _RANGES = (
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    Positions stay relative to `splats.origin`; a comment says it. One SH degree for all, and
-    coefficients within -4..4. Raises SplatError when the file cannot be written.
+    Positions stay relative to `splats.origin`, which a comment holds. All splats get one SH
+    degree, and coefficients are clipped to -4..4. Raises SplatError when the file cannot be
+    written.
     """
     splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
@@ -62,7 +63,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     packed = [_pack(splats.take(rows[part])) for part in reported_blocks(len(splats), _BLOCK)]
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header_text(splats, degree, units))
-        for part in range(3):  # all chunks, then all words, then all SH
+        for part in range(3):  # all chunks, then all vertices, then all SH
             for block in packed:
                 file.write(block[part].data)
     return dropped
@@ -85,17 +86,17 @@ def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """(ranges [chunks, 18] float32, words [N, 4] uint32, SH [N, 3K] uint8) of whole chunks."""
     colours = 0.5 + SH_C0 * splats.sh[:, 0].astype(np.float64)
     scales = np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
-    place, ranges = _within_chunks(splats.means)
-    size, scale_ranges = _within_chunks(scales)
+    positions, ranges = _within_chunks(splats.means)
+    scale_fractions, scale_ranges = _within_chunks(scales)
     colour, colour_ranges = _within_chunks(colours)
     rgba = np.concatenate([colour, linear_opacities(splats)[:, None]], axis=1)
     largest, others = smallest_three.split(unit_quaternions(splats.quaternions))
-    turn = _joined_bits(0.5 + others / (2 * smallest_three.LIMIT), (10, 10, 10))
+    rotations = _pack_bits(0.5 + others / (2 * smallest_three.LIMIT), (10, 10, 10))
     words = (
-        _joined_bits(place, _AXES_BITS),
-        turn | largest.astype(np.uint32) << np.uint32(30),
-        _joined_bits(size, _AXES_BITS),
-        _joined_bits(rgba, _COLOUR_BITS),
+        _pack_bits(positions, _AXES_BITS),
+        rotations | largest.astype(np.uint32) << np.uint32(30),
+        _pack_bits(scale_fractions, _AXES_BITS),
+        _pack_bits(rgba, _COLOUR_BITS),
     )
     sh = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1).astype(np.float64)
     steps = np.floor((sh / (2 * SH_LIMIT) + 0.5) * 256)
@@ -119,8 +120,8 @@ def _within_chunks(
     return fractions, np.concatenate([low, high], axis=1)
 
 
-def _joined_bits(fractions: NDArray[np.floating], bits: tuple[int, ...]) -> NDArray[np.uint32]:
-    """[N] the columns of `fractions` (0..1) in one word, the first column highest."""
+def _pack_bits(fractions: NDArray[np.floating], bits: tuple[int, ...]) -> NDArray[np.uint32]:
+    """[N] the columns of `fractions` (0..1) packed into one word, the first column highest."""
     word = np.zeros(len(fractions), np.uint32)
     for column, width in zip(fractions.T, bits, strict=True):
         top = (1 << width) - 1
@@ -129,8 +130,8 @@ def _joined_bits(fractions: NDArray[np.floating], bits: tuple[int, ...]) -> NDAr
     return word
 
 
-def _split_bits(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.float64]:
-    """[N, len(bits)] the inverse of `_joined_bits`."""
+def _unpack_bits(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.float64]:
+    """[N, len(bits)] the inverse of `_pack_bits`."""
     columns = []
     shift = sum(bits)
     for width in bits:
@@ -141,9 +142,9 @@ def _split_bits(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.f
 
 
 def read(path: Path) -> Splats:
-    """The splats of a packed .ply, float32; the SH element and the colour ranges may be missing.
+    """The splats of a compressed .ply, float32; SH and colour ranges are optional.
 
-    Raises SplatError "splats-unreadable" for what is damaged or is no packed .ply.
+    Raises SplatError "splats-unreadable" for a damaged file or another kind of .ply.
     """
     path = Path(path)
     with reading(path):
@@ -155,7 +156,7 @@ def read(path: Path) -> Splats:
 
 
 def unpack(path: Path, header: Header) -> Splats:
-    """The splats of a packed .ply whose header was read. Raises BadFileError."""
+    """The splats of a compressed .ply whose header was read. Raises BadFileError."""
     if header.encoding == "ascii":
         raise BadFileError("it is a compressed .ply as text, which is not read")
     _require(header, "vertex", _WORDS)
@@ -168,27 +169,27 @@ def unpack(path: Path, header: Header) -> Splats:
         raise BadFileError(f"it has {len(ranges)} chunks for {len(vertices)} splats")
     if any(vertices.dtype[name].str[1:] != "u4" for name in _WORDS):
         raise BadFileError("it is a compressed .ply whose words are no uint")
-    rest = _rest_rows(path, header)
+    rest = _sh_rows(path, header)
     degree = 0 if rest is None else math.isqrt(len(rest.dtype.names or ()) // 3 + 1) - 1
     splats = replace(allocate(len(vertices), degree), origin=header.origin)
     for rows in reported_blocks(len(vertices), _BLOCK):
         chunks = ranges[rows.start // CHUNK : -(-rows.stop // CHUNK)]
         _unpack_block(splats.take(rows), vertices[rows], chunks)
         if degree and rest is not None:
-            splats.sh[rows, 1:] = _rest_values(rest[rows])
+            splats.sh[rows, 1:] = _sh_values(rest[rows])
     return check_finite(splats)
 
 
 def _unpack_block(out: Splats, vertices: NDArray[Any], ranges: NDArray[Any]) -> None:
     """Fill `out` (all but the SH above degree 0) with the splats of whole chunks."""
     words = [vertices[name].astype(np.uint32) for name in _WORDS]
-    rgba = _split_bits(words[3], _COLOUR_BITS)
+    rgba = _unpack_bits(words[3], _COLOUR_BITS)
     colours = _in_range(rgba[:, :3], ranges, _RANGES[2])
     largest_float = float(np.finfo(np.float32).max)
-    turn = (_split_bits(words[1], (2, 10, 10, 10))[:, 1:] - 0.5) * 2 * smallest_three.LIMIT
-    out.means[:] = _in_range(_split_bits(words[0], _AXES_BITS), ranges, _RANGES[0])
-    out.quaternions[:] = smallest_three.join(words[1] >> np.uint32(30), turn)
-    out.log_scales[:] = _in_range(_split_bits(words[2], _AXES_BITS), ranges, _RANGES[1])
+    rotations = (_unpack_bits(words[1], (2, 10, 10, 10))[:, 1:] - 0.5) * 2 * smallest_three.LIMIT
+    out.means[:] = _in_range(_unpack_bits(words[0], _AXES_BITS), ranges, _RANGES[0])
+    out.quaternions[:] = smallest_three.join(words[1] >> np.uint32(30), rotations)
+    out.log_scales[:] = _in_range(_unpack_bits(words[2], _AXES_BITS), ranges, _RANGES[1])
     out.opacity_logits[:] = logits_of(rgba[:, 3])
     out.sh[:, 0] = np.clip((colours - 0.5) / SH_C0, -largest_float, largest_float)
 
@@ -203,14 +204,14 @@ def _require(header: Header, element: str, names: Any) -> None:
 def _in_range(
     fractions: NDArray[np.float64], ranges: NDArray[Any], names: tuple[str, ...]
 ) -> NDArray[np.float64]:
-    """[N, 3] the inverse of `_within_chunks`; files before colour ranges came mean 0..1."""
+    """[N, 3] the inverse of `_within_chunks`. Older files lack colour ranges: these are 0..1."""
     values = np.empty_like(fractions)
     for i, name in enumerate(names):
         ends = []
-        for end, usual in (("min", 0.0), ("max", 1.0)):
+        for end, default in (("min", 0.0), ("max", 1.0)):
             key = name.format(end)
             known = key in (ranges.dtype.names or ())
-            column = ranges[key].astype(np.float64) if known else np.full(len(ranges), usual)
+            column = ranges[key].astype(np.float64) if known else np.full(len(ranges), default)
             if not (np.abs(column) <= np.finfo(np.float32).max).all():
                 raise BadFileError(f"values of {key} are not finite numbers")
             ends.append(np.repeat(column, CHUNK)[: len(fractions)])
@@ -218,8 +219,8 @@ def _in_range(
     return values
 
 
-def _rest_rows(path: Path, header: Header) -> NDArray[Any] | None:
-    """[N] rows of f_rest_0.., if there are any."""
+def _sh_rows(path: Path, header: Header) -> NDArray[Any] | None:
+    """[N] rows of f_rest_0..; None without SH above degree 0."""
     if not any(element.name == "sh" for element in header.elements):
         return None
     kept = header.element("sh")
@@ -234,7 +235,7 @@ def _rest_rows(path: Path, header: Header) -> NDArray[Any] | None:
     return rows[names] if names else None
 
 
-def _rest_values(rows: NDArray[Any]) -> NDArray[np.float32]:
+def _sh_values(rows: NDArray[Any]) -> NDArray[np.float32]:
     """[M, K, 3] coefficients above degree 0."""
     levels = (np.arange(256) + 0.5) / 256
     levels[[0, 255]] = (0.0, 1.0)

@@ -1,4 +1,4 @@
-"""The frame of a glTF file of splats: its JSON, buffer views and accessors, and writing it."""
+"""Writing glTF files: the JSON with buffer views and accessors, and the binary buffer."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ _POINTS = 0
 
 @dataclass(frozen=True)
 class Negated:
-    """An array whose values change their sign when they are looked at, so that the splats need no
-    second copy of it."""
+    """An array that is negated when it is read, which saves a copy."""
 
     array: NDArray[Any]
 
@@ -48,9 +47,13 @@ Rows = NDArray[Any] | Negated
 
 @dataclass(frozen=True)
 class Attribute:
-    """rows [N, W]: what the buffer holds, little-endian, in memory in any order; integers stand
-    for 0..1 or -1..1. width: how many of the W columns are the attribute's; the others fill a row
-    up to a multiple of 4 bytes, as glTF 2.0 wants it (section 3.6.2.4)."""
+    """A vertex attribute.
+
+    Attributes:
+        rows: [N, W] the values, little-endian; integers are normalised to 0..1 or -1..1.
+        width: the number of columns that belong to the attribute; the others pad each row to a
+            multiple of 4 bytes (glTF 2.0, section 3.6.2.4).
+    """
 
     rows: Rows
     width: int
@@ -64,11 +67,17 @@ def write_file(
     *,
     node_scale: float = 1.0,
 ) -> None:
-    """Write one node of splats as `path` (.glb, or .gltf with its .bin), whole or not at all.
+    """Write one node of splats as `path` (.glb, or .gltf with its .bin), completely or not at all.
 
-    primitives: attributes by name, each with as many rows; upright. Positions stay relative to
-    `origin`, which float32 could not hold; asset.extras says it, in the file's axes.
-    Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
+    Args:
+        path: the file.
+        primitives: attributes by name, all with the same number of rows, y up.
+        origin: [3] in the axes of the file; asset.extras holds it, because positions relative to 0
+            would exceed the precision of float32.
+        units: "metres" or "arbitrary".
+        node_scale: scale of the node.
+
+    Raises SplatError when a file cannot be written or a .glb would exceed 4 GiB.
     """
     document, arrays = _document(primitives, origin, units, node_scale)
     size = sum(array.nbytes for array in arrays)
@@ -84,7 +93,7 @@ def _document(
     units: str,
     node_scale: float,
 ) -> tuple[dict[str, Any], list[Rows]]:
-    """(the JSON, its first buffer still without size and name; the arrays in buffer order)."""
+    """(the JSON, whose buffer has no size and name yet; the arrays in buffer order)."""
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
     arrays: list[Rows] = []
@@ -114,7 +123,7 @@ def _document(
         "scene": 0,
         "scenes": [{"nodes": [0] if described else []}],
     }
-    if not described:  # glTF forbids empty lists: a scene without nodes is how it says "nothing"
+    if not described:  # glTF forbids empty lists; a scene without nodes is valid
         document["scenes"] = [{"name": "empty"}]
         return document, []
     node: dict[str, Any] = {"mesh": 0, "name": "splats"}
@@ -131,8 +140,14 @@ def _document(
 
 
 def asset(units: str, origin: NDArray[np.float64], made: str = "", **more: Any) -> dict[str, Any]:
-    """The `asset` of a document of ours. origin [3]: in the file's axes. made: what the generator
-    made, in brackets after its name. more: for the extras."""
+    """The `asset` of a document.
+
+    Args:
+        units: "metres" or "arbitrary".
+        origin: [3] in the axes of the file.
+        made: the kind of content, in brackets after the name of the generator.
+        more: further extras.
+    """
     generator = f"splat {VERSION}{made and f' ({made})'}"
     extras: dict[str, Any] = {"units": units, **more}
     if origin.any():
@@ -141,7 +156,7 @@ def asset(units: str, origin: NDArray[np.float64], made: str = "", **more: Any) 
 
 
 def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
-    """Of a vertex attribute in the buffer view numbered `view`."""
+    """The accessor of a vertex attribute in the buffer view of this number."""
     rows, width = attribute.rows, attribute.width
     described: dict[str, Any] = {
         "bufferView": view,
@@ -152,9 +167,8 @@ def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
     if rows.dtype.kind in "iu":
         described["normalized"] = True
     if name == "POSITION":
-        every = rows[:]
-        described["min"] = [float(v) for v in every.min(axis=0)]
-        described["max"] = [float(v) for v in every.max(axis=0)]
+        described["min"] = [float(v) for v in rows[:].min(axis=0)]
+        described["max"] = [float(v) for v in rows[:].max(axis=0)]
     return described
 
 
@@ -174,8 +188,8 @@ def _primitive(names: dict[str, int]) -> dict[str, Any]:
 
 
 def write_glb(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size: int) -> None:
-    """`document` and, as its one buffer, `arrays` one after the other: `size` bytes in all, a
-    multiple of 4 each. Raises SplatError when it cannot be written or would pass 4 GiB."""
+    """Write a .glb of `document` with one buffer of the `arrays`: `size` bytes in all, each a
+    multiple of 4. Raises SplatError when it cannot be written or would exceed 4 GiB."""
     if arrays:
         document["buffers"] = [{"byteLength": size}]
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
@@ -198,7 +212,7 @@ def write_glb(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size
 
 
 def _write_pair(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size: int) -> None:
-    """The .bin first: whoever finds the .gltf finds what it names."""
+    """Write .bin and .gltf, the .bin first: a .gltf that exists then has its buffer."""
     binary = path.with_suffix(".bin")
     if arrays:
         document["buffers"] = [{"uri": quote(binary.name), "byteLength": size}]

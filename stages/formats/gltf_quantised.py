@@ -1,13 +1,12 @@
-"""A smaller .glb: KHR_gaussian_splatting with the integers that its specification allows.
+"""A smaller .glb: KHR_gaussian_splatting with the integer types that its specification allows.
 
 Rotations are normalised int16, scales and opacities normalised uint16, the fallback colours uint8;
-positions and SH stay float32, which is all that the specification allows for them. Splats are
-grouped into one primitive for each SH degree in use, so that one without view-dependent colour
-pays for none.
+positions and SH stay float32, which the specification requires. Splats are grouped into one
+primitive for each SH degree in use, so that a splat of degree 0 stores no further coefficients.
 
-Why these widths: glTF starts each attribute at a multiple of 4 bytes, so a uint8 opacity is not
-smaller than a uint16. On a room of 216,000 splats rotation, scale and opacity cost 96, 86 and
-97 dB; int8 rotations 66, uint8 opacities 70 and uint8 scales 42.
+Reason for these widths: glTF aligns each attribute to 4 bytes, so a uint8 opacity is not smaller
+than a uint16. On a room of 216,000 splats, quantised rotations, scales and opacities give 96, 86
+and 97 dB; int8 rotations 66, uint8 opacities 70 and uint8 scales 42.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ from stages.scene import Splats
 from stages.scene.flip import flipped
 
 _U16 = 65535
-# A step of the scales may be this part of a middling splat's size. Where a few huge splats would
-# make the steps coarser, scales stay float32.
-_COARSEST_STEP = 0.01
+# Largest step of the scales relative to the median size. Where a few huge splats would make the
+# steps coarser, scales stay float32.
+_MAX_STEP = 0.01
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats` as `path`; return how many could not be drawn and were left out.
 
-    Normalised scales end at 1, so the node enlarges them by a power of two, and positions are
-    divided by it, which costs no bits. Raises SplatError as `gltf.write`.
+    Normalised scales end at 1, so the node scales them up by a power of two; positions are divided
+    by it, which is exact. Raises SplatError as `gltf.write`.
     """
     splats, dropped = drop_undrawable(splats)
     unit = _unit(linear_scales(splats))
@@ -56,29 +55,29 @@ def order(splats: Splats) -> NDArray[np.intp]:
 
 
 def _groups(splats: Splats) -> Iterator[Splats]:
-    """The splats of each degree in use, with no more bands than they use."""
+    """The splats by SH degree in use, each group with the coefficients of its degree."""
     for degree in np.unique(splats.sh_degrees):
         chosen = splats.sh_degrees == degree
         yield splats.with_sh_degree(int(degree)).take(slice(None) if chosen.all() else chosen)
 
 
 def _unit(scales: NDArray[np.float32]) -> float | None:
-    """The power of two that all `scales` [N, 3] lie below; None if steps of it would be coarse."""
+    """The power of two above all `scales` [N, 3]; None if its steps would be too coarse."""
     if not len(scales):
         return None
     unit = float(2.0 ** np.ceil(np.log2(scales.max())))
-    middling = float(np.median(scales.max(axis=1)))
-    return unit if unit / _U16 <= _COARSEST_STEP * middling else None
+    median = float(np.median(scales.max(axis=1)))
+    return unit if unit / _U16 <= _MAX_STEP * median else None
 
 
 def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
-    """splats: y down, all of one degree. unit: see `_unit`."""
-    upright = flipped(splats.with_sh_degree(0))
+    """The attributes of a primitive. splats: y down, all of one SH degree. unit: see `_unit`."""
+    y_up = flipped(splats.with_sh_degree(0))
     opacities = linear_opacities(splats)
     colours = np.empty((len(splats), 4), "u1")
     for rows in blocks(len(splats)):
         colours[rows] = np.rint(255 * fallback_colours(splats.take(rows), opacities[rows]))
-    rotations = np.rint(32767.0 * unit_quaternions(upright.quaternions)).astype("<i2")
+    rotations = np.rint(32767.0 * unit_quaternions(y_up.quaternions)).astype("<i2")
     scales = linear_scales(splats)
     if unit is None:
         scale = Attribute(scales.astype("<f4"), 3)
@@ -88,7 +87,7 @@ def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
         scale = Attribute(_padded(steps.astype("<u2"), 4), 3)
     opacity = np.rint(float(_U16) * opacities[:, None]).astype("<u2")
     return {
-        "POSITION": Attribute((upright.means / np.float32(unit or 1.0)).astype("<f4"), 3),
+        "POSITION": Attribute((y_up.means / np.float32(unit or 1.0)).astype("<f4"), 3),
         "COLOR_0": Attribute(colours, 4),
         f"{EXTENSION}:ROTATION": Attribute(rotations[:, [1, 2, 3, 0]], 4),
         f"{EXTENSION}:SCALE": scale,

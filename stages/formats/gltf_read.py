@@ -1,7 +1,7 @@
-"""Reading KHR_gaussian_splatting, from our own files and from other programs'.
+"""Reading KHR_gaussian_splatting, from our files and those of other programs.
 
-Every number of the JSON is checked before it is used: a file may come from anywhere. Buffers are
-the file's own, data: URIs, or files in its folder or below; nothing is fetched.
+Every number of the JSON is checked before use, because a file may come from anywhere. Buffers are
+the binary chunk, data: URIs, or files in its folder or below; nothing is fetched.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from stages.scene.recentring import recentred
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {5120: "i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_LEAST_BYTES = 12 + 4 + 3 + 1 + 12  # of one splat, with every attribute at its narrowest
+_MIN_SPLAT_BYTES = 12 + 4 + 3 + 1 + 12  # with every attribute at its narrowest type
 
 
 def read(path: Path) -> Splats:
-    """All splats of the file's scene, turned to y down, float32.
+    """All splats of the scene, y down, float32.
 
-    Node transforms may move and scale evenly; what they place far from zero keeps its precision in
-    `origin`. Raises SplatError "splats-unreadable" for a damaged
-    file, one without splats, one that reaches outside its folder, or a feature that is not read
-    (sparse accessors, compression, rotated nodes).
+    Nodes may be translated and uniformly scaled; positions far from zero keep their precision in
+    `origin`. Raises SplatError "splats-unreadable" for a damaged file, one without splats, one that
+    refers to files outside its folder, or an unsupported feature (sparse accessors, compression,
+    rotated nodes).
     """
     path = Path(path)
     with reading(path):
@@ -44,11 +44,11 @@ def read(path: Path) -> Splats:
         buffers = _Buffers(path, _list(document, "buffers"), chunk)
         source = _Source(document, buffers)
         parts: list[Splats] = []
-        for node, move in _nodes(document):
-            for part in source.splats(node, move):
+        for node, transform in _nodes(document):
+            for part in source.splats(node, transform):
                 parts.append(part)
-                # Without sharing, files have no more splats than this: it bounds the memory.
-                if sum(map(len, parts)) * _LEAST_BYTES > buffers.total_bytes():
+                # Splats that are not shared cannot be more than this, which bounds the memory.
+                if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
                     raise BadFileError("it shows its splats several times, which is not read")
         extras = document["asset"].get("extras")
         origin = extras.get("splat_origin") if isinstance(extras, dict) else None
@@ -97,13 +97,13 @@ def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
 
 
 def _mapped(path: Path) -> memoryview:
-    """The file's bytes, read only where they are touched; to change them would change no file.
-    (Kernels would be compiled anew for arrays that may not be written to.)"""
+    """The bytes of the file, mapped copy-on-write: Numba would compile kernels again for read-only
+    arrays."""
     return np.memmap(path, np.uint8, "c").data
 
 
 class _Buffers:
-    """The document's buffers; each is loaded when it is first used."""
+    """The buffers of the document; each is loaded at its first use."""
 
     def __init__(self, path: Path, described: list[Any], chunk: memoryview | None) -> None:
         self._path, self._described, self._chunk = path, described, chunk
@@ -152,19 +152,19 @@ def _file_beside(path: Path, uri: str) -> Path:
 
 
 @dataclass(frozen=True)
-class _Move:
+class _NodeTransform:
     """x -> scale x + offset."""
 
     scale: float = 1.0
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def then(self, inner: _Move) -> _Move:
+    def then(self, inner: _NodeTransform) -> _NodeTransform:
         offset = np.array(self.offset) + self.scale * np.array(inner.offset)
-        return _Move(self.scale * inner.scale, (offset[0], offset[1], offset[2]))
+        return _NodeTransform(self.scale * inner.scale, (offset[0], offset[1], offset[2]))
 
 
-def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _Move]]:
-    """The scene's nodes with their place in the world; each node at most once."""
+def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _NodeTransform]]:
+    """The nodes of the scene with their transform to the world; each node at most once."""
     nodes, scenes = _list(document, "nodes"), _list(document, "scenes")
     if scenes:
         index = document.get("scene", 0)
@@ -174,8 +174,8 @@ def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _Move]]:
             child for node in nodes if isinstance(node, dict) for child in _list(node, "children")
         }
         roots = [index for index in range(len(nodes)) if index not in children]
-    waiting = [(index, _Move()) for index in reversed(roots)]
-    found: list[tuple[dict[str, Any], _Move]] = []
+    waiting = [(index, _NodeTransform()) for index in reversed(roots)]
+    found: list[tuple[dict[str, Any], _NodeTransform]] = []
     seen: set[int] = set()
     while waiting:
         index, outer = waiting.pop()
@@ -183,13 +183,13 @@ def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _Move]]:
         if index in seen:
             raise BadFileError("a node has two parents")
         seen.add(index)
-        move = outer.then(_move_of(node))
-        found.append((node, move))
-        waiting += [(child, move) for child in reversed(_list(node, "children"))]
+        transform = outer.then(_transform_of(node))
+        found.append((node, transform))
+        waiting += [(child, transform) for child in reversed(_list(node, "children"))]
     return found
 
 
-def _move_of(node: dict[str, Any]) -> _Move:
+def _transform_of(node: dict[str, Any]) -> _NodeTransform:
     if "matrix" in node:
         matrix = _numbers(node["matrix"], 16).reshape(4, 4).T
         scale, offset = float(matrix[0, 0]), matrix[:3, 3]
@@ -205,7 +205,7 @@ def _move_of(node: dict[str, Any]) -> _Move:
             raise BadFileError("one of its nodes is rotated or stretched, which is not read")
     if not scale > 0:
         raise BadFileError("one of its nodes has a scale that is not positive")
-    return _Move(scale, (float(offset[0]), float(offset[1]), float(offset[2])))
+    return _NodeTransform(scale, (float(offset[0]), float(offset[1]), float(offset[2])))
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class _Source:
     document: dict[str, Any]
     buffers: _Buffers
 
-    def splats(self, node: dict[str, Any], move: _Move) -> Iterator[Splats]:
+    def splats(self, node: dict[str, Any], transform: _NodeTransform) -> Iterator[Splats]:
         """The splats of a node's mesh, primitive after primitive, in the file's axes."""
         if "mesh" not in node:
             return
@@ -221,10 +221,10 @@ class _Source:
         for primitive in _list(mesh, "primitives"):
             extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
             if isinstance(extensions, dict) and isinstance(extensions.get(_EXTENSION), dict):
-                yield self._primitive(primitive, extensions[_EXTENSION], move)
+                yield self._primitive(primitive, extensions[_EXTENSION], transform)
 
     def _primitive(
-        self, primitive: dict[str, Any], extension: dict[str, Any], move: _Move
+        self, primitive: dict[str, Any], extension: dict[str, Any], transform: _NodeTransform
     ) -> Splats:
         if extension.get("kernel") != "ellipse":
             raise BadFileError("its splats have another kernel than ellipse")
@@ -251,17 +251,17 @@ class _Source:
         if len({len(array) for array in (means, rotations, scales, opacities)}) != 1:
             raise BadFileError("the attributes of a primitive differ in length")
         sh = np.empty((len(means), (degree + 1) ** 2, 3), np.float32)
-        for band in range(degree + 1):
-            for i in range(2 * band + 1):
-                coefficient = values(f"{_EXTENSION}:SH_DEGREE_{band}_COEF_{i}", 3)
+        for d in range(degree + 1):
+            for i in range(2 * d + 1):
+                coefficient = values(f"{_EXTENSION}:SH_DEGREE_{d}_COEF_{i}", 3)
                 if len(coefficient) != len(means):
                     raise BadFileError("the attributes of a primitive differ in length")
-                sh[:, band * band + i] = coefficient
+                sh[:, d * d + i] = coefficient
         return Splats(
-            # float64: `read` brings them near zero
-            means=means.astype(np.float64) * move.scale + np.array(move.offset),
+            # float64: `read` recentres them
+            means=means.astype(np.float64) * transform.scale + np.array(transform.offset),
             quaternions=rotations[:, [3, 0, 1, 2]],
-            log_scales=log_scales_of(scales, move.scale),
+            log_scales=log_scales_of(scales, transform.scale),
             opacity_logits=logits_of(opacities[:, 0]),
             sh=sh,
             sh_degrees=np.full(len(means), degree, np.uint8),
@@ -289,7 +289,7 @@ class _Source:
             raise BadFileError(f"accessor {index} has stride {stride} for elements of {element}")
         if start + length > len(content) or offset + (count - 1) * stride + element > length:
             raise BadFileError(f"accessor {index} reaches past its buffer")
-        if count * _LEAST_BYTES > self.buffers.total_bytes():
+        if count * _MIN_SPLAT_BYTES > self.buffers.total_bytes():
             raise BadFileError(f"accessor {index} counts more splats than its buffers can hold")
         raw: NDArray[Any] = np.ndarray(
             (count, width), dtype, content, start + offset, (stride, dtype.itemsize)

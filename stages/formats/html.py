@@ -1,7 +1,7 @@
-"""One .html that shows its splats by itself: from disk, in any browser, without a network.
+"""A self-contained .html page that shows its splats: from disk, in any browser, without a network.
 
-It holds a viewer and, as base64 of gzip in script elements that nothing runs, the .ply of the
-reference trainer; so it keeps everything that .ply keeps.
+It holds a viewer and a .ply of the reference trainer, as base64 of gzip in script elements of type
+text/plain, so it keeps everything that .ply keeps.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from stages.formats.page.cameras import page_cameras
 from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
-_GZIP = 31  # zlib's name for the gzip container; its header holds no time then
+_GZIP = 31  # wbits of zlib for the gzip container, whose header then holds no time
 _LEVEL = 6
 _CHUNK_BYTES = 3 << 20  # of gzip in a script element; a multiple of 3, so that base64 needs no "="
 _LINE_LIMIT_BYTES = 2 * _CHUNK_BYTES  # base64 takes 4/3, and the element a little
@@ -84,7 +84,7 @@ def _zipped(blocks: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def _chunks(blocks: Iterable[bytes]) -> Iterator[bytes]:
-    """The same bytes in parts of `_CHUNK_BYTES`; the last may be shorter."""
+    """The same bytes in chunks of `_CHUNK_BYTES`; the last may be shorter."""
     held = bytearray()
     for block in blocks:
         held += block
@@ -107,7 +107,7 @@ def read(path: Path) -> Splats:
 
 
 def unzipped(path: Path) -> Iterator[bytes]:
-    """The .ply inside, a part at a time; each script element is a line of its own."""
+    """The .ply inside, in blocks; each script element is one line."""
     start, end = (re.escape(t.encode("ascii")) for t in (document.CHUNK_START, document.CHUNK_END))
     wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)
     unpacker = zlib.decompressobj(_GZIP)

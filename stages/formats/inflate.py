@@ -1,4 +1,4 @@
-"""gzip and zstd streams read piece by piece, that cannot be made to fill the memory."""
+"""Reading gzip and zstd streams in pieces, with bounded memory."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
 
-# Packed splats gzip to a half or a third. What claims more than this is refused before memory is
-# taken for it; little files may, for all their splats can be equal.
+# Splats compress to a half or a third. A file that declares a higher ratio than this is refused
+# before memory is allocated; small files may, because all their splats can be equal.
 _RATIO_LIMIT = 100
 _ALWAYS_ALLOWED_BYTES = 64 << 20
 _PIECE_BYTES = 1 << 18
-_WINDOW_BYTES = 1 << 27  # of zstd: what its own decoders allow; every encoder's levels keep to it
-_EXTRA_BYTES = 1 << 20  # after the splats: extensions, which are passed over
+_WINDOW_BYTES = (
+    1 << 27
+)  # of zstd: the limit of its own decoders, which all levels of the encoder respect
+_EXTRA_BYTES = 1 << 20  # after the splats: extensions, which are ignored
 
 
 class GzipReader:
-    """The content of a gzip file. Every method raises BadFileError for what is damaged."""
+    """The content of a gzip file. Every method raises BadFileError for a damaged file."""
 
-    def __init__(self, file: BinaryIO, size_bytes: int) -> None:
-        self._file, self._size = file, size_bytes
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
         self._gzip = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
-
-    def expect(self, count: int) -> None:
-        """Refuse a file that cannot honestly hold `count` bytes more."""
-        check_size(count, self._size)
 
     def read(self, count: int) -> bytes:
         """Exactly `count` bytes."""
@@ -47,7 +45,7 @@ class GzipReader:
         return out.reshape(count, width)
 
     def finish(self) -> bytes:
-        """What follows, to the end, where gzip keeps its check sum."""
+        """The rest of the content, to the end of the stream, where gzip verifies its checksum."""
         extra = b""
         while part := self._some(_PIECE_BYTES):
             extra += part
@@ -56,7 +54,7 @@ class GzipReader:
         return extra
 
     def _some(self, limit: int) -> bytes:
-        """At least one byte and at most `limit`; nothing at the stream's end."""
+        """1 to `limit` bytes; none at the end of the stream."""
         while not self._gzip.eof:
             piece = self._gzip.unconsumed_tail or self._file.read(_PIECE_BYTES)
             try:
@@ -71,15 +69,15 @@ class GzipReader:
 
 
 def check_size(count: int, file_bytes: int) -> None:
-    """Raises BadFileError for a file that cannot honestly unpack to `count` bytes."""
+    """Raises BadFileError if a file of `file_bytes` cannot plausibly unpack to `count` bytes."""
     if count > max(_ALWAYS_ALLOWED_BYTES, _RATIO_LIMIT * file_bytes):
         raise BadFileError(f"it declares {count} bytes in a file of {file_bytes}")
 
 
 def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np.uint8]:
-    """[count] bytes: the zstd frame in the next `packed_bytes` of the file, whole.
+    """[count] bytes of the zstd frame in the next `packed_bytes` of the file.
 
-    `count` must have passed `check_size`. Raises BadFileError for what is damaged.
+    `count` must have passed `check_size`. Raises BadFileError for a damaged frame.
     """
     import zstandard
 

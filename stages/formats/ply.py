@@ -2,7 +2,7 @@
 
 Rows of float32: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0.. (channel-major: all of red, then
 green, then blue), opacity (logit), scale_0..2 (natural logarithm), rot_0..3 (w, x, y, z).
-The format records neither axes nor units; ours says them in comments. World: y down, as in memory.
+The format has no field for axes and units; our files hold them in comments. World: y down.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from stages.formats.values import allocate, check_finite, drop_undrawable
 from stages.scene import Splats
 from stages.scene.recentring import recentred
 
-_ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3: the columns of a block are gathered from the cache
+_ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3, so that the columns of a block fit the cache
 _Tables = Iterator[tuple[slice, NDArray[Any]]]
 _REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -47,7 +47,7 @@ def property_names(degree: int) -> list[str]:
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    Positions stay relative to `splats.origin`, which float32 could not hold; a comment says it.
+    Positions stay relative to `splats.origin`, which a comment holds.
     Raises SplatError when the file cannot be written.
     """
     splats, dropped = drop_undrawable(splats)
@@ -58,7 +58,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 
 
 def blocks(splats: Splats, units: str) -> Iterator[bytes]:
-    """The bytes of the file, a part at a time; every splat must be drawable."""
+    """The bytes of the file in blocks; every splat must be drawable."""
     yield _header_text(splats, units)
     for rows in reported_blocks(len(splats), _ROWS_AT_ONCE):
         yield _table(splats, rows).tobytes()
@@ -86,9 +86,9 @@ def _table(splats: Splats, rows: slice) -> NDArray[np.float32]:
 def read(path: Path) -> Splats:
     """The splats of a .ply, float32.
 
-    Any order of properties, extra ones, ascii or either byte order, any numeric type, normals or
-    not, degree 0 to 3; packed ones too (see `compressed_ply`). Raises SplatError
-    "splats-unreadable" for what is damaged or is not splats.
+    Properties may be in any order and of any numeric type, with others between them; ascii or
+    either byte order; SH degree 0 to 3; compressed files, too (see `compressed_ply`). Raises
+    SplatError "splats-unreadable" for a damaged file or one without splats.
     """
     path = Path(path)
     with reading(path):
@@ -96,7 +96,7 @@ def read(path: Path) -> Splats:
 
 
 def parse(path: Path) -> Splats:
-    """As `read`, but what is wrong is raised as it is found."""
+    """As `read`, but raises BadFileError."""
     with path.open("rb") as file:
         header = read_header(file)
         if header.is_compressed:
@@ -128,7 +128,7 @@ def parse(path: Path) -> Splats:
 
 
 def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:
-    """All but the means of some rows, `splats` being views of them."""
+    """Fill all but the means of `splats`, which are views of some rows."""
     splats.quaternions[:] = columns.floats([f"rot_{i}" for i in range(4)])
     splats.log_scales[:] = columns.floats([f"scale_{i}" for i in range(3)])
     splats.opacity_logits[:] = columns.floats(["opacity"])[:, 0]
@@ -149,8 +149,8 @@ def _check_is_splats(header: Header) -> None:
 
 
 def _binary_tables(mapped: NDArray[Any]) -> _Tables:
-    """The rows of a binary file, some at a time: [M, P] where all columns are of one type, else
-    [M] structured."""
+    """The rows of a binary file in blocks: [M, P] where all columns have one type, else [M]
+    structured."""
     kinds = {mapped.dtype[name] for name in mapped.dtype.names or ()}
     for rows in reported_blocks(len(mapped), _ROWS_AT_ONCE):
         block = np.array(mapped[rows])
@@ -160,19 +160,19 @@ def _binary_tables(mapped: NDArray[Any]) -> _Tables:
 
 
 def _ascii_numbers(header: Header) -> tuple[int, int]:
-    """(how many numbers precede the vertices, how many theirs are)."""
+    """(the number of values before the vertices, the number of values of the vertices)."""
     skipped = sum(element.count * len(element.properties) for element in header.before("vertex"))
     return skipped, header.vertex.count * len(header.vertex.properties)
 
 
 def _check_ascii_size(path: Path, header: Header) -> None:
-    # A number and its separator take two characters at least.
+    # A number and its separator take at least two characters.
     if 2 * sum(_ascii_numbers(header)) > path.stat().st_size - header.data_starts + 1:
         raise BadFileError("it is cut short: it cannot hold the numbers that it declares")
 
 
 def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
-    """The rows of a text file, some at a time: [M, P] float64."""
+    """The rows of a text file in blocks: [M, P] float64."""
     skipped, declared = _ascii_numbers(header)
     width = len(header.vertex.properties)
     file.seek(header.data_starts)
@@ -203,7 +203,7 @@ def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
 
 
 def _words(file: BinaryIO) -> Iterator[list[bytes]]:
-    """The file's words, some ten thousand at a time."""
+    """The words of the file in batches of some ten thousand."""
     rest = b""
     while block := file.read(1 << 18):
         block = rest + block
@@ -221,7 +221,7 @@ class _Columns:
     table: NDArray[Any]  # [M, P], or [M] structured
 
     def take(self, names: list[str]) -> NDArray[Any]:
-        """[M, len(names)] in a type that holds them all."""
+        """[M, len(names)] in the common type of the columns."""
         if self.table.ndim == 2:
             return self.table[:, [self.names.index(name) for name in names]]
         kind = np.result_type(*(self.table.dtype[name] for name in names)) if names else "f4"

@@ -1,4 +1,4 @@
-"""The header of a .ply, and the rows of its elements as they lie in the file."""
+"""The header of a .ply, and the rows of its elements in binary files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TYPES = {
 def header_text(
     units: str, origin: NDArray[np.float64], elements: Sequence[str], note: str = ""
 ) -> bytes:
-    """The header of a binary file of ours. elements: its lines of elements and properties."""
+    """The header of a binary file that we write. elements: the lines of elements and properties."""
     lines = ["ply", "format binary_little_endian 1.0", *([f"comment {note}"] if note else [])]
     lines.append("comment up axis: -y (right-handed; x right, y down, z forward)")
     lines.append(f"comment units: {units}")
@@ -66,11 +66,11 @@ class Header:
 
     @property
     def is_compressed(self) -> bool:
-        """Packed into integers, see `compressed_ply`."""
+        """Whether its splats are packed into integers, see `compressed_ply`."""
         return any(name == "packed_position" for name, _ in self.vertex.properties)
 
     def before(self, name: str) -> list[Element]:
-        """The elements ahead of `name`. Raises BadFileError if one has rows of unknown length."""
+        """The elements before `name`. Raises BadFileError if one has rows of unknown length."""
         ahead: list[Element] = []
         for element in self.elements:
             if element.name == name:
@@ -128,10 +128,8 @@ def _with_property(element: Element, words: list[str]) -> Element:
 
 
 def binary_rows(path: Path, header: Header, name: str) -> NDArray[np.generic]:
-    """[N] structured rows of the element `name`, mapped from a binary file.
-
-    Raises BadFileError when the file is too short for what it declares, before memory is taken.
-    """
+    """[N] structured rows of the element `name`, memory-mapped from a binary file. Raises
+    BadFileError if the file is shorter than it declares."""
     element = header.element(name)
     if element.has_lists:
         raise BadFileError("its vertices hold lists")

@@ -1,7 +1,7 @@
-"""Splats whose values are told in fewer bits, for formats that pack what repeats.
+"""Quantisation of splats to fewer bits, for formats that compress repeated values.
 
-A format's writer stays as it is: values that lie on a coarser grid of its own take fewer bytes once
-they are compressed, and every reader reads them as it always did.
+Values are rounded to a coarser subset of the grid of the format, so that they compress better. Its
+writer and its readers stay unchanged.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from stages.scene import QuantisedSplats, Splats
 
 @dataclass(frozen=True)
 class BitDepths:
-    """How many each value is told in, and a row of the palette of view-dependent colours."""
+    """Bits of each value, and of a label in the palette of SH coefficients."""
 
     position: int = 16
     rotation: int = 8
@@ -39,12 +39,12 @@ class BitDepths:
 
 
 def quantise_for_sog(splats: Splats, bits: BitDepths) -> Splats:
-    """What a .sog holds of them in so many bits, on the grids that its writer will find again."""
+    """The splats as a .sog of these bit depths holds them."""
     return quantise_splats(smallest_rotations(splats), bits)
 
 
 def quantise_splats(splats: Splats, bits: BitDepths) -> Splats:
-    """The same, axes named as they are."""
+    """As `quantise_for_sog`, without permuting the axes of the ellipsoids."""
     exact = found = splats
     for name, count in asdict(bits).items():
         found = quantise_attribute(exact, found, name, count)
@@ -52,7 +52,7 @@ def quantise_splats(splats: Splats, bits: BitDepths) -> Splats:
 
 
 def quantise_attribute(exact: Splats, splats: Splats, name: str, bits: int) -> Splats:
-    """`splats` with one of the values of `Bits` told in so many, from what it is in `exact`."""
+    """`splats` with one attribute, a field of `BitDepths`, quantised from its value in `exact`."""
     if not len(exact):
         return splats
     if name == "position":
@@ -73,13 +73,13 @@ def quantise_attribute(exact: Splats, splats: Splats, name: str, bits: int) -> S
 
 
 def palette_bits(count: int) -> int:
-    """The most that tell apart all that a palette of so many splats may hold."""
+    """The bits of a label in the largest palette for `count` splats."""
     return (palette_size(count) - 1).bit_length()
 
 
 def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
-    """What a file of this format should hold: drawable splats, their mean colours where colours do
-    not change with the view, in as many bits as were decided on."""
+    """The splats that a file of this format should hold: drawable, quantised to the chosen bit
+    depths, and with view-averaged colours where the format has no SH above degree 0."""
     if row.ending in quantised.finetuned:
         return quantised.finetuned[row.ending]
     splats = quantised.splats
@@ -97,11 +97,11 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
 def _positions(means: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
     if bits >= 16:
         return means.astype(np.float32)
-    curved = symmetric_log(means)
-    low, high = curved.min(axis=0), curved.max(axis=0)
+    encoded = symmetric_log(means)
+    low, high = encoded.min(axis=0), encoded.max(axis=0)
     span = np.where(high > low, high - low, 1.0)
     coarse = 1 << (16 - bits)
-    steps = np.minimum(np.rint((curved - low) / span * (STEPS / coarse)) * coarse, STEPS)
+    steps = np.minimum(np.rint((encoded - low) / span * (STEPS / coarse)) * coarse, STEPS)
     found: NDArray[np.float32] = symmetric_exp(low + span * steps / STEPS).astype(np.float32)
     return found
 

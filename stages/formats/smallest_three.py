@@ -1,4 +1,4 @@
-"""Rotations without their largest component, which the length of 1 gives back."""
+"""Smallest-three encoding of quaternions: the largest component follows from the unit norm."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ LIMIT = np.sqrt(0.5)  # the second largest component of a unit quaternion is at 
 
 
 def split(quaternions: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """(column of the largest component [N]; the others [N, 3], in -LIMIT..LIMIT, in their order).
+    """(index of the largest component [N], the other components [N, 3] in -LIMIT..LIMIT).
 
-    quaternions [N, 4]: unit, in any order of components. q and -q are one rotation: the sign is
-    the one that makes the largest component positive.
+    quaternions [N, 4]: unit, with components in any order. q and -q are the same rotation; the sign
+    is chosen so that the largest component is positive.
     """
     rows = np.arange(len(quaternions))
     largest = np.abs(quaternions).argmax(axis=1)
@@ -22,7 +22,7 @@ def split(quaternions: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[
 
 
 def join(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float32]:
-    """[N, 4] the inverse of `split`, unit whatever the others are."""
+    """[N, 4] unit quaternions, the inverse of `split`."""
     exact = others.astype(np.float64)
     rows = np.arange(len(exact))
     quaternions = np.empty((len(exact), 4))
@@ -34,7 +34,7 @@ def join(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[
 
 
 def _columns(largest: NDArray[np.integer]) -> NDArray[np.intp]:
-    """[N, 3] the columns beside the largest, rising."""
+    """[N, 3] the indices of the other components, ascending."""
     table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], np.intp)
     found: NDArray[np.intp] = table[largest]
     return found

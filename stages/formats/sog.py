@@ -1,10 +1,11 @@
-"""SOG version 2, written: a zip of meta.json and lossless WebP pictures, a pixel a splat.
+"""Writing SOG version 2: a zip of meta.json and lossless WebP images with one pixel a splat.
 
-Positions as 16 bits of sign ln(1 + |x|) in two pictures (low and high bytes), rotations as the
-smallest three of w, x, y, z with 252 + the largest's column in alpha, scale logarithms and dc as
-indices of codebooks of 256, opacity in the alpha of the colour. SH above degree 0 is a label in a
-palette of at most 65,536 rows, whose picture has 64 rows of the palette a line and three bytes a
-coefficient. Axes as in memory (y down). Specification: "The SOG Format", developer.playcanvas.com.
+Positions are 16-bit symmetric logarithms, sign(x) ln(1 + |x|), in two images (low and high bytes).
+Rotations are the smallest three of w, x, y, z, with 252 + the index of the largest in alpha. Log
+scales and SH of degree 0 are indices into codebooks of 256; opacity is the alpha of the colour. SH
+above degree 0 is a label in a palette of at most 65,536 entries, whose image has 64 entries a line
+and three bytes a coefficient. Axes as in memory (y down).
+Specification: "The SOG Format", developer.playcanvas.com.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
 from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
 
-# Beyond them scales look the same, and the codebook's entries are better spent between.
+# Log scales beyond this look the same; clipping leaves more codebook entries for the others.
 LOG_SCALE_LIMIT = 20.0
 _PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
 _DC_LIMIT = 1e4
@@ -37,8 +38,8 @@ STEPS = 65535  # of a position, along each axis
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    Positions stay relative to `splats.origin`; meta.json says it. Raises SplatError when the file
-    cannot be written.
+    Positions stay relative to `splats.origin`, which meta.json holds. Raises SplatError when the
+    file cannot be written.
     """
     splats, dropped = drop_undrawable(splats)
     found = sog_members(splats, morton.morton_order(splats), units)
@@ -49,8 +50,13 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 
 
 def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, bytes]:
-    """The content of meta.json and of each picture, by name; the splats, which must be drawable,
-    in the order `places`."""
+    """The content of meta.json and of each image, by name.
+
+    Args:
+        splats: all drawable.
+        places: [N] the order in which they are written.
+        units: "metres" or "arbitrary".
+    """
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": False}
@@ -61,14 +67,14 @@ def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[st
     for part in (_positions, _shapes, _colours):
         pictures |= part(splats, places, meta)
     if degree and len(splats):
-        pictures |= _rest(splats, places, meta)
-    told = {"meta.json": json.dumps(meta, allow_nan=False).encode()}
-    return told | {name: _webp(pixels) for name, pixels in pictures.items()}
+        pictures |= _sh_palette(splats, places, meta)
+    content = {"meta.json": json.dumps(meta, allow_nan=False).encode()}
+    return content | {name: _webp(pixels) for name, pixels in pictures.items()}
 
 
 def _add(package: zipfile.ZipFile, name: str, content: bytes) -> None:
-    """With the oldest time that zip knows: equal splats give equal bytes. Text is packed, for
-    codebooks are long; pictures are already."""
+    """Add a member with the earliest time of the zip format, so that equal splats give equal bytes.
+    meta.json is compressed; images are compressed already."""
     packing = zipfile.ZIP_DEFLATED if name.endswith(".json") else zipfile.ZIP_STORED
     info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
     package.writestr(info, content, compress_type=packing)
@@ -78,18 +84,19 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
-    # exact: colours where alpha is 0 count too
+    # exact: keep colours where alpha is 0
     Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True, method=4)
     return file.getvalue()
 
 
-def _written(book: NDArray[np.float64]) -> list[float]:
-    """What is as exact as float32, in half of the letters."""
+def _rounded(book: NDArray[np.float64]) -> list[float]:
+    """The codebook with the precision of float32, in half as many characters."""
     return [float(f"{number:.7g}") for number in book]
 
 
 def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """[H, W, channels] nearly square, its sides multiples of 4, from [N, channels]."""
+    """[H, W, channels] nearly square image with sides that are multiples of 4, from rows
+    [N, channels]."""
     width = max(4, 4 * math.ceil(math.sqrt(len(rows)) / 4))
     height = max(4, 4 * math.ceil(len(rows) / width / 4))
     pixels = np.zeros((height * width, rows.shape[1]), np.uint8)
@@ -100,9 +107,8 @@ def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _positions(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
-    """places: the order in which the splats are written; of what follows too."""
     low, high = (np.zeros(3), np.zeros(3))
-    if len(splats):  # the curve rises: the ends of the bent are the bent ends
+    if len(splats):  # the logarithm is monotonic, so it maps the bounds to the bounds
         low, high = (symmetric_log(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
     span = np.where(high > low, high - low, 1.0)
     halves = np.empty((2, len(splats), 3), np.uint8)
@@ -117,37 +123,37 @@ def _positions(
 
 
 def symmetric_log(means: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Positions on the curve whose even steps are stored: finer near the centre."""
+    """Positions on a symmetric logarithmic scale, which is quantised evenly."""
     exact = means.astype(np.float64)
     return np.sign(exact) * np.log1p(np.abs(exact))
 
 
-def symmetric_exp(curved: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of `bent`."""
-    return np.sign(curved) * np.expm1(np.abs(curved))
+def symmetric_exp(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse of `symmetric_log`."""
+    return np.sign(encoded) * np.expm1(np.abs(encoded))
 
 
 def _shapes(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
     book = codebook.scalar_codebook(np.clip(splats.log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
-    meta["scales"] = {"codebook": _written(book), "files": ["scales.webp"]}
-    scales, turns = (np.empty((len(splats), n), np.uint8) for n in (3, 4))
+    meta["scales"] = {"codebook": _rounded(book), "files": ["scales.webp"]}
+    scales, rotations = (np.empty((len(splats), n), np.uint8) for n in (3, 4))
     for rows in reported_blocks(len(splats)):
         part = splats.take(places[rows])
         scales[rows] = codebook.nearest(book, part.log_scales)
         largest, others = smallest_three.split(unit_quaternions(part.quaternions))
-        turns[rows, :3] = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
-        turns[rows, 3] = 252 + largest
+        rotations[rows, :3] = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
+        rotations[rows, 3] = 252 + largest
     meta["quats"] = {"files": ["quats.webp"]}
-    return {"scales.webp": _picture(scales), "quats.webp": _picture(turns)}
+    return {"scales.webp": _picture(scales), "quats.webp": _picture(rotations)}
 
 
 def _colours(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
     book = codebook.scalar_codebook(np.clip(splats.sh[:, 0], -_DC_LIMIT, _DC_LIMIT))
-    meta["sh0"] = {"codebook": _written(book), "files": ["sh0.webp"]}
+    meta["sh0"] = {"codebook": _rounded(book), "files": ["sh0.webp"]}
     pixels = np.empty((len(splats), 4), np.uint8)
     for rows in reported_blocks(len(splats)):
         part = splats.take(places[rows])
@@ -157,11 +163,11 @@ def _colours(
 
 
 def palette_size(count: int) -> int:
-    """Rows at most, for so many splats."""
+    """The largest number of palette entries for `count` splats."""
     return min(PALETTE_LIMIT, max(_PALETTE_LEAST, count // _SPLATS_PER_ENTRY))
 
 
-def _rest(
+def _sh_palette(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
     count = splats.sh.shape[1] - 1
@@ -171,7 +177,7 @@ def _rest(
     size = palette_size(len(splats))
     palette, labels = codebook.vector_palette(vectors.reshape(len(splats), -1), size)
     book = codebook.scalar_codebook(palette)
-    book[np.abs(book).argmin()] = 0.0  # what does not change with the view stays so
+    book[np.abs(book).argmin()] = 0.0  # keep zero exact
     book.sort()
     lines = -(-len(palette) // PER_LINE)
     centroids = np.zeros((lines * PER_LINE, count, 3), np.uint8)
@@ -180,7 +186,7 @@ def _rest(
     meta["shN"] = {
         "count": len(palette),
         "bands": splats.sh_degree,
-        "codebook": _written(book),
+        "codebook": _rounded(book),
         "files": files,
     }
     halves = np.zeros((len(labels), 3), np.uint8)

@@ -1,7 +1,7 @@
-"""Reading SOG version 2, from our own files and from other programs'.
+"""Reading SOG version 2, from our files and those of other programs.
 
-Nothing is unpacked to disk: members are looked up by the names that meta.json gives, and sizes are
-compared with the number of splats before memory is taken.
+Nothing is unpacked to disk. Members are found by their names in meta.json, and sizes are compared
+with the number of splats before memory is allocated.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from stages.formats.values import allocate, check_finite, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16
-PER_LINE = 64  # rows of the palette in a line of its picture
+PER_LINE = 64  # entries of the palette in a line of its image
 _META_LIMIT_BYTES = 1 << 20
-# Real files take 10 bytes a splat. What declares more splats than this is refused before memory is
-# taken for them; few splats may all be equal.
+# Real files take 10 bytes a splat. A file that declares more splats than this is refused before
+# memory is allocated; a small number may all be equal.
 _SPLATS_PER_BYTE, _ALWAYS_ALLOWED = 4, 1 << 16
-Member = Callable[[Any, int], bytes]  # name, most bytes -> content, perhaps a byte more
+Member = Callable[[Any, int], bytes]  # (name, largest size) -> content, up to a byte longer
 
 
 def read(path: Path) -> Splats:
-    """The splats of a .sog, float32. Raises SplatError "splats-unreadable" for what is damaged, of
-    another version, or refers to what is not in it."""
+    """The splats of a .sog, float32. Raises SplatError "splats-unreadable" for a damaged file,
+    another version, or a missing member."""
     path = Path(path)
     with reading(path):
         try:
@@ -51,7 +51,7 @@ def read(path: Path) -> Splats:
 
 
 def in_zip(package: zipfile.ZipFile) -> Member:
-    """What reads the files of a zip."""
+    """A reader of the members of a zip."""
 
     def member(name: Any, limit: int) -> bytes:
         if not isinstance(name, str) or name not in package.NameToInfo:
@@ -65,7 +65,7 @@ def in_zip(package: zipfile.ZipFile) -> Member:
 
 
 def in_folder(folder: Path) -> Member:
-    """What reads the files of a folder, and of no other."""
+    """A reader of the files directly in a folder."""
 
     def member(name: Any, limit: int) -> bytes:
         if not isinstance(name, str) or Path(name).name != name or not (folder / name).is_file():
@@ -78,13 +78,14 @@ def in_folder(folder: Path) -> Member:
 
 @dataclass(frozen=True)
 class Source:
-    """One asset. member: its files. size_bytes: of them all. Methods raise BadFileError."""
+    """One asset. member: reads its files; size_bytes: of all of them. Methods raise
+    BadFileError."""
 
     member: Member
     size_bytes: int
 
     def meta(self) -> dict[str, Any]:
-        """meta.json, of the right version, its count one that the asset can hold."""
+        """meta.json, with its version and a plausible count checked."""
         meta = json.loads(self._member("meta.json", _META_LIMIT_BYTES))
         if not isinstance(meta, dict) or meta.get("version") != 2:
             raise BadFileError("its meta.json is not of SOG version 2")
@@ -96,8 +97,8 @@ class Source:
         count = meta["count"]
         low, high = (self._pixels(meta, "means", i, count)[:, :3] for i in (0, 1))
         ends = [_numbers(meta, "means", name, 3) for name in ("mins", "maxs")]
-        turns = self._pixels(meta, "quats", 0, count)
-        if (turns[:, 3] < 252).any():
+        rotations = self._pixels(meta, "quats", 0, count)
+        if (rotations[:, 3] < 252).any():
             raise BadFileError("its rotations do not name their largest component")
         colours, scales = (self._pixels(meta, part, 0, count) for part in ("sh0", "scales"))
         books = [_numbers(meta, part, "codebook", 256) for part in ("sh0", "scales")]
@@ -108,13 +109,15 @@ class Source:
         for rows in reported_blocks(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
-            bent = ends[0] + (ends[1] - ends[0]) * steps
-            others = (turns[rows, :3] / 255.0 - 0.5) * 2 * smallest_three.LIMIT
+            encoded = ends[0] + (ends[1] - ends[0]) * steps
+            others = (rotations[rows, :3] / 255.0 - 0.5) * 2 * smallest_three.LIMIT
             with np.errstate(over="ignore", invalid="ignore"):
-                out.means[:] = np.sign(bent) * np.expm1(np.abs(bent))
+                out.means[:] = np.sign(encoded) * np.expm1(np.abs(encoded))
                 out.sh[:, 0] = books[0][colours[rows, :3]]
                 out.log_scales[:] = books[1][scales[rows, :3]]
-            out.quaternions[:] = smallest_three.join(turns[rows, 3].astype(np.intp) - 252, others)
+            out.quaternions[:] = smallest_three.join(
+                rotations[rows, 3].astype(np.intp) - 252, others
+            )
             out.opacity_logits[:] = logits_of(colours[rows, 3] / 255.0)
             out.sh[:, 1:] = palette[labels[rows]]
         return splats
@@ -122,7 +125,7 @@ class Source:
     def _palette(
         self, meta: dict[str, Any], count: int
     ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """(SH above degree 0 [entries, K, 3], which of them is each splat's [N])."""
+        """(SH above degree 0 [entries, K, 3], the label of each splat [N])."""
         none = np.zeros((1, 0, 3), np.float32), np.zeros(count, np.intp)
         if "shN" not in meta:
             return none
@@ -141,7 +144,7 @@ class Source:
         return book[indices[:, :3].reshape(-1, k, 3)], labels
 
     def _member(self, name: Any, limit: int) -> bytes:
-        """One of its files. Raises BadFileError if it is not there or larger."""
+        """One of its files. Raises BadFileError if it is missing or larger than `limit`."""
         content = self.member(name, limit)
         if len(content) > limit:
             raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
@@ -150,7 +153,7 @@ class Source:
     def _pixels(
         self, meta: dict[str, Any], part: str, number: int, count: int, width: int = 0
     ) -> NDArray[np.uint8]:
-        """[count, 4] the first pixels of a picture, line by line."""
+        """[count, 4] the first pixels of an image in row-major order."""
         from PIL import Image
 
         files = _part(meta, part).get("files")
@@ -174,7 +177,7 @@ class Source:
 
 
 def _webp_size(content: bytes) -> tuple[int, int]:
-    """(width, height) from the header, before a decoder takes memory for them."""
+    """(width, height) from the header, before a decoder allocates memory."""
     kind = content[12:16] if content[:4] == b"RIFF" and content[8:12] == b"WEBP" else b""
     if kind == b"VP8L" and len(content) >= 25:
         bits = struct.unpack_from("<I", content, 21)[0]

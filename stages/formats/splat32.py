@@ -1,8 +1,8 @@
 """The 32-byte .splat of web viewers: small, without view-dependent colour.
 
 Each record: position 3 x float32, standard deviations 3 x float32, RGBA 4 x uint8, quaternion
-w, x, y, z as 4 x uint8 = 128 + 128 q. No header; axes as in memory (y down). Records come largest
-first (volume x opacity), so that a viewer that is still loading shows the most.
+w, x, y, z as 4 x uint8 = 128 + 128 q. No header; axes as in memory (y down). Records are
+sorted by volume x opacity, largest first, so that a viewer that is still loading shows the most.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ RECORD = np.dtype(
 
 
 def order(splats: Splats) -> NDArray[np.intp]:
-    """[N] rows from the largest volume x opacity to the least, as the file holds both: whoever
-    looks at it finds no row out of its place. Equals keep their order."""
+    """[N] rows by descending volume x opacity, with the opacity as rounded in the file, so that a
+    reader finds the same order. The sort is stable."""
     logs = np.maximum(splats.log_scales, LOG_SCALE_MIN).sum(axis=1, dtype=np.float64)
     with np.errstate(divide="ignore"):
         size = logs + np.log(_alphas(splats), dtype=np.float64)
@@ -59,7 +59,7 @@ def encode(splats: Splats) -> NDArray[np.void]:
 
 
 def _encode_quaternions(unit: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """q and -q are one rotation, but 8 bits hold -1 exactly and +1 not: take the nearer one."""
+    """q and -q are the same rotation, but 8 bits hold -1 exactly and +1 not; take the closer."""
     best = np.clip(np.rint(128 + 128 * unit), 0, 255)
     other = np.clip(np.rint(128 - 128 * unit), 0, 255)
     error = np.square((best - 128) / 128 - unit).sum(axis=1)
@@ -68,9 +68,9 @@ def _encode_quaternions(unit: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def decode(records: NDArray[np.void]) -> Splats:
-    """Splats of degree 0, as a viewer understands the records."""
+    """The splats of the records, SH degree 0."""
     quaternions = (records["quaternion"].astype(np.float32) - 128) / 128
-    quaternions[~quaternions.any(axis=1)] = (1, 0, 0, 0)  # four times 128: no rotation
+    quaternions[~quaternions.any(axis=1)] = (1, 0, 0, 0)  # four times 128: the identity
     rgba = records["rgba"].astype(np.float64) / 255
     return Splats(
         means=records["mean"].astype(np.float32),
@@ -85,7 +85,7 @@ def decode(records: NDArray[np.void]) -> Splats:
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    The format has no place for units, the origin and SH above degree 0: they are not written.
+    The format has no field for units, the origin and SH above degree 0; they are lost.
     Raises SplatError when the file cannot be written.
     """
     splats, dropped = drop_undrawable(splats)
@@ -97,7 +97,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 
 
 def read(path: Path) -> Splats:
-    """The splats of a .splat. Raises SplatError "splats-unreadable" for what is no such file."""
+    """The splats of a .splat. Raises SplatError "splats-unreadable" for other files."""
     path = Path(path)
     with reading(path):
         size = path.stat().st_size

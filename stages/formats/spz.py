@@ -2,9 +2,9 @@
 
 gzip around a header of 16 bytes (magic "NGSP", version, count, SH degree, fractional bits of
 positions, flags, 0) and one array after the other: positions 3 x 24-bit fixed point, opacities
-uint8, colours 3 x uint8 (0.15 dc + 0.5), scales 3 x uint8 (16 (ln + 10)), rotations (the smallest
+uint8, colours 3 x uint8 (0.15 dc + 0.5), scales 3 x uint8 (16 (ln + 10)), rotations (smallest
 three of x, y, z, w in 32 bits), SH uint8 (128 + 128 c), coefficients of one splat together, RGB
-last. Axes: right, up, back, so the splats are turned upright. Specification: nianticlabs/spz,
+last. Axes: right, up, back (y up). Specification: nianticlabs/spz,
 README.
 """
 
@@ -31,15 +31,15 @@ from stages.scene.flip import FLIP, flipped
 _LEVEL = 6  # 9 takes eight times as long for 1 % less
 _LEAST_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
 _FIXED_LIMIT = (1 << 23) - 1
-_SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip then packs
+_SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip compresses
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    The format has no place for units and the origin: they are not written. A splat farther than
-    2048 units from the centre is drawn nearer along its ray and smaller, which looks the same from
-    the middle. Raises SplatError when the file cannot be written.
+    The format has no field for units and the origin; they are lost. A splat farther than 2048
+    units from the centre is moved closer along its ray and scaled down, which looks the same from
+    the centre. Raises SplatError when the file cannot be written.
     """
     splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
@@ -52,7 +52,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         lambda block: _byte(255 * (COLOUR_SCALE * block.sh[:, 0].astype(np.float64) + 0.5)),
         lambda block: _byte(16 * (_within_reach(block).log_scales + 10)),
         lambda block: _pack_rotations(flipped(block.with_sh_degree(0)).quaternions),
-        _rest,
+        _sh,
     )
     with (
         replacing(path) as temporary,
@@ -68,8 +68,8 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
 
 
 def _within_reach(splats: Splats) -> Splats:
-    """Splats beyond what 24 bits can hold, shrunk towards the centre together with their sizes;
-    means and log_scales float64."""
+    """Splats beyond the range of 24 bits are scaled towards the centre; means and log_scales are
+    float64."""
     reach = _FIXED_LIMIT / (1 << _LEAST_FRACTIONAL_BITS)
     means = splats.means.astype(np.float64)
     factors = reach / np.maximum(np.abs(means).max(axis=1, initial=0.0), reach)
@@ -81,7 +81,7 @@ def _within_reach(splats: Splats) -> Splats:
 
 
 def _fractional_bits(means: NDArray[np.floating]) -> int:
-    """As many as the largest coordinate leaves: small scenes get finer steps."""
+    """As many as the largest coordinate allows: small scenes get finer steps."""
     largest = float(max(means.max(initial=0.0), -means.min(initial=0.0)))
     if largest == 0:
         return _LEAST_FRACTIONAL_BITS
@@ -90,14 +90,14 @@ def _fractional_bits(means: NDArray[np.floating]) -> int:
 
 
 def _positions(splats: Splats, bits: int) -> NDArray[np.uint8]:
-    """[N, 3, 3] three bytes a coordinate, upright."""
-    upright = _within_reach(splats).means * FLIP
-    fixed = np.rint(upright * float(1 << bits)).astype("<i4")
+    """[N, 3, 3] three bytes a coordinate, y up."""
+    y_up = _within_reach(splats).means * FLIP
+    fixed = np.rint(y_up * float(1 << bits)).astype("<i4")
     return np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
 
 
-def _rest(splats: Splats) -> NDArray[np.uint8]:
-    """[N, K, 3] SH above degree 0, upright."""
+def _sh(splats: Splats) -> NDArray[np.uint8]:
+    """[N, K, 3] SH above degree 0, y up."""
     sh = flipped(splats).sh[:, 1:]
     steps = np.array([_SH_STEPS[math.isqrt(k) - 1] for k in range(1, 1 + sh.shape[1])], np.float64)
     levels = np.rint(128 * sh.astype(np.float64)) + 128
@@ -106,8 +106,8 @@ def _rest(splats: Splats) -> NDArray[np.uint8]:
 
 
 def _opacities(splats: Splats) -> NDArray[np.uint8]:
-    """[N] of 1 to 254: there are readers that take the logit of 0 and of 255, which is infinite,
-    and neither can be seen to differ from its neighbour."""
+    """[N] in 1..254: some readers take the logit of 0 and 255, which is infinite, and the
+    difference is not visible."""
     return np.clip(_byte(255 * linear_opacities(splats)), 1, 254)
 
 
@@ -117,7 +117,7 @@ def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def _pack_rotations(quaternions: NDArray[np.floating]) -> NDArray[np.uint32]:
-    """[N]: 2 bits name the largest of x, y, z, w; sign and 9 bits for each of the others."""
+    """[N] 2 bits for the index of the largest of x, y, z, w; sign and 9 bits for each other."""
     xyzw = unit_quaternions(quaternions)[:, [1, 2, 3, 0]]
     largest, others = smallest_three.split(xyzw)
     word = largest.astype(np.uint32)

@@ -1,9 +1,9 @@
-"""Reading SPZ of versions 2, 3 and 4, from our own files and from other programs'.
+"""Reading SPZ versions 2, 3 and 4, from our files and those of other programs.
 
 The arrays are those of `spz`. Versions 2 and 3: gzip around a header of 16 bytes and the arrays;
-rotations of version 2 are x, y, z as uint8. Version 4: a plain header of 32 bytes, records of
-extensions, a table of (packed, unpacked) sizes as uint64, and one zstd stream an array; without SH
-above degree 0 there is no array for it. Specification: nianticlabs/spz, README.
+rotations of version 2 are x, y, z as uint8. Version 4: an uncompressed header of 32 bytes, records
+of extensions, a table of (packed, unpacked) sizes as uint64, and one zstd stream an array; without
+SH above degree 0 there is no array for it. Specification: nianticlabs/spz, README.
 """
 
 from __future__ import annotations
@@ -34,25 +34,26 @@ _HAS_EXTENSIONS = 2  # in the flags
 _EXTENSIONS_LIMIT_BYTES = 1 << 20
 # SPZ_ADOBE_coordinate_system: axes other than right, up, back. Codes of the reference library:
 # 0 unspecified, 4 right up back, 6 right down front, which are ours.
-_AXES_EXTENSION, _UPRIGHT, _OURS = 0xADBE0003, (0, 4), 6
+_AXES_EXTENSION, _Y_UP, _OURS = 0xADBE0003, (0, 4), 6
 
 
 @dataclass(frozen=True)
 class _Content:
-    """arrays: [N, bytes] of positions, opacities, colours, scales, rotations, SH."""
+    """arrays: [N, bytes] of positions, opacities, colours, scales, rotations, SH. y_up: whether the
+    axes are those of SPZ; else they are ours."""
 
     version: int
     degree: int
     bits: int
     arrays: list[NDArray[np.uint8]]
-    upright: bool
+    y_up: bool
 
 
 def read(path: Path) -> Splats:
-    """The splats of an .spz, turned to y down, float32.
+    """The splats of an .spz, y down, float32.
 
-    Whether they were trained with antialiasing is not kept. Raises SplatError
-    "splats-unreadable" for what is damaged, or of another version.
+    The antialiasing flag is ignored. Raises SplatError "splats-unreadable" for a damaged file or
+    another version.
     """
     path = Path(path)
     with reading(path), path.open("rb") as file:
@@ -61,22 +62,22 @@ def read(path: Path) -> Splats:
         size = path.stat().st_size
         content = _plain(file, size) if plain else _gzipped(file, size)
         splats = _decoded(content)
-        return check_finite(flipped(splats, reuse=True) if content.upright else splats)
+        return check_finite(flipped(splats, reuse=True) if content.y_up else splats)
 
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:
-    stream = GzipReader(file, size)
+    stream = GzipReader(file)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack(stream.read(HEADER.size))
     if magic != MAGIC:
         raise BadFileError("it does not hold 'NGSP'")
     if version not in (2, 3):
         raise BadFileError(f"it is SPZ version {version} in gzip; there 2 and 3 are read")
     sizes = widths(version, degree, bits)
-    stream.expect(count * sum(sizes))
+    check_size(count * sum(sizes), size)
     arrays = [stream.rows(count, size) for size in sizes]
     extra = stream.finish()
-    upright = _is_upright(extra) if flags & _HAS_EXTENSIONS else True
-    return _Content(version, degree, bits, arrays, upright)
+    y_up = _is_y_up(extra) if flags & _HAS_EXTENSIONS else True
+    return _Content(version, degree, bits, arrays, y_up)
 
 
 def _plain(file: BinaryIO, size: int) -> _Content:
@@ -91,13 +92,13 @@ def _plain(file: BinaryIO, size: int) -> _Content:
         if declared != count * width:
             raise BadFileError(f"it declares {declared} bytes for {count} times {width}")
         arrays.append(read_zstd_frame(file, packed, declared).reshape(count, width))
-    upright = _is_upright(extra) if flags & _HAS_EXTENSIONS else True
-    return _Content(version, degree, bits, arrays, upright)
+    y_up = _is_y_up(extra) if flags & _HAS_EXTENSIONS else True
+    return _Content(version, degree, bits, arrays, y_up)
 
 
 def _table(file: BinaryIO, size: int) -> tuple[tuple[Any, ...], bytes, list[tuple[int, int]]]:
-    """(header, extensions, (packed, unpacked) bytes of each stream) of a file of version 4, which
-    is left where the streams start."""
+    """(header, extensions, (packed, unpacked) bytes of each stream) of a file of version 4. The
+    file position is then at the streams."""
     head = file.read(HEADER.size + _TABLE_STARTS.size)
     if len(head) < HEADER.size + _TABLE_STARTS.size:
         raise BadFileError("it is cut short")
@@ -115,7 +116,7 @@ def _table(file: BinaryIO, size: int) -> tuple[tuple[Any, ...], bytes, list[tupl
 
 
 def packed_sizes(path: Path) -> list[int]:
-    """Bytes in the file of each array of version 4; [] for the versions that pack all together."""
+    """Compressed bytes of each array of version 4; [] for versions with one gzip stream."""
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             return []
@@ -124,21 +125,21 @@ def packed_sizes(path: Path) -> list[int]:
 
 
 def widths(version: int, degree: int, bits: int) -> tuple[int, ...]:
-    """Bytes a splat of each array."""
+    """Bytes a splat takes in each array."""
     if degree > 3 or bits > 31:
         raise BadFileError(f"its SH degree is {degree} and its fractional bits are {bits}")
     return (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
 
 
-def _is_upright(records: bytes) -> bool:
+def _is_y_up(records: bytes) -> bool:
     """Whether the axes are right, up, back; False if they are ours. Other extensions (limits for
-    cameras) are passed over. Raises BadFileError for other axes."""
+    cameras) are ignored. Raises BadFileError for other axes."""
     while len(records) >= _RECORD.size:
         kind, length = _RECORD.unpack_from(records)
         value = records[_RECORD.size : _RECORD.size + length]
         if kind == _AXES_EXTENSION:
             axes = int.from_bytes(value, "little")
-            if axes not in (*_UPRIGHT, _OURS):
+            if axes not in (*_Y_UP, _OURS):
                 raise BadFileError(f"its axes are number {axes} of SPZ, which is not read")
             return axes != _OURS
         records = records[_RECORD.size + length :]
@@ -146,14 +147,14 @@ def _is_upright(records: bytes) -> bool:
 
 
 def _decoded(content: _Content) -> Splats:
-    """The splats in the file's axes."""
+    """The splats in the axes of the file."""
     positions, opacities, colours, scales, rotations, sh = content.arrays
     splats = allocate(len(positions), content.degree)
     for rows in reported_blocks(len(positions)):
         out = splats.take(rows)
         padded = np.zeros((len(out), 3, 4), np.uint8)
         padded[:, :, 1:] = positions[rows].reshape(-1, 3, 3)
-        fixed = padded.view("<i4")[:, :, 0] >> 8  # the shift brings the sign down
+        fixed = padded.view("<i4")[:, :, 0] >> 8  # the shift extends the sign
         out.means[:] = fixed / float(1 << content.bits)
         out.quaternions[:] = _rotations(rotations[rows], content.version)
         out.log_scales[:] = scales[rows].astype(np.float32) / 16 - 10

@@ -1,9 +1,9 @@
-"""Streamed SOG: lod-meta.json, and chunks of SOG in folders beside it, as PlayCanvas lays them out.
+"""Streamed SOG: lod-meta.json and chunks of SOG in folders beside it, in the layout of PlayCanvas.
 
-The scene is cut into leaves by planes; a leaf names, for each level of detail (0 the finest), where
-its splats lie: rows `offset` to `offset + count` of a chunk. A viewer loads for each leaf the level
-that its distance asks for. Ours: a leaf halves its splats' widest side until they are few, chunks
-take leaves one after the other, and rows of a leaf follow a Morton curve.
+A k-d tree divides the scene into leaves. For each level of detail (0 is the finest) a leaf refers
+to the rows `offset` to `offset + count` of a chunk, and a viewer loads the level that suits its
+distance. We split the widest side at the median until a leaf is small enough, fill chunks with one
+leaf after the other, and sort the rows of a leaf along a Morton curve.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class _Leaf:
-    """rows: of each level, in the order in which they are written."""
+    """rows: of each level, in the order of the file."""
 
     rows: tuple[_Rows, ...]
 
@@ -77,8 +77,8 @@ def write(
 
 
 def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
-    """Write `levels`, the finest first, in one frame and all drawable; the folder is made, and what
-    an earlier asset left in it goes. lod-meta.json comes last. Raises SplatError."""
+    """Write `levels`, finest first, all drawable and in one frame. Makes the folder, replaces an
+    earlier asset in it, and writes lod-meta.json last. Raises SplatError."""
     make_folder(path.parent)
     tree = _cut(levels)
     partial = path.with_name(partial_prefix() + "chunks")
@@ -100,7 +100,7 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
         }
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
-            path.unlink(missing_ok=True)  # no moment at which it speaks of other chunks
+            path.unlink(missing_ok=True)  # it must never refer to other chunks
             for old in path.parent.iterdir():
                 if CHUNK.match(old.name) and old.is_dir():
                     shutil.rmtree(old)
@@ -112,14 +112,14 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
 
 @dataclass(frozen=True)
 class _Places:
-    """names: of the chunks. lods: by leaf and level, where its rows are."""
+    """names: of the chunks. lods: by leaf and level, the location of its rows."""
 
     names: list[str]
     lods: dict[tuple[int, int], dict[str, int]]
 
 
 def _cut(levels: Sequence[Splats]) -> _Tree:
-    """All levels cut by the planes that halve the finest."""
+    """The tree of all levels, divided at the medians of the finest."""
 
     def node(rows: list[_Rows], depth: int) -> _Tree:
         means = levels[0].means[rows[0]]
@@ -182,7 +182,7 @@ def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
 
 
 def _described(tree: _Tree, levels: Sequence[Splats], places: _Places) -> dict[str, Any]:
-    """The tree as lod-meta.json says it, with the box of each node's ellipsoids."""
+    """The tree for lod-meta.json, with the bounding box of the ellipsoids of each node."""
     number = 0
 
     def node(part: _Tree) -> dict[str, Any]:
@@ -219,8 +219,8 @@ def _around(boxes: Sequence[tuple[list[float], list[float]]]) -> dict[str, list[
 
 
 def read(path: Path) -> Splats:
-    """The finest level of a streamed SOG that each leaf has, and its surroundings, if it names any.
-    Raises SplatError "splats-unreadable" for what is damaged or refers to what is not there."""
+    """The finest level of each leaf, and the environment if there is one. Raises SplatError
+    "splats-unreadable" for a damaged asset or a missing chunk."""
     path = Path(path)
     with reading(path):
         try:
@@ -258,9 +258,8 @@ def _read(path: Path) -> Splats:
     return replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
 
 
-def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]]:
-    """By chunk: (offset, count) of what is wanted of it, rising."""
-    found: dict[int, list[tuple[int, int]]] = {}
+def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:
+    """By level, the rows of each leaf. Raises BadFileError for what is no tree."""
     waiting = [tree]
     while waiting:
         node = waiting.pop()
@@ -268,20 +267,27 @@ def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]
             raise BadFileError("its tree holds what is no node")
         children, lods = node.get("children"), node.get("lods")
         if isinstance(lods, dict) and lods:
-            at = lods[min(lods, key=int)]
-            values = [at[name] for name in ("file", "offset", "count")]
-            if not all(isinstance(v, int) and 0 <= v < 1 << 40 for v in values):
-                raise BadFileError("its tree names rows by what is no number")
-            if values[0] >= files:
-                raise BadFileError("its tree names a chunk that is not listed")
-            found.setdefault(values[0], []).append((values[1], values[2]))
+            yield lods
         elif isinstance(children, list):
             waiting += children
+
+
+def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]]:
+    """By chunk: (offset, count) of its rows in the finest level, ascending."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for lods in _leaf_lods(tree):
+        at = lods[min(lods, key=int)]
+        values = [at[name] for name in ("file", "offset", "count")]
+        if not all(isinstance(v, int) and 0 <= v < 1 << 40 for v in values):
+            raise BadFileError("its tree names rows by what is no number")
+        if values[0] >= files:
+            raise BadFileError("its tree names a chunk that is not listed")
+        found.setdefault(values[0], []).append((values[1], values[2]))
     return {file: sorted(ranges) for file, ranges in found.items()}
 
 
 def parts_of(path: Path) -> dict[str, Path]:
-    """By address relative to its folder: the asset and every file of its chunks. Raises SplatError
+    """By path relative to the folder: the asset and all files of its chunks. Raises SplatError
     "splats-unreadable"."""
     found = {path.name: path}
     with reading(path):
@@ -295,16 +301,13 @@ def parts_of(path: Path) -> dict[str, Path]:
 
 
 def splat_widths(path: Path, finest: Splats) -> list[float]:
-    """How wide the splats of each level are, in world units: two standard deviations of the middle
-    one of the finest, and so much more where there are fewer. Raises SplatError."""
+    """The width of the splats of each level in world units: two median standard deviations of the
+    finest level, scaled by the square root of the ratio of counts. Raises SplatError."""
     with reading(path):
         meta = json.loads(path.read_text(encoding="utf-8"))
         counts = np.zeros(meta["lodLevels"])
-        waiting = [meta["tree"]]
-        while waiting:
-            node = waiting.pop()
-            waiting += node.get("children") or []
-            for level, at in (node.get("lods") or {}).items():
+        for lods in _leaf_lods(meta["tree"]):
+            for level, at in lods.items():
                 counts[int(level)] += at["count"]
     if not len(finest):
         return [0.0] * len(counts)
@@ -331,22 +334,22 @@ def _source(folder: Path, name: Any) -> Source:
 
 
 def _checked(
-    source: Source, wanted: list[tuple[int, int]] | None
+    source: Source, rows: list[tuple[int, int]] | None
 ) -> tuple[int, list[tuple[int, int]]]:
-    """(SH degree, rows wanted) of a chunk; None wants all. No row is there twice."""
+    """(SH degree, rows) of a chunk, checked for overlaps; None stands for all rows."""
     meta = source.meta()
     rest = meta.get("shN")
     degree = rest.get("bands", 0) if isinstance(rest, dict) else 0
-    if wanted is None:
+    if rows is None:
         return degree, [(0, meta["count"])]
     end = 0
-    for offset, count in wanted:
+    for offset, count in rows:
         if offset < end:
             raise BadFileError("its tree names rows of a chunk twice")
         end = offset + count
     if end > meta["count"]:
         raise BadFileError("its tree names rows that a chunk does not have")
-    return min(degree, 3) if isinstance(degree, int) else 0, wanted
+    return min(degree, 3) if isinstance(degree, int) else 0, rows
 
 
 def _fill(out: Splats, values: Splats) -> None:

@@ -1,4 +1,4 @@
-"""In which units a file of ours says that it is."""
+"""The units that our files declare."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 from stages.base.bad_files import reading
 
 _START_BYTES = 1 << 16
-_SAYS = re.compile(rb"\bunits\"?\s*[:=]\s*\"?metres\b")
+_METRES = re.compile(rb"\bunits\"?\s*[:=]\s*\"?metres\b")
 
 
 def units_of(path: Path) -> str:
-    """ "metres" where the file begins by saying so, as .ply, glTF and .sog of ours do; else
+    """ "metres" where the start of the file declares it, as our .ply, glTF and .sog do; else
     "arbitrary". Raises SplatError "splats-unreadable"."""
     with reading(Path(path)), Path(path).open("rb") as file:
         start = file.read(_START_BYTES)
-    return "metres" if _SAYS.search(start) else "arbitrary"
+    return "metres" if _METRES.search(start) else "arbitrary"

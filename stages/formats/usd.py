@@ -1,8 +1,7 @@
 """USD: .usda, .usdc and .usdz with the schema ParticleField3DGaussianSplat (usd-core >= 26.3).
 
-Linear scales and opacities, raw SH with all bands of one splat together, y up: the splats are
-turned upright. What a file leaves out silently becomes identity, unit scale, opaque or grey in
-viewers, and degree 3: so everything is written.
+Linear scales and opacities, SH coefficients of one splat together, y up. Viewers silently replace
+missing attributes by identity, unit scale, opaque, grey and degree 3, so all are written.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from stages.base.blocks import reported_blocks
 from stages.formats.values import drop_undrawable, linear_opacities, linear_scales, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import flipped
+from stages.scene.rotations import matrices_of
 
 _ROOT, _PRIM = "/Scene", "/Scene/Splats"
 
@@ -30,8 +30,8 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats` as `path` (.usda, .usdc or .usdz); return how many could not be drawn and
     were left out.
 
-    Positions stay relative to `splats.origin`, which float32 could not hold; customLayerData says
-    it, in the file's axes, together with the units. Raises SplatError when the file cannot be
+    Positions stay relative to `splats.origin`; customLayerData holds it, in the axes of the file,
+    together with the units. Raises SplatError when the file cannot be
     written.
     """
     path = Path(path)
@@ -50,7 +50,9 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
     layer = Sdf.Layer.CreateAnonymous(suffix)
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # also where nobody knows: `units` says which
+    UsdGeom.SetStageMetersPerUnit(
+        stage, 1.0
+    )  # also for arbitrary units, which customLayerData names
     root = UsdGeom.Xform.Define(stage, _ROOT).GetPrim()
     stage.SetDefaultPrim(root)
     note: dict[str, Any] = {"units": units}
@@ -62,11 +64,11 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
     base = splats.with_sh_degree(0)
     positions = _filled(Vt.Vec3fArray, base, lambda block: block.means)
     field.CreatePositionsAttr(positions)
-    # Gf keeps the real part last in memory, although it is written first.
-    turns = _filled(
+    # Gf stores the real part last in memory, although it is the first argument.
+    rotations = _filled(
         Vt.QuatfArray, base, lambda block: unit_quaternions(block.quaternions)[:, [1, 2, 3, 0]]
     )
-    field.CreateOrientationsAttr(turns)
+    field.CreateOrientationsAttr(rotations)
     field.CreateScalesAttr(_filled(Vt.Vec3fArray, base, linear_scales))
     field.CreateOpacitiesAttr(_filled(Vt.FloatArray, base, linear_opacities))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.sh_degree)
@@ -82,8 +84,8 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
 
 
 def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any]]) -> Any:
-    """A USD array of `values_of` the upright splats. The library copies what it is given, so it
-    is given a block at a time."""
+    """A USD array of `values_of` the splats, y up. The library copies its arguments, so it gets
+    one block at a time."""
     array, end = kind(0), 0
     for rows in reported_blocks(len(splats)):
         values = np.ascontiguousarray(values_of(flipped(splats.take(rows))), np.float32)
@@ -95,7 +97,7 @@ def _filled(kind: Any, splats: Splats, values_of: Callable[[Splats], NDArray[Any
 
 
 def _extent(splats: Splats) -> NDArray[np.float32]:
-    """[2, 3] the box of all ellipsoids of 3 standard deviations, upright."""
+    """[2, 3] the bounding box of all ellipsoids of 3 standard deviations, y up."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for rows in reported_blocks(len(splats)):
         block = flipped(splats.take(rows))
@@ -108,16 +110,9 @@ def _extent(splats: Splats) -> NDArray[np.float32]:
 
 
 def _reach(unit: NDArray[np.float32], scales: NDArray[np.float32]) -> NDArray[np.float64]:
-    """[N, 3] half the box of each ellipsoid."""
-    w, x, y, z = unit.astype(np.float64).T
-    rows = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    squares = np.einsum("ijn,nj->ni", rows**2, scales.astype(np.float64) ** 2)
+    """[N, 3] half the bounding box of each ellipsoid."""
+    axes = matrices_of(unit)
+    squares = np.einsum("nij,nj->ni", axes**2, scales.astype(np.float64) ** 2)
     return np.asarray(3 * np.sqrt(squares))
 
 
@@ -133,9 +128,9 @@ def _export(layer: Any, path: Path) -> None:
 
 
 def _write_package(path: Path, splats: Splats, units: str, name: str) -> None:
-    """A .usdz: an uncompressed zip with every file aligned to 64 bytes, the first file the scene.
+    """Write a .usdz: an uncompressed zip with files aligned to 64 bytes, the scene first.
 
-    The zip writer copies the time of the file, in local time: a fixed one keeps the bytes equal.
+    The zip writer copies the local time of the file; a fixed time keeps the bytes equal.
     """
     from pxr import Sdf
 
@@ -150,6 +145,6 @@ def _write_package(path: Path, splats: Splats, units: str, name: str) -> None:
 
 
 def _archive_name(name: str) -> str:
-    """Plain ASCII: brackets separate names inside packages, and zip has several encodings."""
+    """An ASCII name: brackets separate names inside packages, and zip has several encodings."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in name)
     return plain.lstrip(".") or "scene.usdc"

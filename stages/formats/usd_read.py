@@ -1,8 +1,8 @@
-"""Reading Gaussian splats from USD, in a process of its own.
+"""Reading Gaussian splats from USD, in a child process.
 
-The USD library ends the whole process when it meets some kinds of damage in a .usdc, so the file
-is opened by a child: `python -m stages.formats.usd_read FILE OUTPUT [keep-damage]` leaves the
-splats in OUTPUT (see stages.scene.storage) or says on its standard output why not.
+The USD library aborts the process for some kinds of damage in a .usdc, so a child opens the file:
+`python -m stages.formats.usd_read FILE OUTPUT [allow-nonfinite]` writes the splats to OUTPUT (see
+stages.scene.storage) or prints the reason why it cannot.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from stages.scene.flip import flipped
 from stages.scene.recentring import recentred
 
 _TYPE = "ParticleField3DGaussianSplat"
-_REFUSED = 3  # exit status of the child when it found what is wrong
+_REFUSED = 3  # exit status of the child when it printed a reason
 _TIMEOUT_SECONDS = 600
-# Address space of the child: the library's own, and per byte of file (arrays may be compressed).
+# Address space of the child: of the library, and per byte of the file (arrays may be compressed).
 _BASE_BYTES, _BYTES_PER_BYTE = 4 << 30, 64
 
 
 def read(path: Path) -> Splats:
-    """All Gaussian splats of a USD file, turned to y down, float32.
+    """All Gaussian splats of a USD file, y down, float32.
 
-    Prims may be moved and scaled evenly; up axis y. What is placed far from zero keeps its
-    precision in `origin`. Raises SplatError "splats-unreadable" for a
-    damaged file, one without splats, one that refers to other files, or one with rotated prims.
+    Prims may be translated and uniformly scaled; the up axis must be y. Positions far from zero
+    keep their precision in `origin`. Raises SplatError "splats-unreadable" for a damaged file, one
+    without splats, one that refers to other files, or one with rotated prims.
     """
     path = Path(path)
     with reading(path), tempfile.TemporaryDirectory() as folder:
@@ -55,13 +55,13 @@ def read(path: Path) -> Splats:
             "stages.formats.usd_read",
             str(path.resolve()),
             str(output),
-            *(["keep-damage"] if allows_nonfinite() else []),
+            *(["allow-nonfinite"] if allows_nonfinite() else []),
         ]
         try:
             child = subprocess.run(
                 command,
                 capture_output=True,
-                # The library writes its crash reports there: let them go with the folder.
+                # The library writes crash reports there; they are deleted with the folder.
                 env={**os.environ, "TMPDIR": folder},
                 cwd=Path(__file__).resolve().parents[2],
                 timeout=_TIMEOUT_SECONDS,
@@ -109,7 +109,7 @@ def _origin(stage: Any) -> NDArray[np.float64]:
 
 
 def _splats(prim: Any) -> Splats:
-    """One particle field, in the file's axes."""
+    """One particle field, in the axes of the file."""
     means = _array(prim, "positions", 3)
     n = len(means)
     orientations = _array(prim, "orientations", 4)
@@ -126,7 +126,7 @@ def _splats(prim: Any) -> Splats:
             raise BadFileError(f"it has {given} {name} for {n} splats, wanted {length}")
     scale, offset = _placement(prim)
     return Splats(
-        means=means.astype(np.float64) * scale + offset,  # `parse` brings them near zero
+        means=means.astype(np.float64) * scale + offset,  # `parse` recentres them
         quaternions=orientations[:, [3, 0, 1, 2]],
         log_scales=log_scales_of(scales, scale),
         opacity_logits=logits_of(opacities),
@@ -168,7 +168,7 @@ def _limit_memory(path: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """The child: exit status 0 with the splats in the second file, or 3 with the reason said."""
+    """The child. Exit status 0: the splats are in the second file; 3: the reason is printed."""
     source, output = map(Path, arguments[:2])
     _limit_memory(source)
     try:
@@ -177,7 +177,7 @@ def main(arguments: list[str]) -> int:
     except BadFileError as error:
         print(error)
         return _REFUSED
-    except Exception as error:  # the library's errors, and what its damaged values lead to
+    except Exception as error:  # errors of the library, and consequences of damaged values
         print(f"it is damaged ({' '.join(str(error).split())[:160]})")
         return _REFUSED
     save_splats(output, splats)

@@ -1,4 +1,4 @@
-"""Which splats a file can hold, and the change between our values and linear ones."""
+"""Checks of splat values, and conversion between our encodings and linear values."""
 
 from __future__ import annotations
 
@@ -17,33 +17,31 @@ from stages.base.blocks import blocks, reported_blocks
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
 from stages.scene import Splats
 
-LOG_SCALE_MIN = -87.0  # below it a scale is no normal float32 any more
-# What linear 0 and 1 become: alpha is drawn between 1/255 and 0.99, so neither can be told from
-# the exact value.
+LOG_SCALE_MIN = -87.0  # below it a scale is not a normal float32
+# The logits of opacities 0 and 1. Alpha is drawn between 1/255 and 0.99, so both look exact.
 LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
 _FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
 
-_keeps_damage: ContextVar[bool] = ContextVar("keeps_damage", default=False)
+_allows_nonfinite: ContextVar[bool] = ContextVar("allows_nonfinite", default=False)
 
 
 @contextmanager
 def nonfinite_allowed() -> Iterator[None]:
-    """Inside, readers hand out values that are not finite instead of refusing the file: for who
-    wants to know what is in it."""
-    token = _keeps_damage.set(True)
+    """A context in which readers return values that are not finite instead of refusing the file."""
+    token = _allows_nonfinite.set(True)
     try:
         yield
     finally:
-        _keeps_damage.reset(token)
+        _allows_nonfinite.reset(token)
 
 
 def allows_nonfinite() -> bool:
-    return _keeps_damage.get()
+    return _allows_nonfinite.get()
 
 
 def drawable_rows(splats: Splats) -> NDArray[np.bool_]:
-    """[N] true where every value is finite, the scales can be squared in float32 and the
-    quaternion has a direction: the rule of our rasteriser. The others no viewer can draw."""
+    """[N] whether a splat can be drawn: all values are finite, the squared scales fit float32 and
+    the quaternion can be normalised. This is the rule of our rasteriser."""
     good = np.empty(len(splats), bool)
     for rows in blocks(len(splats)):
         good[rows] = _drawable(splats.take(rows))
@@ -65,13 +63,13 @@ def _drawable(splats: Splats) -> NDArray[np.bool_]:
 
 
 def drop_undrawable(splats: Splats) -> tuple[Splats, int]:
-    """(the drawable splats, how many were dropped)."""
+    """(the drawable splats, the number of others)."""
     kept = select_rows(splats, drawable_rows(splats))
     return kept, len(splats) - len(kept)
 
 
 def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
-    """The rows where `keep` [N] is true, in their order."""
+    """The rows where `keep` [N] is true."""
     if keep.all():
         return splats
     count = int(keep.sum())
@@ -90,8 +88,8 @@ def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
 
 
 def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
-    """[N, 4] w, x, y, z of length 1; the norm is taken in float64, where 1e-20 squared is
-    not 0."""
+    """[N, 4] normalised w, x, y, z. The norm is computed in float64, where 1e-20 squared is not
+    0."""
     unit = np.empty((len(quaternions), 4), np.float32)
     for rows in blocks(len(quaternions)):
         exact = quaternions[rows].astype(np.float64)
@@ -100,8 +98,8 @@ def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def linear_scales(splats: Splats) -> NDArray[np.float32]:
-    """[N, 3] standard deviations; never below the least normal float32, so that a logarithm
-    gives the scale back."""
+    """[N, 3] standard deviations, at least the smallest normal float32, so that the logarithm is
+    reversible."""
     scales = np.empty((len(splats), 3), np.float32)
     for rows in blocks(len(splats)):
         exact = np.maximum(splats.log_scales[rows].astype(np.float64), LOG_SCALE_MIN)
@@ -110,7 +108,7 @@ def linear_scales(splats: Splats) -> NDArray[np.float32]:
 
 
 def linear_opacities(splats: Splats) -> NDArray[np.float32]:
-    """[N] in [0, 1]."""
+    """[N] opacities in [0, 1]."""
     with np.errstate(over="ignore"):
         return (1.0 / (1.0 + np.exp(-splats.opacity_logits.astype(np.float64)))).astype(np.float32)
 
@@ -128,8 +126,8 @@ def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def log_scales_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
-    """[N, 3] the inverse of `linear_scales`, of scales enlarged by `factor`; 0 (a flat splat)
-    becomes the least scale that a float32 keeps. Raises BadFileError for negative scales."""
+    """[N, 3] the inverse of `linear_scales`, for `scales` times `factor`. Scales of 0, of flat
+    splats, become the smallest normal float32. Raises BadFileError for negative scales."""
     logs = np.empty(scales.shape, np.float32)
     for rows in blocks(len(scales)):
         exact = scales[rows].astype(np.float64) * factor
@@ -141,7 +139,7 @@ def log_scales_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[
 
 
 def allocate(count: int, degree: int) -> Splats:
-    """`count` splats for a reader to fill, float32; what they hold is not defined."""
+    """`count` uninitialised float32 splats of an SH degree, for a reader to fill."""
     return Splats(
         means=scratch.empty((count, 3)),
         quaternions=scratch.empty((count, 4)),
@@ -153,21 +151,20 @@ def allocate(count: int, degree: int) -> Splats:
 
 
 def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """[N] the highest degree with a coefficient that is not 0, of `sh` [N, (L + 1)^2, 3]."""
+    """[N] the highest degree with a nonzero coefficient in `sh` [N, (L + 1)^2, 3]."""
     degrees = np.zeros(len(sh), np.uint8)
     for rows in blocks(len(sh)):
         for degree in range(1, round(sh.shape[1] ** 0.5)):
-            band = sh[rows, degree * degree : (degree + 1) ** 2]
-            degrees[rows][(band != 0).any(axis=(1, 2))] = degree
+            coefficients = sh[rows, degree * degree : (degree + 1) ** 2]
+            degrees[rows][(coefficients != 0).any(axis=(1, 2))] = degree
     return degrees
 
 
 def check_finite(splats: Splats) -> Splats:
-    """What a reader hands out: infinite opacity and scale logarithms made finite in their place
-    (files hold them for opaque and for flat splats), and the degree of each splat found.
+    """The result of a reader. Infinite opacity logits and log scales, which files hold for opaque
+    and flat splats, become finite in place, and the SH degree of each splat is found.
 
-    Raises BadFileError if any other value is not finite: such a file is damaged, and silence would
-    move or lose splats.
+    Raises BadFileError if any other value is not finite: such a file is damaged.
     """
     for rows in blocks(len(splats)):
         logits, logs = splats.opacity_logits[rows], splats.log_scales[rows]
@@ -184,7 +181,7 @@ def check_finite(splats: Splats) -> Splats:
 
 
 def count_nonfinite(values: NDArray[np.floating]) -> int:
-    """How many of `values` are NaN or infinite."""
+    """The number of NaN and infinite `values`."""
     return sum(
         int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)) if values.size
     )

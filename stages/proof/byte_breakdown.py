@@ -116,7 +116,7 @@ def spz(path: Path) -> ByteBreakdown:
     if sizes:
         return ByteBreakdown(dict(zip(_SPZ, sizes, strict=False)))
     with path.open("rb") as file:
-        head = GzipReader(file, path.stat().st_size).read(spz_read.HEADER.size)
+        head = GzipReader(file).read(spz_read.HEADER.size)
     _, version, count, degree, bits, _, _ = spz_read.HEADER.unpack(head)
     widths = spz_read.widths(version, degree, bits)
     parts = {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}

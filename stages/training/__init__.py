@@ -1,1 +1,1 @@
-"""Fitting splats to photographs: the step, its loss and optimiser, growth, schedule."""
+"""Training: the loop, its steps, loss, optimiser, densification and schedule, and fine-tuning."""

@@ -1,4 +1,4 @@
-"""Pictures for people: held-out photographs beside their renders, and the course of training."""
+"""The contact sheet of held-out views and the plot of the evaluations during training."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def training_plot(path: Path, history: Sequence[dict[str, Any]]) -> None:
     if len(points) < 2:
         return
     steps = [h["step"] for h in points]
-    figure, quality = new_plot("The course of training", "step", "held-out PSNR (dB)")
+    figure, quality = new_plot("Evaluations during training", "step", "held-out PSNR (dB)")
     counts = quality.twinx()
     counts.set_ylabel("splats")
     lines = [

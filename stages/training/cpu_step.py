@@ -1,4 +1,4 @@
-"""A training step by the CPU kernels: drawing, loss, the way back and Adam, nothing allocated."""
+"""A training step with the CPU kernels: forward pass, loss, backward pass and Adam."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stages.training.dropout import Dropout
 from stages.training.host_step import HostStep
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients
-from stages.training.target import forget_ignored, target_of
+from stages.training.target import ignore_masked, target_of
 from stages.training.views import Level
 
 
@@ -39,8 +39,8 @@ class CpuStep(HostStep):
         target = target_of(level, forward.image, settings.background)
         means = level.means if level.plain else None
         loss = image_loss(pool, forward.image, target, self._v_image, means=means)
-        forget_ignored(level, self._v_image)
+        ignore_masked(level, self._v_image)
         backward = self.rasteriser.backward(arrays, forward, self._v_image, widths)
-        bands = (settings.sh_degree + 1) ** 2
-        apply_gradients(pool, model, backward, bands, rates, camera.width, camera.height)
+        coefficients = (settings.sh_degree + 1) ** 2
+        apply_gradients(pool, model, backward, coefficients, rates, camera.width, camera.height)
         return loss.value

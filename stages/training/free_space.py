@@ -1,9 +1,11 @@
-"""What hangs in the open air: before surfaces that the start knows, where hardly anybody looks.
+"""Removes floaters that appear during training: splats in space that the seeds show to be free.
 
-Growth creeps out of what stands near by. Where many photographs look, the others pull it back; at
-the rims of three or four, nothing does, and a handful of splats dresses in what those photographs
-show behind it. They lose nothing by it, and the next view past them looks into a cloud. The start
-remembers better: its points lie where photographs agree, or as far back as one of them sees.
+Densification lets splats grow away from surfaces. Where many views look, the other views correct
+them; where only two or three do, nothing does, and a few splats near the cameras reproduce what
+those views show behind them. The training loss does not rise, but other views look into a cloud.
+The seed splats know better, because their points lie where views agree or at the depth that one
+view estimated. So a splat is a floater if it lies clearly in front of the seeds in the few views
+that look past it, and at the depth of the seeds in none.
 """
 
 from __future__ import annotations
@@ -16,45 +18,49 @@ from numpy.typing import NDArray
 
 from stages.scene import Camera
 
-CELLS = 32  # along the longer side of a photograph, as the start fills it
-BEFORE = 0.5  # of the depth: nearer than that is before the surface
-BEHIND = 1.15  # of the depth: farther than that, a photograph cannot see it
-WITNESSES = 2  # photographs that look past it: where few look at all, one depth is a guess
-ENOUGH = 4  # photographs that look past it: they would have contradicted what is not there
+CELLS = 32  # along the longer side of a view; about as dense as the seeds
+NEAR = 0.5  # of the seeds' depth: a splat nearer than that is in front of the surface
+FAR = 1.15  # of the seeds' depth: a splat farther than that is hidden from the view
+MIN_VIEWS = 2  # views that look past a floater: the depth of a single view may be wrong
+MAX_VIEWS = 4  # views: so many would have corrected a floater, so what they look past is real
 
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """cameras: of the photographs in training, a pixel for each cell. depths: of the nearest that
-    the start has in each cell and those around it, [H, W], world units; infinite where it has
-    nothing."""
+    """The space that the seeds show to be free.
+
+    Args:
+        cameras: of the training views, with one pixel for each cell.
+        depths: for each camera [H, W], the smallest depth of a seed in a cell and its neighbours,
+            in world units; infinite where there is none.
+    """
 
     cameras: tuple[Camera, ...]
     depths: tuple[NDArray[np.float64], ...]
 
     def contains(self, means: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """[N] which of these places [N, 3] at least WITNESSES and fewer than ENOUGH photographs
-        look past, at something twice as far away, while none has a surface there."""
-        passed = np.zeros(len(means), np.int32)
-        asked = np.flatnonzero(np.isfinite(means).all(1))
+        """[N] which of the positions [N, 3] are in free space: at least MIN_VIEWS and fewer than
+        MAX_VIEWS views see a surface at more than twice their depth, and no view sees one there."""
+        views_past = np.zeros(len(means), np.int32)
+        open_rows = np.flatnonzero(np.isfinite(means).all(1))
         for camera, depths in zip(self.cameras, self.depths, strict=True):
-            rows, of_depth = _of_depth(camera, depths, means[asked])
-            before = of_depth < BEFORE
-            passed[asked[rows[before]]] += 1
-            passed[asked[rows[~before & (of_depth <= BEHIND)]]] = ENOUGH
-            asked = asked[passed[asked] < ENOUGH]
-        return (passed >= WITNESSES) & (passed < ENOUGH)
+            rows, relative = _relative_depths(camera, depths, means[open_rows])
+            in_front = relative < NEAR
+            views_past[open_rows[rows[in_front]]] += 1
+            views_past[open_rows[rows[~in_front & (relative <= FAR)]]] = MAX_VIEWS
+            open_rows = open_rows[views_past[open_rows] < MAX_VIEWS]
+        return (views_past >= MIN_VIEWS) & (views_past < MAX_VIEWS)
 
 
-def known_free_space(start: NDArray[np.floating], cameras: Sequence[Camera]) -> FreeSpace:
-    """As the start knows it, which has something at these places [N, 3]."""
+def known_free_space(seeds: NDArray[np.floating], cameras: Sequence[Camera]) -> FreeSpace:
+    """The free space of seeds at positions [N, 3], as seen by the training views."""
     from scipy.ndimage import minimum_filter
 
-    start = start[np.isfinite(start).all(1)]
+    seeds = seeds[np.isfinite(seeds).all(1)]
     cells = tuple(camera.fitted(CELLS) for camera in cameras)
     depths = []
     for camera in cells:
-        pixels, z = camera.project(start)
+        pixels, z = camera.project(seeds)
         rows = np.flatnonzero((z > 0) & camera.shows(pixels))
         x, y = pixels[rows].astype(np.intp).T
         nearest = np.full((camera.height, camera.width), np.inf)
@@ -63,11 +69,11 @@ def known_free_space(start: NDArray[np.floating], cameras: Sequence[Camera]) -> 
     return FreeSpace(cells, tuple(depths))
 
 
-def _of_depth(
+def _relative_depths(
     camera: Camera, depths: NDArray[np.float64], means: NDArray[np.floating]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """(rows [K] of the places that the camera shows before or behind something known, how far away
-    they are [K], of that something's depth)."""
+    """(rows [K] of the positions that the camera shows where the seeds' depth is known, their
+    depths as multiples of it [K])."""
     pixels, z = camera.project(means)
     rows = np.flatnonzero((z > 0) & camera.shows(pixels))
     x, y = pixels[rows].astype(np.intp).T

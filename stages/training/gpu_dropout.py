@@ -1,27 +1,27 @@
-"""`dropout.Dropout` on a device: the same splats rest, and the host is told nothing."""
+"""`dropout.Dropout` on a device: drops the same splats, without a transfer to the host."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from stages.training.dropout import FACTORS, FEW, LARGEST_SHARE, STRIDE, Dropout
+from stages.training.dropout import FACTORS, INCREMENT, MAX_PROBABILITY, VIEW_SCALE, Dropout
 
-_LOW = 0xFFFFFFFF  # 64-bit integers hold what 32-bit ones would overflow to
+_LOW = 0xFFFFFFFF  # products are computed in 64-bit integers, which hold what 32-bit ones overflow
 
 
-def dropped(dropout: Dropout, seen: Tensor) -> Tensor:
-    """[N] bool: see `Dropout.resting`. seen [N] int32."""
-    n = len(seen)
+def dropped(dropout: Dropout, counts: Tensor) -> Tensor:
+    """[N] bool: see `Dropout.dropped`. counts [N] int32."""
+    n = len(counts)
     if n == 0:
-        return torch.zeros(0, dtype=torch.bool, device=seen.device)
-    photographs = dropout.views * ((seen.double() + 1.0) / (seen.max() + 1.0))
-    share = torch.square(FEW / photographs.clamp(min=1.0)).clamp(max=LARGEST_SHARE)
-    return _noise(n, dropout.key, seen.device) < share * 2.0**32
+        return torch.zeros(0, dtype=torch.bool, device=counts.device)
+    seen_by = dropout.views * ((counts.double() + 1.0) / (counts.max() + 1.0))
+    probability = torch.square(VIEW_SCALE / seen_by.clamp(min=1.0)).clamp(max=MAX_PROBABILITY)
+    return _noise(n, dropout.key, counts.device) < probability * 2.0**32
 
 
 def _noise(n: int, key: int, device: torch.device) -> Tensor:
-    h = (torch.arange(n, device=device) * STRIDE + key) & _LOW
+    h = (torch.arange(n, device=device) * INCREMENT + key) & _LOW
     for shift, factor in FACTORS:
         h = ((h ^ (h >> shift)) * factor) & _LOW
     return h ^ (h >> 16)

@@ -39,8 +39,8 @@ def place(width, height, BLOCK: tl.constexpr):
 
 @inner
 def pictures(image, target, means, unit, at, mask, width, height):
-    """(picture less the target's mean, picture less target) at offsets; 0 where masked. unit: what
-    one of the target's is worth."""
+    """(picture less the target's mean, picture less target) at offsets; 0 where masked. unit: the
+    value of 1 in the target."""
     value = tl.load(image + at, mask=mask, other=0.0)
     level = tl.load(means + at // (width * height), mask=mask, other=0.0)
     wanted = tl.load(target + at, mask=mask, other=0).to(tl.float32) * unit
@@ -212,8 +212,8 @@ def adam_kernel(
     tl.store(rows + at, value - rate[None, :] * m / (tl.sqrt(v) + EPSILON), mask=there)
     gx = tl.load(means2d + 2 * i, mask=moved, other=0.0) * ndc_x
     gy = tl.load(means2d + 2 * i + 1, mask=moved, other=0.0) * ndc_y
-    pull = tl.load(gradient_sum + i, mask=moved, other=0.0) + tl.sqrt(gx * gx + gy * gy)
-    tl.store(gradient_sum + i, pull, mask=moved)
+    total_gradient = tl.load(gradient_sum + i, mask=moved, other=0.0) + tl.sqrt(gx * gx + gy * gy)
+    tl.store(gradient_sum + i, total_gradient, mask=moved)
     seen = tl.load(gradient_count + i, mask=moved, other=0) + 1
     tl.store(gradient_count + i, seen, mask=moved)
 

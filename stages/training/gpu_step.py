@@ -1,8 +1,8 @@
-"""A training step on the GPU: model, moments, photographs and statistics stay there.
+"""A training step on the GPU: model, moments, views and statistics stay there.
 
-A steady step never waits for the device. What the host must know of a step (its loss, whether its
-lists had room) arrives LAG steps later; lists without room leave the model as it was, and get more
-room once that is known.
+A step does not wait for the device. What the host needs from a step (its loss, and whether its
+intersection lists had enough room) arrives LAG steps later. A step whose lists had too little room
+leaves the model as it was, and the lists are enlarged once the host knows.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from stages.training.optimiser import (
 )
 from stages.training.views import Level
 
-LAG = 8  # steps after which the host reads what a step said
-SPARE = 1.5  # room for the lists, of what the fullest view so far took
+LAG = 8  # steps after which the host reads the results of a step
+SPARE = 1.5  # room for the lists, relative to the largest number so far
 
 
 class Arrivals:
-    """Pairs of numbers on their way from the device to the host, read `lag` steps late."""
+    """Pairs of numbers that are copied from the device to the host and read `lag` steps later."""
 
     def __init__(self, device: torch.device, lag: int) -> None:
         self.lag, self.sent = lag, 0
@@ -56,7 +56,7 @@ class Arrivals:
         self.sent += 1
 
     def read(self) -> tuple[float, float]:
-        """The pair sent `lag` steps ago; the newest, waited for, while there were not as many."""
+        """The pair sent `lag` steps ago; at first, the newest one, which is waited for."""
         late = self.lag if self.sent > self.lag else 0
         slot = (self.sent - 1 - late) % (self.lag + 1)
         if self.on_device:
@@ -65,7 +65,7 @@ class Arrivals:
 
 
 class GpuStep:
-    """See `step.TrainingStep`. skipped: steps that had no room for their lists."""
+    """See `step.TrainingStep`. skipped: number of steps whose lists had too little room."""
 
     def __init__(self, rasteriser: GpuRasteriser, lag: int | None = None) -> None:
         self.rasteriser, self.device = rasteriser, rasteriser.device
@@ -73,7 +73,7 @@ class GpuStep:
         self._arrivals = Arrivals(
             self.device, (0 if interpreted() else LAG) if lag is None else lag
         )
-        self._photographs: dict[int, GpuTarget] = {}
+        self._targets: dict[int, GpuTarget] = {}
         self._corrections = self._on_device(bias_corrections())
         self._unsmoothed = torch.zeros(0, device=self.device)
         self._on_host: Model | None = None
@@ -98,7 +98,7 @@ class GpuStep:
     def model(self) -> Model:
         """See `step.TrainingStep`."""
         if self._on_host is None:
-            rows, coefficients = _host(self._scene.rows), self._scene.coefficients
+            rows, coefficients = _host(self._scene.rows), self._scene.bands
             means, quaternions, log_scales = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
             sh = rows[:, SH : SH + 3 * coefficients].reshape(len(rows), coefficients, 3)
             own = (means, quaternions, log_scales, rows[:, OPACITY], sh, self._sh_degrees)
@@ -118,17 +118,17 @@ class GpuStep:
     ) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
         with gpu_errors_explained(len(self)):
-            known = id(level.means) in self._photographs
-            photograph = self._resident(level)
-            view = photograph.view(self.rasteriser, settings)
+            known = id(level.means) in self._targets
+            view_target = self._target(level)
+            view = view_target.view(self.rasteriser, settings)
             scene, room = self._drawn_scene(smooth, dropout), self._room if known else None
             drawn = self.rasteriser.draw(scene, view, capacity=room)
-            if room is None:  # nothing of this photograph is known yet: it was waited for
+            if room is None:  # the first step on this view waits for the device
                 room = len(drawn.lists.members)
                 self._room = max(self._room, int(SPARE * room))
-            target, means = photograph.target(drawn.image, settings.background)
+            target, means = view_target.target(drawn.image, settings.background)
             loss, v_image = image_loss(drawn.image, target, means)
-            photograph.forget_ignored(v_image)
+            view_target.ignore_masked(v_image)
             parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
             if self._own is not None:
                 parameters *= self._own[:, : parameters.shape[1]]
@@ -152,13 +152,13 @@ class GpuStep:
         if dropout is not None:
             rows = rows.clone()
             rows[:, OPACITY].masked_fill_(dropped(dropout, self._gradient_count), INVISIBLE)
-        return Scene(rows, self._scene.coefficients, widths)
+        return Scene(rows, self._scene.bands, widths)
 
-    def _resident(self, level: Level) -> GpuTarget:
-        key = id(level.means)  # which stay the same object, however often a level is read
-        if key not in self._photographs:
-            self._photographs[key] = gpu_target_of(level, self.device)
-        return self._photographs[key]
+    def _target(self, level: Level) -> GpuTarget:
+        key = id(level.means)  # the same object each time that a level is read
+        if key not in self._targets:
+            self._targets[key] = gpu_target_of(level, self.device)
+        return self._targets[key]
 
     def _adam(
         self,
@@ -182,14 +182,14 @@ class GpuStep:
             *(0.5 * view.width / pixels, 0.5 * view.height / pixels),
             COLUMNS=columns,
             OUT_COLUMNS=out_columns,
-            ACTIVE=active_counts(view.coefficients(self._scene)),
+            ACTIVE=active_counts(view.bands(self._scene)),
             WIDTH=triton.next_power_of_2(out_columns),
             BLOCK=block,
         )
 
     def _own_columns(self, model: Model) -> Tensor | None:
-        """[N, columns] 0 where a gradient is of a band above the splat's own degree, else 1; None
-        where every splat has all bands."""
+        """[N, columns] 0 for SH coefficients above a splat's own degree, else 1; None if every
+        splat has all coefficients."""
         coefficients = model.sh.shape[1]
         own = (model.sh_degrees.astype(np.int64) + 1) ** 2
         if (own >= coefficients).all():

@@ -1,4 +1,4 @@
-"""A photograph on the GPU, and what it asks of its drawing, without a word to the host."""
+"""A training view on the GPU and its target (see `target`), without transfers to the host."""
 
 from __future__ import annotations
 
@@ -19,49 +19,56 @@ from stages.training.views import Level
 
 @dataclass
 class GpuTarget:
-    """pixels [3, H, W]: bytes, or where light was taken out of them or they are cut out float32.
-    means [3]. uncovered [H, W]: how much of the background shows, where a photograph is cut out.
-    ignored [H, W], bright [3, H, W]: where nothing is asked, and where no less than the value is.
+    """A training view on a device.
+
+    Args:
+        level: the view; kept because `gpu_step` identifies views by its means.
+        pixels: [3, H, W] bytes, or float32 if the light is corrected or the view is cut out.
+        means: [3] of the channels.
+        uncovered: [H, W] how much of the background shows in a cut-out view.
+        ignored: [H, W] where the render is not compared.
+        bright: [3, H, W] where the view is overexposed.
+        cameras: on the device, by the settings that they depend on.
     """
 
-    level: Level  # kept: `gpu_step` knows photographs by its means
+    level: Level
     pixels: Tensor
     means: Tensor
     uncovered: Tensor | None = None
     ignored: Tensor | None = None
     bright: Tensor | None = None
-    cams: dict[Any, View] = field(default_factory=dict)
+    cameras: dict[Any, View] = field(default_factory=dict)
 
     def view(self, rasteriser: GpuRasteriser, settings: RasterSettings) -> View:
-        """The photograph's camera; sent to the device once for what it holds of the settings."""
+        """The view's camera, which is sent to the device once for each value of these settings."""
         key = settings.near, settings.dilation_px2, settings.antialias
-        if key not in self.cams:
-            self.cams[key] = rasteriser.view(self.level.camera, settings)
-        known = self.cams[key]
+        if key not in self.cameras:
+            self.cameras[key] = rasteriser.view(self.level.camera, settings)
+        known = self.cameras[key]
         return View(known.cam, known.width, known.height, settings)
 
     def target(self, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
-        """(what `image` [>= 3, H, W] is to be compared with, its channels' means)."""
+        """(the target for `image` [>= 3, H, W], the means of its channels)."""
         if self.level.plain:
             return self.pixels, self.means
-        asked = self.pixels
+        target = self.pixels
         if self.bright is not None:
-            asked = torch.where(self.bright, torch.maximum(asked, image[:3]), asked)
+            target = torch.where(self.bright, torch.maximum(target, image[:3]), target)
         if self.uncovered is not None:
             behind = [self.uncovered * channel for channel in background]
-            asked = asked + torch.stack(behind)
+            target = target + torch.stack(behind)
         if self.ignored is not None:
-            asked = torch.where(self.ignored, image[:3], asked)
-        return asked, asked.mean((1, 2))
+            target = torch.where(self.ignored, image[:3], target)
+        return target, target.mean((1, 2))
 
-    def forget_ignored(self, v_image: Tensor) -> None:
-        """No gradient [3, H, W] where the photograph is to be ignored."""
+    def ignore_masked(self, v_image: Tensor) -> None:
+        """Set the gradient [3, H, W] to 0 in the view's ignored region."""
         if self.ignored is not None:
             v_image.masked_fill_(self.ignored, 0.0)
 
 
 def gpu_target_of(level: Level, device: torch.device) -> GpuTarget:
-    """The photograph, on the device."""
+    """The view, on the device."""
 
     def sent(array: Any) -> Tensor:
         return torch.tensor(array, device=device)

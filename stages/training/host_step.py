@@ -1,4 +1,4 @@
-"""What training steps share that keep the model in arrays of this machine's memory."""
+"""The part that all training steps share whose model is in NumPy arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stages.training.optimiser import Model, empty_model
 
 
 class HostStep:
-    """See `step.TrainingStep`; `step` is left to who inherits."""
+    """See `step.TrainingStep`; subclasses add `step`."""
 
     def __init__(self, rasteriser: Rasteriser) -> None:
         self.rasteriser = rasteriser
@@ -37,10 +37,10 @@ class HostStep:
         return self._model.smoothing if smooth else NO_SMOOTHING
 
     def arrays(self, dropout: Dropout | None) -> Arrays:
-        """The model's, with what sits this step out made invisible."""
+        """The model's arrays, with dropped splats made invisible."""
         arrays = self._model.arrays
         if dropout is None:
             return arrays
-        resting = dropout.resting(self._model.gradient_count)
-        logits = np.where(resting, np.float32(INVISIBLE), self._model.opacity_logits)
+        dropped = dropout.dropped(self._model.gradient_count)
+        logits = np.where(dropped, np.float32(INVISIBLE), self._model.opacity_logits)
         return (*arrays[:3], logits, arrays[4])

@@ -1,4 +1,4 @@
-"""The training loss: what it is worth and its gradient."""
+"""The training loss (Kerbl et al. 2023) and its gradient."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SSIM_WEIGHT = 0.2  # Kerbl et al. 2023
 @dataclass(frozen=True)
 class Loss:
     """value = 0.8 l1 + 0.2 (1 - ssim); v_image [3, H, W]: gradient of H x W x value, so that its
-    entries do not shrink with the picture."""
+    entries do not depend on the size of the picture."""
 
     value: float
     l1: float
@@ -45,7 +45,7 @@ def image_loss(
 ) -> Loss:
     """Compare image [>= 3, H, W] with target [3, H, W]; the gradient is written to v_image.
 
-    target: float32 in 0..1, or bytes. means: its `channel_means`, if they are known.
+    target: float32 in 0..1, or bytes. means: its `channel_means`, if known.
     """
     _, height, width = target.shape
     means = channel_means(target) if means is None else means

@@ -1,4 +1,4 @@
-"""A training step that goes on with fewer splats where a device's memory is full."""
+"""A training step that continues with fewer splats if a device's memory is full."""
 
 from __future__ import annotations
 
@@ -21,8 +21,12 @@ Made = TypeVar("Made")
 
 
 class MemoryLimitedStep:
-    """See `step.TrainingStep`. inner: whose device it is. full: is told how many splats fit, each
-    time that they have to get fewer. Raises MemoryFull where none would fit."""
+    """See `step.TrainingStep`. Raises MemoryFull if no splat fits.
+
+    Args:
+        inner: the training step of the device.
+        full: is called with the number of splats that fit whenever it falls.
+    """
 
     def __init__(self, inner: TrainingStep, full: Callable[[int], None]) -> None:
         self.inner, self._full = inner, full
@@ -31,7 +35,7 @@ class MemoryLimitedStep:
         return len(self.inner)
 
     def load(self, model: Model) -> None:
-        """See `step.TrainingStep`; as much of the model as there is room for."""
+        """See `step.TrainingStep`; loads the most opaque splats that fit."""
         while (fits := self._refused(partial(self.inner.load, model), len(model))) is not None:
             model = most_opaque(model, fits)
 
@@ -61,7 +65,8 @@ class MemoryLimitedStep:
         return found[0]
 
     def _refused(self, work: Callable[[], None], splats: int) -> int | None:
-        """How many of the splats fit, if the work did not; by then all that it held is let go."""
+        """Do the work; None if it succeeded, else how many of the splats fit. By then the memory of
+        the work is free again."""
         try:
             work()
         except MemoryFull as full:

@@ -1,8 +1,8 @@
-"""Adam (Kingma and Ba 2015), sparse: on the splats that a step has seen; or dense, on all.
+"""Adam (Kingma and Ba 2015), sparse: it updates the splats that are visible in a step, or all.
 
-A splat out of view keeps its moments and its own counts of steps, and its bias correction follows
-those counts: the first step of a splat first seen late is lr, not 3 lr. There is a count for each
-group of columns that may begin by itself: the opacity, and a band of SH when it is switched on.
+A splat that is not visible keeps its moments and its own numbers of steps, and its bias correction
+uses those numbers: the first step of a splat that is first visible late is lr, not 3 lr. Each group
+of columns that starts by itself has a number of steps: the opacity, and each SH degree.
 """
 
 from __future__ import annotations
@@ -44,39 +44,41 @@ BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
 # loss: 1e-15, as often used, turns rounding noise into whole steps.
 EPSILON = 1e-4
-# A gradient beyond it is an accident: its step is left out. No honest one comes near, its square is
-# far from float32's end, and one of 1e15 taken in would leave the splat standing for 70,000 steps.
+# A step with a larger gradient is skipped: it is a numerical accident. Valid gradients are much
+# smaller. The square of this one is far from overflow in float32. A gradient of 1e15 in the moments
+# would keep the splat from moving for 70,000 steps.
 LARGEST_GRADIENT = 1e12
-# Columns of `Model.steps`: of all that is there from the start, of the opacity, of the bands of SH.
-BASIC_STEPS, OPACITY_STEPS, BAND_STEPS = 0, 1, 2
-STEP_COUNTS = BAND_STEPS + 3
+# Columns of `Model.steps`: all parameters from the start, the opacity, SH degrees 1 to 3.
+BASIC_STEPS, OPACITY_STEPS, SH_STEPS = 0, 1, 2
+STEP_COUNTS = SH_STEPS + 3
 CHUNK = 512
 _F = np.float32
 
 
 def _column_counts() -> NDArray[np.int64]:
-    """[64] by which count each column of a gradient row goes."""
+    """[64] the column of `Model.steps` that each column of a gradient row uses."""
     counts = np.full(gradient_columns(16), BASIC_STEPS)
     counts[OPACITY] = OPACITY_STEPS
     for degree in (1, 2, 3):
-        counts[used_columns(degree**2) :] = BAND_STEPS + degree - 1
+        counts[used_columns(degree**2) :] = SH_STEPS + degree - 1
     return counts
 
 
-def active_counts(bands: int) -> int:
-    """How many of the counts, from the first, have a part in a step with `bands` of SH."""
-    return BAND_STEPS + math.isqrt(bands) - 1
+def active_counts(coefficients: int) -> int:
+    """How many columns of `Model.steps`, from the first, a step with so many SH coefficients
+    advances."""
+    return SH_STEPS + math.isqrt(coefficients) - 1
 
 
 COLUMN_COUNTS = _column_counts()
-# [STEP_COUNTS x 64] 1 where a column goes by that count, else 0
+# [STEP_COUNTS x 64] 1 where a column uses that count, else 0
 _GROUPS = (np.arange(STEP_COUNTS)[:, None] == COLUMN_COUNTS).astype(np.float32).ravel()
 GROUP_SIZE = len(COLUMN_COUNTS)
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Step sizes, in the units of the parameters (means: world units)."""
+    """Learning rates, in the units of the parameters (means: world units)."""
 
     means: float = 0.0
     quaternions: float = 1e-3
@@ -86,7 +88,7 @@ class LearningRates:
     sh_rest: float = 1.25e-4
 
     def scaled(self, means: float, factor: float) -> LearningRates:
-        """All rates times `factor`, but for that of the means, which is given."""
+        """All rates times `factor`, but that of the means, which is `means`."""
         return LearningRates(
             means,
             self.quaternions * factor,
@@ -96,18 +98,18 @@ class LearningRates:
             self.sh_rest * factor,
         )
 
-    def row(self, bands: int) -> NDArray[np.float32]:
-        """One rate for each column of a gradient row with `bands` of SH."""
-        rates = np.zeros(gradient_columns(bands), np.float32)
+    def row(self, coefficients: int) -> NDArray[np.float32]:
+        """The rate of each column of a gradient row with so many SH coefficients."""
+        rates = np.zeros(gradient_columns(coefficients), np.float32)
         rates[MEAN:ROTATION], rates[ROTATION:LOG_SCALE] = self.means, self.quaternions
         rates[LOG_SCALE:OPACITY], rates[OPACITY] = self.log_scales, self.opacity_logits
-        rates[SH:SH_REST], rates[SH_REST : used_columns(bands)] = self.sh_dc, self.sh_rest
+        rates[SH:SH_REST], rates[SH_REST : used_columns(coefficients)] = self.sh_dc, self.sh_rest
         return rates
 
 
 @kernel
 def _count(steps, i, counts, corrections, scales):
-    """One step more in the first `counts` counts of row i; their bias corrections into `scales`."""
+    """Advance the first `counts` counts of row i; write their bias corrections into `scales`."""
     last = len(corrections) - 1
     for group in range(counts):
         steps[i, group] += 1
@@ -117,7 +119,7 @@ def _count(steps, i, counts, corrections, scales):
 
 @kernel
 def _scales_of(scales, counts, k):
-    """Bias corrections of columns k to k + 16, of both moments."""
+    """Bias corrections of both moments for columns k to k + 16."""
     scale1, scale2 = splat16(_F(0.0)), splat16(_F(0.0))
     for group in range(counts):
         share = vload(_GROUPS, group * GROUP_SIZE + k)
@@ -150,14 +152,18 @@ def adam_step(
     gradient_sum,
     gradient_count,
 ):
-    """Move the visible splats; add up the size of their mean's gradient on the picture.
+    """Update the visible splats; accumulate the norm of the gradient by their 2D positions.
 
-    gradients, means2d: see `cpu.Backward`. steps [N, STEP_COUNTS], of which the first `counts` have
-    a part in this step. corrections [T, 2]: 1 / (1 - beta^t) of both betas. rates [columns of
-    gradients]. ndc_x, ndc_y: factors that take a gradient per pixel to the units
-    of the densification threshold. sh [N, 3 bands]: a 2-D view; what lies above a splat's own
-    degree in sh_degrees [N] stays as it is. A splat with a gradient beyond
-    LARGEST_GRADIENT, or with one that is not finite, stays as it is.
+    A splat with a gradient larger than LARGEST_GRADIENT, or not finite, does not change.
+
+    Args:
+        visible, gradients, means2d: see `raster.definition.Backward`.
+        sh: [N, 3 coefficients], 2-D; coefficients above a splat's degree do not change.
+        sh_degrees: [N].
+        steps: [N, STEP_COUNTS], of which the first `counts` are advanced.
+        corrections: [T, 2] 1 / (1 - beta^t) of both betas.
+        rates: [columns of gradients] learning rates.
+        ndc_x, ndc_y: factors from a gradient per pixel to the units of the densification threshold.
     """
     n = len(visible)
     columns = gradients.shape[1]
@@ -212,11 +218,11 @@ def bias_corrections() -> NDArray[np.float32]:
 
 @dataclass
 class Model:
-    """The splats in training and all that their optimisation remembers.
+    """The splats in training and the state of their optimiser.
 
-    Parameters as in `Splats`, float32; sh_degrees too: what a splat has no bands for is not
-    trained. moment1, moment2: columns as the gradient's, for all bands.
-    steps [N, STEP_COUNTS] int32: how often each was moved, by groups of columns. gradient_sum,
+    Parameters as in `Splats`, float32; sh_degrees too: coefficients above a splat's degree are not
+    trained. moment1, moment2: columns as the gradient's, for all coefficients.
+    steps [N, STEP_COUNTS] int32: numbers of steps, by groups of columns. gradient_sum,
     gradient_count [N]: since the last densification. smoothing [N]: widths of the 3D smoothing
     filter, 0 for none.
     """
@@ -243,7 +249,7 @@ class Model:
         return (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh)
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Model:
-        """The rows named by an index or a mask, moments and all."""
+        """The rows of an index or a mask, with their moments."""
         return Model(*(np.ascontiguousarray(array[index]) for array in vars(self).values()))
 
     def joined(self, other: Model) -> Model:
@@ -252,7 +258,7 @@ class Model:
         return Model(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
 
     def fresh(self) -> Model:
-        """The same parameters with nothing remembered."""
+        """A copy of the parameters with a new optimiser state."""
         found = new_model(*(array.copy() for array in self.arrays))
         found.sh_degrees[:] = self.sh_degrees
         return found
@@ -269,7 +275,7 @@ def new_model(
     opacity_logits: NDArray[np.float32],
     sh: NDArray[np.float32],
 ) -> Model:
-    """A model whose optimiser has seen nothing; each splat has all the bands of `sh`."""
+    """A model with a new optimiser state; each splat has all coefficients of `sh`."""
     n, columns = len(means), gradient_columns(sh.shape[1])
     return Model(
         means,
@@ -300,16 +306,17 @@ def apply_gradients(
     pool: Pool,
     model: Model,
     backward: Backward,
-    bands: int,
+    coefficients: int,
     rates: LearningRates,
     width: int,
     height: int,
     dense: bool = False,
 ) -> None:
-    """One step of Adam on `model`, in place. bands: of SH that the gradients hold.
+    """One step of Adam on `model`, in place. coefficients: number of SH coefficients that the
+    gradients hold.
 
-    dense: splats out of view take part with a gradient of 0, as in Adam on whole tensors: they
-    coast on, and their moments fade. It costs a pass over the whole model.
+    dense: splats that are not visible are updated with a gradient of 0, as in Adam on whole
+    tensors: they keep moving, and their moments decay. It costs a pass over the whole model.
     """
     pixels = width * height
     rows, parameters, means2d = backward.rows, backward.parameters, backward.means2d
@@ -335,9 +342,9 @@ def apply_gradients(
         model.moment1,
         model.moment2,
         model.steps,
-        active_counts(bands),
+        active_counts(coefficients),
         _CORRECTIONS,
-        rates.row(bands),
+        rates.row(coefficients),
         np.float32(0.5 * width / pixels),
         np.float32(0.5 * height / pixels),
         model.gradient_sum,

@@ -1,6 +1,6 @@
 """A training step for any rasteriser: loss and Adam in float64, written from their definitions.
 
-Slow, and what the kernels' own steps are held to.
+It is slow; the steps with kernels are tested against it.
 """
 
 from __future__ import annotations
@@ -57,18 +57,18 @@ class ReferenceStep(HostStep):
         arrays = self.arrays(dropout)
         forward = self.rasteriser.forward(arrays, camera, settings, widths)
         image = torch.tensor(forward.image[:3], dtype=torch.float64, requires_grad=True)
-        value = photograph_loss(*compared(level, image, settings.background))
+        value = reference_loss(*compared(level, image, settings.background))
         torch.autograd.backward(camera.width * camera.height * value)
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
         backward = self.rasteriser.backward(arrays, forward, v_image, widths)
-        bands = (settings.sh_degree + 1) ** 2
-        adam(model, backward, bands, rates, camera.width, camera.height)
+        coefficients = (settings.sh_degree + 1) ** 2
+        adam(model, backward, coefficients, rates, camera.width, camera.height)
         return float(value.detach())
 
 
 def compared(level: Level, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
-    """(what of the drawing, what of the photograph) the loss is of; see `training.target`."""
+    """(render, target) that the loss compares; see `training.target`."""
     target = torch.tensor(level.pixels, dtype=torch.float64) / 255
     drawn, inside = image.detach(), torch.ones_like(target[0])
     if level.mask is not None:
@@ -84,9 +84,9 @@ def compared(level: Level, image: Tensor, background: Colour) -> tuple[Tensor, T
     return torch.where(inside > 0, image, drawn), torch.where(inside > 0, target, drawn)
 
 
-def photograph_loss(image: Tensor, target: Tensor) -> Tensor:
-    """0.8 L1 + 0.2 (1 - SSIM) of pictures [3, H, W]; beyond the rim both are taken to have the
-    target's mean. See `loss_kernels` for the definition."""
+def reference_loss(image: Tensor, target: Tensor) -> Tensor:
+    """0.8 L1 + 0.2 (1 - SSIM) of pictures [3, H, W]; outside the picture, both have the target's
+    mean. See `loss_kernels` for the definition."""
     mean = target.mean((1, 2), keepdim=True)
     score = _ssim(image - mean, target - mean, mean)
     l1 = (image - target).abs().mean()
@@ -111,25 +111,30 @@ def _ssim(x: Tensor, y: Tensor, mean: Tensor) -> Tensor:
 
 
 def adam(
-    model: Model, backward: Backward, bands: int, rates: LearningRates, width: int, height: int
+    model: Model,
+    backward: Backward,
+    coefficients: int,
+    rates: LearningRates,
+    width: int,
+    height: int,
 ) -> None:
     """One sparse step of Adam, as `optimiser.apply_gradients` does it."""
     whole = (np.abs(backward.parameters) <= LARGEST_GRADIENT).all(1)
     rows, g = backward.rows[whole], backward.parameters[whole].astype(np.float64)
     columns = g.shape[1]
-    model.steps[rows, : active_counts(bands)] += 1
+    model.steps[rows, : active_counts(coefficients)] += 1
     t = np.maximum(model.steps[rows], 1).astype(np.float64)[:, COLUMN_COUNTS[:columns]]
     m = BETA1 * model.moment1[rows, :columns] + (1 - BETA1) * g
     v = BETA2 * model.moment2[rows, :columns] + (1 - BETA2) * g * g
     model.moment1[rows, :columns], model.moment2[rows, :columns] = m, v
-    shift = rates.row(bands) * (m / (1 - BETA1**t)) / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
+    shift = rates.row(coefficients) * (m / (1 - BETA1**t)) / (np.sqrt(v / (1 - BETA2**t)) + EPSILON)
     model.means[rows] -= shift[:, MEAN:ROTATION]
     model.quaternions[rows] -= shift[:, ROTATION:LOG_SCALE]
     model.log_scales[rows] -= shift[:, LOG_SCALE:OPACITY]
     model.opacity_logits[rows] -= shift[:, OPACITY]
-    by_band = shift[:, SH : used_columns(bands)].reshape(len(rows), bands, 3)
-    own = np.arange(bands) < (model.sh_degrees[rows, None].astype(int) + 1) ** 2
-    model.sh[rows, :bands] -= np.where(own[:, :, None], by_band, 0.0)
-    pull = backward.means2d[whole].astype(np.float64) * (0.5 * width, 0.5 * height)
-    model.gradient_sum[rows] += np.hypot(*pull.T) / (width * height)
+    by_coefficient = shift[:, SH : used_columns(coefficients)].reshape(len(rows), coefficients, 3)
+    own = np.arange(coefficients) < (model.sh_degrees[rows, None].astype(int) + 1) ** 2
+    model.sh[rows, :coefficients] -= np.where(own[:, :, None], by_coefficient, 0.0)
+    gradient = backward.means2d[whole].astype(np.float64) * (0.5 * width, 0.5 * height)
+    model.gradient_sum[rows] += np.hypot(*gradient.T) / (width * height)
     model.gradient_count[rows] += 1

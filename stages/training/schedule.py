@@ -1,5 +1,8 @@
-"""What happens at which step. The reference recipe is written for 30,000 steps; all its events
-move with the number of steps that a preset can afford, and with what becomes of it on the way."""
+"""What happens at which step, as in Kerbl et al. 2023.
+
+The published schedule has 30,000 steps. Its events are scaled to the number of steps of the run,
+which may change during the run.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-RECIPE_STEPS = 30_000
+PUBLISHED_STEPS = 30_000
 MEANS_LR = 1.6e-4  # x scene extent
 MEANS_LR_END = 0.01  # of the first
-DENSIFICATION_END = 0.5  # share of the run in which the model grows
+DENSIFICATION_END = 0.5  # share of the run in which the model is densified
 BOOST_POWER, BOOST_MAX = 0.6, 6.0
-RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1  # share of the run; share of the rate at its end
-MIN_DENSIFY_INTERVAL = 50  # steps: fewer do not see enough of the scene to judge a splat by
-# (share of the run, scale of the picture): coarse pictures first, they are cheap and smooth
+# Learning rates decay from this share of the run on, to this share of their value.
+RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
+MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
+# (share of the run, scale of the images): small images first, they are cheap and smooth
 RESOLUTIONS = ((0.2, 0.5), (1.0, 1.0))
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """steps: of the whole run. extent: of the scene, world units. sh_degree: reached at the end.
-    n_start: splats at the start. since: (step, share of the run that was done by then) of the last
-    change of plan."""
+    """The schedule of a run.
+
+    Args:
+        steps: of the whole run.
+        extent: of the scene, world units.
+        sh_degree: of the final model.
+        n_start: number of splats at the start.
+        seed: of all random numbers.
+        since: (step, share of the run done by then) of the last change of the plan.
+    """
 
     steps: int
     extent: float
@@ -31,28 +42,28 @@ class Schedule:
     seed: int
     since: tuple[int, float] = (0, 0.0)
 
-    def _scaled(self, recipe_step: int) -> int:
-        return max(1, round(recipe_step * self.steps / RECIPE_STEPS))
+    def _scaled(self, published_step: int) -> int:
+        return max(1, round(published_step * self.steps / PUBLISHED_STEPS))
 
     def share(self, step: int) -> float:
-        """How much of the run is done before `step`, 0 to 1."""
+        """Share of the run that is done before `step`, 0 to 1."""
         from_step, from_share = self.since
         if from_step == 0:
             return step / self.steps
         return from_share + (1.0 - from_share) * (step - from_step) / (self.steps - from_step)
 
     def passes(self, step: int, parts: int) -> bool:
-        """Whether `step` steps end one of `parts` equal parts of the run."""
+        """Whether one of `parts` equal parts of the run ends after `step` steps."""
         before, now = (int(parts * self.share(s) + 1e-9) for s in (step - 1, step))
         return step == self.steps or now > before
 
     def as_planned(self, steps: int, since: int, share: float) -> Schedule:
-        """The same run under a plan that was made before."""
+        """The same run with the plan of a checkpoint."""
         return replace(self, steps=steps, since=(since, share))
 
     def replanned(self, step: int, steps: int) -> Schedule:
-        """The same run, of which `step` steps are done, with `steps` in all: what is left of its
-        course is gone through faster, or more slowly."""
+        """The same run, of which `step` steps are done, with `steps` in all: the rest of the
+        schedule is compressed or stretched."""
         return replace(self, steps=max(steps, step + 1), since=(step, self.share(step)))
 
     def without_densification(self, step: int) -> Schedule:
@@ -69,8 +80,8 @@ class Schedule:
 
     @property
     def boost(self) -> float:
-        """A short run takes longer strides: (30,000 / steps)^0.6, at most 6."""
-        return float(min(BOOST_MAX, max(1.0, (RECIPE_STEPS / self.steps) ** BOOST_POWER)))
+        """Factor of all learning rates, larger for short runs: (30,000 / steps)^0.6, at most 6."""
+        return float(min(BOOST_MAX, max(1.0, (PUBLISHED_STEPS / self.steps) ** BOOST_POWER)))
 
     def means_lr(self, step: int) -> float:
         """Exponential decay to 1 %."""
@@ -78,29 +89,29 @@ class Schedule:
         return float(MEANS_LR * self.extent * self.boost * decay)
 
     def rate_factor(self, step: int) -> float:
-        """What all other rates are multiplied by: the boost, and a decay at the end."""
+        """Factor of all other learning rates: the boost, with a decay at the end."""
         decay = max(0.0, (self.share(step) - RATE_DECAY_FROM) / (1.0 - RATE_DECAY_FROM))
         return float(self.boost * RATE_DECAY_END**decay)
 
     def active_sh_degree(self, step: int) -> int:
-        """One degree more every 1000 steps of the recipe."""
-        return min(self.sh_degree, int(RECIPE_STEPS / 1000 * self.share(step) + 1e-9))
+        """One degree more every 1000 of 30,000 steps."""
+        return min(self.sh_degree, int(PUBLISHED_STEPS / 1000 * self.share(step) + 1e-9))
 
     def densifies_after(self, step: int) -> bool:
         """Whether to densify once `step` is done."""
         interval = max(self._scaled(100), MIN_DENSIFY_INTERVAL)
         done = step + 1
-        starts, ends = 500 / RECIPE_STEPS, DENSIFICATION_END
+        starts, ends = 500 / PUBLISHED_STEPS, DENSIFICATION_END
         return starts <= self.share(done) <= ends and done % interval == 0
 
     def budget(self, step: int, cap: int) -> int:
-        """Splats allowed after `step`: grows evenly to the cap, so that early, noisy gradients do
-        not spend what later, better ones will want."""
+        """Largest number of splats after `step`. It rises linearly to the cap, so that early, noisy
+        gradients do not use up what later, better ones need."""
         share = min(1.0, self.share(step + 1) / DENSIFICATION_END)
         return max(self.n_start, round(self.n_start + (cap - self.n_start) * share))
 
     def removes_giants(self, step: int) -> bool:
-        return self.share(step) >= 3000 / RECIPE_STEPS
+        return self.share(step) >= 3000 / PUBLISHED_STEPS
 
     def level(self, step: int) -> int:
         """Index into RESOLUTIONS."""
@@ -108,20 +119,20 @@ class Schedule:
         return sum(share >= end for end, _ in RESOLUTIONS[:-1])
 
     def view(self, step: int, n_views: int) -> int:
-        """Every one of `n_views` photographs once in each round, in a new order each round."""
+        """Row of the training view of `step`: each of `n_views` once an epoch, in random order."""
         round_number, place = divmod(step, n_views)
         order = np.random.default_rng([self.seed, 1, round_number]).permutation(n_views)
         return int(order[place])
 
     def background(self, step: int) -> tuple[float, float, float]:
-        """Any colour, behind what was cut out: what hides in one shows before the next."""
+        """A random background: splats of one colour show before another."""
         red, green, blue = np.random.default_rng([self.seed, 3, step]).random(3)
         return float(red), float(green), float(blue)
 
     def dropout_key(self, step: int) -> int:
-        """32 random bits, for numbers that a device makes by itself."""
+        """32 random bits for `dropout.Dropout`."""
         return int(np.random.default_rng([self.seed, 4, step]).integers(1 << 32))
 
     def rng(self, step: int) -> np.random.Generator:
-        """Random numbers of one step, whatever happened before it."""
+        """Random numbers of one step, independent of all others."""
         return np.random.default_rng([self.seed, 2, step])

@@ -1,4 +1,4 @@
-"""One training step, whatever does it: the seam between the trainer and a backend's kernels."""
+"""The interface between the trainer and a backend's training step."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from stages.training.views import Level
 
 
 class TrainingStep(Protocol):
-    """A backend's own training step. It holds the model, wherever its kernels want it."""
+    """A backend's training step. It holds the model where the backend's kernels need it."""
 
     def __init__(self, rasteriser: Rasteriser) -> None: ...
 
     def __len__(self) -> int:
-        """How many splats it holds; asks no device."""
+        """Number of splats; needs no transfer from a device."""
 
     def load(self, model: Model) -> None:
-        """Take a model over, moments and all: at the start, and after it grew or shrank."""
+        """Replace the model, including the optimiser's moments."""
 
     def model(self) -> Model:
-        """What it has become, on the host; good until the next step."""
+        """The current model, on the host; good until the next step."""
 
     def step(
         self,
@@ -36,10 +36,17 @@ class TrainingStep(Protocol):
         smooth: bool,
         dropout: Dropout | None = None,
     ) -> float:
-        """Draw, compare with one photograph, move the splats; the loss before that (a device's may
-        be that of a few steps ago). The bands of SH up to `settings.sh_degree` take part. smooth:
-        under the model's smoothing widths. What a masked photograph asks: `training.target`.
-        dropout: which splats sit this step out."""
+        """Forward pass, loss, backward pass and one step of Adam.
+
+        Args:
+            level: the training view at one resolution; masks and light as in `training.target`.
+            settings: of the rasteriser; SH coefficients up to `settings.sh_degree` are trained.
+            rates: learning rates.
+            smooth: whether to render with the model's smoothing widths.
+            dropout: drops splats from this step; None for none.
+
+        Returns the loss before the step; a device may return that of a few steps earlier.
+        """
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
-        """[H, W, 3] of the model as it is; the caller's own."""
+        """[H, W, 3] of the current model, in an array that the caller may keep."""

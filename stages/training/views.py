@@ -1,4 +1,4 @@
-"""The photographs in training, at every resolution of the schedule."""
+"""The training views, at every resolution of the schedule."""
 
 from __future__ import annotations
 
@@ -20,9 +20,16 @@ from stages.training.schedule import RESOLUTIONS
 
 @dataclass(frozen=True)
 class Level:
-    """A photograph at one size: pixels [3, H, W] and the mean of each channel [3], in 0..1. mask
-    [H, W], outside: as in `scene.Photo`; None where everything counts. light: to be taken out of
-    the pixels; None for none. See `training.target`."""
+    """A training view at one size.
+
+    Args:
+        camera: of that size.
+        pixels: [3, H, W].
+        means: [3] the mean of each channel, in 0..1.
+        mask: [H, W], as in `scene.Photo`; None if all pixels count. See `training.target`.
+        outside: what the mask means, as in `scene.Photo`.
+        light: exposure and white balance to correct; None for none.
+    """
 
     camera: Camera
     pixels: NDArray[np.uint8]
@@ -40,19 +47,19 @@ class Level:
         outside: str = "",
         light: Light | None = None,
     ) -> Level:
-        """Of pixels [H, W, 3]."""
+        """A level with pixels [H, W, 3]."""
         planar = np.ascontiguousarray(pixels.transpose(2, 0, 1))
         return cls(camera, planar, channel_means(planar), mask, outside, light)
 
     @property
     def plain(self) -> bool:
-        """Whether its pixels are what a drawing is compared with, as they are."""
+        """Whether the pixels are the target of a render without changes."""
         return self.mask is None and self.light is None
 
 
 @dataclass(frozen=True)
 class TrainingView:
-    """One photograph, at each of RESOLUTIONS."""
+    """A training view at each of RESOLUTIONS."""
 
     name: str
     levels: Sequence[Level]
@@ -64,7 +71,7 @@ class TrainingView:
 
 
 class _Stored(Sequence[Level]):
-    """Levels whose pixels and masks lie in an album, in the order in which they were added."""
+    """Levels whose pixels and masks are stored in an album, in the order of their addition."""
 
     def __init__(self, album: Album) -> None:
         self._album = album
@@ -96,11 +103,16 @@ class _Stored(Sequence[Level]):
 def load_views(
     folder: Path, views: Iterable[View], train_side: int, work: Path, light: bool = False
 ) -> list[TrainingView]:
-    """Photographs scaled so that their longer side is at most `train_side` pixels, and smaller.
-    light: whether to be brought to their median light.
+    """The training views at their resolutions.
 
-    Their bytes lie in a file in the folder `work`, mapped into memory. Raises SplatError, and
-    OSError where the disk is full.
+    Args:
+        folder: of the undistorted images.
+        views: to load.
+        train_side: largest length of the longer side at full resolution, pixels.
+        work: folder for a file with all pixels, which is mapped into memory.
+        light: whether to correct exposure and white balance.
+
+    Raises SplatError, and OSError if the disk is full.
     """
     loaded = []
     with Album(work) as album:

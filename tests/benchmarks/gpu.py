@@ -1,7 +1,7 @@
 """How fast the GPU backend is: `python -m tests.benchmarks.gpu`, on a machine with a GPU.
 
 First the gate: pictures and gradients are the reference's, or nothing is timed. Then scenes of
-100,000, 1,000,000 and 5,000,000 splats at 1080p and 4K: drawing, the way back, both, a whole
+100,000, 1,000,000 and 5,000,000 splats at 1080p and 4K: drawing, backward pass, both, a whole
 training step, each the median of many by the device's own clock; what share of the device's
 bandwidth a step makes use of; memory a splat; gsplat on the same scene in the same process, packed
 and not, where it can be imported (its step with the same loss in torch, and torch's fused Adam).
@@ -37,7 +37,7 @@ from stages.scene import Camera, Splats
 from stages.training.gpu_step import GpuStep
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.reference_step import photograph_loss
+from stages.training.reference_step import reference_loss
 from stages.training.views import Level
 from tests.benchmarks.scenes import random_scene, view
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
@@ -162,7 +162,7 @@ def theirs(splats: Splats, where: Camera, rounds: int, packed: bool) -> dict[str
 
     def step() -> None:
         adam.zero_grad()
-        torch.autograd.backward(photograph_loss(draw()[0].permute(2, 0, 1), target))
+        torch.autograd.backward(reference_loss(draw()[0].permute(2, 0, 1), target))
         adam.step()
 
     with torch.no_grad():

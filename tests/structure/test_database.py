@@ -31,7 +31,7 @@ def make(path: Path) -> Path:
     return path
 
 
-def test_half_written_photographs_and_pairs_are_forgotten(tmp_path: Path) -> None:
+def test_half_written_photographs_and_pairs_are_deleted(tmp_path: Path) -> None:
     path = make(tmp_path / "é #1.db")
     sqlite.repair(path)
     assert sqlite.keypoint_counts(path, 4) == [900, 0, 0, 0]
@@ -48,7 +48,7 @@ def test_a_copy_holds_the_same_and_can_be_reset_alone(tmp_path: Path) -> None:
     assert len(sqlite.verified_pairs(path)) == 2
 
 
-def test_what_is_no_database_is_told_and_can_be_deleted(tmp_path: Path) -> None:
+def test_a_file_that_is_no_database_raises_and_can_be_deleted(tmp_path: Path) -> None:
     garbage = tmp_path / "garbage.db"
     garbage.write_bytes(b"no database at all" * 100)
     with pytest.raises(sqlite3.DatabaseError):

@@ -1,4 +1,4 @@
-"""Matches under a few words are, nearly all, the matches that comparing everything finds."""
+"""Matches found under a few probed words are nearly those of an exhaustive search."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from stages.structure.vocabulary import build_vocabulary, index_by_word
 from tests.structure.sample_jobs import SAMPLE
 
 
-def compared_with_all(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> set[tuple[int, int]]:
-    """Each other's nearest by the angle between them, and clearly so both ways."""
+def exhaustive_matches(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> set[tuple[int, int]]:
+    """Mutual nearest neighbours by angle that pass the ratio test in both directions."""
     cosines = first.astype(float) @ second.astype(float).T / 512.0**2
     angles = np.arccos(np.minimum(cosines, 1.0))
 
@@ -33,7 +33,7 @@ def test_nearly_all_matches_are_found_and_hardly_others() -> None:
     found = descriptor_matching.match_descriptors(
         index_by_word(first, vocabulary), index_by_word(second, vocabulary)
     )
-    wanted = compared_with_all(first, second)
+    wanted = exhaustive_matches(first, second)
     got = {(int(i), int(j)) for i, j in found}
     assert len(wanted) > 300
     assert len(got & wanted) > 0.93 * len(wanted)
@@ -42,7 +42,7 @@ def test_nearly_all_matches_are_found_and_hardly_others() -> None:
     assert (np.diff(found[:, 0].astype(int)) > 0).all()
 
 
-def test_a_picture_matches_itself_feature_by_feature() -> None:
+def test_a_picture_matches_itself() -> None:
     random = np.random.default_rng(0)
     histograms = random.exponential(size=(400, 128)) ** 2
     roots = np.sqrt(histograms / histograms.sum(axis=1, keepdims=True))

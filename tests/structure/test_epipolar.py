@@ -36,14 +36,14 @@ def test_right_poses_fit_and_pixels_off_do_not() -> None:
     assert fits(POSES, shift_px=12.0) < 0.3
 
 
-def test_the_scale_and_the_place_of_the_world_do_not_matter() -> None:
+def test_scale_and_origin_of_the_world_do_not_matter() -> None:
     moved = POSES @ np.linalg.inv(look_at(np.array([9.0, 5, 2]), np.zeros(3)))
     moved[:, :3, 3] *= 1000
     assert fits(moved) == 1.0
 
 
 @pytest.mark.parametrize(
-    ("mistake", "told"),
+    ("mistake", "expected"),
     [
         (lambda p: np.diag([1.0, -1, -1, 1]) @ p, "y and z"),
         (np.linalg.inv, "camera to world instead"),
@@ -53,15 +53,15 @@ def test_the_scale_and_the_place_of_the_world_do_not_matter() -> None:
         (lambda p: p[::-1], "opposite order"),
     ],
 )
-def test_a_mistake_is_found_out(mistake, told: str) -> None:
+def test_a_mistake_is_recognised(mistake, expected: str) -> None:
     given = mistake(POSES)
     assert fits(given) < 0.3
     ratios = {name: fits(poses) for name, poses in likely_mistakes(given).items()}
     (best,) = [name for name, ratio in ratios.items() if ratio > 0.9]
-    assert told in best
+    assert expected in best
 
 
-def test_without_pairs_nothing_is_known() -> None:
+def test_without_pairs_there_is_no_ratio() -> None:
     assert median_inlier_ratio([], np.tile(LENS, (8, 1)), POSES, 640.0) is None
     here = np.tile(POSES[:1], (8, 1, 1))
     assert median_inlier_ratio(PAIRS, np.tile(LENS, (8, 1)), here, 640.0) is None

@@ -15,7 +15,7 @@ from stages.structure import features
 from tests.structure import sample_jobs as jobs
 
 
-def spot(width: int, height: int, x: float, y: float, sigma: float) -> np.ndarray:
+def blob(width: int, height: int, x: float, y: float, sigma: float) -> np.ndarray:
     """[H, W] uint8: a soft bright spot at (x, y), pixel centres at +0.5."""
     u, v = np.meshgrid(np.arange(width) + 0.5 - x, np.arange(height) + 0.5 - y)
     return np.rint(40 + 180 * np.exp(-(u**2 + v**2) / (2 * sigma**2))).astype(np.uint8)
@@ -29,25 +29,25 @@ def found_in(picture: np.ndarray, folder: Path) -> tuple[np.ndarray, np.ndarray]
 
 @pytest.mark.parametrize("sigma", [1.5, 4.0, 9.0])
 @pytest.mark.parametrize("place", [(100.5, 80.5), (100.8, 81.2), (101.0, 81.0)])
-def test_a_spot_is_found_where_it_is(
+def test_a_blob_is_found_where_it_is(
     sigma: float, place: tuple[float, float], tmp_path: Path
 ) -> None:
-    keypoints, _ = found_in(spot(260, 200, *place, sigma), tmp_path)
+    keypoints, _ = found_in(blob(260, 200, *place, sigma), tmp_path)
     nearest = np.abs(keypoints[:, :2] - place).max(axis=1).min()
     assert nearest < 0.04  # half a pixel, and a quarter, are what goes wrong
 
 
-def test_large_photographs_are_searched_smaller_and_told_in_their_own_pixels(
+def test_keypoints_of_large_photographs_are_in_their_own_pixels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(features, "LARGEST_SIDE", 260)
-    keypoints, _ = found_in(spot(780, 600, 300.5, 240.5, 24.0), tmp_path)
+    keypoints, _ = found_in(blob(780, 600, 300.5, 240.5, 24.0), tmp_path)
     best = keypoints[np.abs(keypoints[:, :2] - (300.5, 240.5)).max(axis=1).argmin()]
     assert np.abs(best[:2] - (300.5, 240.5)).max() < 0.2
     assert best[2] == pytest.approx(24 / 2 ** (1 / 6), rel=0.15)  # where DoG answers most
 
 
-def test_a_turned_picture_has_turned_features(tmp_path: Path) -> None:
+def test_a_rotated_picture_has_rotated_features(tmp_path: Path) -> None:
     """Turned clockwise, as seen: (x, y) comes to (height - y, x), and angles grow, from x to y."""
     picture = cv2.imread(str(jobs.SAMPLE / "IMG_0001.jpg"), cv2.IMREAD_GRAYSCALE)
     assert picture is not None
@@ -103,7 +103,7 @@ def test_any_number_of_threads_and_a_new_start_give_the_same(tmp_path: Path) -> 
 
 
 def test_nothing_is_found_where_a_mask_is_black(tmp_path: Path) -> None:
-    picture = np.maximum(spot(260, 200, 60.5, 80.5, 4.0), spot(260, 200, 180.5, 80.5, 4.0))
+    picture = np.maximum(blob(260, 200, 60.5, 80.5, 4.0), blob(260, 200, 180.5, 80.5, 4.0))
     mask = np.zeros_like(picture)
     mask[:, 130:] = 255
     for name, pixels in (("a.png", picture), ("mask.png", mask)):

@@ -48,7 +48,9 @@ def test_a_photograph_has_one_name_in_every_folder(tmp_path: Path) -> None:
     assert written == set(of_ingest.values())
 
 
-def test_a_picture_is_of_the_kind_that_its_name_says_and_of_its_photograph(tmp_path: Path) -> None:
+def test_a_picture_has_the_format_of_its_suffix_and_the_content_of_its_photograph(
+    tmp_path: Path,
+) -> None:
     capture, folder = captured(tmp_path / "ingest"), tmp_path / "sfm"
     model = replace(orbit_model(4, 60), names=tuple(p.image for p in capture.photos))
     for number, view in enumerate(finish(model, capture, folder, Report()).views):
@@ -60,8 +62,8 @@ def test_a_picture_is_of_the_kind_that_its_name_says_and_of_its_photograph(tmp_p
         assert np.abs(image.astype(int) - 50 * number).max() <= 2
 
 
-def test_a_mask_is_undistorted_with_its_photograph_and_travels_on(tmp_path: Path) -> None:
-    """The photographs are white where their masks are, so that both are bent alike."""
+def test_a_mask_is_undistorted_with_its_photograph_and_stored(tmp_path: Path) -> None:
+    """The photographs are white where their masks are, so both must be undistorted alike."""
     capture, folder = captured(tmp_path / "ingest"), tmp_path / "sfm"
     photo = next(photo for photo in capture.photos if photo.image.endswith(".png"))
     drawn = np.zeros((SIZE[1], SIZE[0]), np.uint8)

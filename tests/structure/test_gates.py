@@ -126,12 +126,12 @@ def test_one_photograph_of_sixteen_may_be_left_out_but_not_four() -> None:
     assert codes(replace(BANANA, registered=12)) == ["sfm-too-few-registered"]
 
 
-def test_a_few_contradicting_pairs_are_chance() -> None:
+def test_a_few_inconsistent_pairs_are_accepted() -> None:
     assert codes(replace(BANANA, pairs_checked=8, pairs_inconsistent=2)) == []
     assert codes(replace(PLUSH, pairs_checked=1200, pairs_inconsistent=60)) == []
 
 
-def test_what_is_too_little_to_refuse_is_said() -> None:
+def test_borderline_models_get_a_warning() -> None:
     assert borderline_failures(PLUSH) == []
     few = replace(PLUSH, pairs_checked=100, pairs_inconsistent=5, inconsistent_pair=("a", "b"))
     assert codes(few) == []
@@ -158,7 +158,9 @@ def test_error_limit_grows_with_the_photographs() -> None:
         ([9000] * 9 + [0], True),
     ],
 )
-def test_keypoints_tell_strong_blur_from_mild(counts: list[int], passes: bool) -> None:
+def test_strong_blur_has_too_few_keypoints_and_mild_blur_has_not(
+    counts: list[int], passes: bool
+) -> None:
     assert (check_keypoints(counts) == []) == passes
 
 
@@ -166,7 +168,7 @@ def chain(count: int, config: int = CALIBRATED) -> list[tuple[int, int, int, int
     return [(i, i + 1, 100, config) for i in range(count - 1)]
 
 
-def test_pairs_that_only_turn_are_no_parallax_but_a_flat_field_is_fine() -> None:
+def test_panoramic_pairs_have_no_parallax_but_planar_pairs_are_fine() -> None:
     assert [f.code for f in check_pairs(chain(10, PANORAMIC), 10)] == ["sfm-no-parallax"]
     assert check_pairs(chain(10, PLANAR), 10) == []
     assert check_pairs(chain(10), 10) == []

@@ -1,4 +1,4 @@
-"""Levelling: up is found from cameras that people hold level, and refused when they disagree."""
+"""Levelling: up is found from cameras held level, and not if they disagree."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_up_is_exact_for_level_cameras_however_far_they_look_down(
     assert angle_deg(up, world @ UP) < 1.0
 
 
-def test_crooked_hands_average_out() -> None:
+def test_small_roll_averages_out() -> None:
     up = up_direction(orbit(40, 300, 1.5, roll_deg=5.0))
     assert up is not None
     assert angle_deg(up, UP) < 2.0
@@ -64,7 +64,7 @@ def test_cameras_that_all_look_the_same_way_use_the_tops_of_their_pictures() -> 
     assert angle_deg(up, UP) < 1.0
 
 
-def test_looking_straight_down_up_is_where_the_cameras_are() -> None:
+def test_if_all_look_straight_down_up_is_towards_the_cameras() -> None:
     headings = np.radians(np.arange(0, 360, 30))
     rotations = np.array(
         [[[np.cos(a), 0, np.sin(a)], [-np.sin(a), 0, np.cos(a)], [0, 1, 0]] for a in headings]
@@ -75,7 +75,7 @@ def test_looking_straight_down_up_is_where_the_cameras_are() -> None:
     assert angle_deg(up, UP) < 1.0
 
 
-def test_cameras_held_anyhow_do_not_agree() -> None:
+def test_random_rotations_give_no_up_direction() -> None:
     assert up_direction(np.array([random_rotation(i) for i in range(30)])) is None
 
 

@@ -1,4 +1,4 @@
-"""Exposure and white balance, from what photographs agree on."""
+"""Exposure and white balance, from points seen in several photographs."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def photographs(folder: Path, ev: np.ndarray, hidden: float = 0.1, shiny: bool =
     return files, np.array(points, np.int32), np.array(views, np.int32), np.array(px)
 
 
-def test_a_stop_and_a_tint_are_told_though_some_spots_disagree(tmp_path: Path) -> None:
+def test_exposure_and_tint_are_measured_despite_outliers(tmp_path: Path) -> None:
     ev = np.array([[1, 1, 1], [-1, -1, -1], [0, 0, 0], [0.3, 0, -0.4], [0, 0, 0], [0.5, 0.5, 0.5]])
     found, _ = measure_light(*photographs(tmp_path, ev))
     np.testing.assert_allclose(found, ev - np.median(ev, axis=0), atol=0.06)
 
 
-def test_spots_of_all_kinds_tell_the_same_light_but_not_the_same_shine(tmp_path: Path) -> None:
+def test_halves_of_the_points_agree_on_light_but_not_on_shine(tmp_path: Path) -> None:
     ev = np.linspace(-0.5, 0.5, VIEWS)[:, None] * np.ones(3)
     found, differ = measure_light(*photographs(tmp_path, ev, hidden=0.0))
     assert differ < 0.2 * spread_ev([tuple(row) for row in found.tolist()])
@@ -66,7 +66,7 @@ def test_even_light_is_within_a_cameras_noise(tmp_path: Path) -> None:
     assert spread_ev([tuple(row) for row in found.tolist()]) < NOISE_EV
 
 
-def test_a_photograph_that_shares_no_spot_is_not_known(tmp_path: Path) -> None:
+def test_a_photograph_without_shared_points_has_no_light(tmp_path: Path) -> None:
     files, points, views, px = photographs(tmp_path, np.zeros((VIEWS, 3)))
     alone = views != 2
     found, _ = measure_light(files, points[alone], views[alone], px[alone])

@@ -107,7 +107,7 @@ def test_cameras_are_scaled_with_their_photographs() -> None:
     assert (first.camera.width, first.camera.fx, first.camera.cy) == (640, 250, 240)
 
 
-def test_another_shape_is_refused_and_a_turned_one_explained() -> None:
+def test_another_aspect_ratio_is_refused_and_a_rotated_one_explained() -> None:
     found = cameras("a", "b", "c")
     assert "cropped" in refusal(found, capture("a", "b", "c", size=(480, 480))).hint
     turned = refusal(found, capture("a", "b", "c", size=(480, 640)))
@@ -115,7 +115,7 @@ def test_another_shape_is_refused_and_a_turned_one_explained() -> None:
     assert "EXIF" in turned.hint
 
 
-def test_the_files_own_split_is_kept_only_when_asked_for() -> None:
+def test_the_split_of_the_file_is_used_only_with_the_option() -> None:
     found, photographs = cameras("a", "b", "c", "d", roles="rrtv"), capture("a", "b", "c", "d")
     assert names_of(found, photographs) == ["a", "b", "c", "d"]
     assert names_of(found, photographs, split=True) == ["a", "b", "c"]
@@ -135,7 +135,7 @@ def test_what_a_split_leaves_out_may_lack_its_counterpart() -> None:
     assert refusal(lacking, capture("a", "b", "c"), split=True).code.startswith("cameras-without")
 
 
-def test_where_photographs_have_roles_these_decide_who_judges() -> None:
+def test_roles_decide_which_views_are_held_out() -> None:
     found = cameras(*"abcdefghij", roles="rrrrrrrtrt")
     training, judges = split_held_out(found.views)
     assert [view.name for view in judges] == ["h", "j"]

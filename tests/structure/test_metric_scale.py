@@ -51,11 +51,12 @@ def on_earth(metres: np.ndarray) -> list[tuple[float, float] | None]:
     ]
 
 
-def found(capture: Capture, poses: np.ndarray, *asked: str, levelled: bool = True):
+def found(capture: Capture, poses: np.ndarray, *distance: str, levelled: bool = True):
     report = Report()
-    names = [photo.name for photo in capture.photos]
     posed = [Camera(640, 480, 600.0, 600.0, 320.0, 240.0, pose) for pose in poses]
-    return find_metric_scale(KnownScale(asked), capture, names, posed, [], levelled, report), report
+    return find_metric_scale(
+        KnownScale(distance), capture.photos, posed, [], levelled, report
+    ), report
 
 
 def test_a_distance_between_two_photographs_makes_the_world_metric() -> None:
@@ -77,15 +78,15 @@ def test_points_move_with_the_cameras() -> None:
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "distance",
     [
         ("1.jpg", "2.jpg", "far"), ("1.jpg", "2.jpg", "-1"), ("1.jpg", "2.jpg", "nan"),
         ("1.jpg", "1.jpg", "1"), ("1.jpg", "other.jpg", "1"),
     ],
 )  # fmt: skip
-def test_a_distance_that_cannot_be_used_is_an_error(asked: tuple[str, str, str]) -> None:
+def test_a_distance_that_cannot_be_used_is_an_error(distance: tuple[str, str, str]) -> None:
     with pytest.raises(SplatError) as raised:
-        found(capture_of([None] * 12), cameras(), *asked)
+        found(capture_of([None] * 12), cameras(), *distance)
     assert raised.value.code == "sfm-scale"
 
 
@@ -128,7 +129,7 @@ def test_nothing_is_known_without_gps_a_distance_or_a_level() -> None:
     assert found(capture_of(on_earth(true_east_north(poses))), poses, levelled=False)[0] is None
 
 
-def test_places_across_the_date_line_are_near_each_other() -> None:
+def test_positions_across_the_date_line_are_near_each_other() -> None:
     metres = east_north([(0.0, 179.9999), (0.0, -179.9999), (0.0, 180.0)])
     assert np.ptp(metres[:, 0]) == pytest.approx(22.26, rel=0.01)
 

@@ -1,4 +1,4 @@
-"""The worker process: its end, however it comes, is told, and it never outlives the parent."""
+"""The worker process: every kind of end is reported, and it never outlives the parent."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_success_ticks_at_least_at_the_end(tmp_path: Path, monkeypatch: pytest.M
     assert run(tmp_path) >= 1
 
 
-def test_an_abort_is_told_with_its_last_words(
+def test_an_abort_is_reported_with_its_last_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pretend(monkeypatch, "import os; print('Check failed: x > 0', flush=True); os.abort()")
@@ -57,7 +57,7 @@ def test_an_abort_is_told_with_its_last_words(
     assert "Check failed" in (tmp_path / "log.txt").read_text()
 
 
-def test_last_words_are_not_what_others_told_meanwhile(
+def test_the_last_line_is_not_the_progress_of_other_threads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """COLMAP's other threads, and other processes, go on telling how far they are."""

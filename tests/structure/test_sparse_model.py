@@ -1,4 +1,4 @@
-"""Figures of a model whose every number is known."""
+"""Statistics of a model whose every number is known."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_figures_of_a_half_circle() -> None:
     assert (statistics.cut_points, statistics.cut_views) == (200, 3)
 
 
-def test_pairs_that_the_model_contradicts_are_counted_and_one_is_named() -> None:
+def test_inconsistent_pairs_are_counted_and_one_is_named() -> None:
     model = orbit_model(views=6, points=40)
     fits = np.array([0.9, 0.5, 0.1, 1.0, 0.0])
     result = MappingResult(replace(model, pair_inlier_ratios=fits), (model.names,), timed_out=False)

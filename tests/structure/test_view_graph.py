@@ -20,7 +20,7 @@ def walk(first: int, last: int, each: int = 50) -> list[tuple[int, ...]]:
     return [(i, i + 1, i + 2) for i in range(first, last - 1) for _ in range(each)]
 
 
-def test_two_halves_are_told_apart_and_their_common_points_counted() -> None:
+def test_two_halves_are_separated_and_their_common_points_counted() -> None:
     tracks = [*walk(0, 7), *walk(8, 19), *[(6, 7, 8, 9)] * 5, (2, 15)]
     assert weakest_cut(*seen(tracks), 20) == Cut(6, (0, 1, 2, 3, 4, 5, 6, 7))
 
@@ -35,7 +35,7 @@ def test_halves_without_a_common_point_have_none() -> None:
     assert weakest_cut(*seen([*walk(0, 5), *walk(6, 11)]), 12) == Cut(0, (0, 1, 2, 3, 4, 5))
 
 
-def test_a_walk_hangs_together_by_what_neighbours_share() -> None:
+def test_a_sequence_is_connected_by_points_that_neighbours_share() -> None:
     assert weakest_cut(*seen(walk(0, 19)), 20).points == 100
 
 

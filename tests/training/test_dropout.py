@@ -1,4 +1,4 @@
-"""Splats that sit a step out."""
+"""Splats that are dropped from steps."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from stages.raster.definition import RasterSettings, splat_arrays
 from stages.scene import rgb_to_dc
 from stages.training import gpu_dropout
 from stages.training.cpu_step import CpuStep
-from stages.training.dropout import LARGEST_SHARE, Dropout, noise
+from stages.training.dropout import MAX_PROBABILITY, Dropout, noise
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.reference_step import ReferenceStep
@@ -20,21 +20,21 @@ VIEWS = 20
 
 
 def shares(seen, steps=400):
-    """How often each splat rests, seen in so many of `VIEWS` steps."""
+    """How often each splat is dropped, visible in so many of `VIEWS` steps."""
     seen = np.asarray(seen, np.int32)
-    return np.mean([Dropout(VIEWS, key).resting(seen) for key in range(steps)], axis=0)
+    return np.mean([Dropout(VIEWS, key).dropped(seen) for key in range(steps)], axis=0)
 
 
-def test_what_few_photographs_see_rests_often_and_what_many_see_hardly_ever():
+def test_splats_that_few_views_see_are_dropped_often_and_others_hardly_ever():
     seen = np.repeat([0, 1, 2, 4, 8, 20], 500)
     found = shares(seen).reshape(6, 500).mean(1)
     n = VIEWS * 9 / 21  # photographs that see what 8 of 20 steps had in their picture
-    few = [LARGEST_SHARE] * 3
+    few = [MAX_PROBABILITY] * 3
     wanted = [*few, 4 * (9 / 5) ** 2 / n**2, 4 / n**2, 0.01]
     np.testing.assert_allclose(found, wanted, atol=0.004)
 
 
-def test_steps_and_splats_draw_lots_that_know_nothing_of_each_other():
+def test_random_numbers_of_steps_and_of_splats_are_independent():
     lots = np.array([noise(5000, key) for key in range(64)]) / 2.0**32
     assert abs(lots.mean() - 0.5) < 0.005
     assert abs(np.corrcoef(lots[:32].ravel(), lots[32:].ravel())[0, 1]) < 0.01  # steps
@@ -42,22 +42,22 @@ def test_steps_and_splats_draw_lots_that_know_nothing_of_each_other():
     assert (noise(5000, 7) == noise(9000, 7)[:5000]).all()
 
 
-def test_before_anything_was_counted_and_without_splats_there_is_an_answer():
-    assert Dropout(VIEWS, 1).resting(np.zeros(0, np.int32)).shape == (0,)
+def test_dropout_without_counts_and_without_splats():
+    assert Dropout(VIEWS, 1).dropped(np.zeros(0, np.int32)).shape == (0,)
     assert shares(np.zeros(500)).mean() == pytest.approx(0.01, abs=0.002)
 
 
-def test_a_device_lets_the_same_splats_rest():
+def test_a_device_drops_the_same_splats():
     seen = np.random.default_rng(2).integers(0, 40, 5000).astype(np.int32)
     for key in (0, 1, 0xFFFFFFFF):
-        wanted = Dropout(VIEWS, key).resting(seen)
+        wanted = Dropout(VIEWS, key).dropped(seen)
         found = gpu_dropout.dropped(Dropout(VIEWS, key), torch.tensor(seen))
         np.testing.assert_array_equal(found.numpy(), wanted)
     assert len(gpu_dropout.dropped(Dropout(VIEWS, 1), torch.zeros(0, dtype=torch.int32))) == 0
 
 
 @pytest.mark.parametrize("step_class", [CpuStep, ReferenceStep])
-def test_what_rests_is_not_moved_and_the_others_do_its_part(step_class):
+def test_dropped_splats_do_not_move_and_others_replace_them(step_class):
     scene = cloud(80, 40, 30, degree=0)
     where = camera(40, 30)
     pixels = np.full((3, 30, 40), 200, np.uint8)
@@ -68,12 +68,12 @@ def test_what_rests_is_not_moved_and_the_others_do_its_part(step_class):
     step = step_class(rasteriser_of("cpu" if step_class is CpuStep else "reference"))
     step.load(model)
     dropout = Dropout(3, 5)
-    resting = dropout.resting(model.gradient_count)
-    assert 10 < resting.sum() < 45
+    dropped = dropout.dropped(model.gradient_count)
+    assert 10 < dropped.sum() < 45
     step.step(level, RasterSettings(sh_degree=0), LearningRates(1e-3), False, dropout)
     moved = (step.model().sh != before.sh).any((1, 2))
-    assert not moved[resting].any()
-    assert moved[~resting].mean() > 0.5
+    assert not moved[dropped].any()
+    assert moved[~dropped].mean() > 0.5
     np.testing.assert_array_equal(
-        step.model().opacity_logits[resting], before.opacity_logits[resting]
+        step.model().opacity_logits[dropped], before.opacity_logits[dropped]
     )

@@ -8,7 +8,7 @@ import pytest
 from stages.base.stage import Report
 from stages.scene import DrawSettings, look_at
 from stages.training import hooks
-from stages.training.free_space import ENOUGH, WITNESSES, known_free_space
+from stages.training.free_space import MAX_VIEWS, MIN_VIEWS, known_free_space
 from stages.training.hooks import FLOATER_REMOVALS
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
@@ -62,14 +62,14 @@ def test_where_the_start_has_nothing_nothing_is_known():
     assert held([(0, 0, 4.8)], start=wall().take(np.arange(0))) == [False]
 
 
-@pytest.mark.parametrize("n", [ENOUGH, ENOUGH + 3])
+@pytest.mark.parametrize("n", [MAX_VIEWS, MAX_VIEWS + 3])
 def test_what_enough_photographs_look_past_and_keep_is_there_though_the_start_missed_it(n):
     assert held([(0, 0, 4.8)], n=n) == [False]
 
 
 def test_one_photograph_is_no_witness():
     assert held([(0, 0, 4.8)], n=1) == [False]
-    assert held([(0, 0, 4.8)], n=WITNESSES) == [True]
+    assert held([(0, 0, 4.8)], n=MIN_VIEWS) == [True]
 
 
 def test_what_one_photograph_has_a_surface_at_stays_whatever_others_look_past():

@@ -20,7 +20,7 @@ from stages.training.dropout import Dropout
 from stages.training.gpu_step import GpuStep, image_loss
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.reference_step import ReferenceStep, photograph_loss
+from stages.training.reference_step import ReferenceStep, reference_loss
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 from tests.tolerances import LOSS_GRADIENT
@@ -92,7 +92,7 @@ def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
     drawn = torch.from_numpy(image).to(where)
     found, gradient = image_loss(drawn, target.to(where), means.to(where))
     exact = torch.tensor(image[:3], dtype=torch.float64, requires_grad=True)
-    wanted = photograph_loss(exact, target.double() / 255)
+    wanted = reference_loss(exact, target.double() / 255)
     torch.autograd.backward(size[0] * size[1] * wanted)
     assert exact.grad is not None
     assert float(found) == pytest.approx(float(wanted.detach()), abs=1e-6)

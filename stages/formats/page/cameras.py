@@ -1,6 +1,6 @@
-"""Our cameras, as the page takes them.
+"""Cameras in the conventions of the page.
 
-The viewer turns content by 180 degrees about z, so that y down becomes y up; cameras are turned
+The viewer rotates content by 180 degrees about z, so that y down becomes y up; cameras are rotated
 with it. Its own camera has x right, y up and looks along -z.
 """
 
@@ -23,8 +23,8 @@ _CAMERA_FROM_VIEWERS = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class PageCamera:
-    """A place to look from. photo: the address of its photograph; "" without one. held_out:
-    whether training never saw it."""
+    """A camera of the page. photo: the address of its photograph; "" without one. held_out:
+    whether the view was held out from training."""
 
     name: str
     camera: Camera
@@ -33,7 +33,8 @@ class PageCamera:
 
 
 def page_cameras(views: Sequence[View], splats: Splats) -> tuple[PageCamera, ...]:
-    """The capture's cameras by name, without photographs; or one in front of the splats."""
+    """The cameras of the capture, sorted by name, without photographs; one in front of the splats
+    if there are none."""
     if not views:
         return (PageCamera("in front", front_camera(splats)),)
     held = {view.name for view in split_held_out(tuple(views))[1]}
@@ -42,11 +43,9 @@ def page_cameras(views: Sequence[View], splats: Splats) -> tuple[PageCamera, ...
 
 
 def as_plain(shot: PageCamera, means: NDArray[np.floating]) -> dict[str, Any]:
-    """A shot as plain data. means [N, 3]: what it looks at, for the distance to turn around.
-
-    position, target: the viewer's world. rotation: x, y, z, w, from the viewer's camera to its
-    world. Lengths in pixels as in `Camera`.
-    """
+    """A camera as JSON values: position and target in the viewer's world, rotation x, y, z, w from
+    the viewer's camera to its world, intrinsics in pixels as in `Camera`. means [N, 3]: the splats
+    it looks at, for the distance of the target."""
     camera = shot.camera
     depth = median_depth(camera, means)
     rotation = _VIEWER_FROM_WORLD @ camera.world_to_camera[:3, :3].T @ _CAMERA_FROM_VIEWERS

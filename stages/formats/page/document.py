@@ -1,7 +1,7 @@
-"""The page: one document with the viewer, our script and what it is to show.
+"""The page: one document with the viewer, our scripts and the data of the scene.
 
-Everything but the splats and photographs of `splat view` is inside the document, and its content
-security policy lets it fetch from nowhere else, so that it works from disk and without a network.
+All but the splats and photographs of `splat view` is inside the document, and its content security
+policy forbids other sources, so it works from disk and without a network.
 """
 
 from __future__ import annotations
@@ -39,9 +39,18 @@ def scene_data(
     content: str = "",
     levels: Sequence[float] = (),
 ) -> dict[str, Any]:
-    """What the page shows, as plain data. source: what `splat edit` would read. content: the
-    address of the splats' .ply, or of a lod-meta.json; "" if the document holds them. levels: how
-    wide the splats of each level of detail are, of an asset that streams."""
+    """The data of the page as JSON values.
+
+    Args:
+        title: of the page.
+        splats: for their number and bounds.
+        shots: the cameras.
+        units: "metres" or "arbitrary".
+        source: the file that `splat edit` would read.
+        content: the address of the splats' .ply or of a lod-meta.json; "" if the document holds
+            the splats.
+        levels: width of the splats of each level of detail of a streamed asset.
+    """
     return {
         "title": title,
         "source": source,
@@ -55,7 +64,7 @@ def scene_data(
 
 
 def _bounds(splats: Splats) -> dict[str, list[float]]:
-    """What a box is chosen in: of the middle of the splats, for a few lie far away."""
+    """The range in which a box is selected: the central splats, because a few lie far away."""
     if not len(splats):
         return {"min": [0.0] * 3, "max": [0.0] * 3}
     low, high = np.percentile(splats.means, _MIDDLE_PERCENT, axis=0)
@@ -69,7 +78,7 @@ def head(scene: dict[str, Any]) -> str:
 
 
 def live(scene: dict[str, Any]) -> str:
-    """The page that shows training: pictures come from the trainer, so it needs no viewer."""
+    """The page of live training: the trainer sends pictures, so it needs no viewer."""
     return _head(scene, _asset("parts", "live.css")) + _script(_LIVE_SCRIPTS) + PAGE_END
 
 

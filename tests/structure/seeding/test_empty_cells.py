@@ -74,7 +74,7 @@ def test_nothing_is_added_where_points_already_are(tmp_path: Path) -> None:
     assert len(again) < 0.1 * len(once)
 
 
-def test_a_floor_is_continued_where_two_photographs_agree(tmp_path: Path) -> None:
+def test_a_plane_is_extrapolated_where_two_photographs_support_it(tmp_path: Path) -> None:
     both, points = views(tmp_path), floor_points()
     more, _, _ = fill_cells(tmp_path, both, points)
     inside = in_picture(both[0].camera, more) & in_picture(both[1].camera, more)
@@ -114,7 +114,7 @@ def test_colours_come_from_the_photograph_and_sizes_from_its_cells(tmp_path: Pat
     np.testing.assert_allclose(scales / cell, 0.5, rtol=1e-6)
 
 
-def test_each_cell_takes_the_colour_at_its_own_place(tmp_path: Path) -> None:
+def test_each_cell_has_the_colour_of_its_own_pixel(tmp_path: Path) -> None:
     both, points = views(tmp_path), floor_points()
     picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     picture[:, : WIDTH // 2, 0] = 255

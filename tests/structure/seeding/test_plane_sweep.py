@@ -1,4 +1,4 @@
-"""Points that photographs agree on: on surfaces, where there is something to compare."""
+"""Plane sweep: points lie on surfaces with texture."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def found(tmp_path_factory: pytest.TempPathFactory):
     return folder, views, points, *plane_sweep_points(folder, views, points)
 
 
-def test_agreed_points_lie_on_the_surfaces(found) -> None:
+def test_points_lie_on_the_surfaces(found) -> None:
     _, _, points, more, _ = found
     on_plate = (np.abs(more[:, 2] / PLATE - 1) < 0.03) & (np.abs(more[:, :2]).max(1) < 1.1 * HALF)
     on_wall = np.abs(more[:, 2] / WALL - 1) < 0.03
@@ -64,7 +64,7 @@ def test_agreed_points_lie_on_the_surfaces(found) -> None:
     assert (on_plate | on_wall).mean() > 0.98
 
 
-def test_agreed_points_have_the_colour_of_their_place(found) -> None:
+def test_points_have_the_colour_of_their_pixel(found) -> None:
     _, _, _, more, colours = found
     wall = np.abs(more[:, 2] / WALL - 1) < 0.01
     where = ((more[wall, :2] + 5) / 10 * 768).astype(np.float32)
@@ -93,7 +93,7 @@ def test_plain_surfaces_give_no_points(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
-def test_too_few_photographs_agree_on_nothing(tmp_path: Path, number: int) -> None:
+def test_too_few_photographs_give_no_points(tmp_path: Path, number: int) -> None:
     views, points = capture(tmp_path)
     more, colours = plane_sweep_points(tmp_path, views[:number], points)
     assert more.shape == (0, 3)

@@ -1,4 +1,4 @@
-"""What other photographs say of a place."""
+"""Visibility constraints: which positions other photographs support or contradict."""
 
 import numpy as np
 
@@ -22,29 +22,29 @@ def wall() -> np.ndarray:
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, WALL)], 1)
 
 
-def asked(place: tuple[float, float, float], of: str) -> tuple[int, int]:
-    agree, before = VisibilityConstraints(views(), wall()).count(np.array([place]), of)
+def votes(position: tuple[float, float, float], of: str) -> tuple[int, int]:
+    agree, before = VisibilityConstraints(views(), wall()).count(np.array([position]), of)
     return int(agree[0]), int(before[0])
 
 
-def test_a_place_on_the_wall_is_agreed_to() -> None:
-    assert asked((0.1, 0.2, WALL), of="") == (2, 0)
+def test_a_position_on_the_wall_is_supported() -> None:
+    assert votes((0.1, 0.2, WALL), of="") == (2, 0)
 
 
-def test_a_place_before_the_wall_is_contradicted() -> None:
-    assert asked((0.1, 0.2, 0.5 * WALL), of="") == (0, 2)
+def test_a_position_in_front_of_the_wall_is_contradicted() -> None:
+    assert votes((0.1, 0.2, 0.5 * WALL), of="") == (0, 2)
 
 
-def test_of_a_place_behind_the_wall_nothing_is_known() -> None:
-    assert asked((0.1, 0.2, 2 * WALL), of="") == (0, 0)
+def test_a_position_behind_the_wall_is_neither() -> None:
+    assert votes((0.1, 0.2, 2 * WALL), of="") == (0, 0)
 
 
-def test_a_photograph_is_no_witness_of_its_own() -> None:
-    assert asked((0.1, 0.2, WALL), of="0") == (1, 0)
-    assert asked((0.1, 0.2, 0.5 * WALL), of="1") == (0, 1)
+def test_a_photograph_does_not_support_itself() -> None:
+    assert votes((0.1, 0.2, WALL), of="0") == (1, 0)
+    assert votes((0.1, 0.2, 0.5 * WALL), of="1") == (0, 1)
 
 
-def test_without_points_nobody_knows_anything() -> None:
+def test_without_points_there_is_no_support() -> None:
     agree, before = VisibilityConstraints(views(), np.zeros((0, 3))).count(wall(), "")
     assert not agree.any()
     assert not before.any()

@@ -1,5 +1,5 @@
-// Where the splats come from: an address, or chunks of base64 in the document that together are
-// one gzip of a .ply.
+// The source of the splats: an address, or chunks of base64 in the document that together are one
+// gzip of a .ply.
 function bytesOf(base64) {
     const text = atob(base64);
     const bytes = new Uint8Array(text.length);

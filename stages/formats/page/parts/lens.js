@@ -19,7 +19,7 @@ function frustumOf(shot, width, height, near) {
     ];
 }
 
-// What a shot's lens makes of the viewer's camera counts too: it is asked for when a frame is drawn.
+// The projection of the viewer's camera, with the lens of a shot if one is held.
 function projectionOf(camera) {
     const matrix = camera.projectionMatrix.clone();
     if (camera.calculateProjection) camera.calculateProjection(matrix);

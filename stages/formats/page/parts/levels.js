@@ -1,7 +1,6 @@
-// How much of a streamed asset is drawn: for each of its leaves, the coarsest level whose splats are
-// at most a pixel wide at its distance. The viewer spends what that comes to, as its budget, where it
-// is seen most.
-const BUDGET_DIGITS = 2; // a budget that changes with every step would load and sort anew each time
+// The splat budget of a streamed asset: for each leaf, the coarsest level whose splats are at most a
+// pixel wide at its distance. The viewer distributes the sum over the leaves.
+const BUDGET_DIGITS = 2; // a budget that changes with every step would cause loading and sorting each time
 
 function leavesOf(tree) {
     const found = [];
@@ -15,7 +14,7 @@ function leavesOf(tree) {
 }
 
 class Levels {
-    // sizes: how wide the splats of each level are, the finest first, in world units
+    // sizes: width of the splats of each level, finest first, in world units
     constructor(app, meta, sizes) {
         this.app = app;
         this.sizes = sizes;
@@ -27,7 +26,7 @@ class Levels {
         app.on("update", () => this.choose());
     }
 
-    wanted(place, pixels) {
+    splatsAt(place, pixels) {
         let sum = 0;
         for (const { bound, counts } of this.leaves) {
             const away = place.map((v, i) => Math.max(bound.min[i] - v, v - bound.max[i], 0));
@@ -41,12 +40,12 @@ class Levels {
 
     choose() {
         const { gsplat } = this.app.scene;
-        if (gsplat.splatBudget !== this.budget) this.most = gsplat.splatBudget; // the visitor's choice
+        if (gsplat.splatBudget !== this.budget) this.most = gsplat.splatBudget; // set by the visitor
         const { camera } = this.app.root.findByName("camera");
         const model = this.app.root.findByName("gsplat").getWorldTransform().clone().invert();
         const place = model.transformPoint(camera.entity.getPosition());
         const pixels = (projectionOf(camera).data[5] * this.app.graphicsDevice.height) / 2;
-        const sum = this.wanted([place.x, place.y, place.z], pixels);
+        const sum = this.splatsAt([place.x, place.y, place.z], pixels);
         const whole = this.leaves.reduce((all, { counts }) => all + counts[0], 0);
         const digits = 10 ** Math.max(0, Math.ceil(Math.log10(sum + 1)) - BUDGET_DIGITS);
         const some = sum < whole ? Math.ceil(sum / digits) * digits : this.most;

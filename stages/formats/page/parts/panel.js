@@ -40,8 +40,8 @@ class Panel {
         find("photo").hidden = !beside;
         find("stage").classList.toggle("beside", beside);
         if (beside) find("photo").querySelector("img").src = shot.photo;
-        const told = shot.held_out ? "training never saw it" : "used in training";
-        find("photo").querySelector("figcaption").textContent = `${shot.name}: ${told}`;
+        const role = shot.held_out ? "training never saw it" : "used in training";
+        find("photo").querySelector("figcaption").textContent = `${shot.name}: ${role}`;
         find("note").textContent = "";
     }
 

@@ -154,8 +154,8 @@ class Selection {
             if (this.region && this.region.holds(at[i], at[i + 1], at[i + 2])) this.chosen.push(i);
         }
         const count = (n) => n.toLocaleString("en");
-        const told = this.region ? `${count(this.chosen.length)} of ${count(left)} selected` : `${count(left)} left`;
-        find("chosen").textContent = this.centres ? told : "";
+        const summary = this.region ? `${count(this.chosen.length)} of ${count(left)} selected` : `${count(left)} left`;
+        find("chosen").textContent = this.centres ? summary : "";
         for (const name of ["keep", "drop"]) find(name).disabled = !this.region;
         find("undo").disabled = find("copy").disabled = !this.chain.length;
         const words = this.chain.map(({ word, region }) => `--${word} ${region.text}`);
