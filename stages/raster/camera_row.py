@@ -13,7 +13,7 @@ R, T = 0, 9
 FX, FY, CX, CY = 12, 13, 14, 15
 LOW_X, HIGH_X, LOW_Y, HIGH_Y = 16, 17, 18, 19  # limits of x/z and y/z in the Jacobian J
 NEAR, DILATION, ANTIALIAS = 20, 21, 22
-STAND = 23  # 23:26, the camera's centre in the world
+CAMERA_CENTRE = 23  # 23:26, the camera's centre in the world
 WIDTH, HEIGHT = 26, 27
 
 

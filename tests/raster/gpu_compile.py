@@ -25,14 +25,14 @@ FLOATS, DOUBLES, INTS, LONGS, BYTES, SHORTS = "*fp32", "*fp64", "*i32", "*i64", 
 POINTERS = {
     **dict.fromkeys(("cam", "sums"), DOUBLES),
     **dict.fromkeys(("members", "last", "counts", "row_of", "steps", "gradient_count"), INTS),
-    **dict.fromkeys(("starts", "slots", "firsts", "order", "settled", "ends", "total"), LONGS),
+    **dict.fromkeys(("starts", "slots", "firsts", "order", "ordered", "ends", "total"), LONGS),
     **dict.fromkeys(("status",), BYTES),
     **dict.fromkeys(("target",), "*u8"),
     **dict.fromkeys(("tile_of",), SHORTS),
 }
 WHOLE = ("n", "width", "height", "tiles_x", "tiles", "capacity", "entries", "room")
 REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y")
-SCENE = {"COLUMNS": 64, "STORED": 16, "BANDS": 16, "SMOOTH": False, "ANTIALIAS": False}
+SCENE = {"COLUMNS": 64, "STORED": 16, "COEFFICIENTS": 16, "SMOOTH": False, "ANTIALIAS": False}
 SIZES = {"TILE": 16, "BLOCK": 128, "REAL": tl.float64, "OUT_COLUMNS": 64, "BITS": 20}
 KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (project.project_kernel, {}, {}),
