@@ -1,7 +1,7 @@
-"""Footprints of splats on the picture, and the way back to their parameters, eight at a time.
+"""Projection of splats to footprints, and its backward pass to their parameters, eight at a time.
 
-All of it in float64: eight lanes of it cost little beside blending, and it takes overflow, the loss
-of the determinant and far-away centres off the list of worries. Formulas as in `reference`.
+Everything is in float64, which costs little beside blending and avoids overflow, cancellation in
+the determinant, and loss of precision for distant means. Formulas as in `reference`.
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ def geometry_records(cam, w, rows, geometry):
 
 @kernel
 def sums_origin(geometry, row, width, height):
-    """(o, p, q): where the offsets u' and t' of the way back begin, pixels.
+    """(o, p, q): origin of the offsets u' and t' in the backward pass, pixels.
 
     u' = major - o, t' = (minor - q) - K (major - p), major and minor a pixel's coordinates along
     the axis of the larger variance and along the other. They begin at a mean in the picture; beside

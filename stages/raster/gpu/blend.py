@@ -2,7 +2,7 @@
 
 A tile is one program of one warp: no barriers, and a splat's gradient is added up in registers and
 written once for each tile that it touches, to a place of its own, so that sums are made in a fixed
-order. `alpha_of` is the one function for both directions: the way back divides by 1 - alpha.
+order. Both passes use `alpha_of`, because the backward pass divides by 1 - alpha.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from stages.raster.gpu.project import (
 TRANSMITTANCE_MIN = tl.constexpr(definition.TRANSMITTANCE_MIN)
 NEVER = tl.constexpr(2**30)  # "last entry drawn" of a pixel that was never finished
 PATIENCE = tl.constexpr(16)  # entries between two looks whether a tile is finished
-# What the way back leaves of a splat: see `cpu.blend.SUMS`.
+# Results of the backward pass for a splat: see `cpu.blend.SUMS`.
 S_U, S_T, S_UU, S_TT, S_UT, S_1, S_RED = (tl.constexpr(k) for k in range(7))
 SUMS = tl.constexpr(9)
 

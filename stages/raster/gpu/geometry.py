@@ -1,4 +1,4 @@
-"""Footprints of splats on the picture: what the way there and the way back both compute.
+"""Footprints of splats: what the forward and the backward pass both compute.
 
 Formulas as in `reference`, a splat a lane. REAL is the type that all of it runs in: float64 unless
 a test asks what float32 would leave of the extremes table. A row of parameters has the columns of a

@@ -45,7 +45,7 @@ MEAN_HI, MEAN_LO, CUT_HI, CUT_LO, SLOPE_HI, SLOPE_LO, ROOT_A, ROOT_B, LEVEL, TAL
     tl.constexpr(k) for k in range(10)
 )
 COLOUR, DEPTH = tl.constexpr(10), tl.constexpr(13)
-# Where the sums of the way back begin: see `cpu.projection.sums_origin`.
+# Origin of the sums of the backward pass: see `cpu.projection.sums_origin`.
 ORIGIN, ORIGIN_CUT = tl.constexpr(14), tl.constexpr(15)
 # Where the ellipse lies, beyond which a splat is too faint: middle, half of its box, correlation
 # and the root of 1 less its square; first and last row of tiles.
