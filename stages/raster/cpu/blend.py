@@ -318,11 +318,11 @@ def blend_gradient_tiles(
 def entry_gradient(
     frame, from_origin, number, blocks, paint, row, work, last, last_at, gradients, slot
 ):
-    """Gradient of one splat in one tile into gradients[slot]: see SUMS, u and t from the origin of
-    `sums_origin`.
+    """Gradient of one splat in one tile into gradients[slot]: see SUMS; u and t from the origin
+    of `sums_origin`.
 
-    work: the incoming gradient, the light that passes behind the splat, and what lies behind
-    weighted by the incoming gradient (a suffix sum). The last two move in front of it.
+    work: the incoming gradient; the transmittance behind the splat; the colour behind it times the
+    incoming gradient (a suffix sum). The last two are updated to in front of the splat.
     """
     r, g, bl = splat16(paint[row, 0]), splat16(paint[row, 1]), splat16(paint[row, 2])
     zero, one = splat16(_F(0.0)), splat16(_F(1.0))
