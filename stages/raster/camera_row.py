@@ -14,7 +14,7 @@ R, T = 0, 9
 FX, FY, CX, CY = 12, 13, 14, 15
 LOW_X, HIGH_X, LOW_Y, HIGH_Y = 16, 17, 18, 19  # of the slopes x/z and y/z, beyond which J is frozen
 NEAR, DILATION, ANTIALIAS = 20, 21, 22
-STAND = 23  # 23:26
+CAMERA_CENTRE = 23  # 23:26
 WIDTH, HEIGHT = 26, 27
 
 

@@ -33,14 +33,14 @@ ERROR_CHANGE, WEIGHT, LARGEST_WEIGHT, SQUARED_WEIGHT, WEIGHTED_RESIDUAL = range(
 CONTRIBUTIONS = WEIGHTED_RESIDUAL + 3
 
 
-def used_columns(bands: int) -> int:
+def used_columns(coefficients: int) -> int:
     """Columns of a gradient row that hold something, with `bands` (basis functions) of SH."""
-    return SH + 3 * bands
+    return SH + 3 * coefficients
 
 
-def gradient_columns(bands: int) -> int:
+def gradient_columns(coefficients: int) -> int:
     """Columns of a gradient row with room for `bands` of SH: whole vectors."""
-    return -(-used_columns(bands) // 16) * 16
+    return -(-used_columns(coefficients) // 16) * 16
 
 
 @dataclass(frozen=True)

@@ -105,11 +105,11 @@ class ReferenceRasteriser:
             _pass_on((rgb, *vars(projected).values()), (shades, *vars(shown).values()))
         place = np.empty(len(arrays[0]), np.int64)
         place[_host(projected.index)] = np.arange(len(projected.index))
-        bands = (min(degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
+        coefficients = (min(degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
         columns = [_gradient(t, rows) for t in p.tensors()[:4]]
-        columns.append(_gradient(p.sh, rows)[:, : 3 * bands])
+        columns.append(_gradient(p.sh, rows)[:, : 3 * coefficients])
         values = np.concatenate(columns, 1)
-        parameters = np.zeros((len(rows), gradient_columns(bands)), np.float32)
+        parameters = np.zeros((len(rows), gradient_columns(coefficients)), np.float32)
         parameters[:, : values.shape[1]] = np.clip(values, -_LARGEST, _LARGEST)
         means2d = _gradient(shown.means2d, place[rows]).astype(np.float32)
         return Backward(rows, parameters, means2d)

@@ -98,7 +98,7 @@ class GpuStep:
     def model(self) -> Model:
         """See `step.TrainingStep`."""
         if self._on_host is None:
-            rows, coefficients = _host(self._scene.rows), self._scene.bands
+            rows, coefficients = _host(self._scene.rows), self._scene.coefficients
             means, quaternions, log_scales = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
             sh = rows[:, SH : SH + 3 * coefficients].reshape(len(rows), coefficients, 3)
             own = (means, quaternions, log_scales, rows[:, OPACITY], sh, self._sh_degrees)
@@ -152,7 +152,7 @@ class GpuStep:
         if dropout is not None:
             rows = rows.clone()
             rows[:, OPACITY].masked_fill_(dropped(dropout, self._gradient_count), INVISIBLE)
-        return Scene(rows, self._scene.bands, widths)
+        return Scene(rows, self._scene.coefficients, widths)
 
     def _target(self, level: Level) -> GpuTarget:
         key = id(level.means)  # the same object each time that a level is read
@@ -182,7 +182,7 @@ class GpuStep:
             *(0.5 * view.width / pixels, 0.5 * view.height / pixels),
             COLUMNS=columns,
             OUT_COLUMNS=out_columns,
-            ACTIVE=active_counts(view.bands(self._scene)),
+            ACTIVE=active_counts(view.coefficients(self._scene)),
             WIDTH=triton.next_power_of_2(out_columns),
             BLOCK=block,
         )

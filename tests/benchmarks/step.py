@@ -124,8 +124,8 @@ def one_row(name: str, splats: Splats, camera: Camera) -> tuple[list[str], dict[
     fresh = Stepper(splats, camera, pool)
     first = peak_bytes(fresh)
     again = peak_bytes(fresh)
-    bands = stepper.model.sh.shape[1]
-    first -= 4 * gradient_columns(bands) * visible  # the gradients themselves
+    coefficients = stepper.model.sh.shape[1]
+    first -= 4 * gradient_columns(coefficients) * visible  # the gradients themselves
     allowed = 150 * visible + 24 * intersections + 60 * camera.width * camera.height
     row = [
         name,

@@ -10,8 +10,8 @@ from stages.training.optimiser import OPACITY_STEPS, LearningRates, apply_gradie
 from tests.extremes.measured import Measured, broken, worst
 from tests.tolerances import FIRST_STEP
 
-RATES, BANDS = LearningRates(means=0.01), 4
-USED = used_columns(BANDS)
+RATES, COEFFICIENTS = LearningRates(means=0.01), 4
+USED = used_columns(COEFFICIENTS)
 
 
 def first_seen_late(backend):
@@ -37,7 +37,7 @@ def out_of_range(backend):
         before = _row(model, 0)
         for _ in range(100):
             _step(pool, model, 0, np.ones(USED))
-        moved = np.abs(_row(model, 0) - before) / RATES.row(BANDS)[:USED]
+        moved = np.abs(_row(model, 0) - before) / RATES.row(COEFFICIENTS)[:USED]
         still += int((moved < 10).sum())
     return [
         Measured(33, "moments not finite", broken_moments, 0),
@@ -50,7 +50,7 @@ def switched_on_late(backend):
     r = np.random.default_rng(0)
     model, pool = _model(r), Pool(1)
     for _ in range(999):
-        _step(pool, model, 0, r.normal(size=used_columns(1)), bands=1)
+        _step(pool, model, 0, r.normal(size=used_columns(1)), coefficients=1)
     band = _strides(pool, model, 0, _strong(r))[SH_REST:]
     model.moment1[:, OPACITY] = model.moment2[:, OPACITY] = 0.0
     model.steps[:, OPACITY_STEPS] = 0
@@ -63,7 +63,7 @@ def switched_on_late(backend):
 
 
 def _model(r):
-    shapes = ((2, 3), (2, 4), (2, 3), (2,), (2, BANDS, 3))
+    shapes = ((2, 3), (2, 4), (2, 3), (2,), (2, COEFFICIENTS, 3))
     return new_model(*(r.normal(size=shape).astype(np.float32) for shape in shapes))
 
 
@@ -75,14 +75,14 @@ def _strides(pool, model, row, gradient):
     """How far one step takes each value of a row, over its rate."""
     before = _row(model, row)
     _step(pool, model, row, gradient)
-    return np.abs(_row(model, row) - before) / RATES.row(BANDS)[:USED]
+    return np.abs(_row(model, row) - before) / RATES.row(COEFFICIENTS)[:USED]
 
 
-def _step(pool, model, row, gradient, bands=BANDS):
-    values = np.zeros((1, gradient_columns(bands)), np.float32)
+def _step(pool, model, row, gradient, coefficients=COEFFICIENTS):
+    values = np.zeros((1, gradient_columns(coefficients)), np.float32)
     values[0, : len(gradient)] = gradient
     backward = Backward(np.array([row], np.int32), values, np.zeros((1, 2), np.float32))
-    apply_gradients(pool, model, backward, bands, RATES, 100, 50)
+    apply_gradients(pool, model, backward, coefficients, RATES, 100, 50)
 
 
 def _row(model, row):

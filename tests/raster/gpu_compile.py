@@ -32,7 +32,7 @@ POINTERS = {
 }
 WHOLE = ("n", "width", "height", "tiles_x", "tiles", "capacity", "entries", "room")
 REALS = ("red", "green", "blue", "weight", "unit", "ndc_x", "ndc_y")
-SCENE = {"COLUMNS": 64, "STORED": 16, "BANDS": 16, "SMOOTH": False, "ANTIALIAS": False}
+SCENE = {"COLUMNS": 64, "STORED": 16, "COEFFICIENTS": 16, "SMOOTH": False, "ANTIALIAS": False}
 SIZES = {"TILE": 16, "BLOCK": 128, "REAL": tl.float64, "OUT_COLUMNS": 64, "BITS": 20}
 KERNELS: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
     (project.project_kernel, {}, {}),

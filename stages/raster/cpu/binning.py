@@ -79,7 +79,7 @@ def sort_by_depth(visible, paint, arrays, keys, order, keys2, order2):
         order[place] = place
     # depths are positive, so their bits sort as they do
     radix_order(keys.view(np.uint32), order, keys2, order2)
-    settle_ties(keys.view(np.uint32), order, visible, *arrays)
+    sort_ties(keys.view(np.uint32), order, visible, *arrays)
 
 
 @kernel
@@ -97,15 +97,15 @@ def _comes_before(p, q, visible, means, quaternions, log_scales, opacity_logits,
     for k in range(4):
         if quaternions[i, k] != quaternions[j, k]:
             return quaternions[i, k] < quaternions[j, k]
-    for band in range(sh.shape[1]):
+    for coefficient in range(sh.shape[1]):
         for channel in range(3):
-            if sh[i, band, channel] != sh[j, band, channel]:
-                return sh[i, band, channel] < sh[j, band, channel]
+            if sh[i, coefficient, channel] != sh[j, coefficient, channel]:
+                return sh[i, coefficient, channel] < sh[j, coefficient, channel]
     return False
 
 
 @kernel
-def settle_ties(keys, order, visible, means, quaternions, log_scales, opacity_logits, sh):
+def sort_ties(keys, order, visible, means, quaternions, log_scales, opacity_logits, sh):
     """Sort runs of equal keys by value (a heap sort: a flat wall can hold thousands of ties).
 
     order: places in `visible`, which holds the rows.

@@ -31,7 +31,7 @@ from stages.raster.cpu.tile import (
     PIXELS,
     last_of_blocks,
     load_plane,
-    start_light,
+    start_transmittance,
     store_plane,
 )
 from stages.raster.definition import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -59,7 +59,7 @@ from stages.raster.kernels.simd import (
 )
 
 # Planes of a tile's work, forward and backward.
-RED, GREEN, BLUE, ALPHA, DEPTH, MEDIAN, LIGHT, LAST = (k * PIXELS for k in range(8))
+RED, GREEN, BLUE, ALPHA, DEPTH, MEDIAN, TRANSMITTANCE, LAST = (k * PIXELS for k in range(8))
 V_RED, V_GREEN, V_BLUE, PASSING, BEHIND = (k * PIXELS for k in range(5))
 # What the way back leaves of a splat, sums over a tile's pixels: of v u, v t, v u^2, v t^2, v u t
 # and v, with v the gradient that reaches a pixel's exponent; of the gradients by three colours.
@@ -165,12 +165,12 @@ def blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, pain
             blocks &= blocks - 1
             at = 16 * block
             alpha, _, _ = alpha_of(frame, block)
-            passing = vload(work, LIGHT + at)
+            passing = vload(work, TRANSMITTANCE + at)
             drawn = vand(vge(alpha, splat16(_ALPHA_MIN)), vge(passing, splat16(_T_MIN)))
             alpha = vselect(drawn, vmin(alpha, splat16(_ALPHA_MAX)), zero)
             weight = alpha * passing
             left = passing * (one - alpha)
-            vstore(work, LIGHT + at, left)
+            vstore(work, TRANSMITTANCE + at, left)
             vstore(work, RED + at, vfma(weight, r, vload(work, RED + at)))
             vstore(work, GREEN + at, vfma(weight, g, vload(work, GREEN + at)))
             vstore(work, BLUE + at, vfma(weight, bl, vload(work, BLUE + at)))
@@ -193,7 +193,7 @@ def _finish_tile(background, depths, work):
     """Background behind what was blended; alpha; sums of depths to means."""
     one, least = splat16(_F(1.0)), splat16(_F(0.5) * _ALPHA_MIN)
     for at in range(0, PIXELS, 16):
-        passed = vload(work, LIGHT + at)
+        passed = vload(work, TRANSMITTANCE + at)
         alpha = one - passed
         vstore(work, ALPHA + at, alpha)
         for channel in range(3):
@@ -217,7 +217,7 @@ def blend_tiles(
     background,
     depths,
     image,
-    light,
+    transmittance,
     last,
 ):
     """Draw every tile. image [4 or 6, H, W] float32: red, green, blue, alpha; if `depths`, then
@@ -235,11 +235,11 @@ def blend_tiles(
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
         work[:] = 0.0
-        alive = start_light(tile_x, tile_y, width, height, work, LIGHT, LAST)
+        alive = start_transmittance(tile_x, tile_y, width, height, work, TRANSMITTANCE, LAST)
         start, end = tile_starts[tile], tile_starts[tile + 1]
         blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, paint, depths, work)
         for at in range(0, PIXELS, 16):
-            vstore(light, tile * PIXELS + at, vload(work, LIGHT + at))
+            vstore(transmittance, tile * PIXELS + at, vload(work, TRANSMITTANCE + at))
             vstore(last, tile * PIXELS + at, vload(work, LAST + at))
         _finish_tile(background, depths, work)
         for channel in range(image.shape[0]):
@@ -247,11 +247,11 @@ def blend_tiles(
 
 
 @kernel
-def _start_gradient(v_image, tile, tile_x, tile_y, background, light, work):
+def _start_gradient(v_image, tile, tile_x, tile_y, background, transmittance, work):
     for channel in range(3):
         load_plane(v_image, channel, tile_x, tile_y, work, channel * PIXELS)
     for at in range(0, PIXELS, 16):
-        passed = vload(light, tile * PIXELS + at)
+        passed = vload(transmittance, tile * PIXELS + at)
         vstore(work, PASSING + at, passed)
         behind = vload(work, V_RED + at) * splat16(background[0])
         behind = vfma(vload(work, V_GREEN + at), splat16(background[1]), behind)
@@ -271,7 +271,7 @@ def blend_gradient_tiles(
     geometry,
     paint,
     background,
-    light,
+    transmittance,
     last,
     v_image,
     gradients,
@@ -286,7 +286,7 @@ def blend_gradient_tiles(
         if tile >= tiles_x * tiles_y:
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        _start_gradient(v_image, tile, tile_x, tile_y, background, light, work)
+        _start_gradient(v_image, tile, tile_x, tile_y, background, transmittance, work)
         furthest = last_of_blocks(last, tile, block_last)
         start, end = tile_starts[tile], tile_starts[tile + 1]
         for entry in range(end - 1, start - 1, -1):

@@ -56,11 +56,11 @@ RESIDUAL, BEHIND, PASSING = 0, 3 * PIXELS, 6 * PIXELS
 
 
 @kernel
-def _start(residual, tile, tile_x, tile_y, background, light, work):
+def _start(residual, tile, tile_x, tile_y, background, transmittance, work):
     for channel in range(3):
         load_plane(residual, channel, tile_x, tile_y, work, RESIDUAL + channel * PIXELS)
     for at in range(0, PIXELS, 16):
-        passed = vload(light, tile * PIXELS + at)
+        passed = vload(transmittance, tile * PIXELS + at)
         vstore(work, PASSING + at, passed)
         for channel in range(3):
             behind = passed * splat16(background[channel])
@@ -79,7 +79,7 @@ def contribution_tiles(
     geometry,
     paint,
     background,
-    light,
+    transmittance,
     last,
     residual,
     out,
@@ -96,7 +96,7 @@ def contribution_tiles(
         if tile >= tiles_x * tiles_y:
             break
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        _start(residual, tile, tile_x, tile_y, background, light, work)
+        _start(residual, tile, tile_x, tile_y, background, transmittance, work)
         last_of_blocks(last, tile, block_last)
         start, end = tile_starts[tile], tile_starts[tile + 1]
         for entry in range(end - 1, start - 1, -1):

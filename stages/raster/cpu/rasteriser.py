@@ -95,7 +95,7 @@ class Forward:
     culled: int
     geometry: NDArray[np.float64]
     paint: NDArray[np.float32]
-    light: NDArray[np.float32]
+    transmittance: NDArray[np.float32]
     last: NDArray[np.float32]
     cam: NDArray[np.float64]
     degree: int
@@ -142,7 +142,7 @@ class CpuRasteriser:
         background = np.asarray(settings.background, np.float32)
         tiles = len(lists.starts) - 1
         image = get("image", (6 if depths else 4, height, width), np.float32)
-        light = get("light", (tiles, PIXELS), np.float32)
+        transmittance = get("light", (tiles, PIXELS), np.float32)
         last = get("last", (tiles, PIXELS), np.float32)
         self.pool.share(
             blend.blend_tiles,
@@ -156,7 +156,7 @@ class CpuRasteriser:
             background,
             depths,
             image,
-            light,
+            transmittance,
             last,
         )
         return Forward(
@@ -166,7 +166,7 @@ class CpuRasteriser:
             int(np.count_nonzero(status == CULLED)),
             geometry,
             paint,
-            light,
+            transmittance,
             last,
             cam,
             degree,
@@ -234,7 +234,7 @@ class CpuRasteriser:
             forward.geometry,
             forward.paint,
             forward.background,
-            forward.light,
+            forward.transmittance,
             forward.last,
             planes,
             out,

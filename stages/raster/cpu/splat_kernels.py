@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from stages.raster.camera_row import CX, CY, DILATION, HEIGHT, STAND, WIDTH, R, T
+from stages.raster.camera_row import CAMERA_CENTRE, CX, CY, DILATION, HEIGHT, WIDTH, R, T
 from stages.raster.cpu.binning import COUNT, SLOT
 from stages.raster.cpu.blend import S_1, S_RED, S_T, S_TT, S_U, S_UT, S_UU, SUMS
 from stages.raster.cpu.projection import (
@@ -70,9 +70,9 @@ def _name_rows(rows, start, end):
 
 @kernel
 def _colours_are_finite(i, sh):
-    for band in range(sh.shape[1]):
+    for coefficient in range(sh.shape[1]):
         for channel in range(3):
-            if not math.isfinite(sh[i, band, channel]):
+            if not math.isfinite(sh[i, coefficient, channel]):
                 return False
     return True
 
@@ -145,9 +145,9 @@ def project_splats(
 @kernel
 def _direction(rows, cam, means):
     """(unit x, y, z, distance) from the camera to eight rows."""
-    x = gather8(means, rows, 3, 0) - cam[STAND]
-    y = gather8(means, rows, 3, 1) - cam[STAND + 1]
-    z = gather8(means, rows, 3, 2) - cam[STAND + 2]
+    x = gather8(means, rows, 3, 0) - cam[CAMERA_CENTRE]
+    y = gather8(means, rows, 3, 1) - cam[CAMERA_CENTRE + 1]
+    z = gather8(means, rows, 3, 2) - cam[CAMERA_CENTRE + 2]
     distance = dsqrt(x * x + y * y + z * z)
     return x / distance, y / distance, z / distance, distance
 
@@ -159,8 +159,10 @@ def _shade(rows, cam, degree, means, sh, basis, paint):
     stride = 3 * sh.shape[1]
     for channel in range(3):
         value = spread8(0.5)
-        for band in range((degree + 1) * (degree + 1)):
-            value = value + at(basis, band) * gather8(sh, rows, stride, 3 * band + channel)
+        for coefficient in range((degree + 1) * (degree + 1)):
+            value = value + at(basis, coefficient) * gather8(
+                sh, rows, stride, 3 * coefficient + channel
+            )
         scatter8(paint, rows, 4, channel, dmin(dmax(value, 0.0), COLOUR_MAX))
     mx, my, mz = gather8(means, rows, 3, 0), gather8(means, rows, 3, 1), gather8(means, rows, 3, 2)
     depth = cam[R + 6] * mx + cam[R + 7] * my + cam[R + 8] * mz + cam[T + 2]
@@ -170,22 +172,24 @@ def _shade(rows, cam, degree, means, sh, basis, paint):
 @kernel
 def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out):
     """SH gradients into out[places, SH:]; the direction's are added to the means' in `work`."""
-    bands = (degree + 1) * (degree + 1)
+    coefficients = (degree + 1) * (degree + 1)
     x, y, z, distance = _direction(rows, cam, means)
     sh_basis(degree, x, y, z, basis)
     stride, columns = 3 * sh.shape[1], out.shape[1]
-    for band in range(bands):
-        put(weights, band, spread8(0.0))
+    for coefficient in range(coefficients):
+        put(weights, coefficient, spread8(0.0))
     for channel in range(3):
         # a colour that is clamped passes nothing on
         colour = gather8(paint, rows, 4, channel)
         painted = dand(dgt(colour, 0.0), dgt(_BRIGHTEST, colour))
         g = dselect(painted, at(sums, S_RED + channel), 0.0)
-        for band in range(bands):
-            scatter8(out, places, columns, SH + 3 * band + channel, g * at(basis, band))
+        for coefficient in range(coefficients):
+            scatter8(
+                out, places, columns, SH + 3 * coefficient + channel, g * at(basis, coefficient)
+            )
             if degree > 0:
-                added = g * gather8(sh, rows, stride, 3 * band + channel)
-                put(weights, band, at(weights, band) + added)
+                added = g * gather8(sh, rows, stride, 3 * coefficient + channel)
+                put(weights, coefficient, at(weights, coefficient) + added)
     if degree > 0:
         gx, gy, gz = sh_direction_gradient(degree, x, y, z, weights)
         along = gx * x + gy * y + gz * z
@@ -320,14 +324,14 @@ def _exponent_gradient(rows, cam, geometry, w, sums, shifts, smoothed, places, m
 @kernel
 def sh_basis_values(degree, directions):
     """[N, (degree + 1)^2] basis functions of unit directions [N, 3], for looking at."""
-    n, bands = len(directions), (degree + 1) * (degree + 1)
-    out = np.empty((n, bands), np.float64)
+    n, coefficients = len(directions), (degree + 1) * (degree + 1)
+    out = np.empty((n, coefficients), np.float64)
     basis = np.empty(16 * LANES, np.float64)
     rows = np.empty(LANES, np.int64)
     for start in range(0, n, LANES):
         _name_rows(rows, start, n)
         x, y = gather8(directions, rows, 3, 0), gather8(directions, rows, 3, 1)
         sh_basis(degree, x, y, gather8(directions, rows, 3, 2), basis)
-        for band in range(bands):
-            scatter8(out, rows, bands, band, at(basis, band))
+        for coefficient in range(coefficients):
+            scatter8(out, rows, coefficients, coefficient, at(basis, coefficient))
     return out

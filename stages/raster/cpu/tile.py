@@ -59,7 +59,7 @@ def store_plane(picture, channel, tile_x, tile_y, work, plane):
 
 
 @kernel
-def start_light(tile_x, tile_y, width, height, work, light, last):
+def start_transmittance(tile_x, tile_y, width, height, work, transmittance, last):
     """Light 1 and last NEVER in the tile's pixels; 0 and 0 in those beyond the picture's rim.
 
     light, last: planes of `work`. Returns the mask of blocks that lie in the picture.
@@ -71,7 +71,7 @@ def start_light(tile_x, tile_y, width, height, work, light, last):
             alive |= 1 << block
         for k in range(16):
             inside = y + k // 4 < height and x + k % 4 < width
-            work[light + 16 * block + k] = _F(1.0) if inside else _F(0.0)
+            work[transmittance + 16 * block + k] = _F(1.0) if inside else _F(0.0)
             work[last + 16 * block + k] = NEVER if inside else _F(0.0)
     return alive
 

@@ -84,7 +84,7 @@ def blend_kernel(
     members,
     starts,
     image,
-    light,
+    transmittance,
     last,
     red,
     green,
@@ -135,7 +135,7 @@ def blend_kernel(
         mean = depth / tl.maximum(1.0 - passing, ALPHA_MIN / 2)
         tl.store(image + 4 * plane + at, mean, mask=inside)
         tl.store(image + 5 * plane + at, median, mask=inside)
-    tl.store(light + at, passing, mask=inside)
+    tl.store(transmittance + at, passing, mask=inside)
     tl.store(last + at, finished_at, mask=inside)
 
 
@@ -163,7 +163,7 @@ def blend_gradient_kernel(
     members,
     slots,
     starts,
-    light,
+    transmittance,
     last,
     v_image,
     gradients,
@@ -182,7 +182,7 @@ def blend_gradient_kernel(
     v_r = tl.load(v_image + at, mask=inside, other=0.0)
     v_g = tl.load(v_image + plane + at, mask=inside, other=0.0)
     v_b = tl.load(v_image + 2 * plane + at, mask=inside, other=0.0)
-    passing = tl.load(light + at, mask=inside, other=0.0)
+    passing = tl.load(transmittance + at, mask=inside, other=0.0)
     behind = tl.fma(v_r, red, tl.fma(v_g, green, v_b * blue)) * passing
     for back in range(count):
         number = count - back
@@ -224,7 +224,7 @@ def contribution_kernel(
     members,
     slots,
     starts,
-    light,
+    transmittance,
     last,
     residual,
     out,
@@ -244,7 +244,7 @@ def contribution_kernel(
     e_r = tl.load(residual + at, mask=inside, other=0.0)
     e_g = tl.load(residual + plane + at, mask=inside, other=0.0)
     e_b = tl.load(residual + 2 * plane + at, mask=inside, other=0.0)
-    passing = tl.load(light + at, mask=inside, other=0.0)
+    passing = tl.load(transmittance + at, mask=inside, other=0.0)
     behind_r, behind_g, behind_b = passing * red, passing * green, passing * blue
     for back in range(count):
         number = count - back

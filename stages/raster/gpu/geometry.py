@@ -18,7 +18,7 @@ FX, FY = tl.constexpr(camera_row.FX), tl.constexpr(camera_row.FY)
 CX, CY = tl.constexpr(camera_row.CX), tl.constexpr(camera_row.CY)
 LOW_X, HIGH_X = tl.constexpr(camera_row.LOW_X), tl.constexpr(camera_row.HIGH_X)
 LOW_Y, HIGH_Y = tl.constexpr(camera_row.LOW_Y), tl.constexpr(camera_row.HIGH_Y)
-DILATION, STAND = tl.constexpr(camera_row.DILATION), tl.constexpr(camera_row.STAND)
+DILATION, CAMERA_CENTRE = tl.constexpr(camera_row.DILATION), tl.constexpr(camera_row.CAMERA_CENTRE)
 MEAN, ROTATION = tl.constexpr(definition.MEAN), tl.constexpr(definition.ROTATION)
 LOG_SCALE, OPACITY = tl.constexpr(definition.LOG_SCALE), tl.constexpr(definition.OPACITY)
 SH = tl.constexpr(definition.SH)
@@ -177,9 +177,9 @@ def cross(a0, a1, a2, b0, b1, b2):
 @inner
 def direction(cam, rows, at, mask, REAL: tl.constexpr):
     """(unit x, y, z, distance) from the camera to a splat."""
-    x = column(rows, at, mask, MEAN, REAL) - number(cam, STAND, REAL)
-    y = column(rows, at, mask, MEAN + 1, REAL) - number(cam, STAND + 1, REAL)
-    z = column(rows, at, mask, MEAN + 2, REAL) - number(cam, STAND + 2, REAL)
+    x = column(rows, at, mask, MEAN, REAL) - number(cam, CAMERA_CENTRE, REAL)
+    y = column(rows, at, mask, MEAN + 1, REAL) - number(cam, CAMERA_CENTRE + 1, REAL)
+    z = column(rows, at, mask, MEAN + 2, REAL) - number(cam, CAMERA_CENTRE + 2, REAL)
     distance = tl.sqrt(x * x + y * y + z * z)
     return x / distance, y / distance, z / distance, distance
 

@@ -118,7 +118,7 @@ def rotation_gradient(out, mask, q0, q1, q2, q3, norm, r00, r10, r20, r01, r11, 
 
 @inner
 def colour_gradient(
-    cam, rows, at, mask, record, sums, out, BANDS: tl.constexpr, REAL: tl.constexpr
+    cam, rows, at, mask, record, sums, out, COEFFICIENTS: tl.constexpr, REAL: tl.constexpr
 ):
     """SH gradients into `out`; returns what the viewing directions add to the mean's gradient."""
     x, y, z, distance = direction(cam, rows, at, mask, REAL)
@@ -126,7 +126,7 @@ def colour_gradient(
     g_g = shown_colour(record, sums, 1, mask)
     g_b = shown_colour(record, sums, 2, mask)
     gx, gy, gz = x * 0.0, x * 0.0, x * 0.0
-    for k in tl.static_range(BANDS):
+    for k in tl.static_range(COEFFICIENTS):
         value = basis(k, x, y, z)
         store_gradient(out, SH + 3 * k, mask, g_r * value)
         store_gradient(out, SH + 3 * k + 1, mask, g_g * value)
@@ -285,7 +285,7 @@ def splat_gradient_kernel(
     means2d,
     COLUMNS: tl.constexpr,
     OUT_COLUMNS: tl.constexpr,
-    BANDS: tl.constexpr,
+    COEFFICIENTS: tl.constexpr,
     SMOOTH: tl.constexpr,
     ANTIALIAS: tl.constexpr,
     REAL: tl.constexpr,
@@ -326,7 +326,7 @@ def splat_gradient_kernel(
     g_u, g_v = tl.where(in_u, -g02 * fx / z, 0.0), tl.where(in_v, -g12 * fy / z, 0.0)
     by_x, by_y = (g_x * fx + g_u) / z, (g_y * fy + g_v) / z
     mx, my, mz = turned_back(cam, by_x, by_y, -(g_near + g_u * u + g_v * v) / z, REAL)
-    tx, ty, tz = colour_gradient(cam, rows, at, mask, record, sums, out, BANDS, REAL)
+    tx, ty, tz = colour_gradient(cam, rows, at, mask, record, sums, out, COEFFICIENTS, REAL)
     store_gradient(out, MEAN, mask, mx + tx)
     store_gradient(out, MEAN + 1, mask, my + ty)
     store_gradient(out, MEAN + 2, mask, mz + tz)

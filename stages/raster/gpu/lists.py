@@ -159,7 +159,7 @@ def order_of(rows, a, b, mask, COLUMNS: tl.constexpr, STORED: tl.constexpr):
 
 @triton.jit
 def ties_kernel(
-    keys, order, settled, rows, n, COLUMNS: tl.constexpr, STORED: tl.constexpr, BLOCK: tl.constexpr
+    keys, order, ordered, rows, n, COLUMNS: tl.constexpr, STORED: tl.constexpr, BLOCK: tl.constexpr
 ):
     """settled [n]: `order`, with runs of equal finite keys in the order of the splats' own values.
 
@@ -182,4 +182,4 @@ def ties_kernel(
             wrong = order_of(rows, rival_row, row, tied, COLUMNS, STORED) * way < 0
             place += tl.where(tied & wrong, way, 0)
             rival += way
-    tl.store(settled + place, row, mask=mask)
+    tl.store(ordered + place, row, mask=mask)

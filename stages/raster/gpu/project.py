@@ -168,10 +168,10 @@ def put_shape(shape, mask, x, y, half_x, half_y, rho, thin, height, TILE: tl.con
 
 
 @inner
-def put_colour(record, cam, rows, at, mask, BANDS: tl.constexpr, REAL: tl.constexpr):
+def put_colour(record, cam, rows, at, mask, COEFFICIENTS: tl.constexpr, REAL: tl.constexpr):
     x, y, z, _ = direction(cam, rows, at, mask, REAL)
     red, green, blue = x * 0.0 + 0.5, x * 0.0 + 0.5, x * 0.0 + 0.5
-    for k in tl.static_range(BANDS):
+    for k in tl.static_range(COEFFICIENTS):
         value = basis(k, x, y, z)
         red += value * column(rows, at, mask, SH + 3 * k, REAL)
         green += value * column(rows, at, mask, SH + 3 * k + 1, REAL)
@@ -195,7 +195,7 @@ def project_kernel(
     status,
     COLUMNS: tl.constexpr,
     STORED: tl.constexpr,
-    BANDS: tl.constexpr,
+    COEFFICIENTS: tl.constexpr,
     SMOOTH: tl.constexpr,
     ANTIALIAS: tl.constexpr,
     TILE: tl.constexpr,
@@ -204,7 +204,7 @@ def project_kernel(
 ):
     """Record, shape, key (depth, infinite where not visible) and status of each of n rows.
 
-    rows [n, COLUMNS], STORED bands of SH in them, of which BANDS are drawn. smoothing [n].
+    rows [n, COLUMNS], STORED bands of SH in them, of which COEFFICIENTS are drawn. smoothing [n].
     """
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask, at = i < n, i * COLUMNS
@@ -230,7 +230,7 @@ def project_kernel(
     px, py = held(px), held(py)
     record = records + i * RECORD
     put_record(record, shown, px, py, a, b, c, det, opacity, z, width, height)
-    put_colour(record, cam, rows, at, shown, BANDS, REAL)
+    put_colour(record, cam, rows, at, shown, COEFFICIENTS, REAL)
     rho, thin = b / tl.sqrt(a) / tl.sqrt(c), tl.sqrt(det / a / c)
     put_shape(shapes + i * SHAPE, shown, px, py, half_x, half_y, rho, thin, height, TILE)
     tl.store(keys + i, tl.where(shown, z.to(tl.float32), float("inf")), mask=mask)

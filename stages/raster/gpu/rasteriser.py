@@ -35,7 +35,7 @@ class Scene:
     of SH that they hold. smoothing [N], or [0] for none."""
 
     rows: Tensor
-    bands: int
+    coefficients: int
     smoothing: Tensor
 
     def __len__(self) -> int:
@@ -51,9 +51,9 @@ class View:
     height: int
     settings: RasterSettings
 
-    def bands(self, scene: Scene) -> int:
+    def coefficients(self, scene: Scene) -> int:
         """How many bands of SH take part."""
-        return min((self.settings.sh_degree + 1) ** 2, scene.bands)
+        return min((self.settings.sh_degree + 1) ** 2, scene.coefficients)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Drawn:
     records, keys, status [N]: see `project_kernel`."""
 
     image: Tensor
-    light: Tensor
+    transmittance: Tensor
     last: Tensor
     records: Tensor
     keys: Tensor
@@ -164,12 +164,18 @@ class GpuRasteriser:
     def scene(self, arrays: Arrays, smoothing: NDArray[np.float32] = NO_SMOOTHING) -> Scene:
         """Arrays of the host, as rows on the device."""
         means, quaternions, log_scales, opacity_logits, sh = arrays
-        n, bands = len(means), sh.shape[1]
-        parts = (means, quaternions, log_scales, opacity_logits[:, None], sh.reshape(n, 3 * bands))
-        rows = np.zeros((n, gradient_columns(bands)), np.float32)
-        np.concatenate(parts, 1, out=rows[:, : SH + 3 * bands])
+        n, coefficients = len(means), sh.shape[1]
+        parts = (
+            means,
+            quaternions,
+            log_scales,
+            opacity_logits[:, None],
+            sh.reshape(n, 3 * coefficients),
+        )
+        rows = np.zeros((n, gradient_columns(coefficients)), np.float32)
+        np.concatenate(parts, 1, out=rows[:, : SH + 3 * coefficients])
         widths = torch.tensor(smoothing, device=self.device)
-        return Scene(torch.from_numpy(rows).to(self.device), bands, widths)
+        return Scene(torch.from_numpy(rows).to(self.device), coefficients, widths)
 
     def view(self, camera: Camera, settings: RasterSettings) -> View:
         """A camera and settings, on the device."""
@@ -192,8 +198,8 @@ class GpuRasteriser:
                 *(view.cam, scene.rows, scene.smoothing, n, view.width, view.height),
                 *(records, shapes, keys, status),
                 COLUMNS=scene.rows.shape[1],
-                STORED=scene.bands,
-                BANDS=view.bands(scene),
+                STORED=scene.coefficients,
+                COEFFICIENTS=view.coefficients(scene),
                 SMOOTH=len(scene.smoothing) > 0,
                 ANTIALIAS=view.settings.antialias,
                 TILE=self.tile,
@@ -203,29 +209,29 @@ class GpuRasteriser:
         made = self._lists(scene, view, shapes, keys, capacity)
         planes = 6 if depths else 4
         image = torch.empty(planes, view.height, view.width, **like)
-        light = torch.empty(view.height, view.width, **like)
+        transmittance = torch.empty(view.height, view.width, **like)
         last = torch.empty(view.height, view.width, dtype=torch.int32, **like)
         blend.blend_kernel[(self._tiles(view)[2],)](
-            *(records, made.members, made.starts, image, light, last),
+            *(records, made.members, made.starts, image, transmittance, last),
             *view.settings.background,
             *(view.width, view.height, self._tiles(view)[0]),
             DEPTHS=depths,
             TILE=self.tile,
             num_warps=1,
         )
-        return Drawn(image, light, last, records, keys, status, made)
+        return Drawn(image, transmittance, last, records, keys, status, made)
 
     def gradients(
         self, scene: Scene, view: View, drawn: Drawn, v_image: Tensor
     ) -> tuple[Tensor, Tensor]:
         """([N, gradient_columns], [N, 2]) of parameters and of means on the picture, of the visible
         splats; zeros elsewhere. v_image [3, H, W]."""
-        n, bands = len(scene), view.bands(scene)
+        n, coefficients = len(scene), view.coefficients(scene)
         like: dict[str, Any] = {"device": self.device}
         raw = torch.zeros(len(drawn.lists.members), blend.SUMS.value, **like)
         self._over_tiles(blend.blend_gradient_kernel, view, drawn, v_image, raw)
         sums = self._summed(raw, drawn.lists, self.real)
-        out = torch.zeros(n, gradient_columns(bands), **like)
+        out = torch.zeros(n, gradient_columns(coefficients), **like)
         means2d = torch.zeros(n, 2, **like)
         if n:
             gradients.splat_gradient_kernel[self._grid(n)](
@@ -233,7 +239,7 @@ class GpuRasteriser:
                 *(out, means2d),
                 COLUMNS=scene.rows.shape[1],
                 OUT_COLUMNS=out.shape[1],
-                BANDS=bands,
+                COEFFICIENTS=coefficients,
                 SMOOTH=len(scene.smoothing) > 0,
                 ANTIALIAS=view.settings.antialias,
                 REAL=self.real,
@@ -256,19 +262,19 @@ class GpuRasteriser:
         like: dict[str, Any] = {"device": self.device}
         counts = torch.zeros(n, dtype=torch.int32, **like)
         by_depth, order = torch.sort(keys, stable=True)
-        settled = torch.empty_like(order)
+        ordered = torch.empty_like(order)
         if n:
             plain: dict[str, Any] = {"enable_fp_fusion": False}
             lists.count_kernel[self._grid(n)](
                 *(shapes, keys, counts, n, view.width), TILE=self.tile, BLOCK=self.block, **plain
             )
             lists.ties_kernel[self._grid(n)](
-                *(by_depth, order, settled, scene.rows, n),
+                *(by_depth, order, ordered, scene.rows, n),
                 COLUMNS=scene.rows.shape[1],
-                STORED=scene.bands,
+                STORED=scene.coefficients,
                 BLOCK=self.block,
             )
-        ends = torch.cumsum(counts[settled], 0)
+        ends = torch.cumsum(counts[ordered], 0)
         total = ends[-1:] if n else torch.zeros(1, dtype=torch.int64, **like)
         room = int(total.item()) if capacity is None else capacity
         # radix sorts go by the byte: 16 bits are enough for pictures of 8 million pixels
@@ -277,7 +283,7 @@ class GpuRasteriser:
         row_of = torch.empty(room, dtype=torch.int32, **like)
         if room and n:
             lists.entries_kernel[self._grid(room)](
-                *(shapes, settled, ends, n, across, tiles, view.width, room, tile_of, row_of),
+                *(shapes, ordered, ends, n, across, tiles, view.width, room, tile_of, row_of),
                 BITS=n.bit_length(),
                 TILE=self.tile,
                 BLOCK=self.block,
@@ -287,7 +293,7 @@ class GpuRasteriser:
         bounds = torch.arange(tiles + 1, dtype=keyed, **like)
         starts = torch.searchsorted(sorted_tiles, bounds)
         firsts = torch.empty(n, dtype=torch.int64, **like)
-        firsts[settled] = ends - counts[settled]
+        firsts[ordered] = ends - counts[ordered]
         return Lists(row_of[slots], slots, starts, firsts, counts, total)
 
     def _over_tiles(
@@ -296,7 +302,14 @@ class GpuRasteriser:
         """A pass from far to near over every tile's list; one row of `out` for each entry."""
         made = drawn.lists
         kernel[(self._tiles(view)[2],)](
-            *(drawn.records, made.members, made.slots, made.starts, drawn.light, drawn.last),
+            *(
+                drawn.records,
+                made.members,
+                made.slots,
+                made.starts,
+                drawn.transmittance,
+                drawn.last,
+            ),
             *(planes, out, *view.settings.background),
             *(view.width, view.height, self._tiles(view)[0]),
             TILE=self.tile,
