@@ -1,6 +1,6 @@
 """No pixel of a held-out view reaches the asset, and a photograph with a duplicate is not held out.
 
-Structure from motion is before all this: it has to place the judges too, and sees all photographs.
+Structure from motion registers held-out views too, so it sees all photographs.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ def made(reconstruction: Reconstruction, folder: Path) -> dict[str, bytes]:
     return found
 
 
-def test_no_pixel_of_a_judge_reaches_the_asset(
+def test_no_pixel_of_a_held_out_view_reaches_the_asset(
     reconstruction: Reconstruction, tmp_path: Path
 ) -> None:
     other = tmp_path / "photographs"
     shutil.copytree(reconstruction.folder, other)
-    training, judges = split_held_out(reconstruction.views)
-    assert judges
+    training, held_out = split_held_out(reconstruction.views)
+    assert held_out
     noise = np.random.default_rng(0)
-    for view in judges:
+    for view in held_out:
         with Image.open(other / view.image) as picture:
             pixels = noise.integers(0, 256, (picture.height, picture.width, 3), np.uint8)
         Image.fromarray(pixels).save(other / view.image)
@@ -80,15 +80,15 @@ def views(*twins: str) -> tuple[View, ...]:
     )
 
 
-def test_the_first_of_every_eight_judges() -> None:
-    training, judges = split_held_out(views(*[""] * 17))
-    assert [view.name for view in judges] == ["00", "08", "16"]
+def test_the_first_of_every_eight_is_held_out() -> None:
+    training, held_out = split_held_out(views(*[""] * 17))
+    assert [view.name for view in held_out] == ["00", "08", "16"]
     assert len(training) == 14
 
 
-def test_a_photograph_with_a_twin_does_not_judge() -> None:
-    training, judges = split_held_out(views("00", "00", *[""] * 6, *["08"] * 8))
-    assert [view.name for view in judges] == ["02"]
+def test_a_photograph_with_a_duplicate_is_not_held_out() -> None:
+    training, held_out = split_held_out(views("00", "00", *[""] * 6, *["08"] * 8))
+    assert [view.name for view in held_out] == ["02"]
     assert len(training) == 15
 
 

@@ -161,18 +161,18 @@ def broken(video: Path, kind: str) -> Path:
     return video
 
 
-@pytest.mark.parametrize(("kind", "told"), [
+@pytest.mark.parametrize(("kind", "reason"), [
     ("encrypted", "encrypted"), ("empty", "the file is empty"), ("without index", "index"),
     ("text", "does not open as a video"), ("only sound", "no video"),
 ])  # fmt: skip
 def test_a_video_that_cannot_be_used_is_one_clear_error(
-    video: Path, tmp_path: Path, kind: str, told: str
+    video: Path, tmp_path: Path, kind: str, reason: str
 ) -> None:
     with pytest.raises(SplatError) as raised:
         ingested(broken(video, kind), tmp_path / "out")
     assert raised.value.code == "ingest-video-unusable"
     assert "walk.mp4" in raised.value.given
-    assert told in raised.value.given
+    assert reason in raised.value.given
 
 
 def test_a_broken_video_among_photographs_is_left_out_and_named(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def _names(path: Path) -> list[str]:
     """The first word of each line of the list of pictures."""
     near = (path.with_suffix(".txt"), path.parent / "list.txt", path.parent.parent / "list.txt",
             path.with_name(f"{path.name}.list.txt"))  # fmt: skip
-    found = next((place for place in near if place.is_file()), None)
+    found = next((file for file in near if file.is_file()), None)
     if found is None:
         raise BadFileError(f"there is no list of pictures (list.txt) beside {path.name}")
     lines = found.read_text(encoding="utf-8").splitlines()

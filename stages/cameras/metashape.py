@@ -48,17 +48,17 @@ def read(path: Path) -> CameraFile:
             for sensor in root.iter("sensor")
             if sensor.find("calibration") is not None
         }
-        placed = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
-        missing = {camera.get("sensor_id", "") for camera in placed} - optics.keys()
+        aligned = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
+        missing = {camera.get("sensor_id", "") for camera in aligned} - optics.keys()
         if missing:
             raise BadFileError(f"there is no calibrated sensor {min(missing)[:80]!r}")
-        mine = [optics[camera.get("sensor_id", "")] for camera in placed]
-        words = [(camera.findtext("transform") or "").split() for camera in placed]
-        poses = np.array(words, np.float64).reshape(-1, 4, 4)
+        mine = [optics[camera.get("sensor_id", "")] for camera in aligned]
+        texts = [(camera.findtext("transform") or "").split() for camera in aligned]
+        poses = np.array(texts, np.float64).reshape(-1, 4, 4)
         rotations = poses[:, :3, :3].transpose(0, 2, 1)
         numbers = np.array([values for values, _ in mine], np.float64).reshape(-1, 6)
         views = make_views(
-            [camera.get("label", "") for camera in placed],
+            [camera.get("label", "") for camera in aligned],
             numbers[:, :2],
             numbers[:, 2:],
             poses_of(rotations, poses[:, :3, 3]),
@@ -92,10 +92,10 @@ def _numbers(transform: Element, name: str, count: int) -> NDArray[np.float64]:
     return values
 
 
-def _east_north_up(place: NDArray[np.float64]) -> NDArray[np.float64]:
+def _east_north_up(position: NDArray[np.float64]) -> NDArray[np.float64]:
     """[3, 3] rows at a geocentric position [3]. Up is away from the centre of the earth, which
     differs from the vertical by a fifth of a degree at most."""
-    up = place / np.linalg.norm(place)
+    up = position / np.linalg.norm(position)
     east = np.cross([0.0, 0.0, 1.0], up)
     east = east / max(float(np.linalg.norm(east)), 1e-9)
     return np.stack([east, np.cross(up, east), up])

@@ -41,7 +41,7 @@ def locate(path: Path) -> Path | None:
     """A .json that holds a list, itself or in the folder `path` or ODM's project `path`."""
     if path.is_dir():
         near = (path / _NAME, path / "opensfm" / _NAME)
-        return next((place for place in near if place.is_file()), None)
+        return next((file for file in near if file.is_file()), None)
     if path.suffix.lower() != ".json" or not path.is_file():
         return None
     with path.open("rb") as file:

@@ -45,27 +45,27 @@ _READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cam
 def read_cameras(path: Path) -> CameraFile:
     """The cameras of a file of any listed format. Raises SplatError "cameras-unknown" or
     "cameras-unreadable"."""
-    module, place = _reader(path)
-    found: CameraFile = module.read(place)
+    module, source = _reader(path)
+    found: CameraFile = module.read(source)
     return found
 
 
 def read_points(path: Path) -> FilePoints | None:
     """The sparse points of the file, if it has any. Raises as `read_cameras`."""
-    module, place = _reader(path)
+    module, source = _reader(path)
     if not hasattr(module, "read_points"):
         return None
-    found: FilePoints | None = module.read_points(place)
+    found: FilePoints | None = module.read_points(source)
     return found
 
 
 def files_of(path: Path) -> list[Path]:
     """All files that the cameras are read from. Raises SplatError."""
-    place = _reader(path)[1]
-    folder = place if place.is_dir() else place.parent
-    suffixes = _READ_TOGETHER if place.is_dir() else (".ply",)
+    source = _reader(path)[1]
+    folder = source if source.is_dir() else source.parent
+    suffixes = _READ_TOGETHER if source.is_dir() else (".ply",)
     beside = [child for child in sorted(folder.iterdir()) if child.suffix.lower() in suffixes]
-    return [*beside, *([] if place.is_dir() else [place])]
+    return [*beside, *([] if source.is_dir() else [source])]
 
 
 def _reader(path: Path) -> tuple[ModuleType, Path]:

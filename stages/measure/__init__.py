@@ -1,1 +1,1 @@
-"""How good a picture is, and what each splat is worth to it."""
+"""Evaluation of pictures, the contribution of each splat, capture coverage, trade-off reports."""

@@ -102,14 +102,14 @@ def travelled(moved: NDArray[np.floating]) -> NDArray[np.float64]:
 
     Motion is summed with its direction before it counts, so that camera shake does not add up.
     """
-    place = np.cumsum(moved, axis=0, dtype=np.float64)
-    reached, far = [0], [0.0]
-    for number, now in enumerate(place):
-        away = float(np.linalg.norm(now - place[reached[-1]], axis=1).mean())
+    position = np.cumsum(moved, axis=0, dtype=np.float64)
+    reached, distance = [0], [0.0]
+    for number, now in enumerate(position):
+        away = float(np.linalg.norm(now - position[reached[-1]], axis=1).mean())
         if away >= _SHAKE:
             reached.append(number)
-            far.append(far[-1] + away)
-    return np.interp(np.arange(len(place)), reached, far)
+            distance.append(distance[-1] + away)
+    return np.interp(np.arange(len(position)), reached, distance)
 
 
 def relative_sharpness(sharp: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """How fast the GPU backend is: `python -m tests.benchmarks.gpu`, on a machine with a GPU.
 
 First the gate: pictures and gradients are the reference's, or nothing is timed. Then scenes of
-100,000, 1,000,000 and 5,000,000 splats at 1080p and 4K: drawing, the way back, both, a whole
+100,000, 1,000,000 and 5,000,000 splats at 1080p and 4K: drawing, backward pass, both, a whole
 training step, each the median of many by the device's own clock; what share of the device's
 bandwidth a step makes use of; memory a splat; gsplat on the same scene in the same process, packed
 and not, where it can be imported (its step with the same loss in torch, and torch's fused Adam).

@@ -68,10 +68,10 @@ def main() -> None:
         with PeakMemory() as memory:
             begun = time.monotonic()
             train = load_views(folder, views[: count * 7 // 8], max(SIZE), folder)
-            judges = load_evaluation_views(
+            held_out = load_evaluation_views(
                 folder, views[count * 7 // 8 :], DrawSettings(0.1, max(SIZE))
             )
-            print(f"{len(train)} + {len(judges)} photographs: {time.monotonic() - begun:.0f} s")
+            print(f"{len(train)} + {len(held_out)} photographs: {time.monotonic() - begun:.0f} s")
             order = np.random.default_rng(0).permutation(len(train))
             for number in order[:STEPS]:
                 stepper.step(

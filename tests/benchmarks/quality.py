@@ -1,15 +1,15 @@
-"""How good the presets are, and whether a change made them better: `python -m
-tests.benchmarks.quality --out FOLDER [CAPTURE ...]`.
+"""Quality of the presets, and whether a change improves it: `python -m tests.benchmarks.quality
+--out FOLDER [CAPTURE ...]`.
 
-For the sample and for every folder of photographs that is named: cameras and seeds once, then
-training, pruning and quantising for each preset and seed. A folder that holds cameras, as a scene
-of COLMAP's or a synthetic NeRF scene does, is taken with them, and with its own split if it has
-one. What comes out is judged at one size, over the same photographs, which decided nothing: the
-held-out ones, and for the sample further ones that its renderer draws. Finished cells are kept in
-FOLDER, so a stopped bench goes on.
+For the sample and each given folder of photographs, cameras and seed points are computed once, and
+then each preset and seed is trained, pruned and quantised. A folder that holds cameras, such as a
+COLMAP scene or a synthetic NeRF scene, is read with them and with its own split if it has one. The
+result is evaluated at one size on the same test views: the held-out ones, and for the sample
+further ones that its renderer draws. Finished cells are kept in FOLDER, so that a stopped benchmark
+can go on.
 
 `--keep FILE` stores the figures, `--against FILE` compares with stored ones: paired
-over photographs and seeds, "better", "worse" or "not told apart".
+over views and seeds, "better", "worse" or "no significant difference".
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_ou
 from stages.sfm import SfmSettings
 from stages.train import PRESETS, TrainSettings
 from stages.training.build import corrects_light
-from tests.benchmarks.sample_test_views import judges_in, render_judges
+from tests.benchmarks.sample_test_views import render_test_views, test_views_in
 from tests.sample import PHOTOS
 
 SAMPLE = "sample"
@@ -52,7 +52,7 @@ console = Console(width=150)
 
 @dataclass(frozen=True)
 class Cell:
-    """One capture, preset and seed. side: at which it was judged, pixels. scores: of each judge."""
+    """One capture, preset and seed. side: of the pictures, pixels. scores: of each view."""
 
     capture: str
     preset: str
@@ -65,7 +65,7 @@ class Cell:
 
 
 class Capture:
-    """Photographs, their cameras and seeds, and who judges."""
+    """Photographs, their cameras and seed points, and the test views."""
 
     def __init__(self, name: str, photos: Path, out: Path, side: int) -> None:
         self.name, self.folder = name, out / name
@@ -73,18 +73,20 @@ class Capture:
         pipeline.run({"sfm": with_its_cameras(photos)}, until="seed")
         self.reconstruction: Reconstruction = pipeline.load("sfm")
         self.seeds: Splats = pipeline.load("seed")
-        self.judges = self._judges(out, side)
+        self.test_views = self._test_views(out, side)
 
-    def _judges(self, out: Path, side: int) -> tuple[EvaluationView, ...]:
+    def _test_views(self, out: Path, side: int) -> tuple[EvaluationView, ...]:
         light = corrects_light(self.reconstruction, TrainSettings().light, Report())
         draw_settings = draw_settings_of(self.reconstruction.views, side, light)
         _, held = split_held_out(self.reconstruction.views)
         found = tuple(load_evaluation_views(self.reconstruction.folder, held, draw_settings))
         if self.name != SAMPLE:
             return found
-        render_judges(out / "judges")
+        render_test_views(out / "test_views")
         return (
-            *load_evaluation_views(out / "judges", judges_in(self.reconstruction), draw_settings),
+            *load_evaluation_views(
+                out / "test_views", test_views_in(self.reconstruction), draw_settings
+            ),
             *found,
         )
 
@@ -114,18 +116,18 @@ def named(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def measured(capture: Capture, preset: str, seed: int, side: int) -> Cell:
-    """Train, prune and quantise, and judge what came out; kept on disk. What was judged at another
-    size is judged again."""
+    """Train, prune and quantise, and evaluate the result; kept on disk. What was evaluated at
+    another size is evaluated again."""
     folder = capture.folder / f"{preset}-{seed}"
     kept = folder / "cell.json"
     if kept.is_file():
         cell = Cell(**json.loads(kept.read_text(encoding="utf-8")))
         if cell.side != side:
             splats = load_stage("quantise").load(folder / "quantise").splats
-            cell = replace(cell, side=side, scores=judged(splats, capture.judges, side))
+            cell = replace(cell, side=side, scores=scores_of(splats, capture.test_views, side))
     else:
         splats, cpu, wall = made(capture, preset, seed, folder)
-        found = judged(splats, capture.judges, side)
+        found = scores_of(splats, capture.test_views, side)
         cell = Cell(capture.name, preset, seed, side, len(splats), cpu, wall, found)
     kept.write_text(json.dumps(asdict(cell), indent=1), encoding="utf-8")
     return cell
@@ -148,12 +150,14 @@ def made(capture: Capture, preset: str, seed: int, folder: Path) -> tuple[Splats
     return outputs["quantise"].splats, cpu, wall
 
 
-def judged(splats: Splats, judges: Sequence[EvaluationView], side: int) -> list[dict[str, Any]]:
-    """What each judge says of them at a size."""
+def scores_of(
+    splats: Splats, test_views: Sequence[EvaluationView], side: int
+) -> list[dict[str, Any]]:
+    """The scores of each view at a size."""
     draw = image_renderer(
         replace(splats, draw_settings=replace(splats.draw_settings, side=side)), "auto"
     )
-    return [asdict(score) for score in evaluate(draw, judges, with_flip=True)]
+    return [asdict(score) for score in evaluate(draw, test_views, with_flip=True)]
 
 
 def _cpu_seconds() -> float:
@@ -162,10 +166,10 @@ def _cpu_seconds() -> float:
 
 
 def table_of(cells: list[Cell], side: int) -> Table:
-    """One line for each capture and preset: means over seeds and judges, the spread over seeds."""
+    """One line for each capture and preset: means over seeds and views, the spread over seeds."""
     columns = ("capture", "preset", "seeds", "splats", "CPU s", "wall s", "PSNR dB", "over seeds")
-    more = ("worst judge", "SSIM", "FLIP")
-    table = Table(*columns, *more, title=f"Judged at {side} px")
+    more = ("worst view", "SSIM", "FLIP")
+    table = Table(*columns, *more, title=f"Evaluated at {side} px")
     for (capture, preset), group in grouped(cells).items():
         by_seed = np.array([[row["psnr_db"] for row in cell.scores] for cell in group])
         names = [row["name"] for row in group[0].scores]
@@ -196,9 +200,11 @@ def grouped(cells: list[Cell]) -> dict[tuple[str, str], list[Cell]]:
 
 def compare(now: list[Cell], before: list[Cell]) -> None:
     """A line for each capture and preset that both have, over the seeds that both have. Raises
-    SystemExit where they were not judged at one size."""
+    SystemExit where they were not evaluated at one size."""
     if sides := {cell.side for cell in [*now, *before]} - {now[0].side}:
-        raise SystemExit(f"Judged at {now[0].side} px, and before at {sides.pop()}: give --side.")
+        raise SystemExit(
+            f"Evaluated at {now[0].side} px, and before at {sides.pop()}: give --side."
+        )
     earlier = grouped(before)
     for key, group in grouped(now).items():
         seeds = {cell.seed: cell for cell in earlier.get(key, [])}
@@ -225,7 +231,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--presets", nargs="+", default=["preview"], choices=list(PRESETS))
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--side", type=int, default=480, help="at which all are judged, pixels")
+    parser.add_argument(
+        "--side", type=int, default=480, help="of the pictures that are compared, pixels"
+    )
     parser.add_argument("--keep", metavar="FILE", type=Path)
     parser.add_argument("--against", metavar="FILE", type=Path)
     given = parser.parse_args()

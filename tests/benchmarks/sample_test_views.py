@@ -1,8 +1,8 @@
-"""Further photographs of the sample, at places that no photograph of it was taken from.
+"""Additional test views of the sample, from viewpoints that no photograph of it was taken from.
 
-Three held-out photographs decide nothing; the sample's own renderer makes as many as one likes:
-between the places of the capture, closer, and higher. The truth's cameras are carried over to a
-reconstruction by the similarity that fits the photographs' own places best.
+Three held-out views are too few to compare presets by. The sample's own renderer draws more:
+between the viewpoints of the capture, closer, and higher. The true cameras are mapped to a
+reconstruction by the similarity that fits the cameras of the photographs best.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from stages.scene.similarity import similarity
 
 TRUTH = Path(make.__file__).parent / "still_life" / "truth.json"
 PINHOLE = Lens(width=640, height=480, focal_px=600.0, k=0.0)
-# Place along the capture's arc, y and distance from the axis (metres): between its two rings; then
-# closer; then higher.
+# Position along the capture's arc, y, and distance from the axis (metres): between its two rings,
+# then closer, then higher.
 PLACES = (
     *((2.5, -0.60, 1.36), (5.5, -0.40, 1.38), (8.5, -0.80, 1.30), (11.5, -0.60, 1.36)),
     *((14.5, -0.38, 1.40), (17.5, -0.84, 1.30), (20.5, -0.60, 1.36)),
@@ -33,7 +33,7 @@ _SHAKE_M = 0.04  # of the point looked at
 
 
 def poses() -> list[NDArray[np.float64]]:
-    """[4, 4] world_to_camera of each judge, in the truth's world."""
+    """[4, 4] world_to_camera of each test view, in the world of the truth."""
     rng = np.random.default_rng(99)
     found = []
     for place, y, distance in PLACES:
@@ -44,17 +44,17 @@ def poses() -> list[NDArray[np.float64]]:
     return found
 
 
-def render_judges(folder: Path) -> None:
+def render_test_views(folder: Path) -> None:
     """Draw those that are not in `folder` yet, some seconds each."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, pose in enumerate(poses()):
-        path = folder / f"judge_{number:02d}.png"
+        path = folder / f"test_{number:02d}.png"
         if not path.exists():
             Image.fromarray(photograph(list(make.scene()), Light(), PINHOLE, pose)).save(path)
 
 
-def judges_in(reconstruction: Reconstruction) -> tuple[View, ...]:
-    """The judges as views of this reconstruction's world."""
+def test_views_in(reconstruction: Reconstruction) -> tuple[View, ...]:
+    """The test views in the world of this reconstruction."""
     truth = {
         photo["name"]: np.array(photo["world_to_camera"])
         for photo in json.loads(TRUTH.read_text(encoding="utf-8"))["photos"]
@@ -69,7 +69,7 @@ def judges_in(reconstruction: Reconstruction) -> tuple[View, ...]:
         moved[:3, 3] = -moved[:3, :3] @ (scale * rotation @ _centre(pose) + offset)
         width, height, focal = PINHOLE.width, PINHOLE.height, PINHOLE.focal_px
         camera = Camera(width, height, focal, focal, width / 2, height / 2, moved)
-        views.append(View(f"judge_{number:02d}", f"judge_{number:02d}.png", camera))
+        views.append(View(f"test_{number:02d}", f"test_{number:02d}.png", camera))
     return tuple(views)
 
 

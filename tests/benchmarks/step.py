@@ -1,6 +1,6 @@
 """How long a training step takes, and where: `python -m tests.benchmarks.step`.
 
-The step is the trainer's own: photograph to float, drawing, L1 + SSIM, the way back, Adam and the
+The step is the trainer's own: photograph to float, drawing, L1 + SSIM, backward pass, Adam and the
 statistics for densification. Nothing is timed before kernels and reference agree, on a step too.
 """
 

@@ -1,4 +1,4 @@
-"""Timing on shared machines: rounds interleaved, medians compared, kernels told apart."""
+"""Timing on shared machines: interleaved rounds, medians, and seconds of each kernel."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from tests.benchmarks.hall import Walk, in_hall, through_run
 from tests.structure.truth import centres, similarity
 
 ENDS = 10  # photographs at the beginning and at the end, whose places tell the drift
-TOLD = (
+REPORTED = (
     "points",
     *(f"pairs_{what}" for what in ("looked_at", "matched", "verified")),
     *(f"{step}_seconds" for step in ("features", "matching", "mapping")),
@@ -35,30 +35,30 @@ TOLD = (
 
 
 class Clock:
-    """Listens to progress. told: (seconds, label, done, total) of each that said something new."""
+    """Listens to progress. reported: (seconds, label, done, total) of each change."""
 
     def __init__(self) -> None:
         self._begun = time.monotonic()
-        self.told: list[tuple[float, str, int, int]] = [(0.0, "", 0, 0)]
+        self.reported: list[tuple[float, str, int, int]] = [(0.0, "", 0, 0)]
 
     def __call__(self, label: str, done: int, total: int, numbers: Numbers) -> None:
-        if (label, done, total) != self.told[-1][1:]:
-            self.told.append((time.monotonic() - self._begun, label, done, total))
+        if (label, done, total) != self.reported[-1][1:]:
+            self.reported.append((time.monotonic() - self._begun, label, done, total))
 
     def standstills(self) -> dict[str, tuple[float, int]]:
         """The longest time (seconds) for which each label stood still, and how much was done by
         then; "" before the first."""
         self("the end", 0, 0, {})
         longest: dict[str, tuple[float, int]] = {}
-        for (begun, label, done, _), (ended, *_) in itertools.pairwise(self.told):
+        for (begun, label, done, _), (ended, *_) in itertools.pairwise(self.reported):
             longest[label] = max(longest.get(label, (0.0, 0)), (round(ended - begun, 1), done))
         return longest
 
     def time_left(self) -> dict[str, tuple[float, float]]:
         """Of each label, when half is done: (seconds left at the pace so far, true seconds)."""
         found = {}
-        for label in dict.fromkeys(label for _, label, _, total in self.told if total):
-            mine = [(at, done / total) for at, name, done, total in self.told if name == label]
+        for label in dict.fromkeys(label for _, label, _, total in self.reported if total):
+            mine = [(at, done / total) for at, name, done, total in self.reported if name == label]
             (begun, first), (ended, _) = mine[0], mine[-1]
             half = next(((at, share) for at, share in mine if share >= 0.5), mine[-1])
             if half[1] > first:
@@ -97,7 +97,7 @@ def measure(walk: Walk, folder: Path) -> str:
     away = errors_mm(found.views, walk.poses)
     lengths = np.linalg.norm(away, axis=1)
     drift = np.linalg.norm(away[-ENDS:].mean(axis=0) - away[:ENDS].mean(axis=0))
-    figures = {name: report.metrics[name] for name in TOLD}
+    figures = {name: report.metrics[name] for name in REPORTED}
     return (
         f"{len(walk.poses)}: {seconds:.0f} CPU s, {memory.peak_mib:.0f} MiB, "
         f"{len(lengths)} placed, {lengths.mean():.2f} ({lengths.max():.2f}) thousandths off, "

@@ -1,4 +1,4 @@
-"""What files of cameras say of their world's size and north, and what they do not say."""
+"""Scale and orientation that camera files state for their world."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def transformed(
     return read_cameras(path).georeference
 
 
-def test_a_chunk_that_lies_on_the_earth_is_metric_and_knows_north(tmp_path: Path) -> None:
+def test_a_geocentric_chunk_is_metric_and_has_axes(tmp_path: Path) -> None:
     """By hand: at latitude 0, longitude 90 east, up is y, east is -x, north is z."""
     ground = transformed(tmp_path, TURN, (0.0, 6_378_137.0, 0.0), 12.5)
     assert ground.metres_per_unit == 12.5
@@ -51,7 +51,7 @@ def test_a_chunk_in_local_metres_or_feet_is_metric(tmp_path: Path) -> None:
     ("shift", "scale", "reference"),
     [((0, 0, 0), 1.0, LOCAL), ((1, 2, 3), 2.0, ""), ((1, 2, 3), 2.0, 'GEOGCS["WGS 84"]')],
 )
-def test_a_chunk_that_says_no_unit_is_arbitrary(
+def test_a_chunk_without_a_unit_is_arbitrary(
     tmp_path: Path, shift: tuple[float, ...], scale: float, reference: str
 ) -> None:
     ground = transformed(tmp_path, np.eye(3), shift, scale, reference)
@@ -61,7 +61,7 @@ def test_a_chunk_that_says_no_unit_is_arbitrary(
 def referenced(
     folder: Path, latitude: float, gps: np.ndarray | None, dop: float = 5.0
 ) -> Georeference:
-    """Of OpenSfM's reconstruction of cameras at EYES; gps [V, 3]: what each shot was told."""
+    """Of OpenSfM's reconstruction of cameras at EYES; gps [V, 3]: GPS position of each shot."""
     path = opensfm(folder)
     data: list[dict[str, Any]] = json.loads(path.read_text())
     part = max(data, key=lambda part: len(part["shots"]))

@@ -1,4 +1,4 @@
-"""Paired differences: what is told apart, and what is not."""
+"""Paired differences: which are significant."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE, paired_difference
 
 
-def test_a_thing_is_not_told_apart_from_itself():
+def test_a_result_does_not_differ_from_itself():
     found = paired_difference(np.zeros(8))
     assert (found.mean, found.low, found.high, found.verdict) == (0, 0, 0, INCONCLUSIVE)
 
@@ -21,11 +21,11 @@ def test_a_gain_in_every_photograph_is_better_and_its_negative_worse():
     assert up.mean == pytest.approx(-down.mean)
 
 
-def test_one_lucky_photograph_tells_nothing_apart():
+def test_one_better_view_is_not_significant():
     assert paired_difference(np.array([3.0, 0, 0, 0, 0])).verdict == INCONCLUSIVE
 
 
-def test_one_photograph_says_nothing_of_others():
+def test_a_single_view_says_nothing_of_others():
     found = paired_difference(np.full((1, 5), 2.0))
     assert (found.low, found.high, found.verdict) == (-math.inf, math.inf, INCONCLUSIVE)
 
@@ -57,7 +57,7 @@ def test_the_interval_holds_the_truth_about_as_often_as_it_says(shape):
     assert 0.91 <= held / 300 <= 1.0
 
 
-def test_nothing_and_no_numbers_are_refused():
+def test_no_values_and_values_that_are_not_finite_are_refused():
     for bad in (np.zeros(0), np.array([1.0, np.nan]), np.zeros((2, 2, 2))):
         with pytest.raises(ValueError, match="differences"):
             paired_difference(bad)

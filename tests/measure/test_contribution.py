@@ -1,4 +1,4 @@
-"""What bands of colour are worth, against drawing without them."""
+"""Contributions, compared with drawing without the splat or the SH coefficients."""
 
 from __future__ import annotations
 
@@ -22,42 +22,44 @@ def without(splats: Splats, row: int, degree: int, added: np.ndarray) -> Splats:
     return Removal(np.zeros(len(splats), bool), degrees, shift, 0, 0.0).apply(splats)
 
 
-def test_the_change_of_the_error_is_that_of_drawing_without_the_bands(tmp_path) -> None:
+def test_the_predicted_change_of_the_error_is_that_of_drawing_without_the_coefficients(
+    tmp_path,
+) -> None:
     scene = small_scene(tmp_path, views=4, n=60)
     # no colour at its end, where it is not linear any more
     splats = replace(scene.splats, sh=scene.splats.sh * np.float32(0.3))
     photographs = load_evaluation_views(
         scene.reconstruction.folder, scene.reconstruction.views, splats.draw_settings
     )
-    worth = measure_contributions(splats, photographs, "cpu")
-    assert worth.sse == pytest.approx(squared_error(splats, photographs, "cpu"), rel=1e-5)
+    contributions = measure_contributions(splats, photographs, "cpu")
+    assert contributions.sse == pytest.approx(squared_error(splats, photographs, "cpu"), rel=1e-5)
     for row in (0, 10, 20):
         for degree in (0, 1):
-            cut = without(splats, row, degree, worth.truncated_colour[row, degree])
-            change = squared_error(cut, photographs, "cpu") - worth.sse
-            assert worth.truncated_sse_change[row, degree] == pytest.approx(
+            cut = without(splats, row, degree, contributions.truncated_colour[row, degree])
+            change = squared_error(cut, photographs, "cpu") - contributions.sse
+            assert contributions.truncated_sse_change[row, degree] == pytest.approx(
                 change, rel=2e-3, abs=1e-5
             )
             plain = without(splats, row, degree, np.zeros(3))
             assert not np.array_equal(plain.sh[row, 0], cut.sh[row, 0])
 
 
-def test_of_the_picture_a_splat_is_worth_what_changes_without_it(tmp_path) -> None:
+def test_the_predicted_change_of_the_picture_is_that_of_drawing_without_the_splat(tmp_path) -> None:
     scene = small_scene(tmp_path, views=4, n=60)
     photographs = load_evaluation_views(
         scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
     )
-    worth = measure_contributions(scene.splats, photographs, "cpu")
-    assert (worth.picture_change >= 0).all()
+    contributions = measure_contributions(scene.splats, photographs, "cpu")
+    assert (contributions.picture_change >= 0).all()
     draw = image_renderer(scene.splats, "cpu")
     for row in (0, 10, 20):
         fewer = image_renderer(scene.splats.take(np.arange(60) != row), "cpu")
         changes = [fewer(p.camera).astype(float) - draw(p.camera) for p in photographs]
         wanted = sum(np.square(change).sum() for change in changes)
-        assert worth.picture_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
+        assert contributions.picture_change[row] == pytest.approx(wanted, rel=2e-3, abs=1e-5)
 
 
-def test_worth_goes_on_from_what_other_photographs_told(tmp_path) -> None:
+def test_contributions_of_further_views_are_added(tmp_path) -> None:
     scene = small_scene(tmp_path, views=6, n=60)
     photographs = load_evaluation_views(
         scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings

@@ -1,4 +1,4 @@
-"""One judge for all stages: the same figure for the same scene, whatever its units."""
+"""One evaluation for all stages: the same figures for the same scene in any unit."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_a_file_without_cameras_gets_a_near_plane_of_its_own_size(scene: SmallSc
         assert 1e-4 * extent < raster_settings_of(alone).near < 0.02 * extent
 
 
-def test_photographs_are_judged_at_the_size_that_was_trained(scene: SmallScene) -> None:
+def test_views_are_compared_at_the_size_of_training(scene: SmallScene) -> None:
     views, folder = scene.reconstruction.views, scene.reconstruction.folder
     (small, *_) = load_evaluation_views(folder, views, DrawSettings(0.01, 36))
     assert small.pixels.shape == (27, 36, 3)
@@ -127,7 +127,7 @@ def with_masks(scene: SmallScene, folder: Path, outside: str) -> tuple[View, ...
     )
 
 
-def test_what_is_ignored_is_not_judged(scene: SmallScene) -> None:
+def test_ignored_pixels_are_not_compared(scene: SmallScene) -> None:
     folder = scene.reconstruction.folder
     views = with_masks(scene, folder, IGNORE)
     (photograph, *_) = load_evaluation_views(folder, views, DrawSettings(0.01))
@@ -141,7 +141,9 @@ def test_what_is_ignored_is_not_judged(scene: SmallScene) -> None:
     assert 19.9 < score.psnr_db < 20.5  # but for what is clipped
 
 
-def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScene) -> None:
+def test_transparent_photographs_are_compared_over_white_and_must_be_empty_outside(
+    scene: SmallScene,
+) -> None:
     folder = scene.reconstruction.folder
     views = with_masks(scene, folder, TRANSPARENT)
     draw_settings = draw_settings_of(views)
@@ -157,7 +159,7 @@ def test_what_is_cut_out_is_judged_over_white_and_must_be_empty(scene: SmallScen
     assert score.psnr_db < 4
 
 
-def test_photographs_that_do_not_fit_into_memory_are_judged_alike(
+def test_photographs_that_do_not_fit_into_memory_get_the_same_scores(
     scene: SmallScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, views = scene.reconstruction.folder, scene.reconstruction.views
@@ -173,14 +175,14 @@ def test_photographs_that_do_not_fit_into_memory_are_judged_alike(
 
 
 @pytest.mark.parametrize("count", [0, 1, 24, 25, 200, 1000])
-def test_of_many_judges_a_few_evenly_spread_ones_are_shown(count: int) -> None:
+def test_the_subset_of_many_views_is_small_and_evenly_spaced(count: int) -> None:
     chosen = evaluation_subset(count)
     assert min(count, LARGEST_SUBSET // 2) <= len(chosen) <= LARGEST_SUBSET
     assert count > LARGEST_SUBSET or list(chosen) == list(range(count))
     assert not count or count - chosen[-1] <= chosen.step
 
 
-def test_flip_is_told_by_those_and_psnr_by_all() -> None:
+def test_flip_is_computed_for_the_subset_and_psnr_for_all() -> None:
     camera = Camera(16, 16, 20.0, 20.0, 8.0, 8.0, np.eye(4))
     shown = EvaluationView("a", camera, np.full((16, 16, 3), 99, np.uint8))
     found = evaluate(lambda _: shown.image, [shown] * 50, with_flip=True)

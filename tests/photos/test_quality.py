@@ -85,7 +85,7 @@ def test_a_good_capture_gets_no_advice() -> None:
         ({"width": 600, "height": 450}, "ingest-small", "99.jpg"),
     ],
 )
-def test_one_photograph_that_differs_is_told(changed: dict, code: str, named: str) -> None:
+def test_one_photograph_that_differs_is_reported(changed: dict, code: str, named: str) -> None:
     warnings = codes([*MANY, photo(99, **changed)])
     assert named in warnings.pop(code)
     assert set(warnings) <= {"ingest-mixed-sizes"}
@@ -105,11 +105,11 @@ def test_brightness_stands_in_where_exif_is_missing() -> None:
     assert set(codes(photos)) == {"ingest-brightness-varies"}
 
 
-def test_a_capture_that_is_soft_all_over_is_told() -> None:
+def test_a_capture_that_is_soft_all_over_is_reported() -> None:
     assert set(codes([photo(i, sharpness=2.0) for i in range(24)])) == {"ingest-soft"}
 
 
-def test_too_few_and_alike_are_told() -> None:
+def test_too_few_and_near_duplicates_are_reported() -> None:
     warnings = codes([photo(i) for i in range(5)], [(0, 2, 3)])
     assert set(warnings) == {"ingest-few-photographs", "ingest-near-duplicates"}
     assert "2 of 5" in warnings["ingest-near-duplicates"]
