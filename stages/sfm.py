@@ -153,7 +153,7 @@ def run(
     capture: Capture = inputs["ingest"]
     _check_count(capture)
     if settings.scale:
-        metric_scale.check_distance(settings.scale, capture)  # before hours of work
+        metric_scale.check_distance(settings.scale, capture.photos)  # before hours of work
     if (folder / _FINISHED).exists():
         return _load_finished(folder, report)
     if settings.cameras is not None:

@@ -1,4 +1,4 @@
-"""What a reader says about a file that it cannot use."""
+"""Errors of readers about files that they cannot use."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from stages.base.errors import SplatError
 
 
 class BadFileError(ValueError):
-    """A reader's own finding; `reading` adds which file it was."""
+    """What a reader found wrong; `reading` adds the file's name."""
 
 
 @dataclass(frozen=True)
 class FileKind:
-    """What a file was to be read as."""
+    """What a file was read as, and the texts of the error."""
 
     code: str
     what: str
@@ -41,9 +41,9 @@ CAMERAS = FileKind(
 
 @contextmanager
 def reading(path: Path, kind: FileKind = SPLATS) -> Iterator[None]:
-    """Turn what goes wrong inside the block into the SplatError of `kind` that names `path`.
+    """Turn exceptions inside the block into a SplatError of `kind` that names `path`.
 
-    Besides `BadFileError` these are the exceptions that damaged bytes raise in Python and NumPy;
+    Besides `BadFileError` these are the exceptions that damaged bytes cause in Python and NumPy.
     RecursionError comes from deeply nested JSON, MemoryError from a file larger than memory.
     """
     try:

@@ -1,8 +1,8 @@
-"""Work on many rows a block at a time, so that what is made on the way stays small.
+"""Work on many rows a block at a time, so that temporary arrays stay small.
 
-Who wants to know how far the work is watches it: `with watched(watcher): formats.read(path)`.
-Readers and writers go over the rows more than once (values, order, one attribute after the other),
-so what is told is the pass that is going on.
+Progress goes to a callback: `with progress_reported_to(callback): formats.read(path)`. Readers and
+writers pass over the rows more than once (values, order, one attribute after another); the
+callback gets the progress of the current pass.
 """
 
 from __future__ import annotations
@@ -18,46 +18,46 @@ from numpy.typing import NDArray
 from stages.base.scratch import release_scratch_pages
 
 ROWS = 1 << 16  # 16 MB of splats of degree 3
-Watcher = Callable[[int, int], None]  # (done, in all) of a pass: rows, mostly
-_watcher: ContextVar[Watcher | None] = ContextVar("watcher", default=None)
+ProgressCallback = Callable[[int, int], None]  # (done, total) of a pass, mostly rows
+_callback: ContextVar[ProgressCallback | None] = ContextVar("progress", default=None)
 
 
 @contextmanager
-def progress_reported_to(watcher: Watcher) -> Iterator[None]:
-    """`watcher` hears of every pass inside the block, on the thread that works."""
-    token = _watcher.set(watcher)
+def progress_reported_to(callback: ProgressCallback) -> Iterator[None]:
+    """Call `callback` during every pass inside the block, on the working thread."""
+    token = _callback.set(callback)
     try:
         yield
     finally:
-        _watcher.reset(token)
+        _callback.reset(token)
 
 
 def blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
-    """0..count in slices of `rows`. Scratch arrays stay on their disk between one and the next."""
+    """0..count in slices of `rows`. Pages of scratch arrays are released after each."""
     for start in range(0, count, rows):
         yield slice(start, min(start + rows, count))
         release_scratch_pages()
 
 
 def reported_blocks(count: int, rows: int = ROWS) -> Iterator[slice]:
-    """`blocks`, told to who watches: for a pass that takes its time."""
+    """`blocks` with progress reports, for a slow pass."""
     for part in blocks(count, rows):
         yield part
         report_progress(part.stop, count)
 
 
 def report_progress(done: int, total: int) -> None:
-    """To who watches, of a pass that does not go by rows."""
-    watcher = _watcher.get()
-    if watcher is not None:
-        watcher(done, total)
+    """Report the progress of a pass that does not go by rows."""
+    callback = _callback.get()
+    if callback is not None:
+        callback(done, total)
 
 
 def release_mapped_pages(mapped: NDArray[np.generic]) -> None:
-    """Let go of the pages of a mapped file that were read; the next look reads them again.
+    """Release the pages of a mapped file that were read; the next access reads them again.
 
-    Without it a file that is gone through once counts as memory in use. Does nothing where the
-    system does not offer it, or for an array that is not mapped.
+    Otherwise a file that was read once counts as memory in use. Does nothing on systems without
+    madvise, or for an array that is not mapped.
     """
     holder = getattr(mapped, "_mmap", None)
     with suppress(AttributeError, ValueError, OSError):

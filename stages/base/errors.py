@@ -1,4 +1,4 @@
-"""The one error class that a user is meant to see.
+"""The error class that users see.
 
 A `SplatError` says what was given, what was wanted and what to do next. It has a stable code for
 scripts and documentation, and an exit status for its family, so that a shell can tell bad input
@@ -19,7 +19,7 @@ class Family(IntEnum):
     USAGE = 2  # wrong option, wrong order of commands
     INPUT = 3  # photographs or files that cannot be used
     RECONSTRUCTION = 4  # structure from motion failed its gates
-    RUN_FOLDER = 5  # a run folder that is missing, newer, edited or damaged
+    RUN_FOLDER = 5  # a run folder that is missing, of another version, edited or damaged
     RESOURCES = 6  # disk, memory, permissions
     QUALITY = 7  # a result that failed its own check
 
@@ -28,7 +28,7 @@ class SplatError(Exception):
     """A problem that the user can act on.
 
     code: stable, kebab-case, prefixed by the part it comes from ("sfm-too-few-registered").
-    given, wanted, hint: one or two plain sentences each; `hint` says what to do next.
+    given, wanted, hint: one or two sentences each. `hint` says what to do next.
     """
 
     def __init__(
@@ -63,4 +63,4 @@ class SplatError(Exception):
 
 
 class Interrupted(Exception):  # noqa: N818 - a normal way to stop, not an error
-    """A stage stopped at a safe boundary because the user asked; its checkpoint is on disk."""
+    """A stage stopped at a safe boundary at the user's request; its checkpoint is on disk."""

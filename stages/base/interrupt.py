@@ -1,4 +1,4 @@
-"""Ctrl-C stops at a safe place; a second Ctrl-C stops at once."""
+"""Ctrl-C requests a stop at the next safe boundary; a second Ctrl-C stops at once."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM") if hasa
 
 
 @contextmanager
-def stop_on_signals(stop: threading.Event, told: Callable[[], None]) -> Iterator[None]:
-    """The first SIGINT or SIGTERM sets `stop` and calls `told`; the second raises
-    KeyboardInterrupt; a third ends the process. Outside the main thread signals stay as they are.
+def stop_on_signals(stop: threading.Event, on_stop: Callable[[], None]) -> Iterator[None]:
+    """The first SIGINT or SIGTERM sets `stop` and calls `on_stop`; the second raises
+    KeyboardInterrupt; a third ends the process. Outside the main thread nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -25,7 +25,7 @@ def stop_on_signals(stop: threading.Event, told: Callable[[], None]) -> Iterator
             signal.signal(number, signal.SIG_DFL)
             raise KeyboardInterrupt
         stop.set()
-        told()
+        on_stop()
 
     before = {number: signal.signal(number, handle) for number in _SIGNALS}
     try:

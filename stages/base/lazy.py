@@ -1,4 +1,4 @@
-"""What tables name as "module:name", imported when it is first wanted."""
+"""Objects that registries name as "module:name", imported at first use."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import importlib
 from typing import Any
 
 
-def load_object(place: str) -> Any:
-    """What `place` ("stages.raster.reference_rasteriser:ReferenceRasteriser") names; its module is
-    imported now. Raises ImportError or AttributeError for what is not there."""
-    module, _, name = place.partition(":")
+def load_object(path: str) -> Any:
+    """Import the module and return the object that `path` ("stages.raster.draw:render") names.
+
+    Raises ImportError or AttributeError if there is none.
+    """
+    module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -1,4 +1,4 @@
-"""A helper process that must not outlive who started it."""
+"""Child processes that end with their parent."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ import threading
 
 
 def die_with_parent() -> None:
-    """End when the parent does: by the kernel on Linux, and everywhere when standard input, which
-    the parent holds open, comes to its end."""
+    """Make this process end when its parent does.
+
+    On Linux the kernel ends it. Everywhere it also ends at the end of standard input, which the
+    parent keeps open.
+    """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     threading.Thread(target=_exit_at_end_of_input, daemon=True).start()

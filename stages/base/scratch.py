@@ -1,4 +1,4 @@
-"""Arrays too large for memory, on a disk that has room for them."""
+"""Temporary arrays in files, for data larger than memory."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ _maps: WeakSet[mmap.mmap] = WeakSet()
 
 @contextmanager
 def scratch_in(folder: Path, spare: bool = False) -> Iterator[None]:
-    """Inside, large arrays that `empty` makes are files in `folder`; nobody sees them, and they end
-    with the last look at them, or with the process, however that ends.
+    """Inside the block, large arrays of `empty` are mapped from unnamed files in `folder`.
 
-    spare: only while the disk keeps more room than they take; else they are in memory, as without.
+    The files vanish with the last reference to their array or with the process.
+
+    spare: use memory instead whenever the disk would have less free space left than the array
+        takes, and never raise an error.
     """
     token = _folder.set((folder, spare))
     try:
@@ -38,7 +40,7 @@ def scratch_in(folder: Path, spare: bool = False) -> Iterator[None]:
 
 
 def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-    """As np.empty; mapped from a file if it is large and somebody named a place for it. Raises
+    """As np.empty; mapped from a file if it is large and inside a `scratch_in` block. Raises
     SplatError "disk-full"."""
     place, size = _folder.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
     if place is None or size < LARGE_BYTES:
@@ -48,7 +50,7 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
         if spare and shutil.disk_usage(folder).free < 2 * size:
             return np.empty(shape, dtype)
         with tempfile.TemporaryFile(dir=folder, prefix=".scratch-") as file:
-            # Reserved now: a disk that is full when a page is written would end the process.
+            # Reserved now: a full disk would end the process when a page is written.
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)
             else:
@@ -59,8 +61,8 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
             return np.empty(shape, dtype)
         raise SplatError(
             "disk-full",
-            given=f"{folder} has no {size / 1e9:.1f} GB for splats on their way: {error.strerror}.",
-            wanted="The disk must have room for them, and for the file that comes of them.",
+            given=f"{folder} has no {size / 1e9:.1f} GB for temporary data: {error.strerror}.",
+            wanted="The disk must have room for temporary data and for the output.",
             hint="Free some space, or write to a folder on another disk.",
             family=Family.RESOURCES,
         ) from error
@@ -69,8 +71,8 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
 
 
 def release_scratch_pages() -> None:
-    """Of the pages of such files that were touched: they count as memory in use until then. What
-    was written stays, and the next look finds it."""
+    """Release the memory of scratch arrays. Their contents stay in the files, from where the next
+    access reads them."""
     for mapped in list(_maps):
         with suppress(AttributeError, ValueError, OSError):
             mapped.madvise(mmap.MADV_DONTNEED)

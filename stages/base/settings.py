@@ -1,14 +1,19 @@
-"""What settings may be: stated once, in each field's metadata, and checked from there.
+"""Settings and their bounds, stated once, in the metadata of each field.
 
-"help": with the unit. "min", "max": of numbers, both allowed. "choices": the words allowed; of a
-list's items, of which there must then be one at least unless "may_be_empty". "pattern": of a text,
-a regular expression for all of it, with "wanted", the sentence that says what it asks for.
-"option": the option's name where it is not the field's. "together": of a list, the words that one
-use of the option takes, as its help shows them. "needs": another field, without which a value but
-the default means nothing. "affects_output": False where another value gives the same bytes.
-"midway": True where half-done work goes on under another value, which the stage then says. "panel":
-the heading (one of `PANELS`) under which `splat process --help` lists the option; a setting without
-one is an option of its stage's own command only.
+Keys of the metadata:
+    help: with the unit.
+    min, max: bounds of a number, inclusive.
+    choices: the allowed values; of a list the allowed items, and at least one is required.
+    may_be_empty: True if a list with `choices` may be empty.
+    pattern: regular expression that the whole text must match.
+    wanted: a sentence that says what `pattern` requires.
+    option: the option's name if it is not the field's.
+    together: of a list, the metavars of the values that one use of the option takes.
+    needs: another field, without which only the default has a meaning.
+    affects_output: False if every value gives the same bytes.
+    midway: True if an interrupted stage may be resumed with another value.
+    panel: the heading (one of `PANELS`) under which `splat process --help` lists the option; a
+        setting without one is an option of its stage's own command only.
 """
 
 from __future__ import annotations
@@ -30,10 +35,10 @@ PANELS = (
 
 @dataclass(frozen=True)
 class Setting:
-    """One value that a person may choose, and what it may be.
+    """One setting and its bounds.
 
-    flag: "--max-side". kind: type of the value, or of a list's items (`many`). optional: whether it
-    may be None. default: None if there is none. low, high: of numbers, None where there is no end.
+    flag: "--max-side". kind: type of the value, or of a list's items if `many`. optional: whether
+    it may be None. default: None if there is none. low, high: bounds, None if there is none.
     """
 
     name: str
@@ -54,7 +59,7 @@ class Setting:
     may_be_empty: bool = False
 
     def check(self, value: Any) -> None:
-        """Raises SplatError "option-value" for a value that the setting cannot have."""
+        """Raises SplatError "option-value" for a value out of bounds."""
         if value is None and self.optional:
             return
         items = value if self.many and isinstance(value, (tuple, list)) else (value,)
@@ -65,7 +70,7 @@ class Setting:
             raise self._refused("with nothing")
 
     def parse(self, text: str) -> Any:
-        """One value from what was typed. Raises SplatError "option-value"."""
+        """One value from its text. Raises SplatError "option-value"."""
         try:
             value = self.kind(text)
         except ValueError:
@@ -91,7 +96,7 @@ class Setting:
             "option-value",
             given=f"{self.flag} {value if str(value) else chr(34) * 2} cannot be used.",
             wanted=self.wanted or self._wanted(),
-            hint="Leave it out to get the usual value.",
+            hint="Leave it out to get the default.",
             family=Family.USAGE,
         )
 
@@ -147,8 +152,8 @@ def settings_of(settings_type: type) -> list[Setting]:
 
 
 def check_settings(settings: Any) -> None:
-    """Check every field of a settings dataclass. Raises SplatError "option-value" and, where one
-    means nothing without another, "option-alone"."""
+    """Check every field of a settings dataclass. Raises SplatError "option-value", and
+    "option-alone" for a setting whose `needs` is not given."""
     every = {setting.name: setting for setting in settings_of(type(settings))}
     for name, setting in every.items():
         setting.check(getattr(settings, name))
@@ -160,6 +165,6 @@ def check_settings(settings: Any) -> None:
                 "option-alone",
                 given=f"{setting.flag} means nothing without {other.flag}.",
                 wanted="Both, or neither.",
-                hint=f"Add {other.flag}, or leave {setting.flag} away.",
+                hint=f"Add {other.flag}, or leave {setting.flag} out.",
                 family=Family.USAGE,
             )

@@ -1,4 +1,4 @@
-"""What a stage is, and what it may say while it runs.
+"""The interface of a stage, and the report that it fills while it runs.
 
 A stage knows nothing of manifests, skipping or the terminal. Tests call `stage.run` with a plain
 `Report` and a folder of their own.
@@ -24,13 +24,16 @@ DrawView: TypeAlias = "Callable[[Camera], NDArray[np.uint8]]"
 
 @dataclass
 class Report:
-    """Collects what a stage has to say; `listener` (if any) is told of every progress tick.
+    """Collects metrics, warnings and progress of one run of a stage.
 
-    metrics: plain JSON values, written to the manifest.
-    warnings: (code, message) pairs; the message is a full sentence with advice.
-    stop_requested: set from outside (Ctrl-C); long stages look at it at each step boundary, write
-        their checkpoint and raise `Interrupted`.
-    onlooker: called with what `offer` is given. What it does must not change what a stage makes.
+    Attributes:
+        metrics: plain JSON values, written to the manifest.
+        warnings: (code, message) pairs; the message is a full sentence with advice.
+        listener: called with each progress report.
+        stop_requested: set from outside (Ctrl-C). Long stages check it at each step boundary,
+            write their checkpoint and raise `Interrupted`.
+        preview: called with the function given to `offer`; it must not change the output.
+        device: hardware that the stage ran on, for the manifest.
     """
 
     metrics: dict[str, Any] = field(default_factory=dict)
@@ -41,33 +44,33 @@ class Report:
     device: str = "cpu"
 
     def metric(self, name: str, value: Any) -> None:
-        """Record one figure (JSON-serialisable; unit in the name, such as `train_seconds`)."""
+        """Record one figure, JSON-serialisable, with the unit in its name (`train_seconds`)."""
         self.metrics[name] = value
 
     def warn(self, code: str, message: str) -> None:
-        """Record one warning; the same pair is kept once."""
+        """Record one warning; equal pairs are kept once."""
         if (code, message) not in self.warnings:
             self.warnings.append((code, message))
 
     def progress(
         self, done: int, total: int, label: str = "", **numbers: float | int | str
     ) -> None:
-        """Tell the listener that `done` of `total` units are finished, with the numbers to show."""
+        """Report that `done` of `total` units are finished, with numbers to show beside it."""
         if self.listener is not None:
             self.listener(label, done, total, numbers)
 
     def offer(self, draw: DrawView) -> None:
-        """A picture of the work so far can be drawn, by this thread and until this call returns:
-        draw(camera) gives sRGB [H, W, 3]. It is drawn only if an onlooker wants it."""
+        """Offer a live preview: draw(camera) gives sRGB [H, W, 3] of the work so far. It may be
+        called by this thread only, and until this method returns."""
         if self.preview is not None:
             self.preview(draw)
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A small frozen description of one step of the pipeline.
+    """The description of one stage of the pipeline.
 
-    name: also the command's name and the end of its folder's name.
+    name: also the name of its command and the end of its folder's name.
     version: raised when equal inputs and settings give different bytes.
     reads: names of the earlier stages whose outputs `run` receives.
     settings_type: one flat frozen dataclass, torch-free; each field has a default and carries

@@ -1,7 +1,7 @@
-"""Thread pools, set up before torch, Numba or OpenCV load.
+"""Number of threads, and OpenMP's settings, made before torch, Numba or OpenCV load.
 
-OpenMP's default is to spin while it waits. With another process on the same cores a training run
-then takes ten times as long, and laptops are busy machines.
+By default OpenMP's threads spin while they wait. If another process uses the same cores, training
+then takes ten times as long.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import os
 
 
 def configure() -> None:
-    """Set OpenMP's waiting policy, unless the user did."""
+    """Set OpenMP's waiting policy, unless the user has set it."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def count() -> int:
-    """Threads to use: SPLAT_THREADS if set, else the cores that this process may run on."""
+    """Number of threads: SPLAT_THREADS if set, else the cores that this process may run on."""
     wanted = os.environ.get("SPLAT_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)

@@ -1,1 +1,1 @@
-"""The rasteriser: several backends (`backends`), one definition (`reference`)."""
+"""The rasteriser: one definition (`reference`) and several backends (`backends`)."""

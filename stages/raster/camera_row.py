@@ -1,4 +1,4 @@
-"""The camera and the settings as the numbers that every backend's kernels read."""
+"""The camera and the settings as one row of numbers, as the kernels of every backend read them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 from stages.raster.definition import RasterSettings
 from stages.scene import Camera
 
-# Rotation (row by row) and translation from the world to the camera, then what the names say, and
-# where the camera stands in the world.
+# Columns of the row: rotation (row by row) and translation from the world to the camera, and so on.
 R, T = 0, 9
 FX, FY, CX, CY = 12, 13, 14, 15
-LOW_X, HIGH_X, LOW_Y, HIGH_Y = 16, 17, 18, 19  # of the slopes x/z and y/z, beyond which J is frozen
+LOW_X, HIGH_X, LOW_Y, HIGH_Y = 16, 17, 18, 19  # limits of x/z and y/z in the Jacobian J
 NEAR, DILATION, ANTIALIAS = 20, 21, 22
-CAMERA_CENTRE = 23  # 23:26
+CAMERA_CENTRE = 23  # 23:26, the camera's centre in the world
 WIDTH, HEIGHT = 26, 27
 
 

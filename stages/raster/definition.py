@@ -1,4 +1,4 @@
-"""What every backend agrees on: the constants, how to draw, and what comes of it."""
+"""What all backends share: constants, settings, results and the `Rasteriser` protocol."""
 
 from __future__ import annotations
 
@@ -12,34 +12,40 @@ from numpy.typing import NDArray
 from stages.base.errors import Family, SplatError
 from stages.scene import Camera, Splats
 
-ALPHA_MIN = 1.0 / 255.0  # below it a splat is not drawn in a pixel: it could not change 8 bits
+ALPHA_MIN = (
+    1.0 / 255.0
+)  # a splat with a smaller alpha in a pixel is not drawn: 8 bits would not change
 ALPHA_MAX = 0.99  # as every viewer caps it
-# A pixel is finished once less light than this passes: the most that can leak. Two splats at the
-# cap leave 1e-4, halves 2^-13 or 2^-14; this is near none of them, so that rounding does not decide
-# whether the next splat is drawn.
+# A pixel is finished once its transmittance is below this. Two splats at ALPHA_MAX leave 1e-4, and
+# splats of alpha 1/2 leave 2^-13 or 2^-14. The limit is near none of them, so that rounding does
+# not decide whether the next splat is drawn.
 TRANSMITTANCE_MIN = 8.6e-5
-LOG_SCALE_MAX = 44.0  # exp(2 x 44) is the last square of a scale that float32 holds
-SCALE_MAX = math.exp(LOG_SCALE_MAX)  # also of a smoothing filter's width
-COLOUR_MAX = 1e20  # a colour is clamped there, as at 0: its gradients then fit into float32
-QUATERNION_MIN = 1e-20  # largest component; below it a rotation is lost to rounding
+LOG_SCALE_MAX = (
+    44.0  # float32 holds the square of the scale, exp(2 x 44), but not of much larger ones
+)
+SCALE_MAX = math.exp(LOG_SCALE_MAX)  # also the limit of a smoothing filter's width
+COLOUR_MAX = 1e20  # colours are clamped to 0..COLOUR_MAX, so that their gradients fit into float32
+QUATERNION_MIN = (
+    1e-20  # of the largest component; a smaller quaternion loses its rotation to rounding
+)
 
-# A row of gradients: where each parameter's begin. SH come basis function by basis function, RGB
-# last, DC first; whole vectors of 16 columns, zero beyond the last band.
+# First column of each parameter in a row of gradients. SH coefficients follow each other, DC first,
+# RGB last. A row has whole vectors of 16 columns; those after the last coefficient are zero.
 MEAN, ROTATION, LOG_SCALE, OPACITY, SH, SH_REST = 0, 3, 7, 10, 11, 14
-# A row of contributions, of one splat to one picture w its weights, r render less photograph, sums
-# over pixels: change of the squared error without the splat, of w, the largest w, of w^2, and of
-# w r by channel (PULL to PULL + 2).
+# Columns of a row of contributions of one splat to one picture. With w the splat's blend weight in
+# a pixel and r = render - photograph: change of the squared error if the splat is removed; sum of
+# w; largest w; sum of w^2; sum of w r for each channel (3 columns).
 ERROR_CHANGE, WEIGHT, LARGEST_WEIGHT, SQUARED_WEIGHT, WEIGHTED_RESIDUAL = range(5)
 CONTRIBUTIONS = WEIGHTED_RESIDUAL + 3
 
 
 def used_columns(coefficients: int) -> int:
-    """Columns of a gradient row that hold something, with `bands` (basis functions) of SH."""
+    """Columns in use of a gradient row for splats with so many SH coefficients a channel."""
     return SH + 3 * coefficients
 
 
 def gradient_columns(coefficients: int) -> int:
-    """Columns of a gradient row with room for `bands` of SH: whole vectors."""
+    """All columns of such a row: whole vectors."""
     return -(-used_columns(coefficients) // 16) * 16
 
 
@@ -47,13 +53,14 @@ def gradient_columns(coefficients: int) -> int:
 class RasterSettings:
     """How to draw.
 
-    near: a splat is drawn if the z of its centre is larger; world units, at least 0.
-    dilation_px2: added to both variances of a splat's footprint, as all viewers do; pixels^2.
-    antialias: make up in opacity for what the dilation adds in area.
-    background: RGB behind everything.
-    sh_degree: bands above it are ignored.
+    Args:
+        near: a splat is drawn if the z of its centre is larger; world units, at least 0.
+        dilation_px2: added to both variances of a splat's footprint, as all viewers do; pixels^2.
+        antialias: reduce the opacity by as much as the dilation enlarges the area.
+        background: RGB behind everything.
+        sh_degree: SH coefficients of higher degrees are ignored.
 
-    Raises ValueError for a near plane behind the camera or none at all.
+    Raises ValueError for a near plane that is negative or NaN.
     """
 
     near: float = 0.01
@@ -69,12 +76,16 @@ class RasterSettings:
 
 @dataclass(frozen=True)
 class Rendering:
-    """image [H, W, 3], alpha [H, W], depth and median_depth [H, W] float32.
+    """A picture.
 
-    depth: expected z of what was hit, world units; 0 where alpha is 0. median_depth: z of the splat
-    behind which less than half of the light passes; 0 where more than half passes to the end.
-    culled: splats with values that cannot be drawn (NaN, infinite, overflowing), which is not the
-    same as out of view.
+    Args:
+        image: [H, W, 3] float32.
+        alpha: [H, W] float32.
+        depth: [H, W] float32, expected z of the splats hit, world units; 0 where alpha is 0.
+        median_depth: [H, W] float32, z of the splat at which the transmittance falls below one
+            half; 0 where it never does.
+        culled: number of splats with values that cannot be drawn (NaN, infinite, overflowing).
+            Splats out of view are not counted.
     """
 
     image: NDArray[np.float32]
@@ -84,15 +95,15 @@ class Rendering:
     culled: int
 
 
-class MemoryFull(SplatError):  # noqa: N818 - what is full, as `Interrupted` says
-    """A device's memory does not hold so many splats. fits: how many it would, about."""
+class MemoryFull(SplatError):  # noqa: N818 - names a state, as `Interrupted` does
+    """A device's memory cannot hold so many splats. fits: about how many it can."""
 
     def __init__(self, splats: int, fits: int, room: str) -> None:
         super().__init__(
             "raster-gpu-memory",
             given=f"{splats:,} splats do not fit into the GPU's memory ({room}).",
             wanted=f"About {fits:,} would fit.",
-            hint=f"Train with --max-splats {fits}, close what else uses the card, or choose "
+            hint=f"Train with --max-splats {fits}, close other programs on the card, or choose "
             "--backend cpu.",
             family=Family.RESOURCES,
         )
@@ -104,11 +115,11 @@ Arrays = tuple[NDArray[np.float32], ...]  # means, quaternions, log_scales, opac
 
 
 class Forward(Protocol):
-    """What a forward pass leaves. Its arrays are valid until the rasteriser's next pass.
+    """The result of a forward pass. Its arrays are valid until the rasteriser's next pass.
 
-    image [4 or 6, H, W] float32: RGB, alpha, and if asked for expected and median depth.
-    visible [V] int32: rows of the splats that touch the picture. culled: how many splats hold
-    values that cannot be drawn. What else the way back needs is the backend's own.
+    image [4 or 6, H, W] float32: RGB, alpha, and if requested expected and median depth.
+    visible [V] int32: rows of the splats that touch the picture. culled: number of splats with
+    values that cannot be drawn. Backends add what their backward pass needs.
     """
 
     @property
@@ -124,7 +135,7 @@ class Backward:
     """Gradients of the visible splats, in the order of their rows.
 
     rows [V] int32. parameters [V, gradient_columns]: layout above.
-    means2d [V, 2]: of the mean on the picture, per pixel.
+    means2d [V, 2]: with respect to the projected mean in pixels.
     """
 
     rows: NDArray[np.int32]
@@ -138,7 +149,7 @@ def splat_arrays(splats: Splats) -> Arrays:
 
 
 class Rasteriser(Protocol):
-    """What drawing, judging and training ask of a backend. One instance a thread of control."""
+    """The interface of a backend. An instance must not be used by two threads at once."""
 
     def forward(
         self,
@@ -148,8 +159,15 @@ class Rasteriser(Protocol):
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
         depths: bool = False,
     ) -> Any:
-        """Draw; a `Forward` of this backend's own. arrays: C-contiguous float32. smoothing [N]:
-        see `raster.smoothing`. depths: whether to draw the depth planes."""
+        """Draw. Returns this backend's own kind of `Forward`.
+
+        Args:
+            arrays: parameters of the splats, C-contiguous float32; see `Splats.arrays`.
+            camera: in the frame of the means.
+            settings: how to draw.
+            smoothing: [N] widths of the 3D smoothing filter, see `raster.smoothing`; [0] for none.
+            depths: whether to draw the depth planes.
+        """
 
     def backward(
         self,
@@ -158,9 +176,8 @@ class Rasteriser(Protocol):
         v_image: NDArray[np.float32],
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
     ) -> Backward:
-        """Gradients of the visible splats, from v_image [3, H, W]."""
+        """Gradients of the visible splats from v_image [3, H, W], the gradient of the image."""
 
     def contributions(self, forward: Any, residual: NDArray[np.float32]) -> NDArray[np.float64]:
-        """[V, CONTRIBUTIONS] for the visible splats, columns as above: what each alone does for
-        the picture. residual [3, H, W]: render less photograph.
-        """
+        """[V, CONTRIBUTIONS] of the visible splats; columns as above. residual [3, H, W]:
+        render - photograph."""

@@ -1,4 +1,4 @@
-"""One call draws splats; which backend does it is a setting."""
+"""Draw splats with any backend."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ def render(
 ) -> Rendering:
     """Draw `splats` as `camera` sees them.
 
-    The camera is given in the frame of `splats.means`; `splats.local` moves one that is not.
-
-    settings: `settings_of(splats)` unless told otherwise. smoothing [N]: width of the 3D smoothing
-    filter of each splat, world units; None for none. See `raster.smoothing`.
-
-    backend: see `raster.backends`. Raises ValueError for an unknown one.
+    Args:
+        splats: N splats.
+        camera: in the frame of `splats.means`; `splats.local` moves other cameras there.
+        settings: by default `raster_settings_of(splats)`.
+        backend: see `raster.backends`. Raises ValueError for an unknown one.
+        smoothing: [N] width of each splat's 3D smoothing filter, world units; None for none. See
+            `raster.smoothing`.
     """
     return renderer(splats, settings, backend, smoothing)(camera)
 
@@ -38,8 +39,8 @@ def renderer(
     backend: str = AUTO,
     smoothing: NDArray[np.float32] | None = None,
 ) -> Callable[[Camera], Rendering]:
-    """What draws the same splats from one camera after another, and keeps its buffers between
-    them. What it hands out is the caller's own. As `render` for the rest."""
+    """A function that draws the same splats from one camera after another and keeps its buffers.
+    Its results are copies. Arguments as of `render`."""
     chosen = settings or raster_settings_of(splats)
     widths = NO_SMOOTHING if smoothing is None else np.ascontiguousarray(smoothing, np.float32)
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
@@ -59,6 +60,6 @@ def renderer(
 
 
 def raster_settings_of(splats: Splats) -> RasterSettings:
-    """How these splats are drawn: by their own look, or by their size where they have none."""
+    """By the draw settings of `splats`; without a near plane there, by the extent of the splats."""
     near = splats.draw_settings.near or near_plane_of(splats.means)
     return RasterSettings(near=near, background=(splats.draw_settings.background,) * 3)

@@ -1,15 +1,16 @@
 """The definition of a rendering, in plain torch: any dtype, any device, autograd.
 
-Every backend is held against this file. It is written to be read, not to be fast.
+Every backend is compared with this file in tests. It is written for clarity, not for speed.
 
 A splat with mean m, rotation R(q), scales s and opacity o is seen through the local affine
 approximation of the projection (Zwicker et al. 2001): with V = J W R diag(s), its footprint is a
 Gaussian of covariance V V^T + e I, e the dilation. Along a pixel's ray splats are blended from
-near to far: alpha = min(0.99, o exp(-d)), left out where it is below 1/255, and a pixel is finished
-once less than 8.6e-5 of the light behind passes, after the splat that did it has been blended.
+near to far: alpha = min(0.99, o exp(-d)), with d the exponent at the pixel. A splat is left out of
+a pixel where alpha is below 1/255. A pixel is finished after the splat that takes its transmittance
+below 8.6e-5.
 
 Order: by depth (z in the camera) rounded to float32; equal depths by the splat's own values (mean,
-opacity, scales, rotation, SH), so that the order of rows in a file never shows.
+opacity, scales, rotation, SH), so that the picture does not depend on the order of rows in a file.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ from stages.raster.definition import (
 from stages.raster.sh import C0, C1, C2, C3
 from stages.scene import Camera, Splats
 
-BLOCK = 32  # pixels; the picture is made block by block to bound memory
-MOST = 4_000_000  # (splat, pixel) pairs at once: 32 MB a tensor in float64, of which some 30 live
+BLOCK = 32  # pixels; the picture is computed block by block to bound memory
+MOST = 4_000_000  # (splat, pixel) pairs at once: 32 MB a tensor in float64, about 30 of them
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ def parameters_of(splats: Splats, dtype: torch.dtype = torch.float64) -> Paramet
 
 
 def drawable(p: Parameters, smoothing: Tensor | None = None) -> Tensor:
-    """[N] bool: finite values, scales and smoothing widths whose squares float32 can hold, a
-    rotation that exists."""
+    """[N] bool: values are finite, float32 can hold the squares of scales and smoothing widths, and
+    the quaternion is not zero."""
     finite = torch.stack([t.flatten(1).isfinite().all(1) for t in map(_two_d, p.tensors())]).all(0)
     bounded = (p.log_scales <= LOG_SCALE_MAX).all(1)
     rotates = p.quaternions.abs().amax(1) >= QUATERNION_MIN
@@ -142,7 +143,7 @@ def apply_smoothing(p: Parameters, widths: Tensor) -> tuple[Tensor, Tensor]:
 def project(
     p: Parameters, camera: Camera, settings: RasterSettings, smoothing: Tensor | None = None
 ) -> Projected:
-    """Footprints of the splats that can be seen at all, nearest first."""
+    """Footprints of the splats in front of the near plane, nearest first."""
     like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     world_to_camera = torch.tensor(camera.world_to_camera, **like)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
@@ -254,7 +255,7 @@ def render_tensors(
 def render_projected(
     p: Parameters, projected: Projected, camera: Camera, settings: RasterSettings
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`render_tensors` from footprints already made."""
+    """As `render_tensors`, from given footprints."""
     like: dict[str, Any] = {"dtype": p.means.dtype, "device": p.means.device}
     centre = torch.tensor(camera.centre, **like)
     rgb = colours(p.rows(projected.index), centre, settings.sh_degree)
@@ -277,7 +278,7 @@ def render_projected(
 
 
 def boxes(projected: Projected) -> tuple[Tensor, Tensor]:
-    """([M, 2] low, [M, 2] high): in pixels, the box outside which a splat is too faint to show."""
+    """([M, 2] low, [M, 2] high): the box in pixels outside which a splat's alpha is below 1/255."""
     reach = (2 * torch.log(255 * projected.opacities.detach())).clamp_min(0).sqrt()
     extent = torch.stack([projected.a, projected.c], 1).detach().sqrt() * reach[:, None]
     return projected.means2d.detach() - extent, projected.means2d.detach() + extent

@@ -1,4 +1,4 @@
-"""The reference as a backend: what it takes to draw, judge and train by the definition itself."""
+"""The reference as a backend: draw, evaluate and train by the definition itself."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class ReferenceForward:
-    """As `definition.Forward`; and what was drawn, for drawing it again with gradients."""
+    """As `definition.Forward`, and the inputs, to draw again with gradients."""
 
     image: NDArray[np.float32]
     visible: NDArray[np.int32]
@@ -57,11 +57,11 @@ class ReferenceForward:
 
 
 class ReferenceRasteriser:
-    """Draws and differentiates in torch on any of its devices, in float64 where that has it. Keeps
-    nothing between two passes: the way back draws again, block by block, with gradients."""
+    """Draws and differentiates in torch on any of its devices, in float64 where the device has it.
+    Nothing is kept between passes: the backward pass draws again, block by block."""
 
     def __init__(self, on: str = CPU) -> None:
-        """on: one of `torch_device.DEVICES`. Raises SplatError where it is not there."""
+        """on: one of `torch_device.DEVICES`. Raises SplatError if it is not available."""
         self.device = device_named(on)
         self.dtype = widest(self.device)
 
@@ -102,7 +102,7 @@ class ReferenceRasteriser:
             rgb = colours(p.rows(projected.index), self._tensor(forward.camera.centre), degree)
             shown, shades = _leaves(projected), rgb.detach().requires_grad_()
             self._blend_back(shown, shades, forward, self._tensor(v_image))
-            _pass_on((rgb, *vars(projected).values()), (shades, *vars(shown).values()))
+            _continue_backward((rgb, *vars(projected).values()), (shades, *vars(shown).values()))
         place = np.empty(len(arrays[0]), np.int64)
         place[_host(projected.index)] = np.arange(len(projected.index))
         coefficients = (min(degree, int(arrays[4].shape[1] ** 0.5) - 1) + 1) ** 2
@@ -117,8 +117,8 @@ class ReferenceRasteriser:
     def _blend_back(
         self, shown: Projected, shades: Tensor, forward: ReferenceForward, v_image: Tensor
     ) -> None:
-        """Gradients of footprints and colours, added up block by block: what autograd remembers
-        of a block is gone before the next."""
+        """Add up gradients of footprints and colours block by block, so that autograd's graph of a
+        block is freed before the next."""
         background = self._tensor(forward.settings.background)
         for place, rows, pixels in reversed(list(picture_blocks(shown, forward.camera))):
             if not len(rows):
@@ -131,7 +131,7 @@ class ReferenceRasteriser:
         self, forward: ReferenceForward, residual: NDArray[np.float32]
     ) -> NDArray[np.float64]:
         """See `definition.Rasteriser`. Colour is affine in each alpha: without the splat a pixel
-        changes by -w c + behind alpha / (1 - alpha), "behind" what is composited behind it."""
+        changes by -w c + b alpha / (1 - alpha), with b what is composited behind it."""
         camera, settings = forward.camera, forward.settings
         p, planes = self._parameters(forward.arrays), self._tensor(residual)
         like: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
@@ -186,13 +186,13 @@ def _part(planes: Tensor, place: tuple[int, int, int, int]) -> Tensor:
 
 
 def _leaves(projected: Projected) -> Projected:
-    """The same numbers, from which autograd goes no further back."""
+    """The same values as leaf tensors of autograd."""
     kept = [t.detach().requires_grad_(t.requires_grad) for t in vars(projected).values()]
     return Projected(*kept)
 
 
-def _pass_on(made: Iterable[Tensor], leaves: Iterable[Tensor]) -> None:
-    """What the leaves were given, further back: to what each was made from."""
+def _continue_backward(made: Iterable[Tensor], leaves: Iterable[Tensor]) -> None:
+    """Continue the backward pass from the leaves' gradients to the tensors that they copy."""
     given = [(t, leaf.grad) for t, leaf in zip(made, leaves, strict=True) if leaf.grad is not None]
     if given:
         torch.autograd.backward([t for t, _ in given], [grad for _, grad in given])

@@ -1,11 +1,10 @@
-"""The 3D smoothing filter (Yu et al. 2024, "Mip-Splatting"): no detail finer than any photograph
-could show.
+"""The 3D smoothing filter of Mip-Splatting (Yu et al. 2024): splats without detail that is finer
+than the sampling of every photograph.
 
-A splat is widened by a Gaussian whose variance is 0.2 x (the distance between two of its samples
-in the photograph that samples it most finely)^2, and loses as much opacity as it gains in volume:
-scales become sqrt(s^2 + f^2), the opacity is multiplied by the product of s / sqrt(s^2 + f^2).
-Seen from closer than any photograph was taken, splats then stay soft instead of turning into
-needles and dust.
+A splat is convolved with a Gaussian of variance 0.2 x (sampling interval)^2. The sampling interval
+is the distance between two pixels at the splat, in the photograph that samples it most finely.
+Scales become sqrt(s^2 + f^2), and the opacity is multiplied by the product of s / sqrt(s^2 + f^2).
+From closer than any photograph was taken splats then stay soft, without needles and dust.
 """
 
 from __future__ import annotations
@@ -18,15 +17,22 @@ from numpy.typing import NDArray
 
 from stages.scene import Camera, Splats, logit
 
-VARIANCE = 0.2  # of a sampling interval squared, as in the paper
-RIM = 0.15  # of the picture on each side: a splat just outside still shows
+VARIANCE = 0.2  # in squared sampling intervals, as in the paper
+RIM = 0.15  # of the picture, on each side: a splat with its mean just outside is still visible
 
 
 def smoothing_widths(
     means: NDArray[np.floating], cameras: Sequence[Camera], near: float
 ) -> NDArray[np.float32]:
-    """[N] standard deviation of each splat's filter, in units of `means` (whose frame the cameras
-    are given in). A splat that no camera sees gets the widest of all; 0 without any camera."""
+    """[N] standard deviation of each splat's filter, in the units of `means`.
+
+    A splat that no camera sees gets the largest of all; 0 without any camera.
+
+    Args:
+        means: [N, 3].
+        cameras: in the frame of `means`.
+        near: near plane.
+    """
     finest = np.full(len(means), np.inf)
     for camera in cameras:
         pixels, z = camera.project(means)
@@ -41,7 +47,7 @@ def smoothing_widths(
 
 
 def smoothed(splats: Splats, widths: NDArray[np.float32]) -> Splats:
-    """The same splats with the filter built in, as any viewer draws them."""
+    """The splats with the filter applied to their parameters, for viewers that have no filter."""
     log_scales = splats.log_scales.astype(np.float64)
     with np.errstate(divide="ignore"):
         log_widths = np.log(widths.astype(np.float64))[:, None]

@@ -1,4 +1,4 @@
-"""The devices of torch that the reference draws on. Imports torch when it is first asked."""
+"""The torch devices that the reference backend draws on. Imports torch at first use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DEVICES = (CPU, "cuda", "mps", "xpu")
 
 
 def is_there(name: str) -> bool:
-    """Whether this build of torch finds such a device on this machine."""
+    """Whether this build of torch finds that device on this machine."""
     import torch
 
     known = torch.backends if name == "mps" else torch
@@ -19,14 +19,14 @@ def is_there(name: str) -> bool:
 
 
 def device_named(name: str) -> Any:
-    """The torch device. Raises SplatError (raster-no-device) where it is not there."""
+    """The torch device. Raises SplatError (raster-no-device) if it is not available."""
     import torch
 
     if not is_there(name):
         raise SplatError(
             "raster-no-device",
             given=f"--device {name}: torch {torch.__version__} finds no such device here.",
-            wanted=f"One that is there: {', '.join(filter(is_there, DEVICES))}.",
+            wanted=f"A device that is available: {', '.join(filter(is_there, DEVICES))}.",
             hint="Choose that, or another backend. docs/guide/gpu.md says which build of torch "
             "brings which device.",
             family=Family.RESOURCES,
@@ -46,7 +46,7 @@ def widest(device: Any) -> Any:
 
 
 def describe(name: str) -> str:
-    """What the device is, in a few words. Raises SplatError where it is not there."""
+    """The device's model and torch's version. Raises SplatError if it is not available."""
     import torch
 
     if name == CPU:

@@ -1,4 +1,4 @@
-"""Digests of files and folders: how an input or an output is recognised again."""
+"""Digests of files and folders, by which changed inputs and outputs are detected."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ UNREADABLE = "unreadable"
 
 @dataclass(frozen=True)
 class FileRecord:
-    """One file as it was seen. sha256: hexadecimal, or `UNREADABLE`. size: bytes. mtime_ns:
-    nanoseconds."""
+    """State of one file. sha256: hexadecimal, or `UNREADABLE`. size: bytes. mtime_ns: when it was
+    last modified, nanoseconds."""
 
     sha256: str
     size: int
@@ -39,11 +39,15 @@ def record_files(
 ) -> FileRecords:
     """Every file under `folder` (or `folder` itself if it is a file), by posix name, sorted.
 
-    known: earlier records; a file whose size and modification time are unchanged keeps its digest
-        unread, which makes a second look at a large folder cheap. An edited file has another time.
-    leave_out: names to skip. users: whether the files are the user's own: then names with a leading
-        dot do not count, since desktop programs drop such files among photographs, and a file that
-        may not be read is recorded as that.
+    Args:
+        folder: a folder or a file.
+        known: earlier records. A file with the same size and modification time keeps its digest
+            without being read.
+        leave_out: names to skip.
+        users: whether the files are the user's own. Then names with a leading dot are left out,
+            because desktop programs write such files among photographs, and a file without read
+            permission is recorded as `UNREADABLE`.
+
     Raises OSError.
     """
     known = known or {}
@@ -63,7 +67,7 @@ def record_files(
 
 def _record_if_readable(path: Path, known: FileRecord | None) -> FileRecord:
     if known is not None and known.sha256 == UNREADABLE:
-        known = None  # a change of permissions is no change of time
+        known = None  # new permissions do not change the time
     try:
         return _record(path, known)
     except PermissionError:
@@ -79,7 +83,7 @@ def _record(path: Path, known: FileRecord | None) -> FileRecord:
 
 
 def combined_digest(records: Mapping[str, FileRecord]) -> str:
-    """One SHA-256 over names and contents; times do not count."""
+    """One SHA-256 over names and contents; times are left out."""
     whole = hashlib.sha256()
     for name in sorted(records):
         whole.update(f"{len(name.encode())}:{name}:{records[name].sha256}\n".encode())
@@ -87,34 +91,34 @@ def combined_digest(records: Mapping[str, FileRecord]) -> str:
 
 
 def differences(old: Mapping[str, FileRecord], new: Mapping[str, FileRecord]) -> list[str]:
-    """In words, what changed: ["a.jpg changed", "b.jpg is missing", "c.jpg is new"]."""
-    words = []
+    """What changed, as text: ["a.jpg changed", "b.jpg is missing", "c.jpg is new"]."""
+    changes = []
     for name in sorted(old.keys() | new.keys()):
         if name not in new:
-            words.append(f"{name} is missing")
+            changes.append(f"{name} is missing")
         elif name not in old:
-            words.append(f"{name} is new")
+            changes.append(f"{name} is new")
         elif old[name].sha256 != new[name].sha256:
-            words.append(f"{name} changed")
-    return words
+            changes.append(f"{name} changed")
+    return changes
 
 
 def damage(folder: Path, recorded: Mapping[str, FileRecord]) -> list[str]:
-    """In words, which recorded files under `folder` are not what they were; [] when whole.
+    """Which recorded files under `folder` have changed, as text; [] if none has.
 
-    Files that are not in `recorded` do not count: a viewer may have left some beside ours.
+    Files that are not in `recorded` are ignored: a viewer may have written some beside ours.
     """
-    words = []
+    changes = []
     for name, record in sorted(recorded.items()):
         path = folder / name
         try:
             if not path.is_file():
-                words.append(f"{name} is missing")
+                changes.append(f"{name} is missing")
             elif _record(path, record).sha256 != record.sha256:
-                words.append(f"{name} changed")
+                changes.append(f"{name} changed")
         except OSError as error:
-            words.append(f"{name} cannot be read ({error.strerror})")
-    return words
+            changes.append(f"{name} cannot be read ({error.strerror})")
+    return changes
 
 
 def records_to_data(records: Mapping[str, FileRecord]) -> dict[str, Any]:

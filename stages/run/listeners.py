@@ -8,7 +8,7 @@ from stages.run.manifest import Manifest
 
 
 class Listeners(Listener):
-    """Passes each event of a run on to several listeners, in the order given."""
+    """Forwards each event of a run to several listeners, in the order given."""
 
     def __init__(self, *listeners: Listener) -> None:
         self._listeners = listeners

@@ -1,4 +1,4 @@
-"""Runs stages in order, skips what is finished and unchanged, and says why the rest runs again."""
+"""Runs the stages in order, and skips those that are finished and unchanged."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ __all__ = ["Listener", "Pipeline", "Step"]
 class Pipeline:
     """The stages over one run folder.
 
-    run_folder: made by `run` when missing. photos: the photographs, else those that the run folder
-    remembers. stages: all seven by default.
+    run_folder: made by `run` if it does not exist. photos: the photographs; by default those that
+    the run folder records. stages: all seven by default.
     """
 
     def __init__(
@@ -41,17 +41,17 @@ class Pipeline:
         self.layout = Layout(self.run_folder, every)
 
     def with_run(self, name: str, run: Callable[..., Any]) -> Pipeline:
-        """This pipeline, the stage `name` done by `run`, which makes the same of the same."""
+        """This pipeline with another function for a stage. It must give the same output."""
         stages = (replace(s, run=run) if s.name == name else s for s in self.layout.stages)
         self.layout = replace(self.layout, stages=tuple(stages))
         return self
 
     def stage_folder(self, name: str) -> Path:
-        """Where the finished output of a stage lies (whether or not it does yet)."""
+        """Folder of the finished output of a stage; it need not exist yet."""
         return self.layout.workspace(self.layout.stage(name)).final
 
     def manifest(self, name: str) -> Manifest | None:
-        """Of a finished stage, else None. Raises SplatError for one that cannot be believed."""
+        """The manifest of a finished stage, or None. Raises SplatError as `Manifest.read` does."""
         return Manifest.read(self.stage_folder(name))
 
     def load(self, name: str) -> Any:
@@ -61,27 +61,29 @@ class Pipeline:
         return self.layout.stage(name).load(self.stage_folder(name))
 
     def recorded_settings(self) -> dict[str, Any]:
-        """Settings by stage name, as last asked for; defaults where nothing was."""
+        """Settings by stage name, as last requested; defaults otherwise."""
         return (RunFile.read(self.run_folder) or RunFile()).settings_of(self.layout.stages)
 
     def recorded_photos(self) -> Path | None:
-        """The photographs that the run folder remembers."""
+        """The photographs that the run folder records."""
         recorded = RunFile.read(self.run_folder)
         return recorded.photographs if recorded else None
 
     def busy(self) -> int | None:
-        """Process id of whoever works on the run folder now."""
+        """Id of the process that holds the run folder's lock now, or None."""
         return holder(self.run_folder)
 
     def status(self) -> list[Step]:
-        """The plan for the settings last asked for. Raises SplatError (run-folder-missing)."""
+        """The plan for the settings last requested. Raises SplatError (run-folder-missing)."""
         if not runfolder.is_run_folder(self.run_folder):
             raise runfolder.missing(self.run_folder)
         return self.plan()
 
     def plan(self, settings: Mapping[str, Any] | None = None) -> list[Step]:
-        """What `run` would do, stage by stage. settings: dataclasses by stage name; the recorded
-        ones where left out. Changes nothing. Raises SplatError."""
+        """What `run` would do, one step for each stage. Changes nothing.
+
+        settings: dataclasses by stage name; the recorded ones if left out. Raises SplatError.
+        """
         wanted = {**self.recorded_settings(), **(settings or {})}
         photos = self.photos or self.recorded_photos()
         try:
@@ -98,10 +100,15 @@ class Pipeline:
     ) -> list[Manifest]:
         """Run what has to run, up to and including the stage `until`.
 
-        settings: dataclasses by stage name, remembered for later; the recorded ones where left out.
-        may_run: stages that may run; another one that is not finished and unchanged is an error.
-        Returns the manifests in order. Raises SplatError; Interrupted when a signal stopped it,
-        with everything finished kept and the stage's own checkpoint in its working folder.
+        Args:
+            settings: dataclasses by stage name; recorded for later runs. The recorded ones are
+                used where left out.
+            until: name of the last stage; None for all.
+            may_run: names of the stages that may run; it is an error if another one has to.
+            listener: receives the events of the run.
+
+        Returns the manifests in order. Raises SplatError; Interrupted after a signal. Finished
+        stages are kept then, and the stage's own checkpoint stays in its working folder.
         """
         for given in (settings or {}).values():
             check_settings(given)  # before a folder is made
@@ -172,8 +179,8 @@ class Pipeline:
         until: str | None,
         may_run: Collection[str] | None,
     ) -> None:
-        """Raises SplatError (stage-not-finished) for the first stage that must not run but has
-        to. A planner of its own: the run learns what the stages really made."""
+        """Raises SplatError (stage-not-finished) for the first stage that has to run and may not.
+        It uses a planner of its own, because that of the run learns the real outputs."""
         if may_run is None:
             return
         reached = self.layout.up_to(until)

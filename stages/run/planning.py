@@ -1,4 +1,4 @@
-"""Decides which stages run, and says why."""
+"""Decides which stages run, and why."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ _NAMED_AT_MOST = 3
 
 @dataclass(frozen=True)
 class Step:
-    """One line of a plan. reason: why it runs, in words; "" if it does not. interrupted: work on
-    it was begun and left. failed: and left because it failed. manifest: of the finished run, if
-    there is one."""
+    """One line of a plan.
+
+    reason: why the stage runs; "" if it does not. manifest: of the finished run, if there is one.
+    interrupted: whether there is unfinished work. failed: whether its last attempt failed.
+    """
 
     stage: Stage
     number: int
@@ -35,9 +37,9 @@ class Step:
 
 
 class Planner:
-    """Walks the stages in order, learning the digest of each output as it becomes known.
+    """Goes through the stages in order and keeps the digest of each output that is known.
 
-    photos: the photographs, or None if the run folder does not say.
+    photos: the photographs, or None if the run folder does not record them.
     """
 
     def __init__(self, layout: Layout, photos: Path | None) -> None:
@@ -48,7 +50,7 @@ class Planner:
         self._photo_records: FileRecords | None = None
 
     def plan(self, wanted: Mapping[str, Any]) -> list[Step]:
-        """A step a stage. wanted: settings by stage name. Raises SplatError, OSError."""
+        """One step for each stage. wanted: settings by stage name. Raises SplatError, OSError."""
         steps = []
         for stage in self.layout.stages:
             step = self.assess(stage, wanted[stage.name])
@@ -60,11 +62,11 @@ class Planner:
         return steps
 
     def learn(self, stage: Stage, manifest: Manifest) -> None:
-        """The stage's output is final for this walk."""
+        """Keep the digest of the stage's final output."""
         self._digests[stage.name] = manifest.output_digest
 
     def assess(self, stage: Stage, settings: Any) -> Step:
-        """Whether `stage` has to run, given what was learnt of the stages before it."""
+        """Whether `stage` has to run, given the outputs of the stages before it."""
         space = self.layout.workspace(stage)
         number = self.layout.number(stage)
         manifest = Manifest.read(space.final)
@@ -84,7 +86,7 @@ class Planner:
             stage.settings_type,
         )
         broken = damage(space.final, manifest.outputs)[:_NAMED_AT_MOST]
-        reasons += waiting + [f"its output {words}" for words in broken]
+        reasons += waiting + [f"its output {change}" for change in broken]
         runs = bool(reasons)
         if runs and failure:
             reasons.append(f"failed at the last attempt: {failure}")
@@ -92,7 +94,7 @@ class Planner:
         return Step(stage, number, runs, why, manifest, interrupted, runs and bool(failure))
 
     def request(self, stage: Stage, settings: Any) -> Request:
-        """What `stage` is asked to do. Raises SplatError (photographs-missing), OSError."""
+        """The request for `stage`. Raises SplatError (photographs-missing), OSError."""
         if stage.reads:
             inputs = {name: self._digests[name] for name in stage.reads}
             files = self._files_of(stage, settings)
@@ -107,7 +109,7 @@ class Planner:
         return request_for(stage, settings, inputs, files)
 
     def _masks(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
-        """The masks that lie apart from the photographs, if there are any."""
+        """The records of masks in a folder of their own, if there is one."""
         from stages.photos.masks import mask_folder
 
         folder = mask_folder(self.existing_photos(), getattr(settings, MASKS, None))
@@ -120,8 +122,9 @@ class Planner:
         return {MASKS: record_files(folder, known, users=True)}
 
     def _files_of(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
-        """The user's own files that settings name, by setting. Those that have gone since the
-        stage finished count as unchanged, as photographs do. Raises SplatError, OSError."""
+        """Records of the user's own files that settings name, by setting. Files that were removed
+        after the stage finished count as unchanged, as photographs do. Raises SplatError,
+        OSError."""
         from stages.cameras.table import files_of
 
         found = {}
@@ -145,15 +148,16 @@ class Planner:
                 "photographs-missing",
                 given=f"The photographs are not at {self.photos}.",
                 wanted="The folder of photographs that the run is made from.",
-                hint="Put it back, or say where it is now: splat process PHOTOS --out RUN",
+                hint="Put it back, or name its new place: splat process PHOTOS --out RUN",
             )
         return self.photos
 
     def _request_if_known(
         self, stage: Stage, settings: Any, done: Manifest, waiting: bool
     ) -> Request:
-        """With inputs as the finished run had them where they are not known now: outputs still to
-        come are named on their own, and photographs moved away after ingest are no reason."""
+        """The request with the inputs of the finished run where the present ones are unknown.
+        Outputs of stages that have to run first are a reason of their own, and photographs that
+        were moved away after ingest are none."""
         gone = not stage.reads and (self.photos is None or not self.photos.exists())
         if waiting or gone:
             return request_for(stage, settings, done.inputs, done.input_files)

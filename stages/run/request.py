@@ -1,4 +1,7 @@
-"""What a stage is asked to do: settings, inputs and version. Equal requests give equal bytes."""
+"""The request for a run of a stage: settings, inputs and version.
+
+Equal requests give equal bytes.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,8 @@ REQUEST = "request.json"
 
 @dataclass(frozen=True)
 class Request:
-    """stage, version: which code. settings: plain data. inputs: digest by name. input_files: the
-    user's own files behind an input, one by one."""
+    """stage, version: which code runs. settings: plain data. inputs: digest by name. input_files:
+    records of the user's own files behind an input."""
 
     stage: str
     version: int
@@ -28,18 +31,18 @@ class Request:
     input_files: dict[str, FileRecords]
 
     def key(self, settings_type: type) -> dict[str, Any]:
-        """What half-done work must have been begun for, as plain data: settings that cannot change
-        the output are left out, and those that may change on the way."""
+        """What must be equal to resume an interrupted attempt, as plain data. Settings that do not
+        affect the output, and those that may change on resuming ("midway"), are left out."""
         free = _quiet_fields(settings_type) | _midway_fields(settings_type)
         settings = {k: v for k, v in self.settings.items() if k not in free}
         return {"version": self.version, "settings": settings, "inputs": self.inputs}
 
     def write(self, folder: Path, settings_type: type) -> None:
-        """Leave the request in a working folder. Raises OSError."""
+        """Write the request into a working folder. Raises OSError."""
         write_json(folder / REQUEST, self.key(settings_type))
 
     def matches(self, folder: Path, settings_type: type) -> bool:
-        """Whether a working folder was begun for this same request."""
+        """Whether the work in a folder was begun for an equal request."""
         try:
             left = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -54,8 +57,8 @@ def settings_to_data(settings: Any) -> dict[str, Any]:
 
 
 def settings_from_data(settings_type: type, data: Mapping[str, Any]) -> Any:
-    """The settings that `settings_to_data` wrote; fields that this version lacks are dropped and
-    new ones take their defaults. Raises TypeError or ValueError if the values do not fit."""
+    """The inverse of `settings_to_data`. Unknown fields are dropped, missing ones get their
+    defaults. Raises TypeError or ValueError if a value does not fit."""
     hints = get_type_hints(settings_type)
     known = {}
     for field in fields(settings_type):
@@ -68,30 +71,30 @@ def settings_from_data(settings_type: type, data: Mapping[str, Any]) -> Any:
 
 
 def why_again(request: Request, done: Manifest, settings_type: type) -> list[str]:
-    """In words, what differs between a request and the run that is finished; [] if nothing does."""
-    words = []
+    """The differences between a request and the finished run, as text; [] if there are none."""
+    reasons = []
     if request.version != done.version:
-        words.append(f"new version of the stage ({done.version} -> {request.version})")
-    words += _settings_changes(request.settings, done.settings, settings_type)
+        reasons.append(f"new version of the stage ({done.version} -> {request.version})")
+    reasons += _settings_changes(request.settings, done.settings, settings_type)
     for name in sorted(request.inputs.keys() | done.inputs.keys()):
         if request.inputs.get(name) != done.inputs.get(name):
-            words += _input_changes(name, request, done)
-    return words
+            reasons += _input_changes(name, request, done)
+    return reasons
 
 
 def _settings_changes(
     now: Mapping[str, Any], then: Mapping[str, Any], settings_type: type
 ) -> list[str]:
-    """["steps 7000 -> 30000"]. A setting that did not exist yet counts as its default."""
+    """["steps 7000 -> 30000"]. A setting that the finished run lacks counts as its default."""
     defaults = _defaults(settings_type)
     quiet = _quiet_fields(settings_type)
-    words = []
+    changes = []
     for name, value in now.items():
         before = then.get(name, defaults.get(name))
         if name not in quiet and value != before:
             label = name.replace("_", " ")
-            words.append(f"{label} {_show(before)} -> {_show(value)}")
-    return words
+            changes.append(f"{label} {_show(before)} -> {_show(value)}")
+    return changes
 
 
 def _input_changes(name: str, request: Request, done: Manifest) -> list[str]:
@@ -99,7 +102,7 @@ def _input_changes(name: str, request: Request, done: Manifest) -> list[str]:
         return [f"{name} changed"]
     now, then = request.input_files[name], done.input_files.get(name, {})
     what = "photograph" if name == "photos" else f"{name} file"
-    changes = [f"{what} {words}" for words in differences(then, now)]
+    changes = [f"{what} {change}" for change in differences(then, now)]
     if len(changes) > 3:
         rest = len(changes) - 3
         return [*changes[:3], f"{counted(rest, f'more {what}')} changed"]
@@ -135,5 +138,5 @@ def _defaults(settings_type: type) -> dict[str, Any]:
 def request_for(
     stage: Stage, settings: Any, inputs: dict[str, str], input_files: dict[str, FileRecords]
 ) -> Request:
-    """The request that `stage` gets with these settings and inputs."""
+    """The request for `stage` with these settings and inputs."""
     return Request(stage.name, stage.version, settings_to_data(settings), inputs, input_files)

@@ -1,7 +1,7 @@
-"""`run.json`: which photographs a run folder belongs to, and the settings last asked for.
+"""`run.json`: the photographs of a run folder, and the settings last requested.
 
-It makes a folder a run folder. With it `splat train` goes on with what was asked before, and
-`splat status` can say what would run again.
+A folder with this file is a run folder. `splat train` continues with the settings in it, and
+`splat status` tells from it what would run again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class RunFile:
         return cls(Path(photographs) if photographs else None, data.get("settings", {}))
 
     def write(self, folder: Path) -> None:
-        """Write it, whole or not at all. Raises OSError."""
+        """Write it atomically. Raises OSError."""
         photographs = str(self.photographs) if self.photographs else None
         write_sealed(folder / RUN_FILE, {"photographs": photographs, "settings": self.settings})
 
@@ -45,7 +45,7 @@ class RunFile:
         return RunFile(self.photographs, {**self.settings, **changed})
 
     def settings_of(self, stages: Sequence[Stage]) -> dict[str, Any]:
-        """Settings dataclasses of all stages: as recorded, else the defaults."""
+        """Settings dataclasses of all stages: as recorded, otherwise the defaults."""
         return {
             stage.name: settings_from_data(stage.settings_type, self.settings.get(stage.name, {}))
             for stage in stages

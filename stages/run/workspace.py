@@ -1,9 +1,9 @@
-"""The folders of one stage in a run folder, and how work becomes finished by rename.
+"""The folders of one stage in a run folder, and the renames that make its output final.
 
-`4-train` is finished work. `.4-train.partial` is where work goes on; it is kept when work is
-interrupted, and with the reason in it when work fails. `.4-train.old` is the finished work that is
-being replaced, for the moment between two renames. A crash at any point leaves either the old or
-the new work whole.
+`4-train` holds finished output. `.4-train.partial` is the working folder; it is kept after an
+interruption, and after a failure with the reason in it. `.4-train.old` is the previous output
+between the two renames that replace it. After a crash at any point either the old or the new
+output is complete.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Workspace:
         return self.run_folder / f".{self.label}.old"
 
     def note_failure(self, code: str, given: str) -> None:
-        """Leave in the working folder why it was left; as far as the disk still allows."""
+        """Record in the working folder why the attempt failed, if the disk allows it."""
         with suppress(OSError):
             write_json(self.partial / _FAILURE, {"code": code, "given": given})
 
     def failure(self) -> str:
-        """Why the last attempt failed, with its code; "" if it did not."""
+        """Why the last attempt failed, with the error code; "" if it did not fail."""
         try:
             data = json.loads((self.partial / _FAILURE).read_text(encoding="utf-8"))
             return f"{data['given']} ({data['code']})"
@@ -57,11 +57,11 @@ class Workspace:
             return ""
 
     def begin(self, request: Request, settings_type: type) -> bool:
-        """Make the working folder ready; True if it holds work on the same request. OSError."""
+        """Prepare the working folder. True if it holds work on the same request. Raises OSError."""
         if self.partial.exists():
             (self.partial / _FAILURE).unlink(missing_ok=True)
             if request.matches(self.partial, settings_type):
-                for half in self.partial.rglob(".partial-*"):  # of `replacing`, killed half-way
+                for half in self.partial.rglob(".partial-*"):  # of a killed `replacing`
                     half.unlink()
                 return True
             shutil.rmtree(self.partial)
@@ -70,12 +70,12 @@ class Workspace:
         return False
 
     def finish(self, manifest: Manifest) -> None:
-        """Turn the working folder into the finished one. Raises OSError."""
+        """Write the manifest and make the working folder the finished one. Raises OSError."""
         manifest.write(self.partial)
         self._replace()
 
     def recover(self) -> None:
-        """Complete or undo a replacement that a crash cut short. Raises OSError."""
+        """Complete or undo a replacement that a crash interrupted. Raises OSError."""
         if (self.partial / MANIFEST).exists():
             self._replace()
         elif self.old.exists() and not self.final.exists():
@@ -97,7 +97,7 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Layout:
-    """Which stages a run folder holds, and where. stages: in order."""
+    """The stages of a run folder, in order, and their folders."""
 
     run_folder: Path
     stages: tuple[Stage, ...]

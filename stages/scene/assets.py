@@ -1,4 +1,4 @@
-"""What the pipeline ends in: files that other programs open."""
+"""The output of the pipeline: files that other programs open."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 @dataclass(frozen=True)
 class ExportedFile:
     """One asset. format: its suffix without the dot. path: relative to the assets' folder.
-    size_bytes: with what belongs to it (the .bin beside a .gltf)."""
+    size_bytes: of all its files (with the .bin beside a .gltf)."""
 
     format: str
     path: str
@@ -18,7 +18,7 @@ class ExportedFile:
 
 @dataclass(frozen=True)
 class ExportedAssets:
-    """The files of one export, in the order in which they were asked for."""
+    """The files of one export, in the order in which they were requested."""
 
     folder: Path
     files: tuple[ExportedFile, ...]

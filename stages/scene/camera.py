@@ -39,15 +39,15 @@ class Camera:
     def project(
         self, points: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(pixels [N, 2], z [N]) of points [N, 3] of the world, in float64. Pixels mean nothing
-        where z is not above 0; at z = 0 they are infinite or not numbers."""
+        """(pixels [N, 2], z [N]) of points [N, 3] of the world, in float64. Pixels are
+        meaningless where z <= 0; at z = 0 they are infinite or NaN."""
         at = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         with np.errstate(all="ignore"):
             pixels = at[:, :2] / at[:, 2:] * (self.fx, self.fy) + (self.cx, self.cy)
         return pixels, at[:, 2]
 
     def shows(self, pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """[N] whether pixels [N, 2] lie in the picture, its right and lower rim excluded."""
+        """[N] whether pixels [N, 2] lie in the picture, its right and lower edge excluded."""
         return np.asarray(((pixels >= 0) & (pixels < (self.width, self.height))).all(1))
 
     def resized(self, width: int, height: int) -> Camera:
@@ -68,11 +68,11 @@ class Camera:
         return self.resized(*fitted_size(self.width, self.height, long_side))
 
     def reframed(self, width: int, height: int) -> Camera:
-        """All that the camera sees, in a picture of another size and perhaps shape: more to two
-        sides, never less."""
+        """The camera with another picture size and aspect ratio. It sees at least what it saw
+        before, and more on two sides if the aspect ratio differs."""
         scale = min(width / self.width, height / self.height)
         if abs(scale * self.width - width) < 1.5 and abs(scale * self.height - height) < 1.5:
-            return self.resized(width, height)  # the same shape, but for whole pixels
+            return self.resized(width, height)  # the same aspect ratio, to within a pixel
         return replace(
             self,
             width=width,
@@ -84,7 +84,7 @@ class Camera:
         )
 
     def moved(self, world_from_new: NDArray[np.float64]) -> Camera:
-        """The camera as seen from a new world frame (x_world = world_from_new x_new), [4, 4]."""
+        """The same camera in a new world frame (x_world = world_from_new x_new), [4, 4]."""
         return replace(self, world_to_camera=self.world_to_camera @ world_from_new)
 
 

@@ -15,8 +15,8 @@ from stages.scene.light import Light
 
 Item = TypeVar("Item")
 HELD_OUT_EVERY = 8
-PHOTOS_FOLDER = "photos/"  # of a capture: where its normalised pictures are
-IGNORE, TRANSPARENT = "ignore", "transparent"  # what masks may mean
+PHOTOS_FOLDER = "photos/"  # folder of a capture with its normalised pictures
+IGNORE, TRANSPARENT = "ignore", "transparent"  # meaning of pixels outside a mask
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How splats were fitted to their photographs, and so how they are drawn and judged."""
+"""How splats were trained, and so how they are drawn and evaluated."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from stages.scene.camera import Camera
 from stages.scene.capture import TRANSPARENT, View, scene_extent
 from stages.scene.quantiles import quantiles
 
-NEAR_SHARE = 0.01  # of the cameras' extent: nearer than that no photograph is in focus
-# Of the box of the middle 98 % of the splats, where no camera tells: a scene is mostly seen from
-# within or just outside its box, which is then some two to three extents across.
+NEAR_SHARE = 0.01  # of the cameras' extent: photographs are not in focus nearer than that
+# Of the diagonal of the box around the middle 98 % of the splats, if there are no cameras: a scene
+# is mostly seen from within or just outside its box, which is then two to three extents across.
 NEAR_SHARE_OF_BOX = 0.004
 _MIDDLE = (0.01, 0.99)
 
 
 @dataclass(frozen=True)
 class DrawSettings:
-    """What decides a picture of splats besides the camera; it travels with them.
+    """How a picture of splats is drawn, apart from the camera. It is stored with the splats.
 
-    near: a splat is drawn if the z of its centre is larger; world units. 0 where nobody knows:
-        files of other programs do not tell.
-    side: longer side of the photographs that the splats were fitted to and are judged on, pixels;
-        0 where there were none.
-    background: grey behind everything, 0 to 1: black, or white where photographs are cut out.
-    light: whether photographs are brought to their median light (`scene.light`) first.
+    Args:
+        near: a splat is drawn if the z of its centre is larger; world units. 0 if unknown, as in
+            files of other programs.
+        side: longer side of the photographs in training and evaluation, pixels; 0 if there were
+            none.
+        background: grey level behind everything, 0 to 1: black, or white for cut-out photographs.
+        light: whether photographs are corrected to their median light (`scene.light`) first.
     """
 
     near: float = 0.0
@@ -36,12 +37,12 @@ class DrawSettings:
     light: bool = False
 
     def camera(self, camera: Camera) -> Camera:
-        """`camera` at the size that the splats are judged at; never enlarged."""
+        """`camera` at the size of training and evaluation; never enlarged."""
         return camera.fitted(self.side) if self.side else camera
 
 
 def draw_settings_of(views: tuple[View, ...], side: int = 0, light: bool = False) -> DrawSettings:
-    """How splats fitted to these photographs are drawn. light: as in `Look`."""
+    """How splats trained on these views are drawn. side, light: as in `DrawSettings`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
     return DrawSettings(near_plane(views), side, float(cut_out), light)
 
@@ -52,7 +53,7 @@ def near_plane(views: tuple[View, ...]) -> float:
 
 
 def near_plane_of(means: NDArray[np.floating]) -> float:
-    """A near plane for splats [N, 3] that come without cameras, world units."""
+    """A near plane for splats with means [N, 3] and no cameras, world units."""
     if not np.isfinite(means).all(axis=1).any():
         return NEAR_SHARE
     low, high = quantiles(means, _MIDDLE)

@@ -1,7 +1,7 @@
-"""The turn between our y-down world and y-up formats: 180 degrees about x.
+"""Rotation by 180 degrees about x, between our y-down world and y-up formats.
 
-(x, y, z) becomes (x, -y, -z). It is its own inverse, and costs no precision: every value changes
-its sign or nothing.
+(x, y, z) becomes (x, -y, -z). The rotation is its own inverse and exact: values change their sign
+only.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ FLIP = np.array([1.0, -1.0, -1.0])
 # y(3xx-yy) xyz y(4zz-xx-yy) z(2zz-3xx-3yy) x(4zz-xx-yy) z(xx-yy) x(xx-3yy)
 SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
-# Rotating by q after a half turn h gives h q. We store h q h* instead: the factor h* turns the
-# ellipsoid by 180 degrees about one of its own axes, which it does not notice, and an unrotated
-# splat stays unrotated.
+# Rotating by q and then by the half turn h gives h q. We store h q h* instead: the factor h*
+# rotates the ellipsoid by 180 degrees about one of its own axes, which changes nothing, and so an
+# unrotated splat stays unrotated.
 _QUATERNION_SIGNS = np.array([1, 1, -1, -1], np.float32)
 
 
 def flipped(splats: Splats, *, reuse: bool = False) -> Splats:
     """The splats in the other frame (y down to y up, and back).
 
-    reuse: into the arrays that they come in, for a caller who needs those no more.
+    reuse: write into the arrays of `splats`, which the caller no longer needs.
     """
     signs = {
         "means": FLIP.astype(splats.means.dtype),

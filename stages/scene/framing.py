@@ -1,4 +1,4 @@
-"""Places to look at splats from, where no photograph says."""
+"""Cameras that frame splats, where there are no photographs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stages.scene.camera import Camera, look_at
 from stages.scene.quantiles import quantiles
 from stages.scene.splats import Splats
 
-_WIDTH_WITHOUT_A_PHOTOGRAPH_PX = 960
+_WIDTH_PX = 960
 _MEANS_FOR_DEPTH = 4000
 
 
@@ -19,12 +19,12 @@ def front_camera(splats: Splats) -> Camera:
 
 
 def orbit_cameras(splats: Splats, count: int, part: float) -> tuple[Camera, ...]:
-    """`count` cameras evenly around the middle `part` of the splats, the first in front; each sees
-    all of that part."""
+    """`count` cameras evenly around the middle `part` (0 to 1) of the splats along each axis. The
+    first is in front; each sees all of that part."""
     low, high = quantiles(splats.means, (0.5 - part / 2, 0.5 + part / 2))
     middle = (low + high) / 2
     distance = max(float(np.linalg.norm(high - low)), 1e-3) * 1.2
-    width = _WIDTH_WITHOUT_A_PHOTOGRAPH_PX
+    width = _WIDTH_PX
     height = width * 3 // 4
     cameras = []
     for angle in 2 * np.pi * np.arange(count) / count:
@@ -35,7 +35,7 @@ def orbit_cameras(splats: Splats, count: int, part: float) -> tuple[Camera, ...]
 
 
 def median_depth(camera: Camera, means: NDArray[np.floating]) -> float:
-    """The median z of what lies in the picture; of all in front if nothing does."""
+    """The median z of the means inside the picture; of all in front of the camera if none is."""
     points = means[:: max(1, len(means) // _MEANS_FOR_DEPTH)].astype(np.float64)
     pixels, z = camera.project(points)
     ahead = z > 0.01

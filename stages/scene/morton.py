@@ -1,4 +1,4 @@
-"""An order of splats in which neighbours in space are mostly neighbours in file and memory."""
+"""Morton order of splats: neighbours in space are mostly neighbours in the file and in memory."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ _BITS = 21  # three times 21 fit into 64
 
 
 def morton_order(splats: Splats) -> NDArray[np.intp]:
-    """[N] rows of `splats` in the order of their means; see `order_of`."""
+    """[N] rows of `splats` in Morton order of their means."""
     return morton_order_of(splats.means)
 
 
 def morton_order_of(means: NDArray[np.floating]) -> NDArray[np.intp]:
-    """[N] rows of means [N, 3] along a Morton curve (interleaved bits of x, y, z); equals keep
+    """[N] rows of means [N, 3] along a Morton curve (interleaved bits of x, y, z). Equal means keep
     their order.
 
-    Of the ranks of the coordinates, not of their values: one splat far away would otherwise leave
-    all others in one cell. What is not a number comes last of its axis.
+    The bits are those of the coordinates' ranks, not of their values: otherwise one distant splat
+    would leave all others in one cell. NaN is last on its axis.
     """
     code = np.zeros(len(means), np.uint64)
     for axis in range(3):
@@ -29,7 +29,7 @@ def morton_order_of(means: NDArray[np.floating]) -> NDArray[np.intp]:
 
 
 def _ranks(values: NDArray[np.floating]) -> NDArray[np.uint64]:
-    """[N] place of each value among the distinct ones, scaled to the bits of one axis."""
+    """[N] rank of each value among the distinct ones, scaled to the bits of one axis."""
     distinct, place = np.unique(values, return_inverse=True)
     last = max(1, len(distinct) - 1)
     found: NDArray[np.uint64] = (
@@ -39,7 +39,7 @@ def _ranks(values: NDArray[np.floating]) -> NDArray[np.uint64]:
 
 
 def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Two zero bits between each two bits."""
+    """Insert two zero bits after each bit."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

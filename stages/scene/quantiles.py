@@ -1,4 +1,4 @@
-"""Where the middle of many points lies, one axis at a time: copies of them all would be large."""
+"""Quantiles of many points, one axis at a time to save memory."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 
 def quantiles(means: NDArray[np.floating], shares: Sequence[float]) -> NDArray[np.float64]:
-    """[len(shares), 3] of the coordinates of means [N, 3], linear between neighbours; of the rows
-    that are finite. Zeros where there is none."""
+    """[len(shares), 3] quantiles of the coordinates of means [N, 3], linearly interpolated. Rows
+    that are not finite are left out; zeros if none is left."""
     whole = np.isfinite(means).all(axis=1)
     found = np.zeros((len(shares), 3))
     if whole.any():

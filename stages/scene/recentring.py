@@ -1,23 +1,24 @@
-"""Positions that float32 cannot tell apart, as in a survey's coordinates."""
+"""Recentring of positions that are too large for the precision of float32, such as survey
+coordinates."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-# A float32 has 24 bits (IEEE 754). Farther from zero than 1000 times its own spread, a scene has
-# less than 14 of them left to tell its splats apart, and nearer than 1000 units it does not matter:
-# there they are good to 1/30,000 of a unit.
+# A float32 has a significand of 24 bits (IEEE 754). A scene that is farther from zero than 1000
+# times its own spread has less than 14 bits left for the differences between its splats. Within
+# 1000 units it does not matter: there positions are precise to 1/30,000 of a unit.
 _FAR_SPREADS, _FAR_UNITS = 1000.0, 1000.0
 
 
 def recentred(
     means: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """(means [N, 3] float32, origin [3]): their sum is that of what came in.
+    """(means [N, 3] float32, origin [3]) with the same sum as the arguments.
 
-    Means that lie far from zero for their spread are moved beside it, by whole units; others stay
-    as they are. A value too large for a float32 becomes infinite.
+    Means that are far from zero for their spread are moved near zero by whole units; others are
+    unchanged. A value too large for float32 becomes infinite.
     """
     finite = means[np.isfinite(means).all(axis=1)]
     shift = np.zeros(3)

@@ -1,4 +1,4 @@
-"""The scale, turn and shift between two worlds that know the same points."""
+"""The similarity transform between two sets of corresponding points."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ def similarity(
     a: NDArray[np.float64], b: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """(scale, rotation [3, 3], offset [3]) that take points a [N, 3] nearest b by
-    scale * rotation @ a + offset (Umeyama 1991). Where the points lie on a line, or are one, it is
-    one answer of many."""
+    scale * rotation @ a + offset (Umeyama 1991). For collinear or
+    equal points it is one of many solutions."""
     mean_a, mean_b = a.mean(0), b.mean(0)
     u, sizes, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

@@ -27,7 +27,7 @@ class Splats:
     sh_degrees [N] uint8: the degree that each splat uses; coefficients above it are zero.
     origin [3] float64: what to add to `means` to be back in the capture's coordinates. float32
         positions near zero keep their precision however far away the capture lies.
-    look: how they are drawn and judged.
+    draw_settings: how they are drawn and evaluated.
     """
 
     means: NDArray[np.floating]
@@ -61,7 +61,7 @@ class Splats:
 
     @property
     def arrays(self) -> tuple[NDArray[np.floating], ...]:
-        """The five that describe each splat, in the fields' order: what a rasteriser takes."""
+        """The five parameter arrays in the order of the fields, as a rasteriser takes them."""
         return (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh)
 
     @property
@@ -141,8 +141,8 @@ class QuantisedSplats:
 
 
 def parameters_per_splat(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:
-    """[N] how many numbers a splat of each degree is: place, rotation, scales and opacity, and
-    three for each term of its colour."""
+    """[N] number of parameters of a splat of each SH degree: mean, rotation, scales, opacity, and
+    three for each SH coefficient."""
     return np.asarray(3 + 4 + 3 + 1 + 3 * (sh_degrees.astype(np.int64) + 1) ** 2)
 
 

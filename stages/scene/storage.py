@@ -1,9 +1,9 @@
 """Splats on disk between stages: exact, deterministic, and quick to load.
 
 Layout: the 8 bytes of `MAGIC`, then one block in NumPy's .npy format (version 1.0) for each array
-in the order of `FIELDS`, and a last one [4] float64 for the look: near plane, side, background
-and light. No compression and no timestamps (a zip, and so .npz, would carry them), so equal splats
-give equal bytes.
+in the order of `FIELDS`, and a last one [4] float64 for the draw settings: near plane, side,
+background and light. There is no compression and no timestamp (a zip file, and so .npz, would have
+them), so equal splats give equal bytes.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _DTYPES = {"<f4", "<f8", "|u1"}
 def save_splats(path: Path, splats: Splats) -> Path:
     """Write `splats` to `path` (to `FILE_NAME` inside, if `path` is a folder); return the file.
 
-    Float arrays keep their type (float32 or float64), little-endian. Written whole or not at all.
-    Raises SplatError when the file cannot be written.
+    Float arrays keep their type (float32 or float64), little-endian. Written atomically.
+    Raises SplatError if the file cannot be written.
     """
     target = _file_of(path)
     with replacing(target) as temporary, temporary.open("wb") as file:
@@ -58,7 +58,7 @@ def load_splats(path: Path) -> Splats:
             if file.read(len(MAGIC)) != MAGIC:
                 raise ValueError("it does not start as a splats file")
             arrays = {name: _read_array(file, size, name) for name in FIELDS}
-            near, side, grey, light = _read_array(file, size, "look").astype(np.float64)
+            near, side, grey, light = _read_array(file, size, "draw settings").astype(np.float64)
             if file.read(1):
                 raise ValueError("bytes follow its end")
         draw_settings = DrawSettings(float(near), int(side), float(grey), bool(light))
@@ -69,7 +69,7 @@ def load_splats(path: Path) -> Splats:
             "splats-file-damaged",
             given=f"{source} cannot be read: {reason}.",
             wanted="A splats file as a stage wrote it.",
-            hint="Delete the stage's folder and run the command again; it will be made anew.",
+            hint="Delete the stage's folder and run the command again; it is then made again.",
             family=Family.RUN_FOLDER,
         ) from error
 

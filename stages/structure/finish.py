@@ -56,8 +56,7 @@ def finish(
     taken, lenses = _cameras_and_lenses(model)
     cameras, _ = write_undistorted_images(photos, taken, lenses, capture.folder, folder, report)
     pictures = [folder / IMAGES / photo.picture for photo in photos]
-    names = [photo.name for photo in photos]
-    scale = find_metric_scale(known_scale, capture, names, cameras, pictures, levelled, report)
+    scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
     if scale is not None:
         poses, points = scale.poses(model.world_to_camera), scale.points(model.points)
         model = replace(model, world_to_camera=poses, points=points)

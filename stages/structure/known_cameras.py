@@ -75,15 +75,12 @@ def reconstruct(
     found = read_cameras(path)
     from_file = read_points(path)
     posed = match_cameras(found, capture, split, allow_partial, report)
-    if len(posed) < 3:
-        raise _too_few(len(posed))
+    _check_usable(posed, refine)
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
     photos, taken, lenses = zip(*((p.photo, p.camera, p.lens) for p in posed), strict=True)
     cameras, share = write_undistorted_images(photos, taken, lenses, capture.folder, folder, report)
     _report_lost_area(1.0 - share, report)
     training = [i for i, one in enumerate(posed) if one.role != "test"]
-    if refine and len(training) < len(posed):
-        raise _split_and_refined()
     job = _job(photos, cameras, training, folder, work, seed, max_features, refine)
     _match(job, work, report, seconds_left)
     triangulated = Path(job.out) / "points.npz"
@@ -93,23 +90,15 @@ def reconstruct(
     cloud, observations = find_points(
         from_file, triangulated, training, photos, cameras, folder, seed, report
     )
-    if found.georeference.metres_per_unit and not known_scale.metres_per_unit:
+    georeference = found.georeference
+    if georeference.metres_per_unit and not known_scale.metres_per_unit:
         known_scale = replace(
             known_scale,
-            metres_per_unit=found.georeference.metres_per_unit,
-            source=found.georeference.source,
+            metres_per_unit=georeference.metres_per_unit,
+            source=georeference.source,
         )
-    return _finish(
-        posed,
-        cameras,
-        cloud,
-        observations,
-        folder,
-        report,
-        known_scale,
-        capture,
-        found.georeference.axes,
-    )
+    axes = georeference.axes
+    return _finish(posed, cameras, cloud, observations, folder, report, known_scale, axes)
 
 
 def _report_lost_area(lost: float, report: Report) -> None:
@@ -270,7 +259,6 @@ def _finish(
     folder: Path,
     report: Report,
     known_scale: KnownScale,
-    capture: Capture,
     axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
     """Level, recentre and scale; write the COLMAP model. axes: as in `Georeference`."""
@@ -280,16 +268,16 @@ def _finish(
     world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
     cameras = [camera.moved(world_from_new) for camera in cameras]
     points = (cloud.points - middle) @ turn.T
-    names = [one.photo.name for one in posed]
-    pictures = [folder / IMAGES / one.photo.picture for one in posed]
-    scale = find_metric_scale(known_scale, capture, names, cameras, pictures, levelled, report)
+    photos = [one.photo for one in posed]
+    pictures = [folder / IMAGES / photo.picture for photo in photos]
+    scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
     if scale is not None:
         points, cameras = scale.points(points), scale.cameras(cameras)
         world_from_new[:3, :3] = world_from_new[:3, :3] @ scale.turn.T / scale.metres
     report.metric("file_from_world", world_from_new.tolist())
     return write_reconstruction(
         folder,
-        [one.photo for one in posed],
+        photos,
         cameras,
         replace(cloud, points=points),
         observations,
@@ -314,24 +302,23 @@ def _levelling(
     return levelling_rotation(found, rotations[0, 2], rotations[0, 0]), True
 
 
-def _split_and_refined() -> SplatError:
-    return SplatError(
-        "cameras-split-and-refined",
-        given="--refine-cameras with --split: refinement moves the training cameras and not the "
-        "test cameras, so the test views would no longer fit.",
-        wanted="One of the two options.",
-        hint="Leave --split away; then every eighth photograph is held out.",
-        family=Family.USAGE,
-    )
-
-
-def _too_few(count: int) -> SplatError:
-    return SplatError(
-        "sfm-too-few-photographs",
-        given=f"{counted(count, 'photograph')} of the capture have a camera.",
-        wanted="At least 3.",
-        hint="Check that the file's names are those of the photographs.",
-    )
+def _check_usable(posed: Sequence[PosedPhoto], refine: bool) -> None:
+    if len(posed) < 3:
+        raise SplatError(
+            "sfm-too-few-photographs",
+            given=f"{counted(len(posed), 'photograph')} of the capture have a camera.",
+            wanted="At least 3.",
+            hint="Check that the file's names are those of the photographs.",
+        )
+    if refine and any(one.role == "test" for one in posed):
+        raise SplatError(
+            "cameras-split-and-refined",
+            given="--refine-cameras with --split: refinement moves the training cameras and not "
+            "the test cameras, so the test views would no longer fit.",
+            wanted="One of the two options.",
+            hint="Leave --split away; then every eighth photograph is held out.",
+            family=Family.USAGE,
+        )
 
 
 def _timed_out() -> SplatError:

@@ -86,10 +86,9 @@ def _triangulated(places: Seen, cameras: Sequence[Camera]) -> NDArray[np.float64
     wanted = np.einsum("vcij,vj->ci", perpendicular, centres)
     corners = np.linalg.solve(total, wanted[..., None])[..., 0]
     for camera, at in zip(chosen, seen, strict=True):
-        local = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        pixels = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        pixels, depths = camera.project(corners)
         worst = _LARGEST_ERROR * max(camera.width, camera.height)
-        if (local[:, 2] <= 0).any() or np.abs(pixels - at).max() > worst:
+        if (depths <= 0).any() or np.abs(pixels - at).max() > worst:
             return None
     return corners
 

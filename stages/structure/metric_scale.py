@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.scene import Camera, Capture, Photo
+from stages.scene import Camera, Photo
 from stages.structure.markers import marker_sides
 
 _FEWEST_GPS = 5
@@ -78,8 +78,7 @@ class MetricScale:
 
 def find_metric_scale(
     known: KnownScale,
-    capture: Capture,
-    names: Sequence[str],
+    photos: Sequence[Photo],
     cameras: Sequence[Camera],
     pictures: Sequence[Path],
     levelled: bool,
@@ -90,9 +89,8 @@ def find_metric_scale(
 
     Args:
         known: what the user or the camera file states.
-        capture: the photographs.
-        names, cameras, pictures: [V] names of the registered photographs, their pinhole cameras,
-            and the files of their undistorted pictures.
+        photos, cameras, pictures: [V] the registered photographs, their pinhole cameras, and the
+            files of their undistorted pictures.
         levelled: whether up is -Y.
         report: receives metrics.
 
@@ -100,21 +98,20 @@ def find_metric_scale(
     """
     centres = np.array([camera.centre for camera in cameras])
     if known.distance:
-        metric: MetricScale | None = _from_distance(known.distance, capture, names, centres)
+        metric: MetricScale | None = _from_distance(known.distance, photos, centres)
     elif known.marker:
         metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
     elif known.metres_per_unit:
         metric = MetricScale(known.metres_per_unit, 0.0, known.source)
     else:
-        photos = {photo.name: photo for photo in capture.photos}
-        metric = _from_gps([photos[name] for name in names], centres, levelled, report)
+        metric = _from_gps(photos, centres, levelled, report)
     report.metric("scale_source", metric.source if metric else "nothing")
     report.metric("metres_per_unit", metric.metres if metric else None)
     return metric
 
 
-def check_distance(distance: Sequence[str], capture: Capture) -> float:
-    """The metres of a `KnownScale.distance`. Raises SplatError if it cannot be of this capture."""
+def check_distance(distance: Sequence[str], photos: Sequence[Photo]) -> float:
+    """The metres of a `KnownScale.distance`. Raises SplatError if it cannot be of these photos."""
     *ends, text = distance
     try:
         metres = float(text)
@@ -123,20 +120,18 @@ def check_distance(distance: Sequence[str], capture: Capture) -> float:
     if not (math.isfinite(metres) and metres > 0):
         raise _unusable(f"{text} is not a distance in metres")
     for name in ends:
-        if name not in {photo.name for photo in capture.photos}:
-            raise _unusable(f"{name} is not a photograph of the capture")
+        if name not in {photo.name for photo in photos}:
+            raise _unusable(f"{name} is not a photograph of the capture or was not registered")
     return metres
 
 
 def _from_distance(
-    distance: Sequence[str], capture: Capture, names: Sequence[str], centres: NDArray[np.float64]
+    distance: Sequence[str], photos: Sequence[Photo], centres: NDArray[np.float64]
 ) -> MetricScale:
-    metres = check_distance(distance, capture)
+    metres = check_distance(distance, photos)
     first, second, _ = distance
-    for name in (first, second):
-        if name not in names:
-            raise _unusable(f"{name} could not be registered")
-    a, b = (centres[list(names).index(name)] for name in (first, second))
+    names = [photo.name for photo in photos]
+    a, b = (centres[names.index(name)] for name in (first, second))
     units = float(np.linalg.norm(a - b))
     spread = float(np.linalg.norm(centres - np.median(centres, axis=0), axis=1).max())
     if units < 1e-3 * spread:

@@ -13,6 +13,7 @@ from stages.base.errors import Family, SplatError
 from stages.scene import Camera, Reconstruction, View
 
 FILE_NAME = "reconstruction.json"
+_INTRINSICS = ("fx", "fy", "cx", "cy")
 _ARRAYS = {"points": "<f8", "colours": "|u1", "errors_px": "<f8", "tracks": "<i4"}
 
 
@@ -83,17 +84,14 @@ def _view_to_dict(view: View) -> dict[str, Any]:
         **({"light": list(view.light)} if view.light else {}),
         "width": camera.width,
         "height": camera.height,
-        "fx": float(camera.fx),
-        "fy": float(camera.fy),
-        "cx": float(camera.cx),
-        "cy": float(camera.cy),
-        "world_to_camera": [[float(v) for v in row] for row in camera.world_to_camera],
+        **{name: float(getattr(camera, name)) for name in _INTRINSICS},
+        "world_to_camera": camera.world_to_camera.tolist(),
     }
 
 
 def _view_from_dict(data: dict[str, Any]) -> View:
     matrix = np.array(data["world_to_camera"], np.float64).reshape(4, 4)
-    numbers = {name: float(data[name]) for name in ("fx", "fy", "cx", "cy")}
+    numbers = {name: float(data[name]) for name in _INTRINSICS}
     camera = Camera(
         width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
     )

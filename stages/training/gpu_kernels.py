@@ -205,20 +205,32 @@ def adam_kernel(
     tl.store(moment2 + at, v, mask=there)
     m = m * tl.load(corrections + 2 * t, mask=there, other=0.0)
     v = v * tl.load(corrections + 2 * t + 1, mask=there, other=0.0)
-    rate = tl.where(k < ROTATION, rate_means, tl.where(k < LOG_SCALE, rate_rotation, rate_scale))
-    rate = tl.where(k < OPACITY, rate, tl.where(k < SH, rate_opacity, rate_rest))
-    rate = tl.where((k >= SH) & (k < SH_REST), rate_dc, rate)
+    rate = rate_of(k, rate_means, rate_rotation, rate_scale, rate_opacity, rate_dc, rate_rest)
     value = tl.load(rows + at, mask=there, other=0.0)
     tl.store(rows + at, value - rate[None, :] * m / (tl.sqrt(v) + EPSILON), mask=there)
-    gx = tl.load(means2d + 2 * i, mask=moved, other=0.0) * ndc_x
-    gy = tl.load(means2d + 2 * i + 1, mask=moved, other=0.0) * ndc_y
-    total_gradient = tl.load(gradient_sum + i, mask=moved, other=0.0) + tl.sqrt(gx * gx + gy * gy)
-    tl.store(gradient_sum + i, total_gradient, mask=moved)
-    seen = tl.load(gradient_count + i, mask=moved, other=0) + 1
-    tl.store(gradient_count + i, seen, mask=moved)
+    accumulate(means2d, gradient_sum, gradient_count, i, moved, ndc_x, ndc_y)
 
 
 @inner
 def leads(k):
     """Whether a column is the first that goes by its count."""
     return (k == 0) | (k == OPACITY) | (k == SH_REST) | (k == DEGREE_2) | (k == DEGREE_3)
+
+
+@inner
+def rate_of(k, means, rotation, scale, opacity, dc, rest):
+    """The learning rate of each column."""
+    rate = tl.where(k < ROTATION, means, tl.where(k < LOG_SCALE, rotation, scale))
+    rate = tl.where(k < OPACITY, rate, tl.where(k < SH, opacity, rest))
+    return tl.where((k >= SH) & (k < SH_REST), dc, rate)
+
+
+@inner
+def accumulate(means2d, gradient_sum, gradient_count, i, moved, ndc_x, ndc_y):
+    """Add the norm of the gradient by the 2D position to the statistics of densification."""
+    gx = tl.load(means2d + 2 * i, mask=moved, other=0.0) * ndc_x
+    gy = tl.load(means2d + 2 * i + 1, mask=moved, other=0.0) * ndc_y
+    total_gradient = tl.load(gradient_sum + i, mask=moved, other=0.0) + tl.sqrt(gx * gx + gy * gy)
+    tl.store(gradient_sum + i, total_gradient, mask=moved)
+    seen = tl.load(gradient_count + i, mask=moved, other=0) + 1
+    tl.store(gradient_count + i, seen, mask=moved)

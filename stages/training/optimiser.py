@@ -129,6 +129,47 @@ def _scales_of(scales, counts, k):
 
 
 @kernel
+def _is_invalid(gradients, at, columns):
+    """Whether one of the gradients at `at` is larger than LARGEST_GRADIENT or not finite."""
+    largest = splat16(_F(LARGEST_GRADIENT))
+    invalid = False
+    for k in range(0, columns, 16):
+        invalid |= vany(vnot(vge(largest, vabs(vload(gradients, at + k)))))
+    return invalid
+
+
+@kernel
+def _update_moments(gradients, at, columns, moment1, moment2, own, rates, scales, counts, shift):
+    """Update the moments at `own` with the gradients at `at`; write the step of each parameter into
+    `shift`."""
+    b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
+    b2, c2 = splat16(_F(BETA2)), splat16(_F(1.0 - BETA2))
+    epsilon = splat16(_F(EPSILON))
+    for k in range(0, columns, 16):
+        g = vload(gradients, at + k)
+        m = vfma(b1, vload(moment1, own + k), c1 * g)
+        v = vfma(b2, vload(moment2, own + k), c2 * g * g)
+        vstore(moment1, own + k, m)
+        vstore(moment2, own + k, v)
+        scale1, scale2 = _scales_of(scales, counts, k)
+        step = vload(rates, k) * m * scale1 / (vsqrt(v * scale2) + epsilon)
+        vstore(shift, k, step)
+
+
+@kernel
+def _move(i, shift, means, quaternions, log_scales, opacity_logits, sh, n_sh):
+    """Subtract `shift` from the parameters of splat i, and from its first `n_sh` of `sh`."""
+    for k in range(3):
+        means[i, k] -= shift[MEAN + k]
+        log_scales[i, k] -= shift[LOG_SCALE + k]
+    for k in range(4):
+        quaternions[i, k] -= shift[ROTATION + k]
+    opacity_logits[i] -= shift[OPACITY]
+    for k in range(n_sh):
+        sh[i, k] -= shift[SH + k]
+
+
+@kernel
 def adam_step(
     ticket,
     chunk,
@@ -167,44 +208,24 @@ def adam_step(
     """
     n = len(visible)
     columns = gradients.shape[1]
-    stride = moment1.shape[1]
+    stride, n_sh = moment1.shape[1], min(columns - SH, sh.shape[1])
     shift = np.zeros(columns, np.float32)
     scales = np.empty((STEP_COUNTS, 2), np.float32)
-    b1, c1 = splat16(_F(BETA1)), splat16(_F(1.0 - BETA1))
-    b2, c2 = splat16(_F(BETA2)), splat16(_F(1.0 - BETA2))
-    epsilon, huge = splat16(_F(EPSILON)), splat16(_F(LARGEST_GRADIENT))
     while True:
         start = take_ticket(ticket) * chunk
         if start >= n:
             break
         for rank in range(start, min(start + chunk, n)):
             i = visible[rank]
-            bad = False
-            for k in range(0, columns, 16):
-                g = vload(gradients, rank * columns + k)
-                bad |= vany(vnot(vge(huge, vabs(g))))
-            if bad:
+            if _is_invalid(gradients, rank * columns, columns):
                 continue
             _count(steps, i, counts, corrections, scales)
-            for k in range(0, columns, 16):
-                g = vload(gradients, rank * columns + k)
-                at = np.int64(i) * stride + k
-                m = vfma(b1, vload(moment1, at), c1 * g)
-                v = vfma(b2, vload(moment2, at), c2 * g * g)
-                vstore(moment1, at, m)
-                vstore(moment2, at, v)
-                scale1, scale2 = _scales_of(scales, counts, k)
-                step = vload(rates, k) * m * scale1 / (vsqrt(v * scale2) + epsilon)
-                vstore(shift, k, step)
-            for k in range(3):
-                means[i, k] -= shift[MEAN + k]
-                log_scales[i, k] -= shift[LOG_SCALE + k]
-            for k in range(4):
-                quaternions[i, k] -= shift[ROTATION + k]
-            opacity_logits[i] -= shift[OPACITY]
-            own = 3 * (np.int64(sh_degrees[i]) + 1) ** 2
-            for k in range(min(columns - SH, sh.shape[1], own)):
-                sh[i, k] -= shift[SH + k]
+            at, own = rank * columns, np.int64(i) * stride
+            _update_moments(
+                gradients, at, columns, moment1, moment2, own, rates, scales, counts, shift
+            )
+            used = 3 * (np.int64(sh_degrees[i]) + 1) ** 2
+            _move(i, shift, means, quaternions, log_scales, opacity_logits, sh, min(n_sh, used))
             gx, gy = means2d[rank, 0] * ndc_x, means2d[rank, 1] * ndc_y
             gradient_sum[i] += math.sqrt(gx * gx + gy * gy)
             gradient_count[i] += 1

@@ -11,10 +11,9 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.base.stage import Report
-from stages.scene import Camera, Capture, look_at
+from stages.scene import Camera, look_at
 from stages.structure.markers import marker_sides
 from stages.structure.metric_scale import KnownScale, find_metric_scale
-from tests.structure.bad_captures import SAMPLE
 
 SIDE = 0.37  # of a marker, world units
 EYES = np.array([[0.8, -2.0, -1.0], [-0.9, -1.8, -1.2], [0.1, -2.4, 0.9]])
@@ -70,10 +69,8 @@ def test_sides_of_markers_are_measured(tmp_path: Path, kind: str) -> None:
 
 def test_markers_of_a_stated_size_make_the_world_metric(tmp_path: Path) -> None:
     report = Report()
-    names, pictures = ["a", "b", "c"], photographs(tmp_path)
-    metric = find_metric_scale(
-        KnownScale(marker=0.05), Capture(SAMPLE, ()), names, cameras(), pictures, True, report
-    )
+    pictures = photographs(tmp_path)
+    metric = find_metric_scale(KnownScale(marker=0.05), (), cameras(), pictures, True, report)
     assert metric is not None
     assert metric.metres == pytest.approx(0.05 / SIDE, rel=0.005)
     assert report.metrics["markers"] == 3
@@ -84,9 +81,7 @@ def test_markers_that_are_not_there_are_an_error(tmp_path: Path) -> None:
     pictures = photographs(tmp_path, blank=True)
     assert len(marker_sides(pictures, cameras())) == 0
     with pytest.raises(SplatError, match="no ArUco marker"):
-        find_metric_scale(
-            KnownScale(marker=0.05), Capture(SAMPLE, ()), ["a"], cameras(), pictures, True, Report()
-        )
+        find_metric_scale(KnownScale(marker=0.05), (), cameras(), pictures, True, Report())
 
 
 def test_cameras_that_are_wrong_measure_no_marker(tmp_path: Path) -> None:

@@ -53,10 +53,9 @@ def on_earth(metres: np.ndarray) -> list[tuple[float, float] | None]:
 
 def found(capture: Capture, poses: np.ndarray, *distance: str, levelled: bool = True):
     report = Report()
-    names = [photo.name for photo in capture.photos]
     posed = [Camera(640, 480, 600.0, 600.0, 320.0, 240.0, pose) for pose in poses]
     return find_metric_scale(
-        KnownScale(distance), capture, names, posed, [], levelled, report
+        KnownScale(distance), capture.photos, posed, [], levelled, report
     ), report
 
 

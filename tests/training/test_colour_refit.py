@@ -1,4 +1,4 @@
-"""Colours once more, for all photographs at once."""
+"""The refit of colours to all training views."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def test_one_step_takes_out_most_of_what_colours_alone_got_wrong(truth):
     assert squared_error(after, levels) < 0.25 * squared_error(before, levels)
 
 
-def test_again_and_again_it_never_gets_worse(truth):
+def test_repeated_refits_never_get_worse(truth):
     levels, model = pictures_of(truth), paler(truth)
     errors = [squared_error(model, levels)]
     for _ in range(4):
@@ -71,14 +71,14 @@ def test_nothing_but_colours_moves(truth):
         assert (name == "sh") != np.array_equal(getattr(after, name), array)
 
 
-def test_bands_above_a_splats_own_degree_stay_empty(truth):
+def test_coefficients_above_a_splats_own_degree_stay_zero(truth):
     levels, flat = pictures_of(truth), paler(truth)
     flat.sh_degrees[:] = 0
     flat.sh[:, 1:] = 0.0
     assert not refitted(flat, levels).sh[:, 1:].any()
 
 
-def test_what_is_masked_asks_for_nothing(truth):
+def test_ignored_regions_have_no_influence(truth):
     levels = [
         replace(level, mask=np.zeros((30, 40), np.uint8), outside=IGNORE)
         for level in pictures_of(truth)

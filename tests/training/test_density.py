@@ -1,4 +1,4 @@
-"""Growing and shrinking."""
+"""Densification and pruning during training, and the schedule."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
 
 EXTENT = 10.0
-PHOTOGRAPHS = 8
+VIEWS = 8
 
 
 def model(n, scale=0.01, opacity=0.5):
@@ -24,26 +24,26 @@ def model(n, scale=0.01, opacity=0.5):
     )
 
 
-def pulled(m, rows, by=1.0):
+def with_gradients(m, rows, by=1.0):
     m.gradient_sum[rows] = by
     m.gradient_count[rows] = 1
     return m
 
 
 def grow(m, cap=10**6):
-    return AdaptiveDensity(EXTENT, PHOTOGRAPHS).grow(m, cap, np.random.default_rng(0))
+    return AdaptiveDensity(EXTENT, VIEWS).grow(m, cap, np.random.default_rng(0))
 
 
-def test_small_splats_that_are_pulled_are_cloned_in_place():
-    m = pulled(model(10), [2, 5])
+def test_small_splats_with_large_gradients_are_cloned():
+    m = with_gradients(model(10), [2, 5])
     grown = grow(m)
     assert len(grown) == 12
     np.testing.assert_array_equal(grown.means[10:], m.means[[2, 5]])
     assert not grown.moment1[10:].any()
 
 
-def test_large_splats_that_are_pulled_make_way_for_two_smaller_ones():
-    m = pulled(model(10, scale=0.2), [3])
+def test_large_splats_with_large_gradients_are_split_into_two():
+    m = with_gradients(model(10, scale=0.2), [3])
     grown = grow(m)
     assert len(grown) == 11
     np.testing.assert_allclose(np.exp(grown.log_scales[9:]), 0.2 / 1.6, rtol=1e-5)
@@ -56,13 +56,13 @@ def test_faint_giant_and_broken_splats_go():
     m.opacity_logits[0] = logit(0.004)
     m.log_scales[1] = np.log(0.11 * EXTENT)
     m.means[2, 1] = np.nan
-    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, remove_giants=True)) == 7
-    assert len(AdaptiveDensity(EXTENT, PHOTOGRAPHS).prune(m, remove_giants=False)) == 8
+    assert len(AdaptiveDensity(EXTENT, VIEWS).prune(m, remove_giants=True)) == 7
+    assert len(AdaptiveDensity(EXTENT, VIEWS).prune(m, remove_giants=False)) == 8
 
 
 @pytest.mark.parametrize("room", [0, 1, 3])
-def test_the_cap_is_kept_and_the_strongest_go_first(room):
-    m = pulled(model(10), range(10))
+def test_the_budget_is_kept_and_the_largest_gradients_come_first(room):
+    m = with_gradients(model(10), range(10))
     m.gradient_sum[:] = np.arange(10) + 1.0
     grown = grow(m, cap=10 + room)
     assert len(grown) == 10 + room
@@ -70,8 +70,8 @@ def test_the_cap_is_kept_and_the_strongest_go_first(room):
         np.testing.assert_array_equal(grown.means[10:], m.means[10 - room :])
 
 
-def test_what_one_photograph_sees_grows_after_what_many_see_though_it_is_pulled_at_harder():
-    m = pulled(model(3), range(3))
+def test_splats_that_one_view_sees_are_densified_last_even_with_larger_gradients():
+    m = with_gradients(model(3), range(3))
     m.gradient_count[:] = [1, 30, 60]  # of 60 steps: about 1, 4 and 8 of the 8 photographs
     m.gradient_sum[:] = m.gradient_count * np.array([3.0, 1.0, 1.1], np.float32)
     np.testing.assert_array_equal(grow(m, cap=4).means[3], m.means[2])
@@ -90,7 +90,7 @@ def schedule(steps):
 
 
 @pytest.mark.parametrize("steps", [1, 10, 1500, 30_000])
-def test_the_recipe_scales_to_any_number_of_steps(steps):
+def test_the_schedule_scales_to_any_number_of_steps(steps):
     s = schedule(steps)
     assert 3.2e-4 <= s.means_lr(0) <= 6 * 3.2e-4
     if steps > 1:
@@ -107,7 +107,7 @@ def test_the_recipe_scales_to_any_number_of_steps(steps):
         assert seen[:7] != seen[7:14]
 
 
-def test_the_full_recipe_has_its_published_events():
+def test_the_full_schedule_has_its_published_events():
     s = schedule(30_000)
     assert s.means_lr(0) == pytest.approx(1.6e-4 * 2.0)
     assert s.rate_factor(0) == 1.0

@@ -1,4 +1,4 @@
-"""What hangs before surfaces that the start knows, where hardly anybody looks, goes."""
+"""Splats in space that the seeds show to be free are removed."""
 
 from dataclasses import replace
 
@@ -36,26 +36,26 @@ def cameras(n):
 
 
 def held(means, n=2, start=None):
-    air = known_free_space((wall() if start is None else start).means, cameras(n))
-    return air.contains(np.array(means, np.float32).reshape(-1, 3)).tolist()
+    space = known_free_space((wall() if start is None else start).means, cameras(n))
+    return space.contains(np.array(means, np.float32).reshape(-1, 3)).tolist()
 
 
-def test_what_is_nearer_than_half_of_the_way_to_the_wall_hangs_in_the_air():
+def test_positions_nearer_than_half_the_depth_of_the_wall_are_free():
     assert held([(0, 0, 4.8), (0, 0, 0.5), (0.5, -0.5, 3.0)]) == [True, True, True]
 
 
-def test_what_is_at_the_wall_or_not_far_before_it_or_hidden_behind_it_does_not():
+def test_positions_at_the_wall_or_little_before_it_or_behind_it_are_not_free():
     assert held([(0, 0, FAR), (0, 0, 0.6 * FAR), (0, 0, 2 * FAR)]) == [False, False, False]
 
 
-def test_where_no_photograph_looks_nothing_is_known():
+def test_nothing_is_known_where_no_view_looks():
     assert held([(0, 0, -4.8), (50.0, 0, 4.8)]) == [False, False]
     assert held([(0, 0, 4.8)], n=0) == [False]
     assert held([], n=2) == []
     assert held([(np.nan, 0, 4.8), (0, 0, np.inf)]) == [False, False]
 
 
-def test_where_the_start_has_nothing_nothing_is_known():
+def test_nothing_is_known_where_there_are_no_seeds():
     aside = wall()
     aside.means[:, 0] += 100.0
     assert held([(0, 0, 4.8)], start=aside) == [False]
@@ -63,30 +63,30 @@ def test_where_the_start_has_nothing_nothing_is_known():
 
 
 @pytest.mark.parametrize("n", [MAX_VIEWS, MAX_VIEWS + 3])
-def test_what_enough_photographs_look_past_and_keep_is_there_though_the_start_missed_it(n):
+def test_splats_that_many_views_confirm_are_kept_without_seeds(n):
     assert held([(0, 0, 4.8)], n=n) == [False]
 
 
-def test_one_photograph_is_no_witness():
+def test_one_view_is_not_enough():
     assert held([(0, 0, 4.8)], n=1) == [False]
     assert held([(0, 0, 4.8)], n=MIN_VIEWS) == [True]
 
 
-def test_what_one_photograph_has_a_surface_at_stays_whatever_others_look_past():
+def test_a_surface_in_one_view_outweighs_free_space_in_others():
     post = np.concatenate([wall().means, np.array([[0.0, 0.0, 4.8]], np.float32)])
     beside, at_the_post = (2.0, 0.0, 4.8), (0.0, 0.0, 4.9)
-    air = known_free_space(post, cameras(2))
-    assert air.contains(np.array([beside, at_the_post])).tolist() == [True, False]
+    space = known_free_space(post, cameras(2))
+    assert space.contains(np.array([beside, at_the_post])).tolist() == [True, False]
 
 
-def test_depths_are_of_cells_whatever_the_photographs_size():
+def test_depths_do_not_depend_on_the_size_of_the_views():
     for photograph in (camera(4000, 3000, focal=4000.0), camera(64, 48)):
         (depths,) = known_free_space(wall().means, [photograph]).depths
         assert depths.shape == (24, 32)
         np.testing.assert_allclose(depths, FAR)
 
 
-def test_a_start_with_rows_that_are_no_numbers_is_as_good_without_them():
+def test_seeds_that_are_not_finite_are_left_out():
     start = wall()
     start.means[::7] = np.nan
     start.means[3] = np.inf
@@ -94,12 +94,12 @@ def test_a_start_with_rows_that_are_no_numbers_is_as_good_without_them():
 
 
 class Clouds:
-    """A strategy that hangs a splat before the cameras whenever it is asked to grow."""
+    """A density rule that adds a floater in front of the cameras each time."""
 
     def __init__(self):
         self.made = 0
 
-    def prune(self, model, settled):
+    def prune(self, model, remove_giants):
         return model
 
     def grow(self, model, budget, rng):
@@ -110,7 +110,7 @@ class Clouds:
 
 
 @pytest.mark.parametrize("steps", [1, 60, 403])
-def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, monkeypatch, steps):
+def test_no_floater_is_left_at_the_end_of_training(tmp_path, monkeypatch, steps):
     start = wall()
     pictures = np.full((48, 64, 3), 0.5, np.float32)
     views = [view_of(f"{k}", pictures, one) for k, one in enumerate(cameras(3))]
@@ -126,9 +126,11 @@ def test_no_cloud_that_grew_is_left_at_the_end_of_training(tmp_path, monkeypatch
     assert (model.means[:, 2] > 0.5 * FAR).all()
 
 
-def test_it_is_looked_for_a_few_times_in_a_run_and_at_its_end():
+def test_floaters_are_removed_a_few_times_in_a_run_and_at_its_end():
     for steps in (7, 3000, 30_000):
         schedule = Schedule(steps=steps, extent=1.0, sh_degree=0, n_start=1, seed=0)
-        asked = [step for step in range(steps) if schedule.passes(step + 1, FLOATER_REMOVALS)]
-        assert len(asked) == min(steps, FLOATER_REMOVALS)
-        assert asked[-1] == steps - 1
+        steps_with_removal = [
+            step for step in range(steps) if schedule.passes(step + 1, FLOATER_REMOVALS)
+        ]
+        assert len(steps_with_removal) == min(steps, FLOATER_REMOVALS)
+        assert steps_with_removal[-1] == steps - 1

@@ -17,22 +17,24 @@ from stages.training.optimiser import (
 RATES = LearningRates(means=0.01)
 
 
-def model(n=5, bands=4, seed=0):
+def model(n=5, coefficients=4, seed=0):
     r = np.random.default_rng(seed)
-    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, bands, 3))
+    shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, coefficients, 3))
     return new_model(*(r.normal(size=s).astype(np.float32) for s in shapes))
 
 
-def backward(rows, bands, seed=1, scale=1.0):
+def backward(rows, coefficients, seed=1, scale=1.0):
     r = np.random.default_rng(seed)
-    values = np.zeros((len(rows), gradient_columns(bands)), np.float32)
-    values[:, : used_columns(bands)] = r.normal(size=(len(rows), used_columns(bands))) * scale
+    values = np.zeros((len(rows), gradient_columns(coefficients)), np.float32)
+    values[:, : used_columns(coefficients)] = (
+        r.normal(size=(len(rows), used_columns(coefficients))) * scale
+    )
     means2d = r.normal(size=(len(rows), 2)).astype(np.float32)
     return Backward(np.asarray(rows, np.int32), values, means2d)
 
 
-def apply(m, b, bands=4, dense=False):
-    apply_gradients(Pool(1), m, b, bands, RATES, 100, 50, dense)
+def apply(m, b, coefficients=4, dense=False):
+    apply_gradients(Pool(1), m, b, coefficients, RATES, 100, 50, dense)
 
 
 @pytest.mark.parametrize("dense", [False, True])
@@ -82,10 +84,10 @@ def test_splats_out_of_view_and_broken_gradients_change_nothing():
     assert m.steps.max(1).tolist() == [0, 1, 0, 0, 0]
 
 
-def test_bands_not_active_yet_stay_zero():
-    m = model(3, bands=9)
+def test_sh_coefficients_that_are_not_trained_yet_stay_zero():
+    m = model(3, coefficients=9)
     m.sh[:, 4:] = 0
-    apply(m, backward(range(3), 4), bands=4)
+    apply(m, backward(range(3), 4), coefficients=4)
     assert not m.sh[:, 4:].any()
 
 
@@ -98,9 +100,9 @@ def test_noise_far_below_any_signal_hardly_moves_a_splat():
     assert np.abs(m.means - before).max() < 5 * RATES.means
 
 
-def test_what_optimisation_remembers_is_less_than_a_third_of_what_it_needs_anyway():
+def test_the_optimiser_state_is_less_than_a_third_of_the_memory():
     """Parameters, a gradient and two moments are 4 x 236 bytes at degree 3."""
-    m = model(10, bands=16)
+    m = model(10, coefficients=16)
     remembered = sum(array.nbytes for array in vars(m).values()) + 10 * 4 * gradient_columns(16)
     assert remembered <= 1.3 * 10 * 4 * 236
 

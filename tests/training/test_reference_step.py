@@ -66,7 +66,7 @@ def test_one_step_leaves_the_same_moments_counts_and_loss(degree: int, outside: 
 
 
 @pytest.mark.parametrize("outside", ["", IGNORE, TRANSPARENT])
-def test_another_light_is_taken_out_alike(outside: str) -> None:
+def test_light_is_corrected_alike(outside: str) -> None:
     light = (0.7, -0.4, 0.1)
     kernels, losses = stepped("cpu", 1, 1, outside, light)
     plain, wanted = stepped("reference", 1, 1, outside, light)
@@ -84,7 +84,7 @@ def test_many_steps_end_at_the_same_loss() -> None:
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_bands_above_a_splat_s_own_degree_are_not_trained(backend: str) -> None:
+def test_coefficients_above_a_splats_own_degree_are_not_trained(backend: str) -> None:
     level, start = level_of(cloud(80, 40, 30, degree=1)), cloud(60, 40, 30, degree=1, seed=4)
     model = new_model(*(array.copy() for array in splat_arrays(start)))
     poor = np.arange(60) % 2 == 0

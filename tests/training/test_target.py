@@ -1,4 +1,4 @@
-"""What is masked in a photograph teaches nothing, or that nothing is there."""
+"""Masked regions are ignored in training, or trained to be empty."""
 
 from __future__ import annotations
 

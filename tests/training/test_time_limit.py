@@ -1,4 +1,4 @@
-"""Runs that end when their time is up, or when nothing is left to gain."""
+"""Runs with a time limit, and schedules that change during the run."""
 
 import numpy as np
 import pytest

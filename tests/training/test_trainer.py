@@ -38,13 +38,13 @@ from tests.training.pictures import view_of
 def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, backend="cpu"):
     # of an extent of 10, no splat of these toys is large enough to be pruned as a giant
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=degree, n_start=len(start), seed=0)
-    judges = [
+    held_out = [
         EvaluationView(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
         for view in views
     ]
     report = report or Report()
     return Trainer(
-        schedule, views, judges, DrawSettings(near=0.1), cap, folder, report, backend=backend
+        schedule, views, held_out, DrawSettings(near=0.1), cap, folder, report, backend=backend
     )
 
 
@@ -84,8 +84,10 @@ def fit(pictures, scene, steps, rates, degree=0):
         backward = rasteriser.backward(model.arrays, forward, v_image)
         shrink = 0.1 ** (step / steps)
         now = rates.scaled(rates.means * shrink, shrink)
-        bands = (degree + 1) ** 2
-        apply_gradients(rasteriser.pool, model, backward, bands, now, where.width, where.height)
+        coefficients = (degree + 1) ** 2
+        apply_gradients(
+            rasteriser.pool, model, backward, coefficients, now, where.width, where.height
+        )
     renders = []
     for _, where in pictures:
         image = rasteriser.forward(model.arrays, where, settings).image[:3]
@@ -216,7 +218,7 @@ def test_time_goes_on_over_an_interruption_and_each_entry_of_the_history_has_its
     assert second.times[-1].cpu_seconds > 300
 
 
-def test_looking_on_does_not_change_what_is_trained(tmp_path):
+def test_a_live_preview_does_not_change_what_is_trained(tmp_path):
     """Every step drawn, from elsewhere, larger and smaller than the photographs; the model grows on
     the way."""
     alone, start = small_problem(tmp_path, "alone", steps=150)
@@ -240,7 +242,7 @@ def test_looking_on_does_not_change_what_is_trained(tmp_path):
     assert watched.history == alone.history
 
 
-def test_an_onlooker_sees_what_the_reference_draws(tmp_path):
+def test_the_live_preview_is_what_the_reference_draws(tmp_path):
     report = Report()
     t, start = small_problem(tmp_path, "seen", report, steps=40)
     where = camera(48, 36)
@@ -404,17 +406,17 @@ def test_a_run_that_another_backend_goes_on_with_says_so(tmp_path):
     ]
     assert report.metrics["trained_by"] == "cpu (cpu) to step 3, then reference (cpu)"
     assert "then reference" in dict(report.warnings)["train-several-backends"]
-    told = headline(cast(Any, SimpleNamespace(stage="train", metrics=report.metrics)))
-    assert "trained by cpu (cpu) to step 3" in told
+    line = headline(cast(Any, SimpleNamespace(stage="train", metrics=report.metrics)))
+    assert "trained by cpu (cpu) to step 3" in line
     assert "train-several-backends" not in dict(trained("cpu").warnings)
 
 
-def test_a_cap_that_was_asked_for_is_told_as_that(tmp_path):
+def test_a_cap_that_the_user_set_is_reported_as_such(tmp_path):
     assert cap.cap_for(tmp_path, 500, 100) == cap.Cap(500, "--max-splats")
     assert not list(tmp_path.iterdir())
 
 
-def test_no_more_is_modelled_than_the_photographs_tell(tmp_path, monkeypatch):
+def test_splats_have_no_more_parameters_than_the_views_have_values(tmp_path, monkeypatch):
     """60 x 40 pixels of three numbers each; a splat of degree 1 has 23, one of degree 3 has 59."""
     small = camera(width=60, height=40)
     monkeypatch.setattr(cap, "MIN_CAP", 10)
@@ -427,7 +429,7 @@ def test_no_more_is_modelled_than_the_photographs_tell(tmp_path, monkeypatch):
     assert cap.cap_for(tmp_path, 0, 10**9).origin == "free memory"
 
 
-def test_a_damaged_note_of_the_cap_is_written_anew(tmp_path, monkeypatch):
+def test_a_damaged_cap_file_is_written_again(tmp_path, monkeypatch):
     monkeypatch.setattr(cap, "available_mib", lambda: 4096.0)
     for text in ("", "[]", '{"splats": "many", "origin": "?"}', '{"splats": 0, "origin": "?"}'):
         (tmp_path / cap.FILE_NAME).write_text(text)

@@ -1,4 +1,4 @@
-"""A block grows in its own rectangle, and keeps what stands around it."""
+"""A block is densified in its own rectangle, and keeps the splats around it."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def model() -> Model:
 BLOCK = BoundedDensity(AdaptiveDensity(extent=1.0, views=8), (0.0, -9.0, 9.0, 9.0))
 
 
-def test_a_block_grows_in_its_own_rectangle_alone(model) -> None:
+def test_a_block_is_densified_only_in_its_own_rectangle(model) -> None:
     grown = BLOCK.grow(model.take(np.arange(3)), 100, np.random.default_rng(0))
     assert sorted(grown.means[:, 0]) == [-2, -1, 1, 1]
 
 
-def test_giants_go_where_something_can_take_their_place(model) -> None:
+def test_giants_are_removed_only_inside(model) -> None:
     assert sorted(BLOCK.prune(model, True).means[:, 0]) == [-2, -1, 1]
     assert sorted(BLOCK.rule.prune(model, True).means[:, 0]) == [-1, 1]
 
 
-def test_what_does_not_show_goes_everywhere(model) -> None:
+def test_transparent_splats_are_removed_everywhere(model) -> None:
     model.opacity_logits[1:3] = -20.0
     assert sorted(BLOCK.prune(model, False).means[:, 0]) == [-2, 2]
