@@ -50,7 +50,10 @@ _STAGES = {  # help and example by stage name
     "seed": ("Turn the sparse points into initial splats.", "splat seed"),
     "train": ("Optimise the splats on the photographs.", "splat train --preset best"),
     "prune": ("Remove floaters and splats that do not improve the pictures.", "splat prune"),
-    "quantise": ("Choose the precision of the values, and round them.", "splat quantise"),
+    "quantise": (
+        "Choose the precision of stored values, and fine-tune the splats to file formats.",
+        "splat quantise --format sog",
+    ),
     "export": (
         "Write the files that other programs open.",
         "splat export --format gltf --format usdz",

@@ -190,9 +190,9 @@ def fidelity(psnr_db: float) -> str:
     return "lossless" if psnr_db >= LOSSLESS_DB else figure("psnr_db", psnr_db)
 
 
-def times(seconds: float, cpu_seconds: float | None) -> str:
-    """Wall time, with the CPU time of all cores if the two differ by half or more."""
-    if cpu_seconds is None or max(seconds, 0.1) / 1.5 < cpu_seconds < max(seconds, 0.1) * 1.5:
+def times(seconds: float, cpu_seconds: float) -> str:
+    """Wall time; with the CPU time of all cores if it differs by more than half, and 1 s."""
+    if abs(cpu_seconds - seconds) <= max(seconds / 2, 1.0):
         return duration(seconds)
     return f"{duration(seconds)} ({duration(cpu_seconds)} CPU)"
 

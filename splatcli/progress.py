@@ -40,7 +40,7 @@ def listener_for(quiet: bool, as_json: bool) -> Listener:
 
 
 class Quiet(Listener):
-    """Only what needs a person."""
+    """Prints warnings, and the wait after Ctrl-C."""
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         warn(stage, manifest)
@@ -73,7 +73,7 @@ class Events(Listener):
             console.emit("progress", stage=stage.name, **values, numbers=plain(numbers))
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        console.emit("finished", stage=stage.name, **_account(manifest))
+        console.emit("finished", stage=stage.name, **_result_of(manifest))
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
         console.emit("skipped", stage=stage.name)
@@ -82,26 +82,28 @@ class Events(Listener):
         console.emit("stopping")
 
 
-def _account(manifest: Manifest) -> dict[str, Any]:
+def _result_of(manifest: Manifest) -> dict[str, Any]:
     return {
         "seconds": manifest.seconds,
+        "cpu_seconds": manifest.cpu_seconds,
         "peak_memory_mib": manifest.peak_memory_mib,
         "metrics": manifest.metrics,
         "warnings": manifest.warnings,
     }
 
 
-class _Pace:
-    """Rate and remaining time of one phase, over what was done since it was first seen.
+class _PhaseTimer:
+    """Rate and remaining time of one phase of a stage.
 
-    A phase ends when the count falls or has another end; labels may name each photograph.
+    A new phase begins when the count falls or the total changes, not when the label changes: it may
+    name each photograph.
     """
 
     def __init__(self) -> None:
         self._start, self._first, self._done, self._total = 0.0, 0, 0, -1
 
     def new_phase(self, done: int, total: int) -> bool:
-        """Take note of the count; True if it is the first of a phase."""
+        """Record the count; True if it is the first of a phase."""
         new = total != self._total or done < self._done
         if new:
             self._start, self._first = time.monotonic(), done
@@ -121,27 +123,27 @@ def _rate(per_second: float) -> str:
 
 
 def _figures(numbers: Numbers) -> str:
-    """The figures in words, less those that the count already says."""
+    """The figures as text, without those that the count shows."""
     return console.figures({name: value for name, value in numbers.items() if name not in _COUNTED})
 
 
 class Lines(Listener):
-    """A line now and then: output that is read later, or goes to a file."""
+    """A line every few seconds, for output that goes to a file."""
 
     def __init__(self) -> None:
         self._last = 0.0
-        self._pace = _Pace()
+        self._timer = _PhaseTimer()
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
-        self._pace = _Pace()
+        self._timer = _PhaseTimer()
         console.note(_started(stage, number, reason, resumed))
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         now = time.monotonic()
-        if not self._pace.new_phase(done, total) and now - self._last < _LINE_EVERY_S:
+        if not self._timer.new_phase(done, total) and now - self._last < _LINE_EVERY_S:
             return
         self._last = now
-        parts = [f"{done}/{total}", self._pace.text(), _figures(numbers)]
+        parts = [f"{done}/{total}", self._timer.text(), _figures(numbers)]
         console.note(f"  {label or stage.name}: " + ", ".join(filter(None, parts)))
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
@@ -169,16 +171,16 @@ class _Rate(ProgressColumn):
 
 
 class Bars(Listener):
-    """A bar a stage, with rate, remaining time and the figures that matter."""
+    """A bar for each stage, with rate, remaining time and figures."""
 
     def __init__(self, screen: Console) -> None:
         self._screen = screen
         self._progress: Progress | None = None
-        self._pace = _Pace()
+        self._timer = _PhaseTimer()
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._close()
-        self._pace = _Pace()
+        self._timer = _PhaseTimer()
         self._progress = Progress(
             TextColumn(f"[bold]{number}/7 {stage.name:<8}[/bold]"),
             TextColumn("{task.description}", markup=False),
@@ -197,7 +199,7 @@ class Bars(Listener):
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         if self._progress is None:
             return
-        if self._pace.new_phase(done, total):
+        if self._timer.new_phase(done, total):
             self._progress.reset(self._task, total=total, completed=done)
         self._progress.update(
             self._task,
@@ -230,9 +232,9 @@ class Bars(Listener):
 
 @contextmanager
 def counting(what: str, total: int, quiet: bool, as_json: bool) -> Iterator[Callable[[], None]]:
-    """Yield what is called after each of `total` things; shows how many are done, how fast and how
-    long it will still take."""
-    done, last, pace = 0, time.monotonic(), _Pace()
+    """Yield a function to call after each of `total` items; shows the count, the rate and the
+    remaining time."""
+    done, last, timer = 0, time.monotonic(), _PhaseTimer()
     bar = Progress(
         TextColumn(what),
         BarColumn(bar_width=24),
@@ -244,13 +246,13 @@ def counting(what: str, total: int, quiet: bool, as_json: bool) -> Iterator[Call
         disable=quiet or as_json or not console.err.is_terminal,
     )
     task = bar.add_task(what, total=total)
-    pace.new_phase(0, total)
+    timer.new_phase(0, total)
 
     def tick() -> None:
         nonlocal done, last
         done += 1
         bar.advance(task)
-        pace.new_phase(done, total)
+        timer.new_phase(done, total)
         every = _EVENT_EVERY_S if as_json else _LINE_EVERY_S
         if (done < total or not as_json) and time.monotonic() - last < every:
             return
@@ -258,7 +260,7 @@ def counting(what: str, total: int, quiet: bool, as_json: bool) -> Iterator[Call
         if as_json:
             console.emit("progress", label=what, done=done, total=total)
         elif bar.disable and not quiet:
-            console.note(f"{what}: {done}/{total}, {pace.text()}")
+            console.note(f"{what}: {done}/{total}, {timer.text()}")
 
     with bar:
         yield tick

@@ -77,9 +77,10 @@ def _view_parameter() -> Parameter:
 
 
 def _shown(setting: Setting) -> str | bool:
-    """The default for the help; "by preset" where presets differ in it."""
+    """The default for the help; "by preset" for a training setting in which presets differ."""
     values = {getattr(preset, setting.name, setting.default) for preset in presets().values()}
-    return options.shown_default(setting) if len(values) == 1 else "by preset"
+    by_preset = len(values) > 1 and setting in settings_of(type(presets()[DEFAULT_PRESET]))
+    return "by preset" if by_preset else options.shown_default(setting)
 
 
 def _shown_or_recorded(setting: Setting) -> str | bool:

@@ -53,7 +53,7 @@ def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -
 
 def time_of(manifest: Manifest) -> str:
     """How long a stage took."""
-    return console.times(manifest.seconds, getattr(manifest, "cpu_seconds", None))
+    return console.times(manifest.seconds, manifest.cpu_seconds)
 
 
 def headline(manifest: Manifest) -> str:
@@ -107,6 +107,7 @@ def _as_data(
         "stages": {
             m.stage: {
                 "seconds": m.seconds,
+                "cpu_seconds": m.cpu_seconds,
                 "peak_memory_mib": m.peak_memory_mib,
                 "device": m.device,
                 "metrics": m.metrics,

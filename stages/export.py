@@ -45,7 +45,11 @@ _NAME = r"(?!assets$)(?![ .])[^/\\:*?\"<>|\[\]\x00-\x1f]{1,100}(?<![ .])"
 class ExportSettings:
     """Settings of the export."""
 
-    formats: tuple[str, ...] = formats_setting(DEFAULT_FORMATS, panel="Output")
+    formats: tuple[str, ...] = formats_setting(
+        DEFAULT_FORMATS,
+        "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply",
+        panel="Output",
+    )
     name: str = setting(
         "scene",
         "Name of the files, without a suffix.",

@@ -64,7 +64,12 @@ class QuantiseSettings:
     max_views: int = setting(
         DECIDING_VIEWS, "Training views to measure on, at most.", min=1, max=100_000
     )
-    formats: tuple[str, ...] = formats_setting(rounding_formats(DEFAULT_FORMATS), may_be_empty=True)
+    formats: tuple[str, ...] = formats_setting(
+        rounding_formats(DEFAULT_FORMATS),
+        "File format to fine-tune the splats to; repeatable. Formats that need no fine-tuning "
+        "change nothing",
+        may_be_empty=True,
+    )
     rounding_steps: int = setting(
         45,
         "Steps of fine-tuning after each attribute that a format rounds (.splat, .spz, "

@@ -99,12 +99,23 @@ def formats() -> str:
 
 
 def format_modules() -> str:
+    from stages.formats.table import TABLE
+    from stages.proof.checks import CHECKS
+    from stages.surface.table import MESHES
+
     rows: list[tuple[str, ...]] = []
-    for row in _formats():
-        places = (row.writer, getattr(row, "reader", ""))
-        cells = (f"`{place.replace(':', '` `')}`" if place else "none" for place in places)
-        rows.append((f"`{row.ending}`", *cells))
-    return _table(("format", "writer", "reader"), rows)
+    for row in TABLE:
+        check = CHECKS[row.ending].read
+        places = (row.writer, row.reader, f"{check.__module__}:{check.__qualname__}")
+        rows.append((f"`{row.ending}`", *(_place(place) for place in places)))
+    for mesh in MESHES.values():
+        rows.append((f"`{mesh.ending}`", _place(mesh.writer), "", _place(mesh.independent_reader)))
+    return _table(("format", "writer", "reader", "independent reader"), rows)
+
+
+def _place(text: str) -> str:
+    module, _, name = text.partition(":")
+    return f"`{module.replace('.', '/')}.py` `{name}`"
 
 
 def cameras() -> str:

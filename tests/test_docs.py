@@ -14,6 +14,8 @@ from typer.main import get_command
 from splatcli.app import app
 from stages import STAGE_NAMES
 from stages.base.distribution import VERSION
+from stages.formats.table import TABLE
+from stages.train import PRESETS
 from tests.docs_commands import bash_lines, inline_commands, splat_commands
 from tests.docs_tables import PAGES, ROOT, renewed
 
@@ -25,7 +27,7 @@ _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
 _NO_CODES = {
     *("drop-floaters", "max-mb"),  # operations of `splat edit`
     *("utf-8", "utf-8-sig", "no-store", "same-origin"),  # encodings, headers
-    "keep-damage",  # an argument of the USD reader's process
+    "allow-nonfinite",  # an argument of the USD reader's process
     *("in-use", "peak-memory"),  # parts of file names
     *("no-rotation", "too-large"),  # flags of `splat info`
 }
@@ -73,6 +75,19 @@ def test_readme_is_short_and_has_both_commands() -> None:
     run = "splat process sample_captures/still_life/images --preset preview --out run"
     assert f"pip install . && {run}" in text
     assert 'pip install ".[test]" && pytest' in text
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/guide/presets.md"])
+def test_presets_are_those_of_the_code(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8").replace(",", "")
+    for name, preset in PRESETS.items():
+        (row,) = [line for line in text.splitlines() if re.match(rf"\| `{name}`.*steps at", line)]
+        assert f"{preset.steps} steps at {preset.train_side} px" in row
+
+
+def test_readme_names_every_format() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8").split("## Formats")[1]
+    assert {"mesh", *(row.ending for row in TABLE)} <= set(re.findall(r"`([\w.-]+)`", text))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)

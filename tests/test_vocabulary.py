@@ -43,19 +43,23 @@ WORDS = (
     Word("answers?|answered", "result of the validation probe", TRAINING, "a server may answer"),
     Word("doubts?|doubtful", "a threshold with a name, a warning"),
     Word("way (back|there)", "backward pass, forward pass"),
-    Word("forwards|backwards", "forward pass, backward pass"),
+    Word("backwards|forwards and", "backward pass, forward pass"),
     Word("pull(s|ed|ing)?(?! request)", "gradient"),
     Word("strides", "step size, learning rate", (*TRAINING, "docs"), "an array has one as well"),
     Word("how far", "step size, progress, distance", TRAINING),
     Word(
-        '(?<!loss_)(?<!")bands?(?!")',
+        '(?<!loss_)(?<!")bands?(?!"|_count)',
         "SH coefficients, SH degree",
+<<<<<<< HEAD
         reason='loss_strips: rows of a picture; "bands": a key of SOG',
+=======
+        reason='loss_bands, band_count: rows of a picture; "bands": a key of SOG',
+>>>>>>> main
     ),
     Word("passed[ _]on", "generalisation ratio"),
     Word("hands", "executor; a verb: sends, gives"),
     Word(
-        "in shares|shares? of (features|match|structure|its|it|one)",
+        "(?-i:in shares)|shares? of (features|match|structure|its|it|one)",
         "chunks",
         reason="a share is a fraction, too",
     ),

@@ -118,7 +118,7 @@ def _kernel_cache() -> Check:
 
 
 def _readable(what: str, names: Callable[[], list[str]]) -> Check:
-    """What can be read on this machine: libraries are built with more or less."""
+    """The formats that the libraries of this machine can read."""
     label = f"{what} read"
     try:
         return Check(label, ", ".join(names()))
@@ -159,7 +159,7 @@ def _backend(backend: Backend) -> Check:
 
 
 def _gpu() -> Check:
-    """What GPU there is, also to a torch that cannot use it."""
+    """The GPU, also if torch cannot use it."""
     try:
         from stages.raster.gpu import device
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import field
 from typing import Any
 
+from stages.base.settings import setting
 from stages.formats.table import FORMATS
 from stages.surface.table import MESHES, MeshFormat
 
@@ -26,7 +26,6 @@ def mesh_formats(names: Iterable[str]) -> list[MeshFormat]:
     return [MESHES[ending] for ending in dict.fromkeys(endings) if ending in MESHES]
 
 
-def formats_setting(default: tuple[str, ...], **metadata: Any) -> Any:
+def formats_setting(default: tuple[str, ...], help: str, **metadata: Any) -> Any:
     """The `formats` field of a stage's settings."""
-    help = "File format to write; repeatable. mesh is a collision proxy, as .glb and .ply"
-    return field(default=default, metadata={"help": help, "choices": CHOICES, **metadata})
+    return setting(default, help, choices=CHOICES, **metadata)

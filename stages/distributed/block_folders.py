@@ -1,7 +1,7 @@
-"""Run folders that begin with training: of a part of another run's photographs, from its splats.
+"""Run folders of blocks: with some views of another run and given initial splats, ready to train.
 
-`splat status`, `splat view` and `splat train` take them as any other. Pictures are not copied: a
-part's cameras name those of the whole.
+`splat status`, `splat view` and `splat train` accept them. Pictures are not copied: a block's views
+refer to the files of the whole run.
 """
 
 from __future__ import annotations
@@ -21,15 +21,23 @@ from stages.run.runfile import RunFile
 if TYPE_CHECKING:
     from stages.scene import Reconstruction, Splats
 
-_POINTS = 100_000  # of the sparse cloud, at most: it only says how large the scene is
+_POINTS = 100_000  # at most, of the sparse cloud, which only tells the extent of the scene
 
 
 def begin(
     whole: Pipeline, folder: Path, part: Reconstruction, start: Splats, settings: Any
 ) -> None:
-    """Make `folder` a run folder with ingest, sfm and seed finished: `part`, whose pictures lie
-    with the whole's, and the splats to start from. settings: of training. Equal inputs make equal
-    folders, so that it may be begun again at any time. Raises SplatError, OSError."""
+    """Make `folder` a run folder in which ingest, sfm and seed have finished. Equal inputs give
+    equal folders, so that this can be repeated.
+
+    Args:
+        whole: the run of the whole scene, which has the pictures.
+        part: the output of sfm.
+        start: the output of seed.
+        settings: of training.
+
+    Raises SplatError, OSError.
+    """
     from stages.scene import save_splats
     from stages.structure.reconstruction_files import save_reconstruction
 
@@ -39,7 +47,7 @@ def begin(
     _finish(pipeline.stage_folder("ingest"), replace(ingest, outputs={}))
     place = pipeline.stage_folder("sfm")
     place.mkdir(exist_ok=True)
-    save_reconstruction(place, _pointing_at(part, place))
+    save_reconstruction(place, _relocated(part, place))
     sfm = _finish(place, _of(whole, "sfm"))
     place = pipeline.stage_folder("seed")
     place.mkdir(exist_ok=True)
@@ -57,7 +65,7 @@ def _of(whole: Pipeline, name: str) -> Manifest:
 
 
 def _finish(folder: Path, like: Manifest) -> Manifest:
-    """Write a manifest that says what `like` says, of the files that lie there."""
+    """Write a manifest like `like`, for the files in the folder."""
     folder.mkdir(exist_ok=True)
     outputs = record_files(folder, leave_out=frozenset([MANIFEST]))
     metrics: Mapping[str, Any] = {"trained_by": "the run that this is a block of"}
@@ -76,8 +84,8 @@ def _finish(folder: Path, like: Manifest) -> Manifest:
     return manifest
 
 
-def _pointing_at(part: Reconstruction, place: Path) -> Reconstruction:
-    """With the pictures' paths as seen from `place`, and points enough to tell its size."""
+def _relocated(part: Reconstruction, place: Path) -> Reconstruction:
+    """With paths of the pictures relative to `place`, and a sample of the points."""
     lead = Path(os.path.relpath(part.folder, place))
     views = tuple(
         replace(

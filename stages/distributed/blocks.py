@@ -1,9 +1,10 @@
-"""One scene in blocks: training as many runs, on whatever brings runs to their end.
+"""Training of a large scene in blocks.
 
-A coarse model of the whole is trained first. It says which photographs show which block, and
-stands for the surroundings while each block is trained, in a run folder of its own under `blocks/`.
-Then each block gives what lies in its cell, and seams are put right on the photographs that cross
-them.
+1. A coarse model of the whole scene is trained. It decides which views show which block, and is the
+   background of each block's training.
+2. Each block is trained by an executor, in a run folder of its own under `blocks/`.
+3. The splats of each block that lie in its cell are merged, and the seams between blocks are
+   fine-tuned on the views that cross them.
 """
 
 from __future__ import annotations
@@ -33,55 +34,60 @@ if TYPE_CHECKING:
     from stages.scene import DrawSettings, Reconstruction, Splats, TrainedSplats, View
 
 FOLDER, COARSE = "blocks", "coarse"
-PHOTOGRAPHS_A_BLOCK = 250
-# As much less than is asked of the whole; and no more splats than one of the blocks gets.
+VIEWS_PER_BLOCK = 250
+# Divisors of the settings for the coarse model; it has no more splats than one of the blocks.
 COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4
 
 
-def in_blocks(pipeline: Pipeline, open_engine: OpenExecutor) -> Pipeline:
-    """The pipeline, training in blocks where its settings ask for it."""
-    plain = pipeline.layout.stage("train")
-    return pipeline.with_run("train", partial(_train, pipeline, plain, open_engine))
+def in_blocks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
+    """The pipeline, which trains in blocks if its settings ask for it."""
+    stage = pipeline.layout.stage("train")
+    return pipeline.with_run("train", partial(_train, pipeline, stage, open_executor))
 
 
-def blocks_wanted(asked: str, photographs: int) -> int:
-    """How many blocks `TrainSettings.blocks` means for as many photographs."""
-    return max(1, round(photographs / PHOTOGRAPHS_A_BLOCK)) if asked == "auto" else int(asked)
+def count_blocks(setting: str, views: int) -> int:
+    """The number of blocks for `TrainSettings.blocks` and this many views."""
+    return max(1, round(views / VIEWS_PER_BLOCK)) if setting == "auto" else int(setting)
 
 
 def _train(
     pipeline: Pipeline,
-    plain: Stage,
-    open_engine: OpenExecutor,
+    stage: Stage,
+    open_executor: OpenExecutor,
     inputs: Mapping[str, Any],
     settings: Any,
     folder: Path,
     report: Report,
 ) -> Any:
-    """The stage `train`, for any number of blocks."""
+    """The stage `train` for any number of blocks."""
     single = replace(settings, blocks="1")
-    photographs = 0 if settings == single else len(inputs["sfm"].views)
-    blocks = blocks_wanted(settings.blocks, photographs)
+    views = 0 if settings == single else len(inputs["sfm"].views)
+    blocks = count_blocks(settings.blocks, views)
     if blocks == 1:
-        return plain.run(inputs, single, folder, report)
+        return stage.run(inputs, single, folder, report)
     _check(settings)
     root = pipeline.run_folder.absolute() / FOLDER
     root.mkdir(exist_ok=True)
-    with open_engine(root, _Told(report)) as engine:
-        scene = _Scene(pipeline, _with_roles(inputs["sfm"]), single, root, engine, report)
-        return scene.train(blocks, inputs["seed"], folder)
+    with open_executor(root, _BlockProgress(report)) as executor:
+        training = _BlockTraining(
+            *(pipeline, _with_roles(inputs["sfm"]), single, root, executor, report)
+        )
+        return training.train(blocks, inputs["seed"], folder)
 
 
 @dataclass
-class _Scene:
-    """What is trained in blocks. whole: with the judges told apart once for all blocks. settings:
-    of the whole. root: the folder of the blocks' run folders."""
+class _BlockTraining:
+    """The training of one scene in blocks.
+
+    whole: the scene, whose views have the same roles in all blocks. settings: of the whole scene.
+    root: the folder of the blocks' run folders.
+    """
 
     pipeline: Pipeline
     whole: Reconstruction
     settings: Any
     root: Path
-    engine: Executor
+    executor: Executor
     report: Report
 
     def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
@@ -96,24 +102,24 @@ class _Scene:
         self.settings = replace(self.settings, light="on" if light else "off")
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
-        places, weights = partition.weighted_points(replace(self.whole, views=training))
-        cells = partition.partition(places, weights, blocks)
+        points, weights = partition.weighted_points(replace(self.whole, views=training))
+        cells = partition.partition(points, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
-        member = block_views.assign_views(
-            block_views.block_fractions(coarse, cells, cameras, backend_of_settings(self.settings))
-        )
-        folders = self._blocks(seeds, coarse, cells, member, partition.margin(places))
-        parts = self._parts(folders, cells, member)
+        backend = backend_of_settings(self.settings)
+        fractions = block_views.block_fractions(coarse, cells, cameras, backend)
+        assigned = block_views.assign_views(fractions)
+        folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
+        parts = self._parts(folders, cells, assigned)
         draw_settings = draw_settings_of(self.whole.views, self.settings.train_side, light)
-        crossed = block_views.crosses_blocks(member)
-        crossing = [v for v, both in zip(self.whole.views, crossed, strict=True) if both]
-        teachers = [view for view in crossing if view in training]
-        trained = self._joined(parts, cells, teachers, draw_settings)
+        crosses = block_views.crosses_blocks(assigned)
+        crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]
+        seam_views = [view for view in crossing if view in training]
+        trained = self._merge(parts, cells, seam_views, draw_settings, len(training))
         save(folder, trained)
         self._evaluate(trained.splats, held, folder)
         self.report.metric("training_views", len(training))
         self.report.metric("held_out_views", len(held))
-        self.report.metric("crossing", [view.name for view in crossing])
+        self.report.metric("views_across_blocks", [view.name for view in crossing])
         self.report.metric("train_seconds", round(time.monotonic() - started, 1))
         return trained
 
@@ -143,13 +149,13 @@ class _Scene:
         seeds: Splats,
         coarse: Splats,
         cells: Sequence[Cell],
-        member: NDArray[np.bool_],
+        assigned: NDArray[np.bool_],
         margin: float,
     ) -> list[str]:
-        """Train each block; by cell, the run folder that has it: the coarse model's for a cell that
-        no photograph shows."""
+        """Train the blocks. Returns the name of each cell's run folder: the coarse model's for a
+        cell that no training view shows."""
         folders, largest = [], 0
-        for number, (cell, chosen) in enumerate(zip(cells, member, strict=True), start=1):
+        for number, (cell, chosen) in enumerate(zip(cells, assigned, strict=True), start=1):
             views = tuple(v for v, own in zip(self.whole.views, chosen, strict=True) if own)
             folders.append(COARSE)
             if any(view.role != "test" for view in views):
@@ -163,46 +169,46 @@ class _Scene:
                 f"No photograph shows {counted(len(empty), 'block')} of {len(cells)} "
                 f"({', '.join(empty)}): the coarse model stands there. Ask for fewer --blocks.",
             )
-        for left in self.root.iterdir():  # by an earlier cut into more blocks
-            if left.name.isdigit() and left.name not in folders:
-                shutil.rmtree(left)
+        for path in self.root.iterdir():  # of an earlier partition into more blocks
+            if path.name.isdigit() and path.name not in folders:
+                shutil.rmtree(path)
         self._run([folder for folder in folders if folder != COARSE], largest)
         return folders
 
     def _parts(
-        self, folders: Sequence[str], cells: Sequence[Cell], member: NDArray[np.bool_]
-    ) -> list[TrainedSplats]:
-        """What each block learnt of its cell, together no more splats than the whole may have. One
-        block at a time is held whole."""
-        parts: list[TrainedSplats] = []
-        told = []
-        given = [
+        self, folders: Sequence[str], cells: Sequence[Cell], assigned: NDArray[np.bool_]
+    ) -> list[Splats]:
+        """The splats of each block in its cell, together at most the maximum of the scene. Only one
+        block at a time is in memory as a whole."""
+        parts: list[Splats] = []
+        facts = []
+        counts = [
             int(cell.holds(self._trained(folder).splats.means).sum())
             for folder, cell in zip(folders, cells, strict=True)
         ]
-        share = min(1.0, self.settings.max_splats / max(1, sum(given)))
-        for number, (folder, cell, chosen) in enumerate(zip(folders, cells, member, strict=True)):
-            trained = self._trained(folder)
+        kept_fraction = min(1.0, self.settings.max_splats / max(1, sum(counts)))
+        for number, (folder, cell, chosen) in enumerate(zip(folders, cells, assigned, strict=True)):
+            splats = self._trained(folder).splats
             views = tuple(v for v, shows in zip(self.whole.views, chosen, strict=True) if shows)
-            own = self._own(trained.splats, cell, int(share * given[number]), views)
-            parts.append(replace(trained, splats=trained.splats.take(own)))
-            told.append(
+            own = self._own(splats, cell, int(kept_fraction * counts[number]), views)
+            parts.append(splats.take(own))
+            facts.append(
                 {
                     "run_folder": f"{FOLDER}/{folder}",
                     "low_x_z": cell.low,
                     "high_x_z": cell.high,
-                    "photographs": int(chosen.sum()),
-                    "splats_trained": len(trained.splats),
-                    "splats_given": int(own.sum()),
+                    "views": int(chosen.sum()),
+                    "splats_trained": len(splats),
+                    "splats_in_cell": int(own.sum()),
                 }
             )
-        self.report.metric("blocks", told)
+        self.report.metric("blocks", facts)
         return parts
 
     def _own(
         self, splats: Splats, cell: Cell, most: int, views: Sequence[View]
     ) -> NDArray[np.bool_]:
-        """[N] which of a block's splats are of the whole: those of its cell, at most as many."""
+        """[N] which of a block's splats go into the merged scene: at most `most` of its cell."""
         from stages.distributed import merge
         from stages.measure.evaluation import load_evaluation_views
 
@@ -211,18 +217,20 @@ class _Scene:
             return own
         training = [view for view in views if view.role != "test"]
         photographs = load_evaluation_views(self.whole.folder, training, splats.draw_settings)
-        return merge.shown_most(splats, own, most, photographs, backend_of_settings(self.settings))
+        return merge.most_visible(
+            splats, own, most, photographs, backend_of_settings(self.settings)
+        )
 
     def _begin(
         self, name: str, part: Reconstruction, seeds: Splats, coarse: Splats, wide: Cell
     ) -> int:
-        """Make a block's run folder; how many splats it may have, its surroundings included. Of
-        the whole's, it has the share that the coarse model has in its cell."""
+        """Make a block's run folder. Returns the maximum of its splats, background included: its
+        fraction of the scene's maximum is the coarse model's fraction in its cell."""
         from stages.distributed import merge
 
         inside = int(wide.holds(coarse.means).sum())
         own = max(1, round(self.settings.max_splats * inside / len(coarse)))
-        start = merge.surrounded(seeds, coarse, wide, own)
+        start = merge.initial_splats(seeds, coarse, wide, own)
         cap: int = max(len(start), len(coarse) - inside + own)
         settings = replace(self.settings, max_splats=cap, within=(*wide.low, *wide.high))
         block_folders.begin(self.pipeline, self.root / name, part, start, settings)
@@ -234,58 +242,59 @@ class _Scene:
 
     def _run(self, names: Sequence[str], most_splats: int) -> None:
         """Train in the run folders of these names. Raises SplatError for the first that failed,
-        once the others have ended."""
+        after the others have ended."""
         tasks = [RunTask(self.root / name, until="train") for name in names]
         run_all(
-            self.engine,
+            self.executor,
             tasks,
             resources_of(replace(self.settings, max_splats=most_splats)),
             self.report.stop_requested,
             lambda done: self.report.progress(done, len(names), "blocks"),
-            hint="Give the same command again: blocks that are finished are kept.",
+            hint="Give the same command again: finished blocks are kept.",
         )
 
-    def _joined(
+    def _merge(
         self,
-        parts: Sequence[TrainedSplats],
+        parts: Sequence[Splats],
         cells: Sequence[Cell],
-        crossing: Sequence[View],
+        seam_views: Sequence[View],
         draw_settings: DrawSettings,
+        training_views: int,
     ) -> TrainedSplats:
-        """The blocks as one, their seams put right by the photographs that cross them. In the
-        report, how many splats each gave: they lie block after block."""
+        """The blocks as one model, block after block, whose seams are fine-tuned on `seam_views`.
+        training_views: how many the whole scene has."""
         import numpy as np
 
         from stages.distributed import merge
         from stages.measure.evaluation import load_evaluation_views
         from stages.scene import TrainedSplats, training_extent
         from stages.training.finetune import FineTuner
+        from stages.training.validation import uses_dropout
 
         degree, backend = self.settings.sh_degree, backend_of_settings(self.settings)
-        given = [part.splats.with_sh_degree(degree) for part in parts]
-        splats, counts = merge.merged(given, cells, draw_settings)
-        dropout = np.mean([part.dropout for part in parts]) > 0.5
-        overfitted = np.mean([part.overfitted for part in parts]) > 0.5
-        found = TrainedSplats(splats, bool(dropout), bool(overfitted))
+        splats, counts = merge.merge_blocks(
+            [part.with_sh_degree(degree) for part in parts], cells, draw_settings
+        )
+        dropout = uses_dropout(training_views)
         seam = merge.at_seams(splats, counts, cells)
-        gone = np.zeros(len(splats), bool)
-        if crossing:
+        removed = np.zeros(len(splats), bool)
+        if seam_views:
             self.report.progress(0, 1, "seams")
-            photographs = load_evaluation_views(self.whole.folder, crossing, draw_settings)
+            photographs = load_evaluation_views(self.whole.folder, seam_views, draw_settings)
             extent = training_extent(self.whole)
-            tuner = FineTuner(photographs, extent, backend, self.report, found.dropout)
-            splats, gone = merge.put_right(splats, seam, photographs, tuner, backend)
+            finetuner = FineTuner(photographs, extent, backend, self.report, dropout)
+            splats, removed = merge.finetune_seams(splats, seam, photographs, finetuner, backend)
         ends = np.cumsum([0, *counts])
-        left = [int((~gone[i:j]).sum()) for i, j in pairwise(ends)]
+        by_block = [int((~removed[i:j]).sum()) for i, j in pairwise(ends)]
         self.report.metric("splats", len(splats))
-        self.report.metric("splats_by_block", left)
+        self.report.metric("splats_by_block", by_block)
         self.report.metric("splats_at_seams", int(seam.sum()))
-        self.report.metric("pruned_at_seams", int(gone.sum()))
-        return replace(found, splats=splats)
+        self.report.metric("pruned_at_seams", int(removed.sum()))
+        return TrainedSplats(splats, dropout, overfitted=dropout)
 
 
-class _Told(Listener):
-    """What runs in this process say, told as progress of the whole."""
+class _BlockProgress(Listener):
+    """Reports the progress of runs in this process as progress of the whole training."""
 
     def __init__(self, report: Report) -> None:
         self._report = report
@@ -295,37 +304,36 @@ class _Told(Listener):
         self._started += 1
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
-        which = "coarse model" if self._started < 2 else f"block {self._started - 1}"
-        self._report.progress(done, total, f"{which}: {label}", **numbers)
+        run = "coarse model" if self._started < 2 else f"block {self._started - 1}"
+        self._report.progress(done, total, f"{run}: {label}", **numbers)
 
 
 def _with_roles(whole: Reconstruction) -> Reconstruction:
-    """With the judges of the whole named, so that no block learns from another one's."""
+    """With a role for each view, so that no block trains on another block's held-out views."""
     from stages.scene import split_held_out
 
     _, held = split_held_out(whole.views)
-    judges = {view.name for view in held}
-    if not judges:
+    names = {view.name for view in held}
+    if not names:
         return whole
-    views = (replace(v, role="test" if v.name in judges else "train") for v in whole.views)
+    views = (replace(v, role="test" if v.name in names else "train") for v in whole.views)
     return replace(whole, views=tuple(views))
 
 
 def _check(settings: Any) -> None:
-    """Raises SplatError for what cannot be asked of blocks."""
+    """Raises SplatError for settings that do not go with blocks."""
     if not settings.max_splats:
         raise SplatError(
             "blocks-without-cap",
-            given="--blocks was asked for, and nothing says how many splats the whole may have.",
-            wanted="A number of splats that blocks can share: what is free in memory tells only of "
-            "one of them.",
+            given="--blocks was given, and no maximum of splats.",
+            wanted="A maximum that the blocks can share: the free memory limits only one block.",
             hint="Give --max-splats, for example 250000 for each block.",
             family=Family.USAGE,
         )
     if settings.seconds or settings.within:
         raise SplatError(
             "blocks-without-end",
-            given="--blocks cannot be had together with --seconds or --within.",
+            given="--blocks cannot be combined with --seconds or --within.",
             wanted="Steps, which each block makes: --steps.",
             hint="Leave --seconds and --within away.",
             family=Family.USAGE,

@@ -1,4 +1,4 @@
-"""Blocks made one again: each gives what lies in its own cell, and seams are put right."""
+"""Merging of blocks: each block's splats in its own cell, with fine-tuned seams."""
 
 from __future__ import annotations
 
@@ -14,30 +14,29 @@ from stages.measure.evaluation import EvaluationView
 from stages.scene import DrawSettings, Splats
 from stages.training.finetune import FineTuner
 
-REACH = 3.0  # standard deviations: as far as a splat is there
-STEPS_A_PHOTOGRAPH, MOST_STEPS = 24, 1200  # of putting seams right
-HARM_PARTS = (1.0, 0.5, 0.25, 0.1, 0.0)  # of what seems to harm, the first that drawing agrees to
+REACH = 3.0  # standard deviations to which a splat extends
+STEPS_PER_VIEW, MAX_STEPS = 24, 1200  # of fine-tuning the seams
+REMOVED_FRACTIONS = (1.0, 0.5, 0.25, 0.1, 0.0)  # tried in turn, see `finetune_seams`
 
 
-def surrounded(seeds: Splats, coarse: Splats, cell: Cell, most: int) -> Splats:
-    """What a block starts from: the seeds in its cell, at most as many, evenly chosen; and around
-    it the coarse model of the whole."""
+def initial_splats(seeds: Splats, coarse: Splats, cell: Cell, most: int) -> Splats:
+    """The initial splats of a block: at most `most` of the seeds in its cell, evenly sampled, and
+    outside its cell the coarse model of the scene."""
     degree = coarse.sh_degree
     inside = seeds.with_sh_degree(degree).take(cell.holds(seeds.means))
     if len(inside) > most:
         inside = inside.take(np.linspace(0, len(inside) - 1, most).round().astype(np.int64))
-    return _joined([inside, coarse.take(~cell.holds(coarse.means))], coarse.draw_settings)
+    return _concatenated([inside, coarse.take(~cell.holds(coarse.means))], coarse.draw_settings)
 
 
-def shown_most(
+def most_visible(
     splats: Splats,
     own: NDArray[np.bool_],
     most: int,
     photographs: Sequence[EvaluationView],
     backend: str,
 ) -> NDArray[np.bool_]:
-    """[N] as many of a block's splats `own` [N]: without those whose going changes the pictures of
-    its photographs least."""
+    """[N] the `most` splats of a block's `own` [N] whose removal would change its views most."""
     change = measure_contributions(splats, photographs, backend).picture_change
     rows = np.flatnonzero(own)
     kept = own.copy()
@@ -45,18 +44,18 @@ def shown_most(
     return kept
 
 
-def merged(
+def merge_blocks(
     parts: Sequence[Splats], cells: Sequence[Cell], draw_settings: DrawSettings
 ) -> tuple[Splats, list[int]]:
-    """(the splats of each part whose centres lie in its cell, part after part; how many of each).
+    """(the splats of each part whose centres lie in its cell, part after part; the count of each).
 
-    What stood in for a block's surroundings is left behind. All parts have one origin.
+    The background of each block's training is left out. All parts have the same origin.
     """
     own = [part.take(cell.holds(part.means)) for part, cell in zip(parts, cells, strict=True)]
-    return _joined(own, draw_settings), [len(part) for part in own]
+    return _concatenated(own, draw_settings), [len(part) for part in own]
 
 
-def _joined(parts: Sequence[Splats], draw_settings: DrawSettings) -> Splats:
+def _concatenated(parts: Sequence[Splats], draw_settings: DrawSettings) -> Splats:
     arrays = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in (*("means", "quaternions", "log_scales"), "opacity_logits", "sh", "sh_degrees")
@@ -65,7 +64,7 @@ def _joined(parts: Sequence[Splats], draw_settings: DrawSettings) -> Splats:
 
 
 def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> NDArray[np.bool_]:
-    """[N] which of the splats of `merged` reach over the border of their cell."""
+    """[N] which splats of `merge_blocks` extend over the border of their cell."""
     reach = REACH * np.exp(splats.log_scales.max(axis=1).astype(np.float64))
     ends = np.cumsum([0, *counts])
     found = np.zeros(len(splats), bool)
@@ -75,24 +74,29 @@ def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> ND
     return found
 
 
-def put_right(
+def finetune_seams(
     splats: Splats,
     seam: NDArray[np.bool_],
-    photographs: Sequence[EvaluationView],
-    tuner: FineTuner,
+    views: Sequence[EvaluationView],
+    finetuner: FineTuner,
     backend: str,
 ) -> tuple[Splats, NDArray[np.bool_]]:
-    """(the splats without those at the seam that these photographs would be better without, tuned
-    to them all for a while; [N] which went). Two blocks that each stood in for the other have put
-    there twice what is there once; what only seems to be too much is missed when all of it goes,
-    and drawing tells."""
-    worth = measure_contributions(splats, photographs, backend)
-    harm = np.flatnonzero(seam & (worth.sse_change < 0))
-    harm = harm[np.argsort(worth.sse_change[harm], kind="stable")]
-    for part in HARM_PARTS:
-        gone = np.zeros(len(splats), bool)
-        gone[harm[: int(part * len(harm))]] = True
-        if squared_error(splats.take(~gone), photographs, backend) <= worth.sse:
+    """Remove superfluous splats at the seams, then fine-tune all splats.
+
+    Two adjacent blocks may both have modelled the same surface near their border. Candidates are
+    the splats of `seam` [N] whose removal alone would reduce the squared error of `views`. Removing
+    all of them may increase it, so that the largest of `REMOVED_FRACTIONS` is chosen that does not,
+    as measured by rendering.
+
+    Returns: (the splats, [N] which were removed).
+    """
+    found = measure_contributions(splats, views, backend)
+    candidates = np.flatnonzero(seam & (found.sse_change < 0))
+    candidates = candidates[np.argsort(found.sse_change[candidates], kind="stable")]
+    for fraction in REMOVED_FRACTIONS:
+        removed = np.zeros(len(splats), bool)
+        removed[candidates[: int(fraction * len(candidates))]] = True
+        if squared_error(splats.take(~removed), views, backend) <= found.sse:
             break
-    steps = min(MOST_STEPS, STEPS_A_PHOTOGRAPH * len(photographs))
-    return tuner.finetune(splats.take(~gone), steps, worth.view_counts[~gone]), gone
+    steps = min(MAX_STEPS, STEPS_PER_VIEW * len(views))
+    return finetuner.finetune(splats.take(~removed), steps, found.view_counts[~removed]), removed

@@ -1,1 +1,1 @@
-"""A server of this machine only, and what it shows: a finished scene, or one in training."""
+"""Pages of finished and of training scenes, their local server, camera paths and films."""

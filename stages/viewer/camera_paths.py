@@ -1,6 +1,6 @@
-"""A path from camera to camera: in which order, how smoothly, how level.
+"""Paths through given cameras: their order, interpolation, smoothing and levelling.
 
-The world is ours: y down, so up is -Y. All cameras of a path share one lens.
+The world is y down. All cameras of a path have the same intrinsics.
 """
 
 from __future__ import annotations
@@ -16,35 +16,34 @@ from stages.scene import Camera, Splats
 from stages.scene.rotations import matrices_of, quaternions_of
 from stages.viewer.orbit import common_lens, focus
 
-_STEEPEST_DEG = 80.0  # beyond, a horizon is nothing to be level with
-_SAMPLES = 64  # of each stretch between two cameras, to measure its length
-_STANDSTILL = 1e-6  # of a path's length: two cameras in one place
-_DETOUR = 1.5  # times the shorter tour: an order that long was not the way someone walked
+_STEEPEST_DEG = 80.0  # slope beyond which a camera is not levelled
+_SAMPLES = 64  # of each segment between two cameras, to measure its length
+_COINCIDENT = 1e-6  # of a path's length: two cameras at one position
+_DETOUR = 1.5  # times the found tour: a longer given order was not the photographer's way
 
 
 def tour(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.int64]:
-    """[V] an order in which neighbours are near: as given, unless that way is half as long again
-    as a tour found by going to the nearest that is left, improved by reversing stretches (2-opt).
-    """
+    """[V] an order of the cameras with short steps: the given one, unless it is `_DETOUR` times as
+    long as a tour found by the nearest-neighbour heuristic and improved by 2-opt."""
     keys = _keys(cameras)
-    apart = _lengths(keys[:, None], keys[None], _reach(cameras, splats))
+    apart = _lengths(keys[:, None], keys[None], _subject_distance(cameras, splats))
     given = np.arange(len(keys))
-    found = _untangled(_by_nearest(apart), apart)
-    return given if _way(given, apart) <= _DETOUR * _way(found, apart) else found
+    found = _two_opt(_nearest_neighbour(apart), apart)
+    return given if _path_length(given, apart) <= _DETOUR * _path_length(found, apart) else found
 
 
 def interpolated(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
-    """On from the first camera to the last at constant speed, through every one between.
+    """From the first camera to the last at constant speed, through all others.
 
     Positions and quaternions follow one centripetal Catmull-Rom spline (Yuksel, Schaefer & Keyser,
     "Parameterization and applications of Catmull-Rom curves", 2011), which neither overshoots nor
-    loops where cameras are unevenly spaced. Speed counts turning too: by what it moves the subject.
+    loops where cameras are unevenly spaced. Speed includes rotation, by the motion of the subject.
     """
     keys = _keys(cameras)
-    _shorter_way_round(keys)
-    reach = _reach(cameras, splats)
+    _align_signs(keys)
+    reach = _subject_distance(cameras, splats)
     steps = _lengths(keys[:-1], keys[1:], reach)
-    moved = np.concatenate([[True], steps > _STANDSTILL * max(steps.sum(), 1e-12)])
+    moved = np.concatenate([[True], steps > _COINCIDENT * max(steps.sum(), 1e-12)])
     keys = keys[moved]
     lens = common_lens(cameras)
     if len(keys) == 1:
@@ -57,13 +56,13 @@ def interpolated(cameras: Sequence[Camera], splats: Splats, frames: int) -> tupl
 
 
 def smoothed(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
-    """A path without the jerks of a hand: positions and quaternions averaged over neighbours with
-    Gaussian weights of standard deviation `frames`. Ends stay near their places."""
+    """A smoothed hand-held path: positions and quaternions averaged with Gaussian weights whose
+    standard deviation is `frames`. The ends stay near their positions."""
     keys = _keys(cameras)
-    _shorter_way_round(keys)
+    _align_signs(keys)
     reach = min(int(np.ceil(3 * frames)), len(keys) - 1)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
-    # Mirrored through the end itself, so that the path still ends there.
+    # Point reflection at the ends keeps them in place.
     before, after = 2 * keys[0] - keys[reach:0:-1], 2 * keys[-1] - keys[-2 : -2 - reach : -1]
     padded = np.vstack([before, keys, after])
     rows = [np.convolve(column, weights / weights.sum(), "valid") for column in padded.T]
@@ -72,8 +71,8 @@ def smoothed(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
 
 
 def levelled(camera: Camera) -> Camera:
-    """The camera turned about its own axis until the horizon is level: all the way up to a slope
-    of 70 degrees, and gradually less up to 80."""
+    """The camera rotated about its axis until the horizon is level: fully up to a slope of 70
+    degrees, and gradually less up to 80."""
     right, down, forward = camera.world_to_camera[:3, :3]
     slope = np.degrees(np.arcsin(min(1.0, abs(forward[1]))))
     share = np.clip((_STEEPEST_DEG - slope) / 10.0, 0.0, 1.0)
@@ -84,14 +83,14 @@ def levelled(camera: Camera) -> Camera:
 
 
 def length_in_turns(cameras: Sequence[Camera], splats: Splats) -> float:
-    """How long the way from the first to the last is, in turns around what they look at."""
+    """The length of the path from the first camera to the last, in orbits around its subject."""
     keys = _keys(cameras)
-    reach = _reach(cameras, splats)
+    reach = _subject_distance(cameras, splats)
     return float(_lengths(keys[:-1], keys[1:], reach).sum() / (2 * np.pi * max(reach, 1e-12)))
 
 
-def _reach(cameras: Sequence[Camera], splats: Splats) -> float:
-    """The median distance from the cameras to what they look at."""
+def _subject_distance(cameras: Sequence[Camera], splats: Splats) -> float:
+    """The median distance from the cameras to their subject."""
     middle = focus(cameras, splats)
     return float(np.median([np.linalg.norm(camera.centre - middle) for camera in cameras]))
 
@@ -102,15 +101,16 @@ def _keys(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     return np.hstack([[camera.centre for camera in cameras], quaternions_of(rotations)])
 
 
-def _shorter_way_round(keys: NDArray[np.float64]) -> None:
-    """Choose of q and -q, which are the same rotation, the one nearer to that before."""
+def _align_signs(keys: NDArray[np.float64]) -> None:
+    """Choose the sign of each quaternion (q and -q are the same rotation) nearest to the previous
+    one."""
     for before, key in itertools.pairwise(keys):
         key[3:] *= np.sign(before[3:] @ key[3:]) or 1.0
 
 
 def _lengths(a: NDArray[np.float64], b: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """[...] between poses [..., 7] (position, quaternion): how far the camera moves and, at
-    distance `reach`, its axis turns; world units."""
+    """[...] the distance between poses [..., 7] (position, quaternion): the translation and, at
+    distance `reach`, the displacement by rotation; world units."""
     cosines = np.abs(np.sum(a[..., 3:] * b[..., 3:], axis=-1))
     turns = 2 * np.arccos(np.clip(cosines, 0.0, 1.0))
     found: NDArray[np.float64] = np.hypot(
@@ -147,11 +147,11 @@ def _posed(lens: Camera, pose: NDArray[np.float64]) -> Camera:
     return replace(lens, world_to_camera=matrix)
 
 
-def _way(order: NDArray[np.int64], apart: NDArray[np.float64]) -> float:
+def _path_length(order: NDArray[np.int64], apart: NDArray[np.float64]) -> float:
     return float(apart[order[:-1], order[1:]].sum())
 
 
-def _by_nearest(apart: NDArray[np.float64]) -> NDArray[np.int64]:
+def _nearest_neighbour(apart: NDArray[np.float64]) -> NDArray[np.int64]:
     order, left = [0], np.ones(len(apart), bool)
     left[0] = False
     while left.any():
@@ -160,9 +160,9 @@ def _by_nearest(apart: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.array(order)
 
 
-def _untangled(order: NDArray[np.int64], apart: NDArray[np.float64]) -> NDArray[np.int64]:
-    """2-opt. A place as far from all others as it is near closes the tour, so that either end may
-    move too."""
+def _two_opt(order: NDArray[np.int64], apart: NDArray[np.float64]) -> NDArray[np.int64]:
+    """2-opt. A virtual camera at distance zero from all others closes the tour, so that its ends
+    may change too."""
     n = len(apart)
     closed = np.zeros((n + 1, n + 1))
     closed[:n, :n] = apart
@@ -181,5 +181,5 @@ def _untangled(order: NDArray[np.int64], apart: NDArray[np.float64]) -> NDArray[
     end = int(np.flatnonzero(ring == n)[0])
     path = np.concatenate([ring[end + 1 :], ring[:end]])
     jumps = np.append(apart[path[:-1], path[1:]], apart[path[-1], path[0]])
-    path = np.roll(path, -1 - int(np.argmax(jumps)))  # begins and ends at the longest jump
+    path = np.roll(path, -1 - int(np.argmax(jumps)))  # cut at the longest step
     return path if list(path).index(0) <= n // 2 else path[::-1]

@@ -1,4 +1,4 @@
-"""A film of pictures: H.264 in an .mp4 that browsers, phones and editors play."""
+"""Films: H.264 in an .mp4 file that browsers, phones and editors play."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stages.base.errors import Family, SplatError
 
 _BT709 = 1  # ITU-T H.273: primaries, transfer and matrix have the same number
 _LIMITED_RANGE = 1  # luma in 16..235, as players expect
-_FFMPEGS_OWN = 256  # its errors start above those of operating systems
+_FFMPEG_ERRORS = 256  # FFmpeg's own error numbers start here, above the system's
 _CONSTANT_QUALITY = "17"  # of x264's 0..51; differences from the pictures are hard to see
 
 AddFrame = Callable[[NDArray[np.uint8]], None]
@@ -24,11 +24,16 @@ AddFrame = Callable[[NDArray[np.uint8]], None]
 
 @contextmanager
 def film(path: Path, width: int, height: int, fps: float) -> Iterator[AddFrame]:
-    """Yield what adds a picture [H, W, 3] uint8, sRGB, to the film `path`, which appears whole when
-    the block ends, or not at all. width, height: even, as 4:2:0 has a colour for each 2 x 2 pixels.
+    """Yield a function that adds a picture [H, W, 3] uint8 sRGB to the film `path`.
 
-    The picture starts before the file is loaded whole ("faststart"), and says how its colours are
-    meant (BT.709). Raises SplatError "film-encoder", or what keeps the file from being written.
+    The file is written whole when the block ends, or not at all. It can be played before it is
+    loaded whole ("faststart"), and declares its colours as BT.709.
+
+    Args:
+        width, height: even, because 4:2:0 has one colour for each 2 x 2 pixels.
+        fps: frames a second.
+
+    Raises SplatError "film-encoder", and OSError if the file cannot be written.
     """
     import av
 
@@ -55,8 +60,8 @@ def film(path: Path, width: int, height: int, fps: float) -> Iterator[AddFrame]:
                 yield add
                 container.mux(stream.encode(None))
         except av.FFmpegError as error:
-            if error.errno != errno.EINVAL and 0 < (error.errno or 0) < _FFMPEGS_OWN:
-                raise OSError(error.errno, error.strerror) from error  # a full disk, for one
+            if error.errno != errno.EINVAL and 0 < (error.errno or 0) < _FFMPEG_ERRORS:
+                raise OSError(error.errno, error.strerror) from error  # such as a full disk
             raise SplatError(
                 "film-encoder",
                 given=f"The film could not be encoded: {error}.",

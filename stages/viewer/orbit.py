@@ -1,4 +1,4 @@
-"""A turn around the scene, as a path of cameras with one lens. The world is ours: up is -Y."""
+"""An orbit around the scene: a path of cameras with the same intrinsics. The world is y down."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from stages.scene import Camera, Splats, look_at
 from stages.scene.framing import median_depth
 
-_STEEPEST_DEG = 80.0  # seen from straight above, left and right lose their meaning
-_INSIDE = 0.9  # of an arc: at its very ends a single photograph looks
+_STEEPEST_DEG = 80.0  # elevation; from straight above, left and right are undefined
+_INSIDE = 0.9  # of an arc: its ends are seen by a single view only
 
 
 def orbit(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camera, ...]:
-    """A level turn around what `cameras` look at, from their median distance and elevation; to and
-    fro over the arc that they saw where they left out much of the turn. A loop: the frame after
-    the last would be the first.
+    """A level turn around what `cameras` look at, at their median distance and elevation.
+
+    If the cameras leave out much of the turn, the path goes to and fro over the arc that they
+    cover. It is a loop: the frame after the last equals the first.
     """
     middle = focus(cameras, splats)
     away = np.array([camera.centre for camera in cameras]) - middle
@@ -39,9 +40,9 @@ def orbit(cameras: Sequence[Camera], splats: Splats, frames: int) -> tuple[Camer
 
 
 def arc_seen(cameras: Sequence[Camera], splats: Splats) -> tuple[float, float]:
-    """(middle, half its width) of the arc around what `cameras` look at that they look from well,
-    radians from +z towards +x. The whole turn, from the first camera on, unless a third of it or
-    more is left out; also of one camera."""
+    """(centre, half width) of the arc that the cameras cover, radians from +z towards +x. The whole
+    turn, starting at the first camera, if the widest gap is less than a third of it, or if there
+    is one camera."""
     away = np.array([camera.centre for camera in cameras]) - focus(cameras, splats)
     angles = np.arctan2(away[:, 0], away[:, 2])
     ordered = np.sort(angles)
@@ -54,8 +55,8 @@ def arc_seen(cameras: Sequence[Camera], splats: Splats) -> tuple[float, float]:
 
 
 def focus(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.float64]:
-    """[3] the point nearest to the cameras' axes (least squares), if most look towards it; else
-    the median of what lies in the middle of each picture."""
+    """[3] the point nearest to the cameras' axes (least squares) if most cameras look towards it,
+    else the median of the points at each camera's median depth on its axis."""
     centres = np.array([camera.centre for camera in cameras])
     ahead = np.array([camera.forward for camera in cameras])
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
@@ -69,8 +70,8 @@ def focus(cameras: Sequence[Camera], splats: Splats) -> NDArray[np.float64]:
 
 
 def common_lens(cameras: Sequence[Camera]) -> Camera:
-    """A camera with the commonest size and the median focal lengths of that size, looking through
-    the middle of its picture."""
+    """A camera with the most frequent picture size, the median focal lengths of that size, and the
+    principal point in the centre."""
     sizes = [(camera.width, camera.height) for camera in cameras]
     width, height = max(sizes, key=sizes.count)
     alike = [c for c, size in zip(cameras, sizes, strict=True) if size == (width, height)]

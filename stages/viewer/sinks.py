@@ -1,4 +1,4 @@
-"""What takes renderings one after another and makes files of them."""
+"""Sinks: they receive renderings one after another and write pictures or films."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stages.viewer.image_files import (
     save_picture,
 )
 
-_SAMPLED = 12  # frames that say how near and far a path sees
+_SAMPLED = 12  # frames of a path that determine its depth range
 _SAMPLED_SIDE = 240  # pixels
 
 Put = Callable[[Rendering], None]
@@ -26,7 +26,7 @@ Put = Callable[[Rendering], None]
 
 @contextmanager
 def picture_sink(path: Path, depth: bool) -> Iterator[Put]:
-    """The picture `path`; with `depth` its depth beside it as .depth.tiff. Raises SplatError."""
+    """Writes the picture `path`; with `depth` also its depth as .depth.tiff. Raises SplatError."""
 
     def put(rendering: Rendering) -> None:
         save_picture(path, eight_bits(rendering.image))
@@ -38,8 +38,8 @@ def picture_sink(path: Path, depth: bool) -> Iterator[Put]:
 
 @contextmanager
 def folder_sink(folder: Path, frames: int, depth: bool) -> Iterator[Put]:
-    """frame_0001.png and so on in `folder`, which is made; frames that are there are written
-    again. With `depth` also frame_0001.depth.tiff. Raises SplatError."""
+    """Writes frame_0001.png and so on into `folder`, which is made; existing frames are replaced.
+    With `depth` also frame_0001.depth.tiff. Raises SplatError."""
     make_folder(folder)
     number = 0
 
@@ -55,7 +55,7 @@ def folder_sink(folder: Path, frames: int, depth: bool) -> Iterator[Put]:
 
 
 def frames_beyond(folder: Path, frames: int) -> int:
-    """How many pictures an earlier, longer path left in `folder`."""
+    """The number of frames in `folder` that belong to an earlier, longer path."""
     numbers = (path.stem.removeprefix("frame_") for path in folder.glob("frame_*.png"))
     return sum(number.isdigit() and int(number) > frames for number in numbers)
 
@@ -64,8 +64,8 @@ def frames_beyond(folder: Path, frames: int) -> int:
 def film_sink(
     path: Path, width: int, height: int, fps: float, near_far: tuple[float, float] | None
 ) -> Iterator[Put]:
-    """The film `path`, and, if its range is given, one of its depth in colours beside it as
-    .depth.mp4; both appear whole at the end. Raises SplatError."""
+    """Writes the film `path`; with a depth range also a film of the depth colours, .depth.mp4. Both
+    are written whole at the end. Raises SplatError."""
     with ExitStack() as stack:
         add = stack.enter_context(film(path, width, height, fps))
         add_depth = None
@@ -84,6 +84,6 @@ def film_sink(
 def sampled_range(
     draw: Callable[[Camera], Rendering], cameras: Sequence[Camera]
 ) -> tuple[float, float]:
-    """(near, far) of a whole path, so that a colour means the same depth in every frame."""
+    """(near, far) of a whole path, so that a colour is the same depth in every frame."""
     some = cameras[:: max(1, len(cameras) // _SAMPLED)]
     return depth_range([draw(camera.fitted(_SAMPLED_SIDE)).median_depth for camera in some])

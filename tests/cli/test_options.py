@@ -80,13 +80,7 @@ def test_equal_pictures_are_lossless_and_no_number_of_decibels() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cpu_s", "text"),
-    [
-        (None, "10.0 s"),
-        (12.0, "10.0 s"),
-        (19.0, "10.0 s (19.0 s CPU)"),
-        (5.0, "10.0 s (5.0 s CPU)"),
-    ],
+    ("cpu_s", "text"), [(12.0, "10.0 s"), (5.0, "10.0 s"), (19.0, "10.0 s (19.0 s CPU)")]
 )
-def test_cpu_time_is_shown_where_it_differs_by_half(cpu_s: float | None, text: str) -> None:
+def test_cpu_time_is_shown_where_it_differs_by_half(cpu_s: float, text: str) -> None:
     assert console.times(10.0, cpu_s) == text

@@ -80,7 +80,7 @@ def test_blocks_are_runs_of_their_own_and_one_in_the_end(tmp_path, photos) -> No
     told, splats = manifest.metrics["blocks"], pipeline.load("train").splats
     assert [row["run_folder"] for row in told] == ["blocks/1", "blocks/2", "blocks/3"]
     assert manifest.metrics["splats"] == len(splats)
-    given = sum(row["splats_given"] for row in told)
+    given = sum(row["splats_in_cell"] for row in told)
     assert given <= SMALL["max_splats"]
     assert len(splats) == given - manifest.metrics["pruned_at_seams"]
     assert len(splats) == sum(manifest.metrics["splats_by_block"])
@@ -150,7 +150,7 @@ def test_one_block_is_the_scene_as_ever(tmp_path, photos) -> None:
     ("asked", "photographs", "wanted"), [("auto", 100, 1), ("auto", 10_000, 40), ("3", 5, 3)]
 )
 def test_auto_means_a_block_for_so_many_photographs(asked, photographs, wanted) -> None:
-    assert blocks.blocks_wanted(asked, photographs) == wanted
+    assert blocks.count_blocks(asked, photographs) == wanted
 
 
 def test_a_block_that_no_photograph_shows_is_the_coarse_model_s(

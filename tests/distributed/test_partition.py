@@ -63,7 +63,7 @@ def test_a_photograph_teaches_what_it_shows_and_not_what_is_hidden(tmp_path) -> 
     behind = replace(wall, means=(wall.means + np.array([2, 0, 0])).astype("f4"))
     lines = (np.array([-2.0, 0.0]), np.array([0.0, 2.0]))
     halves = [partition.Cell((low, -9.0), (high, 9.0)) for low, high in lines]
-    both, _ = merge.merged([wall, behind], halves, wall.draw_settings)
+    both, _ = merge.merge_blocks([wall, behind], halves, wall.draw_settings)
     cells = partition.partition(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
     eye = Camera(72, 54, 160.0, 160.0, 36.0, 27.0, look_at(np.array([-4.0, 0, 0]), np.zeros(3)))
     share = block_views.block_fractions(both, cells, [eye], AUTO)
@@ -81,7 +81,7 @@ def test_each_photograph_teaches_one_block_at_least() -> None:
 def test_merged_blocks_give_each_place_once_and_in_order(tmp_path) -> None:
     splats = small_scene(tmp_path, views=2).splats
     cells = partition.partition(splats.means[:, [0, 2]].astype(np.float64), np.ones(len(splats)), 3)
-    whole, counts = merge.merged([splats] * 3, cells, splats.draw_settings)
+    whole, counts = merge.merge_blocks([splats] * 3, cells, splats.draw_settings)
     assert sum(counts) == len(splats)
     assert sorted(map(tuple, whole.means)) == sorted(map(tuple, splats.means))
     ends = np.cumsum([0, *counts])
@@ -108,6 +108,6 @@ def test_a_block_with_too_many_splats_gives_those_that_its_photographs_show() ->
     seen = [EvaluationView("a", scenes.camera(), np.zeros((48, 64, 3), np.uint8))]
     own = np.ones(len(both), bool)
     own[-3:] = False
-    found = merge.shown_most(both, own, len(wall) - 3, seen, AUTO)
+    found = merge.most_visible(both, own, len(wall) - 3, seen, AUTO)
     assert not found[: len(hidden)].any()
     assert (found[len(hidden) :] == own[len(hidden) :]).all()
