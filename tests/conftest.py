@@ -47,16 +47,16 @@ def pytest_configure(config: pytest.Config) -> None:
 def _fault_of_installation() -> str | None:
     """Why these tests would not test this checkout as it is installed."""
     try:
-        origin = json.loads(distribution("splat").read_text("direct_url.json") or "{}")
+        origin = json.loads(distribution("splatcli").read_text("direct_url.json") or "{}")
     except PackageNotFoundError:
-        return "splat is not installed"
+        return "splatcli is not installed"
     import stages
 
     home = Path(stages.__file__).parents[1]
     if origin.get("dir_info", {}).get("editable"):
-        return None if home == ROOT else f"splat is installed from {home}, not from {ROOT}"
+        return None if home == ROOT else f"splatcli is installed from {home}, not from {ROOT}"
     if home == ROOT:
-        return "what is installed as splat is not complete"
+        return "what is installed as splatcli is not complete"
     for top in ("stages", "splatcli"):
         for path in (home / top).rglob("*.py"):
             source = ROOT / path.relative_to(home)

@@ -158,7 +158,7 @@ def read(path: Path) -> Splats:
 def unpack(path: Path, header: Header) -> Splats:
     """The splats of a compressed .ply whose header was read. Raises BadFileError."""
     if header.encoding == "ascii":
-        raise BadFileError("it is a compressed .ply as text, which is not read")
+        raise BadFileError("it is a compressed .ply as text, which is not supported")
     _require(header, "vertex", _WORDS)
     _require(
         header, "chunk", [name.format(e) for n in _RANGES[:2] for name in n for e in ("min", "max")]

@@ -49,7 +49,7 @@ def read(path: Path) -> Splats:
                 parts.append(part)
                 # Splats that are not shared cannot be more than this, which bounds the memory.
                 if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
-                    raise BadFileError("it shows its splats several times, which is not read")
+                    raise BadFileError("its nodes share meshes, which is not supported")
         extras = document["asset"].get("extras")
         origin = extras.get("splat_origin") if isinstance(extras, dict) else None
         origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
@@ -128,7 +128,7 @@ class _Buffers:
                 raise BadFileError(f"buffer {index} has no content")
             return self._chunk
         if not isinstance(uri, str):
-            raise BadFileError(f"the address of buffer {index} is no text")
+            raise BadFileError(f"the address of buffer {index} is not text")
         if uri.startswith("data:"):
             head, _, body = uri.partition(",")
             if not head.endswith(";base64"):
@@ -145,9 +145,9 @@ def _file_beside(path: Path, uri: str) -> Path:
     inside = not (parts.scheme or parts.netloc or "\\" in name or "\0" in name or ":" in name)
     target = (folder / name).resolve() if inside else folder
     if not inside or not name or not target.is_relative_to(folder):
-        raise BadFileError(f"it names {uri[:80]!r}, which is not a file in its own folder")
+        raise BadFileError(f"it refers to {uri[:80]!r}, which is not a file in its own folder")
     if not target.is_file():
-        raise BadFileError(f"{name[:80]!r}, which it names, is not there")
+        raise BadFileError(f"{name[:80]!r}, which it refers to, is not there")
     return target
 
 
@@ -195,14 +195,14 @@ def _transform_of(node: dict[str, Any]) -> _NodeTransform:
         scale, offset = float(matrix[0, 0]), matrix[:3, 3]
         even = np.array_equal(matrix[:3, :3], scale * np.eye(3))
         if not even or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-            raise BadFileError("one of its nodes is rotated or stretched, which is not read")
+            raise BadFileError("one of its nodes is rotated or stretched, which is not supported")
     else:
         rotation = _numbers(node.get("rotation", [0, 0, 0, 1]), 4)
         scales = _numbers(node.get("scale", [1, 1, 1]), 3)
         offset = _numbers(node.get("translation", [0, 0, 0]), 3)
         scale = float(scales[0])
         if np.abs(rotation[:3]).max() > 1e-7 or not (scales == scale).all():
-            raise BadFileError("one of its nodes is rotated or stretched, which is not read")
+            raise BadFileError("one of its nodes is rotated or stretched, which is not supported")
     if not scale > 0:
         raise BadFileError("one of its nodes has a scale that is not positive")
     return _NodeTransform(scale, (float(offset[0]), float(offset[1]), float(offset[2])))
@@ -231,7 +231,7 @@ class _Source:
         if extension.get("colorSpace") != "srgb_rec709_display":
             raise BadFileError("its colours are in another space than srgb_rec709_display")
         if "extensions" in extension:
-            raise BadFileError("its splats are compressed, which is not read")
+            raise BadFileError("its splats are compressed, which is not supported")
         attributes = primitive.get("attributes")
         if not isinstance(attributes, dict):
             raise BadFileError("a primitive has no attributes")
@@ -271,7 +271,7 @@ class _Source:
         """[count, width] float32, normalised integers decoded."""
         accessor = _item(_list(self.document, "accessors"), index, "accessor")
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise BadFileError(f"accessor {index} is sparse or empty, which is not read")
+            raise BadFileError(f"accessor {index} is sparse or empty, which is not supported")
         if (
             accessor.get("componentType") not in _TYPES
             or _WIDTHS.get(str(accessor.get("type"))) != width
@@ -303,13 +303,13 @@ class _Source:
 def _list(holder: dict[str, Any], key: str) -> list[Any]:
     value = holder.get(key, [])
     if not isinstance(value, list):
-        raise BadFileError(f"its {key} are no list")
+        raise BadFileError(f"its {key} are not a list")
     return value
 
 
 def _item(items: list[Any], index: Any, what: str) -> dict[str, Any]:
     if type(index) is not int or not 0 <= index < len(items) or not isinstance(items[index], dict):
-        raise BadFileError(f"it names {what} {str(index)[:40]}, which it does not hold")
+        raise BadFileError(f"it refers to {what} {str(index)[:40]}, which it does not hold")
     found: dict[str, Any] = items[index]
     return found
 

@@ -115,7 +115,7 @@ def unzipped(path: Path) -> Iterator[bytes]:
         size = page.seek(0, 2)
         page.seek(max(0, size - _END_BYTES))
         if not page.read().rstrip().endswith(document.PAGE_END.strip().encode("ascii")):
-            raise BadFileError("it is no whole page: its end is missing")
+            raise BadFileError("the page is incomplete: its end is missing")
         page.seek(0)
         try:
             while line := page.readline(_LINE_LIMIT_BYTES):

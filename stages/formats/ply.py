@@ -198,21 +198,16 @@ def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
 
 
 def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
-    for words in _words(file):
-        yield np.array(words, dtype=np.float64)
-
-
-def _words(file: BinaryIO) -> Iterator[list[bytes]]:
-    """The words of the file in batches of some ten thousand."""
+    """The numbers of the file in batches of some ten thousand."""
     rest = b""
     while block := file.read(1 << 18):
         block = rest + block
-        cut = max(block.rfind(b" "), block.rfind(b"\n"), block.rfind(b"\r"), block.rfind(b"\t")) + 1
+        cut = max(block.rfind(space) for space in (b" ", b"\n", b"\r", b"\t")) + 1
         if cut == 0 and len(block) > 1 << 18:
             raise BadFileError("it holds a word that is no number")
         rest = block[cut:]
-        yield block[:cut].split()
-    yield rest.split()
+        yield np.array(block[:cut].split(), dtype=np.float64)
+    yield np.array(rest.split(), dtype=np.float64)
 
 
 @dataclass(frozen=True)

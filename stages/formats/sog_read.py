@@ -45,7 +45,7 @@ def read(path: Path) -> Splats:
             with zipfile.ZipFile(path) as package:
                 return check_finite(Source(in_zip(package), path.stat().st_size).splats())
         except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-            raise BadFileError(f"it is no whole zip ({error})") from error
+            raise BadFileError(f"it is not a complete zip ({error})") from error
         except (NotImplementedError, RuntimeError) as error:  # encrypted, or packed in another way
             raise BadFileError(f"its zip cannot be unpacked ({error})") from error
 
@@ -140,7 +140,7 @@ class Source:
         halves = self._pixels(meta, "shN", 1, count)
         labels = halves[:, 0] + 256 * halves[:, 1].astype(np.intp)
         if len(labels) and labels.max() >= entries:
-            raise BadFileError("its splats name SH that is not in its palette")
+            raise BadFileError("its splats refer to SH that is not in its palette")
         return book[indices[:, :3].reshape(-1, k, 3)], labels
 
     def _member(self, name: Any, limit: int) -> bytes:

@@ -140,7 +140,7 @@ def _is_y_up(records: bytes) -> bool:
         if kind == _AXES_EXTENSION:
             axes = int.from_bytes(value, "little")
             if axes not in (*_Y_UP, _OURS):
-                raise BadFileError(f"its axes are number {axes} of SPZ, which is not read")
+                raise BadFileError(f"its axes are number {axes} of SPZ, which is not supported")
             return axes != _OURS
         records = records[_RECORD.size + length :]
     return True

@@ -226,7 +226,7 @@ def read(path: Path) -> Splats:
         try:
             return check_finite(_read(path))
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-            raise BadFileError(f"one of its chunks is no whole zip ({error})") from error
+            raise BadFileError(f"one of its chunks is not a complete zip ({error})") from error
 
 
 def _read(path: Path) -> Splats:
@@ -234,7 +234,7 @@ def _read(path: Path) -> Splats:
         raise BadFileError("it is too large for a list of chunks")
     meta = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(meta, dict) or meta.get("version", 1) != 1:
-        raise BadFileError("it is no lod-meta.json of version 1")
+        raise BadFileError("it is not a lod-meta.json of version 1")
     names = meta.get("filenames")
     if not isinstance(names, list) or not isinstance(meta.get("tree"), dict):
         raise BadFileError("it lacks filenames or a tree")
@@ -264,7 +264,7 @@ def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:
     while waiting:
         node = waiting.pop()
         if not isinstance(node, dict):
-            raise BadFileError("its tree holds what is no node")
+            raise BadFileError("its tree holds an entry that is not a node")
         children, lods = node.get("children"), node.get("lods")
         if isinstance(lods, dict) and lods:
             yield lods
@@ -279,9 +279,9 @@ def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]
         at = lods[min(lods, key=int)]
         values = [at[name] for name in ("file", "offset", "count")]
         if not all(isinstance(v, int) and 0 <= v < 1 << 40 for v in values):
-            raise BadFileError("its tree names rows by what is no number")
+            raise BadFileError("its tree refers to rows by something that is not a number")
         if values[0] >= files:
-            raise BadFileError("its tree names a chunk that is not listed")
+            raise BadFileError("its tree refers to a chunk that is not listed")
         found.setdefault(values[0], []).append((values[1], values[2]))
     return {file: sorted(ranges) for file, ranges in found.items()}
 
@@ -345,10 +345,10 @@ def _checked(
     end = 0
     for offset, count in rows:
         if offset < end:
-            raise BadFileError("its tree names rows of a chunk twice")
+            raise BadFileError("its tree refers to rows of a chunk twice")
         end = offset + count
     if end > meta["count"]:
-        raise BadFileError("its tree names rows that a chunk does not have")
+        raise BadFileError("its tree refers to rows that a chunk does not have")
     return min(degree, 3) if isinstance(degree, int) else 0, rows
 
 

@@ -99,7 +99,7 @@ _USD = Format(
 TABLE = (
     Format(
         "ply",
-        opens_in="nearly everything that knows splats",
+        opens_in="nearly every program that reads splats",
         keeps="everything, float32",
         writer="stages.formats.ply:write",
         reader="stages.formats.ply:read",
@@ -107,7 +107,7 @@ TABLE = (
     Format(
         "splat",
         opens_in="web viewers",
-        keeps="8-bit colour and rotation; the mean of the colours that photographs see",
+        keeps="8-bit colour and rotation; one colour, averaged over the views",
         writer="stages.formats.splat32:write",
         reader="stages.formats.splat32:read",
         order="stages.formats.splat32:order",
@@ -162,7 +162,7 @@ TABLE = (
     ),
     Format(
         "lod-meta.json",
-        opens_in="PlayCanvas, SuperSplat, which load what is near first",
+        opens_in="PlayCanvas, SuperSplat, which load nearby chunks first",
         keeps="as `sog`, in chunks and levels of detail; written by `splat edit`",
         writer="stages.formats.streamed_sog:write",
         reader="stages.formats.streamed_sog:read",
@@ -175,7 +175,7 @@ TABLE = (
     Format(
         "html",
         opens_in="any browser, from disk, without a network",
-        keeps="everything; the viewer and the cameras too",
+        keeps="everything; also the viewer and the cameras",
         writer="stages.formats.html:write",
         reader="stages.formats.html:read",
         takes_views=True,

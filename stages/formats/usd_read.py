@@ -72,7 +72,7 @@ def read(path: Path) -> Splats:
         if child.returncode == _REFUSED:
             raise BadFileError(child.stdout.decode("utf-8", "replace").strip()[:300])
         if child.returncode != 0:
-            raise BadFileError("it is damaged: the USD library gave up on it")
+            raise BadFileError("it is damaged: the USD library crashed on it")
         return load_splats(output)
 
 
@@ -95,10 +95,10 @@ def _open(path: Path) -> Any:
     if layer is None:
         raise BadFileError("it is not USD")
     if layer.GetCompositionAssetDependencies():
-        raise BadFileError("it refers to other files, which are not read")
+        raise BadFileError("it refers to other files, which are not supported")
     stage = Usd.Stage.Open(layer)
     if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
-        raise BadFileError("its up axis is not y, which is not read")
+        raise BadFileError("its up axis is not y, which is not supported")
     return stage
 
 
@@ -154,7 +154,7 @@ def _placement(prim: Any) -> tuple[float, NDArray[np.float64]]:
     if not (np.isfinite(matrix).all() and scale > 0):
         raise BadFileError("its splats are mirrored or have no size")
     if np.abs(matrix[:3, :3] / scale - np.eye(3)).max() > 1e-6:
-        raise BadFileError("its splats are rotated or stretched, which is not read")
+        raise BadFileError("its splats are rotated or stretched, which is not supported")
     return scale, matrix[3, :3]
 
 

@@ -69,8 +69,8 @@ def html(path: Path) -> ByteBreakdown:
 
 
 def usd(path: Path) -> ByteBreakdown:
-    unknown = "USD packs values as it likes, and tells nobody how many bytes each attribute took"
-    return ByteBreakdown({}, unknown=unknown)
+    why = "USD compresses values and does not say how many bytes each attribute takes"
+    return ByteBreakdown({}, unknown=why)
 
 
 def _ply_columns(header: Header) -> dict[str, int]:

@@ -28,7 +28,7 @@ class MeshFormat:
     independent_reader: str
     y_up: bool = False
     opens_in: str = "game engines, mesh tools"
-    keeps: str = "no splats: triangles to collide with, see below"
+    keeps: str = "no splats: triangles for collision"
 
 
 _GLB = MeshFormat("mesh.glb", "stages.surface.gltf:write", "stages.surface.checks:read_glb", True)

@@ -103,7 +103,7 @@ def test_colours_that_differ_are_merged_last() -> None:
     assert (pure < 1e-3).mean() > 0.9
 
 
-def test_what_is_worth_nothing_goes_and_what_must_stay_is_not_left_out() -> None:
+def test_splats_without_cost_are_removed_and_those_of_infinite_cost_stay() -> None:
     splats = wall(400)
     nothing = np.zeros(400, bool)
     nothing[::8] = True

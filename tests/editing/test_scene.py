@@ -71,7 +71,7 @@ def test_a_scene_that_is_moved_as_a_whole_costs_nothing(words: tuple[str, ...]) 
     np.testing.assert_allclose(drawn, render(start.splats, cameras()[1]).image, atol=0.01)
 
 
-def test_photographs_say_what_may_go() -> None:
+def test_training_views_decide_what_is_removed() -> None:
     solid = room()  # most of it hidden behind the rest
     start = scene(replace(solid, opacity_logits=solid.opacity_logits + 3))
     half = f"decimate {len(start.splats) // 2}"

@@ -66,7 +66,7 @@ def test_a_half_turn_about_x_is_the_one_that_files_with_y_up_get() -> None:
     )
 
 
-def test_the_origin_goes_along() -> None:
+def test_the_origin_is_transformed_too() -> None:
     splats = replace(
         exact(5, 1), origin=np.array([100.0, 0, 0]), draw_settings=DrawSettings(near=0.5)
     )

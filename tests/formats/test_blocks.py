@@ -17,7 +17,7 @@ QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]
 
 
 @pytest.mark.parametrize("suffix", QUICK)
-def test_reading_and_writing_are_told(tmp_path: Path, suffix: str) -> None:
+def test_reading_and_writing_report_progress(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     told: list[tuple[int, int]] = []
     with blocks.progress_reported_to(lambda done, total: told.append((done, total))):

@@ -71,7 +71,7 @@ def test_ply_rows_follow_the_reference_layout(tmp_path: Path) -> None:
     np.testing.assert_allclose(row[22:], [3 * W, 3 * X, 3 * Y, 3 * Z], rtol=1e-6)
 
 
-def test_ply_says_where_its_origin_lies(tmp_path: Path) -> None:
+def test_ply_holds_its_origin_in_a_comment(tmp_path: Path) -> None:
     from plyfile import PlyData
 
     formats.write(tmp_path / "a.ply", many_splats(4), units="metres")
@@ -218,7 +218,7 @@ def test_usd_attributes_are_all_there_linear_and_upright(tmp_path: Path, suffix:
     assert Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr().Get() == "srgb_rec709_scene"
 
 
-def test_usd_keeps_all_bands_of_one_splat_together(tmp_path: Path) -> None:
+def test_usd_keeps_all_sh_coefficients_of_one_splat_together(tmp_path: Path) -> None:
     from pxr import Usd
 
     splats = many_splats(5)
@@ -245,7 +245,7 @@ def test_usdz_packages_pass_the_packaging_rules(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", formats.FORMATS)
-def test_the_second_reader_finds_the_same_ellipsoids_and_colours(
+def test_the_independent_reader_finds_the_same_ellipsoids_and_colours(
     tmp_path: Path, suffix: str
 ) -> None:
     formats.write(tmp_path / f"a.{suffix}", red_splat())

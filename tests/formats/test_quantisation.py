@@ -74,7 +74,7 @@ def covariances(splats: Splats) -> np.ndarray:
     return axes @ axes.transpose(0, 2, 1)
 
 
-def test_only_formats_that_pack_are_told_in_fewer_bits() -> None:
+def test_only_formats_that_compress_are_quantised() -> None:
     splats = many_splats(100)
     quantised = QuantisedSplats(splats, 3, {"bits": vars(FEW)})
     for name, row in FORMATS.items():

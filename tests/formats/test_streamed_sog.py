@@ -56,7 +56,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     path.write_text(json.dumps(meta))
 
 
-def test_the_finest_level_comes_back_in_the_order_that_is_told(asset: Path) -> None:
+def test_the_finest_level_comes_back_in_the_declared_order(asset: Path) -> None:
     splats = many_splats(2000)
     found, wanted = formats.read(asset), splats.take(streamed_sog.order(splats))
     assert found.sh_degree == 3
@@ -97,7 +97,7 @@ def test_a_leaf_bounds_what_is_in_it(asset: Path) -> None:
     assert all((np.array(leaf["bound"]["min"]) >= low - 1e-9).all() for leaf in leaves(meta))
 
 
-def test_units_and_origin_are_told(tmp_path: Path) -> None:
+def test_units_and_origin_are_kept(tmp_path: Path) -> None:
     far = replace(many_splats(50), origin=np.array([1e6, 2.0, 3.0]))
     path = tmp_path / "lod-meta.json"
     levels.write(path, far, units="metres")

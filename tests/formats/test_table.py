@@ -37,7 +37,7 @@ def test_a_writer_takes_views_where_its_row_says_so(row: Format) -> None:
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
-def test_rows_of_a_file_lie_in_the_order_that_the_table_tells(tmp_path: Path, row: Format) -> None:
+def test_rows_of_a_file_are_in_the_order_of_the_table(tmp_path: Path, row: Format) -> None:
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
@@ -48,7 +48,7 @@ def test_rows_of_a_file_lie_in_the_order_that_the_table_tells(tmp_path: Path, ro
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
-def test_what_a_row_says_is_lost_is_lost_and_nothing_else(tmp_path: Path, row: Format) -> None:
+def test_formats_lose_what_their_rows_declare_and_nothing_else(tmp_path: Path, row: Format) -> None:
     splats = many_splats(200)
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, splats)
@@ -68,7 +68,7 @@ def test_a_format_leaves_the_files_that_its_row_names(tmp_path: Path, row: Forma
 
 
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
-def test_every_format_tells_its_bytes_or_why_not(tmp_path: Path, row: Format) -> None:
+def test_every_format_has_a_byte_breakdown_or_a_reason(tmp_path: Path, row: Format) -> None:
     path = tmp_path / f"a.{row.ending}"
     formats.write(path, many_splats(300))
     found = byte_breakdown_of(path)

@@ -46,7 +46,7 @@ def test_an_unknown_order_is_found_though_all_positions_moved_a_little() -> None
     np.testing.assert_array_equal(matched_rows(splats, moved, ()), rows)
 
 
-def test_splats_at_one_place_are_told_apart_by_their_values() -> None:
+def test_splats_at_one_place_are_distinguished_by_their_values() -> None:
     splats = many_splats(N)
     splats = replace(splats, means=np.repeat(splats.means[: N // 4], 4, axis=0))
     file, rows = shuffled(splats)

@@ -256,7 +256,7 @@ def test_without_photographs_the_middle_of_the_splats_is_seen_from_three_sides(
 
 
 @pytest.mark.parametrize("name", ["usda", "usdc", "usdz"])
-def test_the_usd_librarys_own_validators_have_nothing_to_say(
+def test_the_usd_librarys_validators_find_no_errors(
     scene: SmallScene, tmp_path: Path, name: str
 ) -> None:
     formats.write(tmp_path / f"a.{name}", scene.splats)

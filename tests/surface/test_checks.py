@@ -55,7 +55,7 @@ def test_the_glb_stands_upright_for_another_reader(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.faces, tent().faces)
 
 
-def test_the_glb_says_what_it_is(tmp_path: Path) -> None:
+def test_the_glb_declares_what_it_is(tmp_path: Path) -> None:
     assert write(tmp_path / "a.mesh.glb", tent(), "arbitrary") == ""
     document = GLTF2().load(str(tmp_path / "a.mesh.glb"))
     assert "collision proxy" in document.asset.generator

@@ -48,7 +48,7 @@ def asset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(levels, "_FEWEST", 600)
     monkeypatch.setattr(streamed_sog, "LEAF", 1000)
     monkeypatch.setattr(streamed_sog, "CHUNK_SPLATS", 3000)
-    formats.write(tmp_path / "a" / "lod-meta.json", wall(SPLATS))
+    levels.write(tmp_path / "a" / "lod-meta.json", wall(SPLATS))
     return tmp_path / "a" / "lod-meta.json"
 
 
