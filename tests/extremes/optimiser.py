@@ -46,7 +46,7 @@ def out_of_range(backend):
 
 
 def switched_on_late(backend):
-    """At step 1000: a band that had no part before; the opacity, begun anew."""
+    """At step 1000: an SH degree that had no part before; the opacity, begun anew."""
     r = np.random.default_rng(0)
     model, pool = _model(r), Pool(1)
     for _ in range(999):
@@ -57,7 +57,7 @@ def switched_on_late(backend):
     opacity = _strides(pool, model, 0, _strong(r))[OPACITY]
     what = "over its rate, less 1"
     return [
-        Measured(34, f"a band's first step {what}", worst(abs(band - 1)), FIRST_STEP),
+        Measured(34, f"an SH degree's first step {what}", worst(abs(band - 1)), FIRST_STEP),
         Measured(34, f"opacity's first step after a reset {what}", abs(opacity - 1), FIRST_STEP),
     ]
 

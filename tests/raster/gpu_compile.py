@@ -25,7 +25,7 @@ FLOATS, DOUBLES, INTS, LONGS, BYTES, SHORTS = "*fp32", "*fp64", "*i32", "*i64", 
 POINTERS = {
     **dict.fromkeys(("cam", "sums"), DOUBLES),
     **dict.fromkeys(("members", "last", "counts", "row_of", "steps", "gradient_count"), INTS),
-    **dict.fromkeys(("starts", "slots", "firsts", "order", "settled", "ends", "total"), LONGS),
+    **dict.fromkeys(("starts", "slots", "firsts", "order", "ordered", "ends", "total"), LONGS),
     **dict.fromkeys(("status",), BYTES),
     **dict.fromkeys(("target",), "*u8"),
     **dict.fromkeys(("tile_of",), SHORTS),

@@ -1,1 +1,1 @@
-"""The CPU backend: Numba kernels, the same bytes for any number of threads."""
+"""The CPU backend: Numba kernels that give the same bytes for any number of threads."""

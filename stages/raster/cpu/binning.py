@@ -1,7 +1,7 @@
-"""Which splats touch which 16x16 tile, in blending order. Exact to 4x4 pixels: ellipses, not boxes.
+"""Lists of the splats that touch each 16x16 tile, in blending order.
 
-Tiles are first found splat by splat, in the order of rows, then laid out tile by tile, nearest
-first.
+Ellipses are tested exactly to blocks of 4x4 pixels. The tiles of each splat are found in the order
+of rows, then written tile by tile, nearest splat first.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from stages.raster.kernels.simd64 import (
 TILE = 16  # pixels across and down
 BLOCK = 4  # a tile is 4x4 blocks of 4x4 pixels
 CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
-# Columns of `places`, one line for each visible splat: its row, where its tiles were written, how
-# many they are, and the slot of its first gradient.
+# Columns of `places`, one row for each visible splat: its row in the input, the position and number
+# of its tiles, and the slot of its first gradient.
 ROW, FOUND, COUNT, SLOT = range(4)
 _LN2 = math.log(2.0)
 _HALF_LOG2E = 0.5 / _LN2
 _FAINTEST = math.log2(ALPHA_MIN)
 _FAR = 1e9
-BATCH = 32  # splats whose spans are found together
+BATCH = 32  # splats whose spans are computed together
 _EIGHT = np.arange(8.0)
 
 
@@ -67,13 +67,13 @@ def radix_order(keys, order, keys2, order2):
             counts[digit] = to + 1
             keys2[to] = keys[i]
             order2[to] = order[i]
-        for i in range(n):  # as slices they would be checked to be of one length, by much code
+        for i in range(n):  # slices would add much code that checks their lengths
             keys[i], order[i] = keys2[i], order2[i]
 
 
 @kernel
 def sort_by_depth(visible, paint, arrays, keys, order, keys2, order2):
-    """order [V]: places in `visible`, nearest first; see `_comes_before` for equal depths."""
+    """order [V]: indices into `visible`, nearest first; see `_comes_before` for equal depths."""
     for place in range(len(visible)):
         keys[place] = paint[visible[place], 3]
         order[place] = place
@@ -84,7 +84,7 @@ def sort_by_depth(visible, paint, arrays, keys, order, keys2, order2):
 
 @kernel
 def _comes_before(p, q, visible, means, quaternions, log_scales, opacity_logits, sh):
-    """The documented order of equal depths: by the splats' own values, place against place."""
+    """The order of equal depths that `reference` defines: by the splats' own values."""
     i, j = visible[p], visible[q]
     for k in range(3):
         if means[i, k] != means[j, k]:
@@ -106,9 +106,10 @@ def _comes_before(p, q, visible, means, quaternions, log_scales, opacity_logits,
 
 @kernel
 def sort_ties(keys, order, visible, means, quaternions, log_scales, opacity_logits, sh):
-    """Sort runs of equal keys by value (a heap sort: a flat wall can hold thousands of ties).
+    """Sort runs of equal keys by the splats' values. A heap sort, because a flat wall can have
+    thousands of ties.
 
-    order: places in `visible`, which holds the rows.
+    order: indices into `visible`, which holds the rows.
     """
     n = len(order)
     start = 0
@@ -126,7 +127,7 @@ def sort_ties(keys, order, visible, means, quaternions, log_scales, opacity_logi
 def _heap_sort(run, visible, means, quaternions, log_scales, opacity_logits, sh):
     n = len(run)
     for step in range(n // 2 - 1 + n):
-        # first build the heap from the last parent up, then move the largest to the end
+        # build the heap from the last parent up, then move the largest to the end
         if step < n // 2:
             root, size = n // 2 - 1 - step, n
         else:
@@ -158,15 +159,15 @@ def _pixel_range(low, high, n):
 
 @kernel
 def _reach2(level):
-    """Squared reach, in sigmas, of a splat of log2 opacity `level`; a hair more, so that rounding
-    never takes a pixel that the blending would draw."""
+    """Squared radius, in sigmas, at which a splat of log2 opacity `level` reaches ALPHA_MIN. It is
+    slightly enlarged, so that rounding never loses a pixel that blending would draw."""
     return 2.0 * _LN2 * max(level - _FAINTEST, 0.0) * 1.00001 + 1e-5
 
 
 @kernel
 def bound_tiles(ticket, visible, geometry, width, height, bounds):
-    """bounds[place]: tiles of a visible splat's bounding box and one more: what `find_tiles` may
-    write."""
+    """bounds[place]: number of tiles of a visible splat's bounding box, plus one: the most that
+    `find_tiles` writes."""
     n = len(visible)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:
@@ -187,12 +188,11 @@ def bound_tiles(ticket, visible, geometry, width, height, bounds):
 
 @kernel
 def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
-    """First (spans[at : at + 8]) and last (the 8 after) of the 4-pixel columns that a splat touches
-    in each of the eight block rows from pixel row `top` on; far and -1 where none.
+    """First (spans[at : at + 8]) and last (the next 8) of the 4-pixel columns that a splat touches
+    in each of the eight block rows from pixel row `top` on; _FAR and -1 where it touches none.
 
-    y0, y1: the pixel rows that it touches. In a slab of y the ellipse reaches furthest right where
-    its right end lies, or as near to it as the slab goes: at y there, to
-    slope y + sqrt((reach^2 - y^2 / c) det / c).
+    y0, y1: the pixel rows that it touches. Within a slab of rows the ellipse extends furthest right
+    at the row y nearest to its rightmost point, to slope y + sqrt((reach^2 - y^2 / c) det / c).
     """
     x, y = geometry[row, GX], geometry[row, GY]
     a, c = geometry[row, GVX], geometry[row, GVY]
@@ -210,7 +210,7 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
     right = slope * y_at + dsqrt(dmax(rest * (reach2 - y_at * y_at * per_c), 0.0))
     y_at = dmin(dmax(low, -right_end), high)
     left = slope * y_at - dsqrt(dmax(rest * (reach2 - y_at * y_at * per_c), 0.0))
-    # first and last pixel whose centre lies within, then their blocks
+    # first and last pixel whose centre is inside, then their blocks
     first = dmax(dceil(dmin(left + (x - 0.5), width + 1.0)), 0.0)
     last = dmin(dfloor(dmax(right + (x - 0.5), -2.0)), width - 1.0)
     first_block, last_block = dfloor(first * (1.0 / BLOCK)), dfloor(last * (1.0 / BLOCK))
@@ -221,7 +221,7 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
 
 @kernel
 def _mask(spans, q0, tile_x):
-    """Which blocks of tile column tile_x the four block rows from spans[q0] on touch."""
+    """Mask of the blocks of tile column tile_x that the four block rows from spans[q0] on touch."""
     mask = 0
     for q in range(4):
         low = min(max(spans[q0 + q] - 4 * tile_x, 0), 4)
@@ -232,10 +232,10 @@ def _mask(spans, q0, tile_x):
 
 @kernel
 def _emit_tile_row(spans, q0, tile_row, at, tiles, masks):
-    """Write the tiles of one tile row, whose block rows are the four from spans[q0] on, from
-    position `at` on; the position after them. tile_row: number of the row's first tile.
+    """Write the tiles of one tile row from position `at` on; returns the position after them.
 
-    Two tiles are written without asking whether they are touched, and taken back if not.
+    The tile row's block rows are the four from spans[q0] on. tile_row: number of its first tile.
+    Two tiles are written without a branch; the position does not advance if they are not touched.
     """
     least = min(min(spans[q0], spans[q0 + 1]), min(spans[q0 + 2], spans[q0 + 3]))
     most = max(max(spans[q0 + 8], spans[q0 + 9]), max(spans[q0 + 10], spans[q0 + 11]))
@@ -253,9 +253,10 @@ def _emit_tile_row(spans, q0, tile_row, at, tiles, masks):
 
 @kernel
 def _span_batch(first, last, visible, geometry, width, height, places, groups, spans):
-    """Block spans of the places first..last, two tile rows a group; the number of groups.
+    """Block spans of visible splats first..last, in groups of two tile rows; returns the number of
+    groups.
 
-    groups [G, 2]: the place, and its upper tile row. spans [16 G]: see `_block_spans`.
+    groups [G, 2]: index of the splat, and the upper tile row. spans [16 G]: see `_block_spans`.
     """
     n = 0
     for place in range(first, last):
@@ -274,12 +275,12 @@ def _span_batch(first, last, visible, geometry, width, height, places, groups, s
 
 @kernel
 def find_tiles(ticket, visible, geometry, width, height, places, tiles, masks):
-    """The tiles that each visible splat touches, from places[place, FOUND] on; ROW and COUNT.
+    """Write the tiles that each visible splat touches from places[place, FOUND] on, ROW and COUNT.
 
-    tiles: number of the tile. masks: which of its 4x4-pixel blocks, bit 4 row + column.
+    tiles: number of the tile. masks: its touched 4x4-pixel blocks, bit 4 row + column.
 
-    Spans are computed for a batch of splats before any is walked through: how many tiles a splat
-    has cannot be guessed, and a wrong guess is cheap only once the numbers are at hand.
+    Spans are computed for a batch of splats before their tiles are written: the number of tiles is
+    unpredictable, and a mispredicted branch costs least when its operands are ready.
     """
     tiles_x = (width + TILE - 1) // TILE
     most = BATCH * ((height + TILE - 1) // TILE // 2 + 1)
@@ -307,14 +308,14 @@ def find_tiles(ticket, visible, geometry, width, height, places, tiles, masks):
 
 @kernel
 def _look_ahead(rank, last, order, places, tiles):
-    """Ask for what later ranks will read; it may lie anywhere."""
+    """Prefetch what later ranks read; it is not contiguous."""
     prefetch(places, 4 * np.int64(order[min(rank + 16, last)]))
     prefetch(tiles, np.int64(places[order[min(rank + 8, last)], FOUND]))
 
 
 @kernel
 def count_tiles(ticket, order, places, tiles, tile_counts):
-    """tile_counts[chunk, tile]: entries, by chunk of the blending order."""
+    """tile_counts[chunk, tile]: number of entries, by chunk of the blending order."""
     n = len(order)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:
@@ -330,9 +331,9 @@ def count_tiles(ticket, order, places, tiles, tile_counts):
 
 @kernel
 def scan_counts(tile_counts, tile_starts):
-    """Turn counts into positions: tile_counts becomes where each chunk writes in each tile's list.
+    """Turn counts into positions: where each chunk writes in each tile's list.
 
-    tile_starts [tiles + 1]. Returns the number of intersections.
+    tile_starts [tiles + 1] is filled, too. Returns the number of intersections.
     """
     total = 0
     for tile in range(tile_counts.shape[1]):
@@ -347,8 +348,8 @@ def scan_counts(tile_counts, tile_starts):
 
 @kernel
 def fill_tiles(ticket, order, places, tiles, found_masks, positions, members, slots, masks):
-    """Write each tile's list, nearest first: the row, the slot where its gradient goes (splat by
-    splat, in the order of rows), the mask of its blocks."""
+    """Write each tile's list, nearest first: the splat's row, the slot of its gradient (slots are
+    ordered by row), and the mask of its blocks."""
     n = len(order)
     size = (n + CHUNKS - 1) // CHUNKS
     while True:

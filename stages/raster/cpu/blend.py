@@ -1,12 +1,11 @@
-"""Blending the splats of a tile, near to far, and the gradient back through it, far to near.
+"""Blending of a tile's splats from near to far, and its backward pass from far to near.
 
-A tile is 16x16 pixels in blocks of 4x4; a block is one vector. A splat is drawn in those blocks
-only that its ellipse touches. Per (splat, tile) the exponent is rewritten in float64 around the
-tile's first pixel, so that everything that runs in float32 is small:
+A tile has 16x16 pixels in blocks of 4x4; a block is one vector. A splat is drawn only in the blocks
+that its ellipse touches. For each (splat, tile) the exponent is expressed in float64 around the
+tile's first pixel, so that all float32 values are small:
     log2 alpha = log2 opacity - (A u)^2 - (B t)^2,
-u the pixel's offset along the axis of the larger variance, t across. `alpha_of` is the one
-function for both directions: alpha must be the same to the last bit, since the way back divides by
-1 - alpha.
+with u the pixel's offset along the axis of the larger variance and t across it. Both passes use
+`alpha_of`: alpha must be the same to the last bit, because the backward pass divides by 1 - alpha.
 """
 
 from __future__ import annotations
@@ -61,14 +60,14 @@ from stages.raster.kernels.simd import (
 # Planes of a tile's work, forward and backward.
 RED, GREEN, BLUE, ALPHA, DEPTH, MEDIAN, TRANSMITTANCE, LAST = (k * PIXELS for k in range(8))
 V_RED, V_GREEN, V_BLUE, PASSING, BEHIND = (k * PIXELS for k in range(5))
-# What the way back leaves of a splat, sums over a tile's pixels: of v u, v t, v u^2, v t^2, v u t
-# and v, with v the gradient that reaches a pixel's exponent; of the gradients by three colours.
+# Results of the backward pass for a splat, sums over a tile's pixels: of v u, v t, v u^2, v t^2,
+# v u t and v, with v the gradient with respect to a pixel's exponent; the three colours' gradients.
 S_U, S_T, S_UU, S_TT, S_UT, S_1, S_RED = range(7)
 SUMS = S_RED + 3
-AHEAD = 6  # entries: how early a splat's record is asked for
+AHEAD = 6  # entries by which a splat's record is prefetched
 _F = np.float32
 _ALPHA_MIN, _ALPHA_MAX, _T_MIN = _F(ALPHA_MIN), _F(ALPHA_MAX), _F(TRANSMITTANCE_MIN)
-_FAINTEST = _F(-115.0)  # log2 of alpha: below it `vexp2` would leave its range
+_FAINTEST = _F(-115.0)  # log2 of alpha; `vexp2` is not valid much below
 _HALF = _F(0.5)
 
 
@@ -128,8 +127,8 @@ def _sums_frame(geometry, row, tile_x, tile_y, width, height):
 
 @kernel
 def alpha_of(frame, block):
-    """Of the 16 pixels of a block: alpha before the cap, and what takes offsets of the first block
-    to those of this one, along and across."""
+    """Of the 16 pixels of a block: alpha before the cap, and the differences between the offsets of
+    this block and of the first, along and across."""
     major, a, b, slope, level, us, ts = frame
     along = splat16(_STEPS[major + block])
     across = vfma(slope, along, splat16(_STEPS[16 - major + block]))
@@ -142,10 +141,10 @@ def alpha_of(frame, block):
 def blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, paint, depths, work):
     """Blend entries start..end of the lists into `work` (planes as above).
 
-    alive: mask of the blocks that still want light. depths: whether the depth planes are wanted.
+    alive: mask of the blocks with unfinished pixels. depths: whether to fill the depth planes.
 
-    Rows of arrays are reached by index, never sliced: a slice counts references, and threads would
-    fight over the counter. Nothing is skipped for want of a drawn pixel: a wrongly guessed branch
+    Rows of arrays are accessed by index, never sliced: a slice changes a reference count, which
+    threads would contend for. Blocks without a drawn pixel are not skipped: a mispredicted branch
     costs more than a block.
     """
     zero, one = splat16(_F(0.0)), splat16(_F(1.0))
@@ -190,7 +189,7 @@ def blend_tile(tile_x, tile_y, start, end, alive, members, masks, geometry, pain
 
 @kernel
 def _finish_tile(background, depths, work):
-    """Background behind what was blended; alpha; sums of depths to means."""
+    """Add the background, fill alpha, and turn sums of depths into means."""
     one, least = splat16(_F(1.0)), splat16(_F(0.5) * _ALPHA_MIN)
     for at in range(0, PIXELS, 16):
         passed = vload(work, TRANSMITTANCE + at)
@@ -223,8 +222,8 @@ def blend_tiles(
     """Draw every tile. image [4 or 6, H, W] float32: red, green, blue, alpha; if `depths`, then
     expected and median depth.
 
-    light, last [tiles, 256] float32, block by block: what the way back needs: the light that
-    passes at the end and the number of the last entry drawn, NEVER where a pixel was not finished.
+    transmittance, last [tiles, 256] float32, block by block, for the backward pass: the final
+    transmittance, and the number of the last entry drawn (NEVER where a pixel was not finished).
     """
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
@@ -319,11 +318,11 @@ def blend_gradient_tiles(
 def entry_gradient(
     frame, from_origin, number, blocks, paint, row, work, last, last_at, gradients, slot
 ):
-    """Gradient of one splat in one tile into gradients[slot]: see SUMS, u and t from the origin of
-    `sums_origin`.
+    """Gradient of one splat in one tile into gradients[slot]: see SUMS; u and t from the origin
+    of `sums_origin`.
 
-    work: the incoming gradient, the light that passes behind the splat, and what lies behind
-    weighted by the incoming gradient (a suffix sum). The last two move in front of it.
+    work: the incoming gradient; the transmittance behind the splat; the colour behind it times the
+    incoming gradient (a suffix sum). The last two are updated to in front of the splat.
     """
     r, g, bl = splat16(paint[row, 0]), splat16(paint[row, 1]), splat16(paint[row, 2])
     zero, one = splat16(_F(0.0)), splat16(_F(1.0))
@@ -349,7 +348,7 @@ def entry_gradient(
         after = vload(work, BEHIND + at)
         vstore(work, BEHIND + at, vfma(weight, shade, after))
         v = alpha * (after * inverse - before * shade)
-        v = vselect(vgt(splat16(_ALPHA_MAX), raw), v, zero)  # the cap passes nothing on
+        v = vselect(vgt(splat16(_ALPHA_MAX), raw), v, zero)  # no gradient where alpha is capped
         u, t = us + along, ts + across
         by_u, by_t = v * u, v * t
         v_1 = v_1 + v

@@ -1,13 +1,13 @@
-"""What each splat is worth to a picture: its weights, the exact change of the squared error if it
-were removed, and what tells that change if its colour were another.
+"""Contributions of each splat to a picture: its blend weights, the exact change of the squared
+error if it is removed, and the terms of that change for any other colour.
 
 Colour is affine in each alpha, so removing one splat changes a pixel by
     dI = -w c + behind alpha / (1 - alpha),
-w its blend weight, c its colour, "behind" what is composited behind it (background included, light
-at its place included); the squared error against a photograph changes by 2 r dI + dI^2, r the
-residual. A colour that changes by d changes a pixel by w d, and so the error by 2 d sum(w r) + d^2
-sum(w^2), channel by channel. Exact but for pixels that the stopping rule or the alpha cut-off would
-treat otherwise.
+with w its blend weight, c its colour and "behind" what is composited behind it, background and
+transmittance included. The squared error against a photograph changes by 2 r dI + dI^2, with r the
+residual. A colour change d changes a pixel by w d, and so the error by 2 d sum(w r) + d^2 sum(w^2)
+in each channel. This is exact except in pixels where the stopping rule or the alpha cut-off would
+then act differently.
 """
 
 from __future__ import annotations

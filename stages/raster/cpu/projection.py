@@ -1,7 +1,7 @@
-"""Footprints of splats on the picture, and the way back to their parameters, eight at a time.
+"""Projection of splats to footprints, and its backward pass to their parameters, eight at a time.
 
-All of it in float64: eight lanes of it cost little beside blending, and it takes overflow, the loss
-of the determinant and far-away centres off the list of worries. Formulas as in `reference`.
+Everything is in float64, which costs little beside blending and avoids overflow, cancellation in
+the determinant, and loss of precision for distant means. Formulas as in `reference`.
 """
 
 from __future__ import annotations
@@ -252,13 +252,13 @@ def geometry_records(cam, w, rows, geometry):
 
 @kernel
 def sums_origin(geometry, row, width, height):
-    """(o, p, q): where the offsets u' and t' of the way back begin, pixels.
+    """(o, p, q): origin of the offsets u' and t' in the backward pass, pixels.
 
     u' = major - o, t' = (minor - q) - K (major - p), major and minor a pixel's coordinates along
-    the axis of the larger variance and along the other. They begin at a mean in the picture; beside
-    a mean out of it where they are least in the picture, so that neither is larger than that. Sums
-    from a mean 1e5 pixels away would keep few digits of where the pixels are, and all that a step
-    of the mean along its ray changes is in those.
+    the axis of the larger variance and along the other. The origin is the mean if it is in the
+    picture, otherwise the point of the picture where the offsets are smallest.
+    Sums of offsets from a mean 1e5 pixels away would keep few digits of the pixels' positions,
+    which decide the gradient along the viewing ray.
     """
     x, y = geometry[row, GX], geometry[row, GY]
     wide = geometry[row, GVX] >= geometry[row, GVY]
@@ -282,8 +282,8 @@ def sums_origin(geometry, row, width, height):
 def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_near, g_opacity, smoothed, out):
     """Chain rule from the footprints of eight splats to their parameters.
 
-    Gradients of mean x, mean y (px), of A, B, K of the exponent A u^2 + B (v - K u)^2, of the
-    logarithm of 1 / z through that exponent, and of the opacity drawn.
+    Gradients of mean x, mean y (px), of A, B, K of the exponent A u^2 + B (v - K u)^2, of
+    ln(1 / z) through that exponent, and of the drawn opacity.
     smoothed: whether a smoothing filter was used.
     out (work of GRADIENTS entries): gradients of mean, quaternion, log-scales, opacity logit.
     """
@@ -340,8 +340,8 @@ def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_near, g_opacity, smoot
 
 @kernel
 def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_near, out):
-    """out[MEAN] from the gradients of the mean on the picture, of the Jacobian's last column, and
-    of the logarithm of 1 / z with slopes held still."""
+    """out[MEAN] from the gradients of the projected mean, of the Jacobian's last column, and of
+    ln(1 / z) at fixed slopes."""
     fx, fy = cam[FX], cam[FY]
     z, u, v = at(w, Z), at(w, SLOPE), at(w, SLOPE + 1)
     # a slope inside its limits moves with the mean; a clamped one does not
@@ -355,7 +355,7 @@ def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_near, out):
 
 @kernel
 def _quaternion_gradient(cam, w, out):
-    """out[ROTATION] from the gradient of W R that stands in the work's AXES."""
+    """out[ROTATION] from the gradient of W R, which is in the work's AXES."""
     q0, q1 = at(w, QUATERNION), at(w, QUATERNION + 1)
     q2, q3 = at(w, QUATERNION + 2), at(w, QUATERNION + 3)
     g0, g1, g2 = at(w, AXES), at(w, AXES + 3), at(w, AXES + 6)
@@ -390,7 +390,7 @@ def _fill(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, 
 def footprint_values(
     row: int, cam: NDArray[np.float64], arrays: tuple[NDArray[np.float32], ...]
 ) -> NDArray[np.float64]:
-    """[WORK_ROW] what `footprint` makes of one row, for looking at."""
+    """[WORK_ROW] the result of `footprint` for one row, for tests."""
     work = np.zeros(WORK_ROW * LANES)
     rows = np.full(LANES, row, np.int64)
     _fill(rows, cam, *arrays[:4], np.zeros(0, np.float32), work)

@@ -1,4 +1,4 @@
-"""The CPU backend: Numba kernels, forward and backward, with buffers that are kept and reused."""
+"""The CPU backend: Numba kernels, forward and backward, with reused buffers."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from stages.raster.definition import (
 from stages.raster.kernels.pool import Pool, default_pool
 from stages.scene import Camera
 
-CHUNK = 512  # splats a ticket; whole vectors
+CHUNK = 512  # splats for each ticket; whole vectors
 
 
 class Buffers:
-    """Arrays by name that only ever grow, so that a training step allocates next to nothing."""
+    """Arrays by name that only grow, so that a training step allocates almost nothing."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
@@ -48,8 +48,8 @@ class Buffers:
         return have[:size].reshape(shape)
 
     def carve(self, *wanted: tuple[tuple[int, ...], Any]) -> list[NDArray[Any]]:
-        """Uninitialised arrays of (shape, dtype) out of one buffer that all such calls share: what
-        the last call gave is overwritten by the next."""
+        """Uninitialised arrays of (shape, dtype) from one buffer that all calls share: each call
+        invalidates the arrays of the one before."""
         sizes = [int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in wanted]
         ends = np.cumsum([-(-size // 64) * 64 for size in sizes])
         arena = self.get("scratch", (int(ends[-1]),), np.uint8)
@@ -62,11 +62,11 @@ class Buffers:
 
 @dataclass(frozen=True)
 class TileLists:
-    """What each tile draws, nearest first: entries starts[t]..starts[t + 1].
+    """The splats of each tile, nearest first: entries starts[t]..starts[t + 1] for tile t.
 
     members [I]: row of the splat. slots [I]: where the entry's gradient goes; the slots of a splat
-    follow each other. masks [I]: which 4x4 blocks of the tile the splat touches. places [V, 4]: for
-    each visible splat its row, its slots' number and first; see `binning`.
+    are contiguous. masks [I]: 4x4 blocks of the tile that the splat touches. places [V, 4]: row,
+    number of slots and first slot of each visible splat; see `binning`.
     """
 
     starts: NDArray[np.int64]
@@ -81,12 +81,12 @@ class TileLists:
 
 @dataclass(frozen=True)
 class Forward:
-    """What a forward pass leaves for the way back.
+    """The result of a forward pass, with what the backward pass needs.
 
-    image [4 or 6, H, W]: RGB, alpha, and if asked for expected and median depth. visible [V] int32:
-    rows of the splats that touch the picture, ascending. geometry, paint: of all rows (of visible
-    ones filled). light, last: see `blend.blend_tiles`. The arrays belong to the rasteriser's
-    buffers: valid until its next forward pass.
+    image [4 or 6, H, W]: RGB, alpha, and if requested expected and median depth. visible [V] int32:
+    rows of the splats that touch the picture, ascending. geometry, paint: of all rows, filled for
+    visible ones. transmittance, last: see `blend.blend_tiles`. The arrays are buffers of the
+    rasteriser, valid until its next forward pass.
     """
 
     image: NDArray[np.float32]
@@ -109,7 +109,7 @@ class Forward:
 
 
 class CpuRasteriser:
-    """Draws and differentiates. One instance a thread of control; it owns its buffers."""
+    """Draws and differentiates. An instance owns buffers: one thread at a time may use it."""
 
     def __init__(self, pool: Pool | None = None) -> None:
         self.pool = pool or default_pool()
@@ -123,10 +123,7 @@ class CpuRasteriser:
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
         depths: bool = False,
     ) -> Forward:
-        """arrays: means, quaternions, log_scales, opacity_logits, sh (C-contiguous).
-
-        smoothing [N]: see `raster.smoothing`. depths: whether to draw the depth planes.
-        """
+        """See `definition.Rasteriser`."""
         cam = camera_row(camera, settings)
         degree = min(settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1)
         width, height = camera.width, camera.height
@@ -182,7 +179,7 @@ class CpuRasteriser:
         v_image: NDArray[np.float32],
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
     ) -> Backward:
-        """Gradients of the visible splats, from v_image [3, H, W]."""
+        """See `definition.Rasteriser`."""
         n = len(forward.visible)
         get = self.buffers.get
         (raw,) = self.buffers.carve(((forward.n_intersections, blend.SUMS), np.float32))
@@ -222,7 +219,7 @@ class CpuRasteriser:
         planes: NDArray[np.float32],
         out: NDArray[np.float32],
     ) -> None:
-        """A pass from far to near over every tile's list; one row of `out` for each entry."""
+        """Run a kernel from far to near over every tile's list; one row of `out` for each entry."""
         self.pool.share(
             kernel,
             forward.width,
@@ -294,9 +291,9 @@ class CpuRasteriser:
 
 
 def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:
-    """starts: the sum of all counts before; returns the sum of all.
+    """Fill `starts` with the sums of all counts before; returns the total.
 
-    Raises MemoryError where it does not fit into 31 bits: 2 billion entries take 90 GB.
+    Raises MemoryError if it needs more than 31 bits: 2 billion entries take 90 GB.
     """
     total = int(counts.sum(dtype=np.int64))
     if total >= 2**31:

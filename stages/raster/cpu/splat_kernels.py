@@ -1,4 +1,4 @@
-"""The kernels that run over splats: projecting, shading, and gathering gradients."""
+"""Kernels over splats: projection, colour, and gathering of gradients."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ from stages.raster.kernels.simd64 import (
 )
 
 OUT_OF_VIEW, VISIBLE, CULLED = 0, 1, 2
-LARGEST = 3.4e38  # what float32 holds: no gradient is handed on as infinite
-_BRIGHTEST = float(np.float32(COLOUR_MAX))  # as it is kept in the paint
+LARGEST = 3.4e38  # near the largest float32: no gradient becomes infinite
+_BRIGHTEST = float(np.float32(COLOUR_MAX))  # in float32, as in `paint`
 _LN2 = math.log(2.0)
 
 
 @kernel
 def _name_rows(rows, start, end):
-    """The next eight rows from `start`; beyond `end` the last one again."""
+    """The next eight rows from `start`; the last one is repeated beyond `end`."""
     for lane in range(LANES):
         rows[lane] = min(start + lane, end - 1)
 
@@ -79,7 +79,7 @@ def _colours_are_finite(i, sh):
 
 @kernel
 def _block_of_colours_is_finite(start, sh):
-    """Whether eight rows from `start` hold finite colours only; 0 x value is 0 for those."""
+    """Whether eight rows from `start` have finite colours only; 0 x value is 0 for these."""
     size = sh.shape[1] * 3
     nothing = spread8(0.0)
     for k in range(size):
@@ -171,7 +171,7 @@ def _shade(rows, cam, degree, means, sh, basis, paint):
 
 @kernel
 def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, weights, work, out):
-    """SH gradients into out[places, SH:]; the direction's are added to the means' in `work`."""
+    """SH gradients into out[places, SH:]; the directions' are added to the means' in `work`."""
     coefficients = (degree + 1) * (degree + 1)
     x, y, z, distance = _direction(rows, cam, means)
     sh_basis(degree, x, y, z, basis)
@@ -179,7 +179,7 @@ def _colour_gradient(rows, places, cam, degree, means, sh, paint, sums, basis, w
     for coefficient in range(coefficients):
         put(weights, coefficient, spread8(0.0))
     for channel in range(3):
-        # a colour that is clamped passes nothing on
+        # a clamped colour has no gradient
         colour = gather8(paint, rows, 4, channel)
         painted = dand(dgt(colour, 0.0), dgt(_BRIGHTEST, colour))
         g = dselect(painted, at(sums, S_RED + channel), 0.0)
@@ -229,7 +229,7 @@ def splat_gradients(
     out,
     means2d,
 ):
-    """Sum each splat's (splat, tile) gradients, in a fixed order, and take them to parameters.
+    """Sum each splat's (splat, tile) gradients in a fixed order, and continue to its parameters.
 
     splats [V, 4]: `TileLists.places`.
     """
@@ -273,8 +273,8 @@ def splat_gradients(
 
 @kernel
 def _shifts(rows, cam, geometry, shifts):
-    """Where the sums of eight rows begin (see `sums_origin`), along and across: less the mean (0:2)
-    and less the principal point (2:4), each 8 lanes of `shifts`."""
+    """The origins of the sums of eight rows (see `sums_origin`), along and across: minus the mean
+    (0:2) and minus the principal point (2:4), each 8 lanes of `shifts`."""
     for lane in range(LANES):
         row = rows[lane]
         o, p, q = sums_origin(geometry, row, cam[WIDTH], cam[HEIGHT])
@@ -292,9 +292,9 @@ def _exponent_gradient(rows, cam, geometry, w, sums, shifts, smoothed, places, m
     """From the sums over pixels that `blend.entry_gradient` describes to means2d and to the
     parameters' gradients in `work`.
 
-    With q the exponent's gradient by a pixel's offset, p a pixel and c the principal point, the
-    exponent falls with the logarithm of 1 / z as q (p - c) - e q^2: what becomes of moving the mean
-    and what becomes of scaling the footprint, each as large as the mean is far, is never formed.
+    With q the exponent's gradient with respect to a pixel's offset, p a pixel and c the principal
+    point, the derivative of the exponent by ln(1 / z) is -(q (p - c) - e q^2). So the two large
+    terms that cancel for a distant mean (its motion, and the footprint's scaling) are never formed.
     """
     root_a = gather8(geometry, rows, GEOMETRY_ROW, GA)
     root_b, k = gather8(geometry, rows, GEOMETRY_ROW, GB), gather8(geometry, rows, GEOMETRY_ROW, GK)
@@ -323,7 +323,7 @@ def _exponent_gradient(rows, cam, geometry, w, sums, shifts, smoothed, places, m
 
 @kernel
 def sh_basis_values(degree, directions):
-    """[N, (degree + 1)^2] basis functions of unit directions [N, 3], for looking at."""
+    """[N, (degree + 1)^2] basis functions of unit directions [N, 3], for tests."""
     n, coefficients = len(directions), (degree + 1) * (degree + 1)
     out = np.empty((n, coefficients), np.float64)
     basis = np.empty(16 * LANES, np.float64)

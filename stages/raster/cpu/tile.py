@@ -1,4 +1,4 @@
-"""One tile of 16x16 pixels while it is worked on: planes of 256 floats, 4x4 pixels a vector.
+"""The working memory of one tile of 16x16 pixels: planes of 256 floats, 4x4 pixels a vector.
 
 Plane p of a tile's work holds block b (b % 4 across, b // 4 down) at p + 16 b, row by row.
 """
@@ -18,13 +18,13 @@ from stages.raster.kernels.simd import (
 
 PIXELS = TILE * TILE
 BLOCKS = 16
-NEVER = np.float32(3e38)  # "last entry drawn" of a pixel that was never finished
+NEVER = np.float32(3e38)  # the last entry drawn in a pixel that was not finished
 _F = np.float32
 
 
 @kernel
 def load_plane(picture, channel, tile_x, tile_y, work, plane):
-    """A tile of picture[channel] into a plane of `work`; 0 beyond the picture's rim."""
+    """A tile of picture[channel] into a plane of `work`; 0 outside the picture."""
     height, width = picture.shape[1], picture.shape[2]
     left, top = tile_x * TILE, tile_y * TILE
     if left + TILE <= width and top + TILE <= height:
@@ -42,7 +42,7 @@ def load_plane(picture, channel, tile_x, tile_y, work, plane):
 
 @kernel
 def store_plane(picture, channel, tile_x, tile_y, work, plane):
-    """The way back of `load_plane`."""
+    """The inverse of `load_plane`."""
     height, width = picture.shape[1], picture.shape[2]
     left, top = tile_x * TILE, tile_y * TILE
     if left + TILE <= width and top + TILE <= height:
@@ -60,9 +60,9 @@ def store_plane(picture, channel, tile_x, tile_y, work, plane):
 
 @kernel
 def start_transmittance(tile_x, tile_y, width, height, work, transmittance, last):
-    """Light 1 and last NEVER in the tile's pixels; 0 and 0 in those beyond the picture's rim.
+    """Transmittance 1 and last NEVER in the tile's pixels; 0 and 0 outside the picture.
 
-    light, last: planes of `work`. Returns the mask of blocks that lie in the picture.
+    transmittance, last: planes of `work`. Returns the mask of blocks in the picture.
     """
     alive = 0
     for block in range(BLOCKS):

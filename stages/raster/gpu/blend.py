@@ -1,8 +1,8 @@
-"""Blending the splats of a tile, near to far, and the gradient back through it, far to near.
+"""Blending of a tile's splats from near to far, and its backward pass from far to near.
 
-A tile is one program of one warp: no barriers, and a splat's gradient is added up in registers and
-written once for each tile that it touches, to a place of its own, so that sums are made in a fixed
-order. `alpha_of` is the one function for both directions: the way back divides by 1 - alpha.
+A tile is one program of one warp, without barriers. A splat's gradient is summed in registers and
+written once for each tile that it touches, to a slot of its own, so that sums have a fixed order.
+Both passes use `alpha_of`, because the backward pass divides by 1 - alpha.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from stages.raster.gpu.project import (
 )
 
 TRANSMITTANCE_MIN = tl.constexpr(definition.TRANSMITTANCE_MIN)
-NEVER = tl.constexpr(2**30)  # "last entry drawn" of a pixel that was never finished
-PATIENCE = tl.constexpr(16)  # entries between two looks whether a tile is finished
-# What the way back leaves of a splat: see `cpu.blend.SUMS`.
+NEVER = tl.constexpr(2**30)  # the last entry drawn in a pixel that was not finished
+PATIENCE = tl.constexpr(16)  # entries between two checks whether a tile is finished
+# Results of the backward pass for a splat: see `cpu.blend.SUMS`.
 S_U, S_T, S_UU, S_TT, S_UT, S_1, S_RED = (tl.constexpr(k) for k in range(7))
 SUMS = tl.constexpr(9)
 
@@ -150,7 +150,7 @@ def furthest(starts, last, at, inside):
 
 @inner
 def origin_frame(record, x, y):
-    """(u, t) of the tile's first pixel from where the sums begin."""
+    """(u, t) of the tile's first pixel from the origin of the sums."""
     tall = tl.load(record + TALL)
     major, minor = x + tall * (y - x), y + tall * (x - y)
     t = (minor - tl.load(record + ORIGIN_CUT)) - tl.load(record + SLOPE_HI) * major
@@ -204,7 +204,7 @@ def blend_gradient_kernel(
         shade = tl.fma(v_b, tl.load(record + COLOUR + 2), shade)
         v = alpha * (behind * inverse - passing * shade)
         behind = tl.fma(weight, shade, behind)
-        v = tl.where(raw < ALPHA_MAX, v, 0.0)  # the cap passes nothing on
+        v = tl.where(raw < ALPHA_MAX, v, 0.0)  # no gradient where alpha is capped
         _, _, u_x, u_y, t_x, t_y = frame
         u, t = origin_frame(record, x, y)
         u = tl.fma(i + 0.0, u_x, tl.fma(j, u_y, u))

@@ -1,6 +1,6 @@
-"""Where the kernels run: a GPU, or Triton's interpreter on the CPU (TRITON_INTERPRET=1), for tests.
+"""The device of the Triton kernels: a GPU, or for tests Triton's interpreter (TRITON_INTERPRET=1).
 
-This module imports neither torch nor Triton before it is asked.
+torch and Triton are imported at first use.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stages.base.errors import Family, SplatError
 if TYPE_CHECKING:
     from stages.raster.definition import MemoryFull
 
-INSTALL = "docs/guide/gpu.md says which build of torch brings what is missing."
+INSTALL = "docs/guide/gpu.md says which build of torch to install."
 _OLDEST = (7, 0)  # compute capability that Triton compiles for
 BYTES_A_SPLAT = 1500  # of training, with degree 3 and 4 tiles a splat: docs/experiments/gpu.md
 _NVIDIA, _AMD = Path("/proc/driver/nvidia/version"), Path("/dev/kfd")  # there with their drivers
@@ -32,12 +32,12 @@ def interpreted() -> bool:
 
 
 def why_unavailable() -> str:
-    """Why the backend "gpu" is not to be chosen here by itself; "" where it is."""
+    """Why "auto" does not choose this backend on this machine; "" if it does."""
     return "Triton's interpreter is on, for tests" if interpreted() else missing()
 
 
 def missing() -> str:
-    """What keeps the kernels from a GPU; "" for nothing."""
+    """Why the kernels cannot use a GPU; "" if they can."""
     if importlib.util.find_spec("triton") is None:
         return "Triton is not installed"
     import torch
@@ -49,7 +49,7 @@ def missing() -> str:
     try:
         if torch.version.cuda and torch.cuda.get_device_capability() < _OLDEST:
             return f"{torch.cuda.get_device_name()} is too old for Triton"
-    except RuntimeError as error:  # another program may hold it for itself
+    except RuntimeError as error:  # another program may use it exclusively
         return f"the GPU does not answer: {str(error).splitlines()[0]}"
     if not os.environ.get("CC") and not any(map(shutil.which, _COMPILERS)):
         return "no C compiler found, which Triton needs once to launch its kernels"
@@ -57,7 +57,7 @@ def missing() -> str:
 
 
 def _unseen(cuda: str | None) -> str:
-    """Why a torch built for CUDA (else for ROCm) sees no card, as far as the system tells."""
+    """Why torch built for CUDA (or for ROCm if None) finds no card, as far as can be known."""
     nvidia, amd = _NVIDIA.exists(), _AMD.exists()
     if cuda and nvidia:
         return f"NVIDIA's driver {_driver()} is too old for CUDA {cuda}, or shows no card to it"
@@ -69,7 +69,7 @@ def _unseen(cuda: str | None) -> str:
 
 
 def _driver() -> str:
-    """NVIDIA's, by its number; "" where it does not tell."""
+    """Version of NVIDIA's driver; "" if unknown."""
     try:
         found = re.search(r"\b\d+\.\d+(\.\d+)?\b", _NVIDIA.read_text())
     except OSError:
@@ -78,7 +78,7 @@ def _driver() -> str:
 
 
 def require() -> Any:
-    """The torch device to run on. Raises SplatError where there is none."""
+    """The torch device to run on. Raises SplatError if there is none."""
     fault = missing() if not interpreted() else _no_triton()
     if fault:
         raise SplatError(
@@ -98,7 +98,7 @@ def _no_triton() -> str:
 
 
 def describe() -> str:
-    """Card, memory, driver, torch and Triton, in one line; of the interpreter as well."""
+    """Card, memory, and versions of driver, torch and Triton, in one line."""
     import torch
 
     if interpreted():
@@ -112,7 +112,7 @@ def describe() -> str:
 
 
 def built() -> str:
-    """Which torch, and which Triton."""
+    """Versions of torch and Triton."""
     import torch
 
     if importlib.util.find_spec("triton") is None:
@@ -124,7 +124,7 @@ def built() -> str:
 
 @contextmanager
 def gpu_errors_explained(splats: int) -> Iterator[None]:
-    """What a device refuses while it works on so many splats, as SplatError."""
+    """Turn errors of the device, while it works on so many splats, into SplatError."""
     import torch
 
     try:
@@ -139,14 +139,14 @@ def gpu_errors_explained(splats: int) -> Iterator[None]:
         raise SplatError(
             "raster-gpu-failed",
             given=f"The GPU stopped: {str(error).splitlines()[0]}.",
-            wanted="It must answer; another program may hold it for itself.",
+            wanted="A GPU that answers; another program may use it exclusively.",
             hint="Run `splat doctor`, see nvidia-smi or rocm-smi, or choose --backend cpu.",
             family=Family.RESOURCES,
         ) from error
 
 
 def out_of_memory(splats: int, free: int, held: int, total: int) -> MemoryFull:
-    """The error for `splats` splats that did not fit; bytes free, held by us, and on the card."""
+    """The error for splats that did not fit. Bytes: free, held by this process, total."""
     from stages.raster.definition import MemoryFull
 
     fits = splats // 2

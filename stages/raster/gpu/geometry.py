@@ -1,4 +1,4 @@
-"""Footprints of splats on the picture: what the way there and the way back both compute.
+"""Footprints of splats: what the forward and the backward pass both compute.
 
 Formulas as in `reference`, a splat a lane. REAL is the type that all of it runs in: float64 unless
 a test asks what float32 would leave of the extremes table. A row of parameters has the columns of a
@@ -61,7 +61,7 @@ def drawable(rows, at, mask, smoothing, i, STORED: tl.constexpr, SMOOTH: tl.cons
         good = good & is_finite(value)
         if (k >= LOG_SCALE) & (k < OPACITY):
             good = good & (value <= LOG_SCALE_MAX)
-    q0, q1, q2, q3 = quaternion(rows, at, mask, tl.float64)  # the bound is no float32
+    q0, q1, q2, q3 = quaternion(rows, at, mask, tl.float64)  # the bound is not exact in float32
     good = good & (largest4(q0, q1, q2, q3) >= QUATERNION_MIN)
     if SMOOTH:
         width = tl.load(smoothing + i, mask=mask, other=0.0).to(tl.float64)
@@ -108,7 +108,7 @@ def position(cam, rows, at, mask, REAL: tl.constexpr):
 
 @inner
 def turned(cam, x, y, z, REAL: tl.constexpr):
-    """A vector of the world, along the camera's axes."""
+    """A vector of the world in camera axes."""
     a = number(cam, 0, REAL) * x + number(cam, 1, REAL) * y + number(cam, 2, REAL) * z
     b = number(cam, 3, REAL) * x + number(cam, 4, REAL) * y + number(cam, 5, REAL) * z
     c = number(cam, 6, REAL) * x + number(cam, 7, REAL) * y + number(cam, 8, REAL) * z
@@ -117,7 +117,7 @@ def turned(cam, x, y, z, REAL: tl.constexpr):
 
 @inner
 def turned_back(cam, a, b, c, REAL: tl.constexpr):
-    """A vector along the camera's axes, in the world."""
+    """A vector in camera axes, in world axes."""
     x = number(cam, 0, REAL) * a + number(cam, 3, REAL) * b + number(cam, 6, REAL) * c
     y = number(cam, 1, REAL) * a + number(cam, 4, REAL) * b + number(cam, 7, REAL) * c
     z = number(cam, 2, REAL) * a + number(cam, 5, REAL) * b + number(cam, 8, REAL) * c
@@ -126,7 +126,7 @@ def turned_back(cam, a, b, c, REAL: tl.constexpr):
 
 @inner
 def slopes(cam, x, y, z, REAL: tl.constexpr):
-    """(u, v, whether u, whether v is inside): x/z and y/z, held within their limits."""
+    """(u, v, whether u, whether v is inside): x/z and y/z, clamped to their limits."""
     slope_x, slope_y = x / z, y / z
     u = tl.minimum(tl.maximum(slope_x, number(cam, LOW_X, REAL)), number(cam, HIGH_X, REAL))
     v = tl.minimum(tl.maximum(slope_y, number(cam, LOW_Y, REAL)), number(cam, HIGH_Y, REAL))
@@ -135,7 +135,7 @@ def slopes(cam, x, y, z, REAL: tl.constexpr):
 
 @inner
 def scale(rows, at, mask, width, k, SMOOTH: tl.constexpr, REAL: tl.constexpr):
-    """(scale along axis k under the smoothing filter, what that scale was before over it)."""
+    """(scale along axis k with the smoothing filter, ratio of the scale without it to that)."""
     s = tl.exp(column(rows, at, mask, LOG_SCALE + k, REAL))
     ratio = s * 0.0 + 1.0
     if SMOOTH:
@@ -149,7 +149,7 @@ def scale(rows, at, mask, width, k, SMOOTH: tl.constexpr, REAL: tl.constexpr):
 
 @inner
 def axis_x(cam, w, x, y, z, REAL: tl.constexpr):
-    """A splat's first axis along the camera's: the first column of W R(q)."""
+    """A splat's first axis in camera axes: the first column of W R(q)."""
     return turned(
         cam, 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y), REAL
     )
@@ -224,7 +224,7 @@ def basis(K: tl.constexpr, x, y, z):
 
 @inner
 def basis_slope(K: tl.constexpr, x, y, z):
-    """Gradient of `basis` by the direction, before its normalisation."""
+    """Gradient of `basis` with respect to the direction before its normalisation."""
     xx, yy, zz, none = x * x, y * y, z * z, x * 0.0
     a, b, c = none, none, none
     if K == 1:

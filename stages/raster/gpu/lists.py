@@ -1,4 +1,4 @@
-"""Which splats each tile draws, nearest first: kernels between torch's sorts.
+"""Lists of the splats of each tile, nearest first: the kernels between torch's sorts.
 
 A splat's tiles are found row of tiles by row of tiles, from its ellipse. How many they are is
 counted first; then each entry of the lists finds its splat by bisection, so that a splat of
@@ -64,7 +64,7 @@ def row_span(x, y, half_x, half_y, rho, thin, tile_row, width, TILE: tl.constexp
 
 @triton.jit
 def count_kernel(shapes, keys, counts, n, width, TILE: tl.constexpr, BLOCK: tl.constexpr):
-    """counts [n] int32: tiles that each splat touches, 0 for those that are not visible."""
+    """counts [n] int32: number of tiles that each splat touches, 0 if it is not visible."""
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
     shown = tl.load(keys + i, mask=mask, other=float("inf")) < float("inf")
@@ -141,7 +141,7 @@ def compared(rows, a, b, mask, k, sign, COLUMNS: tl.constexpr):
 
 @inner
 def order_of(rows, a, b, mask, COLUMNS: tl.constexpr, STORED: tl.constexpr):
-    """-1 where rows a come before rows b, 1 where after, 0 where all is equal: by mean, opacity,
+    """-1 where rows a come before rows b, 1 where after, 0 where equal: by mean, opacity,
     scales, rotation and SH, as in `reference`."""
     sign = (a * 0).to(tl.int32)
     for k in tl.static_range(3):
@@ -161,7 +161,7 @@ def order_of(rows, a, b, mask, COLUMNS: tl.constexpr, STORED: tl.constexpr):
 def ties_kernel(
     keys, order, ordered, rows, n, COLUMNS: tl.constexpr, STORED: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """settled [n]: `order`, with runs of equal finite keys in the order of the splats' own values.
+    """ordered [n]: `order`, with runs of equal finite keys in the order of the splats' own values.
 
     keys [n]: sorted. A splat moves up by those before it that belong behind it, and down by those
     behind it that belong before it.

@@ -1,4 +1,4 @@
-"""From parameters to what blending reads: one 64-byte record a splat, and where its ellipse lies.
+"""Projection of splats: one 64-byte record for each, which blending reads, and its ellipse.
 
 The record holds the exponent around the axis of the larger variance, to base 2, as the CPU does:
     log2 alpha = level - (A u)^2 - (B t)^2,  u = major - mean,  t = minor - K major - cut,
@@ -45,10 +45,10 @@ MEAN_HI, MEAN_LO, CUT_HI, CUT_LO, SLOPE_HI, SLOPE_LO, ROOT_A, ROOT_B, LEVEL, TAL
     tl.constexpr(k) for k in range(10)
 )
 COLOUR, DEPTH = tl.constexpr(10), tl.constexpr(13)
-# Where the sums of the way back begin: see `cpu.projection.sums_origin`.
+# Origin of the sums of the backward pass: see `cpu.projection.sums_origin`.
 ORIGIN, ORIGIN_CUT = tl.constexpr(14), tl.constexpr(15)
-# Where the ellipse lies, beyond which a splat is too faint: middle, half of its box, correlation
-# and the root of 1 less its square; first and last row of tiles.
+# The ellipse outside which alpha is below 1/255: centre, half the size of its box, correlation and
+# sqrt(1 - correlation^2); first and last row of tiles.
 SHAPE = tl.constexpr(8)
 S_X, S_Y, S_HALF_X, S_HALF_Y, S_RHO, S_THIN, S_FIRST, S_LAST = (tl.constexpr(k) for k in range(8))
 OUT_OF_VIEW, VISIBLE, CULLED = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
@@ -240,7 +240,7 @@ def project_kernel(
 
 @inner
 def is_small(x):
-    """What its own type can hold with room for a product."""
+    """The value, clamped so that its type can hold a product of it."""
     return x < 1e37 if x.dtype == tl.float32 else x < 1e300
 
 

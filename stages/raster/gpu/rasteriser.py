@@ -1,4 +1,4 @@
-"""The GPU backend: Triton's kernels, torch's sorts, tensors that stay on the device."""
+"""The GPU backend: Triton kernels and torch sorts on tensors that stay on the device."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from stages.raster.gpu import blend, gradients, lists, project
 from stages.raster.gpu.device import gpu_errors_explained, interpreted, require
 from stages.scene import Camera
 
-VISIBLE, CULLED = 1, 2  # as `project_kernel` says them
+VISIBLE, CULLED = 1, 2  # as `project_kernel` writes them
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Splats on the device. rows [N, columns]: parameters, in the columns of a gradient row; bands:
-    of SH that they hold. smoothing [N], or [0] for none."""
+    """Splats on the device. rows [N, columns]: parameters, in the columns of a gradient row.
+    coefficients: SH coefficients a channel. smoothing [N], or [0] for none."""
 
     rows: Tensor
     coefficients: int
@@ -52,16 +52,19 @@ class View:
     settings: RasterSettings
 
     def coefficients(self, scene: Scene) -> int:
-        """How many bands of SH take part."""
+        """Number of SH coefficients a channel that take part."""
         return min((self.settings.sh_degree + 1) ** 2, scene.coefficients)
 
 
 @dataclass(frozen=True)
 class Lists:
-    """What each tile draws. members [capacity]: rows, tile by tile, nearest first, from
-    starts[tile]; slots: where each entry's gradient goes, those of a splat one after the other.
-    firsts, counts [N]: a splat's slots. total: entries wanted, a tensor; at most as many as there
-    is room for are drawn."""
+    """The splats of each tile.
+
+    members [capacity]: rows, tile by tile from starts[tile], nearest first. slots: where each
+    entry's gradient goes; the slots of a splat are contiguous. firsts, counts [N]: first slot and
+    number of slots of each splat. total: number of entries, a tensor. Entries beyond the capacity
+    are not drawn.
+    """
 
     members: Tensor
     slots: Tensor
@@ -87,7 +90,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Forward:
-    """As `definition.Forward`; and what the way back needs."""
+    """As `definition.Forward`, with what the backward pass needs."""
 
     image: NDArray[np.float32]
     visible: NDArray[np.int32]
@@ -98,13 +101,13 @@ class Forward:
 
 
 class GpuRasteriser:
-    """Draws and differentiates. tile: pixels across and down, a power of two. real: what footprints
-    are computed in."""
+    """Draws and differentiates. tile: pixels across and down, a power of two. real: the Triton type
+    in which footprints are computed."""
 
     def __init__(self, tile: int | None = None, real: Any = tl.float64) -> None:
         self.device: torch.device = require()
         emulated = interpreted()
-        # an interpreter pays by the operation, whatever its width
+        # the interpreter's cost depends on the number of operations, not on their width
         self.tile = tile or (32 if emulated else 16)
         self.block = 4096 if emulated else 128
         self.real = real
@@ -162,7 +165,7 @@ class GpuRasteriser:
         return found
 
     def scene(self, arrays: Arrays, smoothing: NDArray[np.float32] = NO_SMOOTHING) -> Scene:
-        """Arrays of the host, as rows on the device."""
+        """Rows on the device from arrays on the host."""
         means, quaternions, log_scales, opacity_logits, sh = arrays
         n, coefficients = len(means), sh.shape[1]
         parts = (
@@ -185,8 +188,8 @@ class GpuRasteriser:
     def draw(
         self, scene: Scene, view: View, depths: bool = False, capacity: int | None = None
     ) -> Drawn:
-        """A picture. capacity: how many entries of the lists there is room for; asked of the
-        device, which is waited for, if not told."""
+        """Draw. capacity: number of entries that the lists have room for. By default it is read
+        from the device, which waits for the device."""
         n = len(scene)
         like: dict[str, Any] = {"device": self.device}
         records = torch.empty(n, project.RECORD.value, **like)
@@ -277,7 +280,7 @@ class GpuRasteriser:
         ends = torch.cumsum(counts[ordered], 0)
         total = ends[-1:] if n else torch.zeros(1, dtype=torch.int64, **like)
         room = int(total.item()) if capacity is None else capacity
-        # radix sorts go by the byte: 16 bits are enough for pictures of 8 million pixels
+        # radix sorts work by bytes; 16 bits are enough for pictures of 8 million pixels
         keyed = torch.int16 if tiles < 2**15 else torch.int32
         tile_of = torch.empty(room, dtype=keyed, **like)
         row_of = torch.empty(room, dtype=torch.int32, **like)
@@ -299,7 +302,7 @@ class GpuRasteriser:
     def _over_tiles(
         self, kernel: Any, view: View, drawn: Drawn, planes: Tensor, out: Tensor
     ) -> None:
-        """A pass from far to near over every tile's list; one row of `out` for each entry."""
+        """Run a kernel from far to near over every tile's list; one row of `out` for each entry."""
         made = drawn.lists
         kernel[(self._tiles(view)[2],)](
             *(

@@ -1,5 +1,5 @@
-"""What compiled kernels stand on: vectors, threads, and where they are kept."""
+"""Support for compiled kernels: vector types, threads, and the cache of compiled code."""
 
 from stages.raster.kernels import cache
 
-cache.prepare()  # before Numba, which is told by the environment
+cache.prepare()  # before Numba is imported, which reads the environment

@@ -27,12 +27,12 @@ _held: list[FileLock] = []
 
 
 def folder() -> Path:
-    """Where this process finds and leaves compiled kernels."""
+    """The folder where this process reads and writes compiled kernels."""
     return Path(os.environ[_VARIABLE])
 
 
 def are_compiled(kernel: str = "*") -> bool:
-    """Whether an earlier run left compiled kernels, or this one; the first compiles for a while."""
+    """Whether there are compiled kernels; if not, the first use compiles for a while."""
     return any(folder().rglob(f"*.{kernel}-*.nbi"))
 
 

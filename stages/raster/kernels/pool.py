@@ -1,8 +1,8 @@
-"""Two or more threads for kernels that release the GIL.
+"""A pool of threads for kernels that release the GIL.
 
-Plain threads instead of an OpenMP team: nothing spins while it waits, torch's pool is not fought
-for the cores, and nothing has to be installed. Work is shared through a counter (`take_ticket`),
-so that a thread that lost its core to another process does not hold the rest up.
+Plain threads instead of OpenMP: they do not spin while they wait, do not compete with torch's pool,
+and need no library. Work is shared through a counter (`take_ticket`), so that a thread that lost
+its core to another process does not delay the others.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stages.base import threads
 
 
 class Pool:
-    """Runs one kernel call per thread; the calling thread takes part."""
+    """Runs one kernel call for each thread; the calling thread takes part."""
 
     def __init__(self, n_threads: int | None = None) -> None:
         self.n_threads = n_threads or threads.count()
@@ -34,9 +34,9 @@ class Pool:
         *args: Any,
         beside: Callable[[], Any] | None = None,
     ) -> None:
-        """kernel(counter, *args) in every thread; the kernel takes tickets from `counter`.
+        """Call kernel(counter, *args) in every thread; the kernel takes tickets from `counter`.
 
-        beside: something else that one thread does first, while the others begin.
+        beside: a function that the calling thread runs first, while the others begin.
         """
         self._ticket[0] = 0
         futures = [
@@ -55,7 +55,7 @@ _default: list[Pool] = []
 
 
 def default_pool() -> Pool:
-    """The process's own pool, made at first use."""
+    """The pool of this process, made at first use."""
     if not _default:
         _default.append(Pool())
     return _default[0]
