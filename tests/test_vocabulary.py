@@ -48,13 +48,9 @@ WORDS = (
     Word("strides", "step size, learning rate", (*TRAINING, "docs"), "an array has one as well"),
     Word("how far", "step size, progress, distance", TRAINING),
     Word(
-        '(?<!loss_)(?<!")bands?(?!"|_count)',
+        '(?<!")bands?(?!")',
         "SH coefficients, SH degree",
-<<<<<<< HEAD
-        reason='loss_strips: rows of a picture; "bands": a key of SOG',
-=======
-        reason='loss_bands, band_count: rows of a picture; "bands": a key of SOG',
->>>>>>> main
+        reason='"bands": a key of SOG',
     ),
     Word("passed[ _]on", "generalisation ratio"),
     Word("hands", "executor; a verb: sends, gives"),
