@@ -63,7 +63,13 @@ ROWS = (
     Row(31, "far_and_wide", "footprints of 1e3 to 2e20 px, off-centre", footprints.far_and_wide),
     Row(32, "brightest", "SH coefficients 3.4e38, 1e19", colours.brightest),
     Row(33, "out_of_range", "one gradient of 1e13 to NaN", optimiser.out_of_range, ONE),
-    Row(34, "switched_on_late", "a band, a reset at step 1000", optimiser.switched_on_late, ONE),
+    Row(
+        34,
+        "switched_on_late",
+        "coefficients, a reset at step 1000",
+        optimiser.switched_on_late,
+        ONE,
+    ),
     Row(35, "widths_out_of_range", "smoothing NaN, inf, < 0", culling.widths_out_of_range),
 )
 
@@ -97,7 +103,7 @@ def listing() -> str:
     """The whole table as Markdown."""
     notes: list[str] = []
     lines = [
-        HEAD.format(wheres="; ".join(wheres()) or "nobody"),
+        HEAD.format(wheres="; ".join(wheres()) or "no machine"),
         f"| row | input | measured | bound | {' | '.join(COLUMNS)} | result |",
         f"|--:|---|---|--:|{'--:|' * len(COLUMNS)}---|",
     ]
