@@ -233,9 +233,7 @@ def contributions_of(view_counts, sse_change, scene_depth=(4.0,)) -> Contributio
     weight = (seen > 0).astype(np.float64)
     change, depth = np.asarray(sse_change, np.float64), np.asarray(scene_depth, np.float64)
     no_sh = np.zeros((len(seen), 0))
-    return Contributions(
-        change, change, weight, weight, seen, 1.0, depth, no_sh, no_sh, no_sh, depth
-    )
+    return Contributions(change, change, weight, seen, 1.0, depth, no_sh, no_sh, no_sh, depth)
 
 
 def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +19,7 @@ from stages.run import results
 if TYPE_CHECKING:
     from stages.editing.operations import AppliedOperation
     from stages.editing.scene import EditedScene
+    from stages.editing.syntax import ParsedOperation
 
 
 def edit(
@@ -41,11 +43,6 @@ def edit(
     run's, or lie in its export folder, the PSNR of the run's photographs is printed for each
     operation.
     """
-    from stages import formats
-    from stages.base import scratch
-    from stages.base.atomic import make_folder
-    from stages.editing import levels, operations
-
     if target is None and not dry_run:
         raise SplatError(
             "edit-no-target",
@@ -54,11 +51,29 @@ def edit(
             hint=f"splat edit {source} edited.ply --keep 'opacity > 0.1'",
             family=Family.USAGE,
         )
-    target = target or Path("scene.ply")
-    row, chain = (
-        formats.format_of(target),
-        operations.prepare_operations(parsed_operations(ctx), target),
-    )
+    parsed = parsed_operations(ctx)
+    facts = _edit(source, target or Path("scene.ply"), parsed, dry_run, quiet, as_json)
+    if as_json:
+        console.emit("edited", **facts)
+    else:
+        _show(facts)
+
+
+def _edit(
+    source: Path,
+    target: Path,
+    parsed: Sequence[ParsedOperation],
+    dry_run: bool,
+    quiet: bool,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Apply the operations and write `target`. Returns figures: splats, steps, PSNR, bytes."""
+    from stages import formats
+    from stages.base import scratch
+    from stages.base.atomic import make_folder
+    from stages.editing import levels, operations
+
+    row, prepared = formats.format_of(target), operations.prepare_operations(parsed, target)
     if not dry_run:
         make_folder(target.parent)
     with ExitStack() as stack:
@@ -68,7 +83,7 @@ def edit(
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps = []
-        for step in operations.apply_operations(scene, chain):
+        for step in operations.apply_operations(scene, prepared):
             scene = step.scene
             steps.append(_report(step, as_json, quiet))
         facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
@@ -80,10 +95,7 @@ def edit(
             facts |= {"target": str(target), "size_bytes": row.size_bytes(target)}
             if views:
                 facts |= _proven(source, target, scene)
-    if as_json:
-        console.emit("edited", **facts)
-    else:
-        _show(facts)
+    return facts
 
 
 def _load_scene(source: Path) -> EditedScene:

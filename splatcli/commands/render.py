@@ -120,12 +120,31 @@ def render(
     Frames that are in the folder already are written again. Depth is z in world units, 0 where
     there is nothing; in films near is light and far is dark.
     """
+    options = _Options(out, camera, path, frames, seconds, fps, width, depth)
+    kind = options.kind()
+    facts = _render(target, options, kind, backend, device, quiet, as_json)
+    if kind == "folder" and not quiet:
+        _warn_of_other_frames(out, facts["frames"])
+    if as_json:
+        console.emit("rendered", out=str(out), kind=kind, **facts)
+    else:
+        _print(out, kind, facts)
+
+
+def _render(
+    target: Path | None,
+    options: _Options,
+    kind: str,
+    backend: str | None,
+    device: str | None,
+    quiet: bool,
+    as_json: bool,
+) -> dict[str, Any]:
+    """Draw and write the pictures. Returns figures: frames, size, depth range, times."""
     from stages.raster.backends import AUTO, qualified_name
     from stages.raster.draw import renderer
     from stages.raster.torch_device import CPU
 
-    options = _Options(out, camera, path, frames, seconds, fps, width, depth)
-    kind = options.kind()
     begun = time.monotonic()
     splats, pipeline = load_target(target)
     run = pipeline or results.run_around(target)
@@ -144,13 +163,7 @@ def render(
     facts |= {"frames": len(cameras), "width": cameras[0].width, "height": cameras[0].height}
     if rate is not None:
         facts["frames_a_second"] = round(rate, 2)
-    facts |= {"splats": len(splats), "seconds": round(time.monotonic() - begun, 2)}
-    if kind == "folder" and not quiet:
-        _warn_of_other_frames(out, len(cameras))
-    if as_json:
-        console.emit("rendered", out=str(out), kind=kind, **facts)
-    else:
-        _print(out, kind, facts)
+    return facts | {"splats": len(splats), "seconds": round(time.monotonic() - begun, 2)}
 
 
 def _cameras(splats: Splats, views: tuple[View, ...], options: _Options, kind: str) -> list[Camera]:

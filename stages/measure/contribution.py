@@ -43,7 +43,6 @@ class Contributions:
             negative where the views would be matched better without it.
         picture_change: [N] summed squared change of the pictures then, whatever the views show.
         weight: [N] summed blend weight.
-        largest_weight: [N] largest blend weight in any pixel.
         view_counts: [N] views in which a pixel has a blend weight of 1/255 or more.
         sse: summed squared error of the pictures as they are.
         scene_depth: [V] median depth of each picture, world units; inf where nothing is drawn.
@@ -60,7 +59,6 @@ class Contributions:
     sse_change: NDArray[np.float64]
     picture_change: NDArray[np.float64]
     weight: NDArray[np.float64]
-    largest_weight: NDArray[np.float64]
     view_counts: NDArray[np.int32]
     sse: float
     scene_depth: NDArray[np.float64]
@@ -79,7 +77,6 @@ class Contributions:
             sse_change=self.sse_change[rows],
             picture_change=self.picture_change[rows],
             weight=self.weight[rows],
-            largest_weight=self.largest_weight[rows],
             view_counts=self.view_counts[rows],
             sh_sums=tuple(sums[rows] for sums in self.sh_sums),
         )
@@ -101,14 +98,12 @@ def measure_contributions(
             before the splats around them changed a little. The result includes them.
     """
     n = len(splats)
-    change, picture = np.zeros(n), np.zeros(n)
-    weight, largest = np.zeros(n), np.zeros(n)
+    change, picture, weight = np.zeros(n), np.zeros(n), np.zeros(n)
     view_counts, sse, depths, psnr_db = np.zeros(n, np.int32), 0.0, [], []
     if previous is not None:
         change, picture = previous.sse_change.copy(), previous.picture_change.copy()
-        weight, largest = previous.weight.copy(), previous.largest_weight.copy()
-        view_counts, sse = previous.view_counts.copy(), previous.sse
-        depths = previous.scene_depth.tolist()
+        weight, view_counts = previous.weight.copy(), previous.view_counts.copy()
+        sse, depths = previous.sse, previous.scene_depth.tolist()
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
     settings = raster_settings_of(splats)
     truncation = _ShTruncation(splats, previous.sh_sums if previous else ())
@@ -130,7 +125,6 @@ def measure_contributions(
         change[rows] += found[:, ERROR_CHANGE]
         picture[rows] += without_residual
         weight[rows] += found[:, WEIGHT]
-        largest[rows] = np.maximum(largest[rows], found[:, LARGEST_WEIGHT])
         view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
         truncation.add(view.camera.centre, rows, found)
     truncated_sse_change, truncated_picture_change, truncated_colour = truncation.figures()
@@ -138,7 +132,6 @@ def measure_contributions(
         sse_change=change,
         picture_change=picture,
         weight=weight,
-        largest_weight=largest,
         view_counts=view_counts,
         sse=sse,
         scene_depth=np.array(depths),

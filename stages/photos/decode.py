@@ -228,10 +228,9 @@ def _loaded_by_opencv(data: bytes) -> Image.Image:
         raise Unusable(why, EIGHT_OR_SIXTEEN_BITS)
     if samples.dtype == np.uint16:
         samples = _to_8_bit(samples)
-    if samples.ndim == 3 and samples.shape[2] == 4:
-        return Image.fromarray(cv2.cvtColor(samples, cv2.COLOR_BGRA2RGBA))
     if samples.ndim == 3:
-        return Image.fromarray(cv2.cvtColor(samples, cv2.COLOR_BGR2RGB))
+        code = cv2.COLOR_BGRA2RGBA if samples.shape[2] == 4 else cv2.COLOR_BGR2RGB
+        samples = cv2.cvtColor(samples, code)
     return Image.fromarray(samples)
 
 

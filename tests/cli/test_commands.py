@@ -280,7 +280,7 @@ def test_wrong_words_are_named_in_our_words_and_exit_2(splat, words: list[str], 
     ("words", "said"),
     [
         (["--backend", "gpu"], "The backend gpu cannot run here"),
-        (["--backend", "reference", "--device", "xpu"], "One that is there: cpu."),
+        (["--backend", "reference", "--device", "xpu"], "A device that is available: cpu."),
     ],
 )
 def test_what_cannot_draw_here_is_said_before_other_work(splat, monkeypatch, words, said) -> None:

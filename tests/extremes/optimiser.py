@@ -20,10 +20,8 @@ def first_seen_late(backend):
     model, pool = _model(r), Pool(1)
     for _ in range(999):
         _step(pool, model, 0, r.normal(size=USED))
-    step_sizes = _step_sizes(pool, model, 1, _strong(r))
-    return [
-        Measured(28, "first step over its rate, less 1", worst(abs(step_sizes - 1)), FIRST_STEP)
-    ]
+    strides = _strides(pool, model, 1, _strong(r))
+    return [Measured(28, "first step over its rate, less 1", worst(abs(strides - 1)), FIRST_STEP)]
 
 
 def out_of_range(backend):
@@ -48,18 +46,18 @@ def out_of_range(backend):
 
 
 def switched_on_late(backend):
-    """At step 1000: coefficients that took no part before; the opacity after a reset."""
+    """At step 1000: an SH degree that had no part before; the opacity, begun anew."""
     r = np.random.default_rng(0)
     model, pool = _model(r), Pool(1)
     for _ in range(999):
         _step(pool, model, 0, r.normal(size=used_columns(1)), coefficients=1)
-    late = _step_sizes(pool, model, 0, _strong(r))[SH_REST:]
+    band = _strides(pool, model, 0, _strong(r))[SH_REST:]
     model.moment1[:, OPACITY] = model.moment2[:, OPACITY] = 0.0
     model.steps[:, OPACITY_STEPS] = 0
-    opacity = _step_sizes(pool, model, 0, _strong(r))[OPACITY]
+    opacity = _strides(pool, model, 0, _strong(r))[OPACITY]
     what = "over its rate, less 1"
     return [
-        Measured(34, f"a coefficient's first step {what}", worst(abs(late - 1)), FIRST_STEP),
+        Measured(34, f"an SH degree's first step {what}", worst(abs(band - 1)), FIRST_STEP),
         Measured(34, f"opacity's first step after a reset {what}", abs(opacity - 1), FIRST_STEP),
     ]
 
@@ -73,7 +71,7 @@ def _strong(r):
     return r.choice([-1.0, 1.0], USED) * r.uniform(50.0, 100.0, USED)
 
 
-def _step_sizes(pool, model, row, gradient):
+def _strides(pool, model, row, gradient):
     """How far one step takes each value of a row, over its rate."""
     before = _row(model, row)
     _step(pool, model, row, gradient)

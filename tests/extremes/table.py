@@ -66,7 +66,7 @@ ROWS = (
     Row(
         34,
         "switched_on_late",
-        "coefficients, a reset at step 1000",
+        "an SH degree, a reset at step 1000",
         optimiser.switched_on_late,
         ONE,
     ),
@@ -103,7 +103,7 @@ def listing() -> str:
     """The whole table as Markdown."""
     notes: list[str] = []
     lines = [
-        HEAD.format(wheres="; ".join(wheres()) or "no machine"),
+        HEAD.format(wheres="; ".join(wheres()) or "nobody"),
         f"| row | input | measured | bound | {' | '.join(COLUMNS)} | result |",
         f"|--:|---|---|--:|{'--:|' * len(COLUMNS)}---|",
     ]
