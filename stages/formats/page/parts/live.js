@@ -1,4 +1,4 @@
-// Pictures come from the trainer, one asked for at a time: at once while the visitor moves, seldom
+// Pictures come from the trainer, one request at a time: at once while the visitor moves, seldom
 // while everything rests, never while the page is hidden. For scripts: `splatLive` tells what is
 // shown.
 const STATE_MS = 500;

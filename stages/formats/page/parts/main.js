@@ -2,7 +2,7 @@
 // For scripts: `splatReady` is a promise that resolves when the first camera is drawn, and
 // `splatShow(name)` one that resolves when the camera of that name is; `splatSelection` what is
 // selected.
-// Sorting runs beside drawing and takes a few frames to be seen; every ten, what streams is asked for.
+// Sorting runs beside drawing and takes a few frames to be seen; every ten, the streamed levels are chosen again.
 const STEADY_FRAMES = 12;
 
 function settingsFor(scene) {
@@ -102,8 +102,8 @@ async function start() {
         return { name, splats: app.stats.frame.gsplats, renderer: app.graphicsDevice.deviceType };
     };
     find("message").hidden = true;
-    const judged = scene.shots.find((shot) => shot.held_out);
-    const first = named(query.get("camera")) || judged || scene.shots[0];
+    const heldOut = scene.shots.find((shot) => shot.held_out);
+    const first = named(query.get("camera")) || heldOut || scene.shots[0];
     return window.splatShow(first.name);
 }
 
