@@ -29,7 +29,7 @@ LIGHT_BACKENDS = (*BACKENDS, "gpu") if _INTERPRETED else BACKENDS
 
 
 def camera(width=64, height=48, focal=60.0, cx=None, cy=None, matrix=None):
-    """A pinhole camera, at the origin and looking along +z unless told otherwise."""
+    """A pinhole camera, at the origin and looking along +z by default."""
     return Camera(
         width,
         height,
@@ -104,9 +104,11 @@ def gradients(backend, scene, view, v_image, settings=None, smoothing=None):
     found = rasteriser.backward(arrays, forward, planar, widths)
     full = np.zeros((len(scene), found.parameters.shape[1]))
     full[found.rows] = found.parameters
-    bands = (min(settings.sh_degree, scene.sh_degree) + 1) ** 2
+    coefficients = (min(settings.sh_degree, scene.sh_degree) + 1) ** 2
     sh = np.zeros(scene.sh.shape)
-    sh[:, :bands] = full[:, SH : used_columns(bands)].reshape(len(scene), bands, 3)
+    sh[:, :coefficients] = full[:, SH : used_columns(coefficients)].reshape(
+        len(scene), coefficients, 3
+    )
     return {
         "means": full[:, MEAN:ROTATION],
         "quaternions": full[:, ROTATION:LOG_SCALE],

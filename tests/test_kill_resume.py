@@ -69,7 +69,7 @@ def command(folder: Path, draw: random.Random) -> list[str]:
 
 
 def complete(folder: Path, draw: random.Random) -> list[dict[str, Any]]:
-    """What the run told on its way to the end."""
+    """The events that the run reported until its end."""
     return events(
         subprocess.run(
             command(folder, draw), cwd=folder, capture_output=True, text=True, timeout=600

@@ -25,7 +25,7 @@ ORACLE = 1e-9
 """The reference against the textbook formula in extended precision."""
 
 WORKED = 6e-5
-"""Examples worked by hand are printed to 4 or 5 digits."""
+"""Examples computed by hand are printed to 4 or 5 digits."""
 
 BLEED = 1e-4
 """Light that may still pass when a pixel is finished."""

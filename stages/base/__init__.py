@@ -1,1 +1,1 @@
-"""The ground floor: what every room stands on, and knows nothing of splats."""
+"""Tools of all packages: errors, settings, the stage interface, files, memory, threads."""

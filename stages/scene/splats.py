@@ -66,7 +66,7 @@ class Splats:
 
     @property
     def sh_degree(self) -> int:
-        """The degree that `sh` has room for."""
+        """The SH degree of the coefficients in `sh`."""
         return {1: 0, 4: 1, 9: 2, 16: 3}[self.sh.shape[1]]
 
     @property
@@ -96,7 +96,7 @@ class Splats:
         return camera.moved(shift)
 
     def with_sh_degree(self, degree: int) -> Splats:
-        """Higher bands dropped, or zero bands added."""
+        """With coefficients of higher degrees dropped, or zero coefficients added."""
         wanted = (degree + 1) ** 2
         have = self.sh.shape[1]
         if wanted <= have:

@@ -16,8 +16,8 @@ def test_blocks_hold_every_row_once(count: int, rows: int) -> None:
 
 
 def test_a_pass_is_told_to_its_end_and_only_inside() -> None:
-    told: list[tuple[int, int]] = []
-    with blocks.progress_reported_to(lambda done, total: told.append((done, total))):
+    reported: list[tuple[int, int]] = []
+    with blocks.progress_reported_to(lambda done, total: reported.append((done, total))):
         list(blocks.reported_blocks(9, 4))
     list(blocks.reported_blocks(9, 4))
-    assert told == [(4, 9), (8, 9), (9, 9)]
+    assert reported == [(4, 9), (8, 9), (9, 9)]

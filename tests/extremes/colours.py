@@ -83,7 +83,7 @@ def _v():
 
 
 def _with_coefficient(value):
-    """One splat in ten has a coefficient of `value`, in every band and channel by turns."""
+    """One splat in ten has a coefficient of `value`, in each coefficient and channel in turn."""
     scene = cloud(100, degree=2)
     rows = np.arange(0, 100, 10)
     scene.sh[rows, rows // 10 % 9, rows % 3] = value

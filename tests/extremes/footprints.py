@@ -1,4 +1,4 @@
-"""Rows 1-4, 6-8 and 31: footprints of extreme shape, and their way back to the parameters."""
+"""Rows 1-4, 6-8 and 31: footprints of extreme shape, and their gradients."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _needle(backend, row, scene, bound):
 def _alpha(backend, scene, view):
     if backend != "reference":
         return render(scene, view, RasterSettings(), backend).alpha
-    with torch.no_grad():  # in float64: `render` hands out float32
+    with torch.no_grad():  # in float64: `render` returns float32
         return render_tensors(parameters_of(scene), view, RasterSettings())[1].numpy()
 
 

@@ -37,14 +37,14 @@ def on_gpu(row: Row) -> bool:
 def kept(real: str = DOUBLE) -> dict[int, list[Measured]]:
     """What was measured, by row."""
     return {
-        int(number): [Measured(int(number), *line) for line in told["numbers"]]
-        for number, told in _read().get(real, {}).items()
+        int(number): [Measured(int(number), *line) for line in entry["numbers"]]
+        for number, entry in _read().get(real, {}).items()
     }
 
 
 def wheres(real: str = DOUBLE) -> list[str]:
     """What measured it."""
-    return sorted({told["where"] for told in _read().get(real, {}).values()})
+    return sorted({entry["where"] for entry in _read().get(real, {}).values()})
 
 
 def _read() -> dict[str, Any]:
@@ -56,7 +56,7 @@ def _write(every: dict[str, Any]) -> None:
     """A row a line."""
     parts = []
     for real, column in every.items():
-        lines = (f"  {json.dumps(number)}: {json.dumps(told)}" for number, told in column.items())
+        lines = (f"  {json.dumps(number)}: {json.dumps(entry)}" for number, entry in column.items())
         parts.append(f" {json.dumps(real)}: {{\n" + ",\n".join(lines) + "\n }")
     KEPT.write_text("{\n" + ",\n".join(parts) + "\n}\n")
 
@@ -65,8 +65,8 @@ def keep(row: Row, found: list[Measured], real: str) -> None:
     """Put one row's numbers in the place of those kept before."""
     every = _read()
     numbers = [[m.what, float(f"{m.error:.3g}"), m.bound, m.note] for m in found]
-    told = {"where": device.describe(), "numbers": numbers}
-    column = {**every.get(real, {}), str(row.number): told}
+    entry = {"where": device.describe(), "numbers": numbers}
+    column = {**every.get(real, {}), str(row.number): entry}
     every[real] = {number: column[number] for number in sorted(column, key=int)}
     _write(every)
 

@@ -103,10 +103,10 @@ def _of_cubin(cubin: bytes) -> dict[str, int]:
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(cubin)
         file.flush()
-        told = subprocess.run(
+        process = subprocess.run(
             [str(tool), "-res-usage", file.name], capture_output=True, text=True, check=True
         )
-    text = told.stdout + told.stderr
+    text = process.stdout + process.stderr
     numbers = {name: int(value) for name, value in re.findall(r"(REG|STACK|LOCAL):(\d+)", text)}
     return {"registers": numbers["REG"], "spills": numbers["STACK"] + numbers["LOCAL"]}
 

@@ -104,18 +104,18 @@ def test_float64_is_given_up_where_the_device_refuses_it(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("name", ["cuda", "mps", "xpu"])
 def test_a_device_that_is_not_there_is_named_with_those_that_are(name, monkeypatch) -> None:
     monkeypatch.setattr(torch_device, "is_there", lambda asked: asked == "cpu")
-    with pytest.raises(SplatError, match=f"--device {name}") as told:
+    with pytest.raises(SplatError, match=f"--device {name}") as caught:
         rasteriser_of(qualified_name("reference", name))
-    assert told.value.code == "raster-no-device"
-    assert told.value.wanted == "One that is there: cpu."
+    assert caught.value.code == "raster-no-device"
+    assert caught.value.wanted == "A device that is available: cpu."
 
 
 def test_only_a_backend_that_takes_devices_is_given_one() -> None:
     assert qualified_name("gpu", "cpu") == "gpu"
     assert qualified_name("reference", "mps") == "reference@mps"
-    with pytest.raises(SplatError, match="--backend reference") as told:
+    with pytest.raises(SplatError, match="--backend reference") as caught:
         qualified_name("auto", "cuda")
-    assert told.value.code == "option-device"
+    assert caught.value.code == "option-device"
     with pytest.raises(ValueError, match="cpu@cuda"):
         backend_of("cpu@cuda")
 

@@ -42,7 +42,7 @@ LIGHT_ROWS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 13, 14, 15, 22, 24, 31)
 
 @pytest.fixture(autouse=True)
 def poisoned_memory() -> Iterator[None]:
-    """What memory held before must not matter: torch hands it out full of NaN."""
+    """Results must not depend on uninitialised memory: torch fills it with NaN here."""
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
@@ -151,15 +151,15 @@ def test_every_kernel_compiles_within_its_registers(target):
     """For a GPU that is not here. A warp of blending keeps at most 128 registers a thread, so that
     16 of them live on a multiprocessor, and spills nothing; elsewhere two doubles may spill, as
     projection does on sm_100 (8 bytes)."""
-    told = subprocess.run(
+    process = subprocess.run(
         processes.module("tests.raster.gpu_compile", target),
         capture_output=True,
         text=True,
         check=False,
         env={**os.environ, "TRITON_INTERPRET": "0"},
     )
-    assert told.returncode == 0, told.stderr[-2000:]
-    found = json.loads(told.stdout)
+    assert process.returncode == 0, process.stderr[-2000:]
+    found = json.loads(process.stdout)
     assert len(found) == 14
     for name, taken in found.items():
         assert taken["spills"] <= (0 if name.startswith("blend") else 16), (name, taken)
@@ -221,10 +221,10 @@ def test_what_is_missing_is_named(fault, said, monkeypatch, tmp_path):
     assert bool(device.missing()) == bool(said)
     assert backend_of("auto").name == ("cpu" if said else "gpu")
     if said:
-        with pytest.raises(SplatError, match=said) as told:
+        with pytest.raises(SplatError, match=said) as caught:
             device.require()
-        assert told.value.code == "raster-no-gpu"
-        assert "--backend cpu" in told.value.hint
+        assert caught.value.code == "raster-no-gpu"
+        assert "--backend cpu" in caught.value.hint
 
 
 def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
@@ -238,10 +238,10 @@ def test_what_a_gpu_made_is_looked_at_without_one(monkeypatch):
 
 
 def test_memory_that_runs_out_names_the_cap_that_would_fit():
-    with pytest.raises(SplatError) as told, device.gpu_errors_explained(1_000_000):
+    with pytest.raises(SplatError) as caught, device.gpu_errors_explained(1_000_000):
         raise torch.OutOfMemoryError("CUDA out of memory")
-    assert told.value.code == "raster-gpu-memory"
-    assert "--max-splats 500000" in told.value.hint
+    assert caught.value.code == "raster-gpu-memory"
+    assert "--max-splats 500000" in caught.value.hint
     nearly = device.out_of_memory(1_000_000, free=0, held=4 << 30, total=8 << 30)
     assert nearly.fits == 800_000
     far = device.out_of_memory(10_000_000, free=1 << 30, held=3 << 30, total=8 << 30)
@@ -251,10 +251,10 @@ def test_memory_that_runs_out_names_the_cap_that_would_fit():
 def test_a_gpu_that_is_busy_is_named():
     said = "CUDA error: all CUDA-capable devices are busy or unavailable"
     with (
-        pytest.raises(SplatError, match="busy or unavailable") as told,
+        pytest.raises(SplatError, match="busy or unavailable") as caught,
         device.gpu_errors_explained(1),
     ):
         raise RuntimeError(said)
-    assert told.value.code == "raster-gpu-failed"
+    assert caught.value.code == "raster-gpu-failed"
     with pytest.raises(RuntimeError, match="shape"), device.gpu_errors_explained(1):
         raise RuntimeError("shape")

@@ -1,4 +1,4 @@
-"""Numbers worked by hand, on both backends."""
+"""Numbers computed by hand, on both backends."""
 
 import numpy as np
 import pytest

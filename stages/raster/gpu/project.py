@@ -204,7 +204,7 @@ def project_kernel(
 ):
     """Record, shape, key (depth, infinite where not visible) and status of each of n rows.
 
-    rows [n, COLUMNS], STORED bands of SH in them, of which COEFFICIENTS are drawn. smoothing [n].
+    rows [n, COLUMNS], with STORED SH coefficients, of which COEFFICIENTS are drawn. smoothing [n].
     """
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask, at = i < n, i * COLUMNS

@@ -28,9 +28,9 @@ def python(code: str, home: Path, **more: str) -> str:
 
 
 def test_nothing_is_made_before_kernels_are_needed(tmp_path: Path) -> None:
-    told = python("import os, stages, stages.run.pipeline; print('NUMBA_CACHE_DIR' in os.environ)",
+    shown = python("import os, stages, stages.run.pipeline; print('NUMBA_CACHE_DIR' in os.environ)",
                   tmp_path)  # fmt: skip
-    assert told == "False"
+    assert shown == "False"
     assert not list(tmp_path.iterdir())
 
 
