@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base import threads
 from stages.base.errors import Interrupted, SplatError
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
 
@@ -31,51 +32,38 @@ _PIXELS_AT_ONCE = 250_000_000  # over all threads; about 4 bytes each while they
 class IngestSettings:
     """Settings of reading photographs."""
 
-    max_side: int = field(
-        default=1600,
-        metadata={
-            "panel": "Quality and time",
-            "help": "Longer side of the photographs used for structure from motion and, at most, "
-            "for training (px).",
-            "min": 64,
-            "max": 32_768,
-        },
+    max_side: int = setting(
+        1600,
+        "Longer side of the photographs used for structure from motion and, at most, "
+        "for training (px).",
+        panel="Quality and time",
+        min=64,
+        max=32_768,
     )
-    masks: Path | None = field(
-        default=None,
-        metadata={
-            "panel": "Light and masks",
-            "help": "Folder of masks, white where a photograph counts, named as the photographs "
-            "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside "
-            "that of the photographs is found without this option.",
-            "affects_output": False,  # its content does, which is an input
-        },
+    masks: Path | None = setting(
+        None,
+        "Folder of masks, white where a photograph counts, named as the photographs "
+        "are: a.png, a.jpg.png or a_mask.png for a.jpg. A folder called masks in or beside "
+        "that of the photographs is found without this option.",
+        panel="Light and masks",
+        affects_output=False,  # its content does, which is an input
     )
-    invert_masks: bool = field(
-        default=False,
-        metadata={
-            "panel": "Light and masks",
-            "help": "Masks are black where a photograph counts, not white.",
-        },
+    invert_masks: bool = setting(
+        False, "Masks are black where a photograph counts, not white.", panel="Light and masks"
     )
-    mask_means: str = field(
-        default="auto",
-        metadata={
-            "panel": "Light and masks",
-            "help": "How pixels outside a mask are treated: ignore (as unknown), transparent (as "
-            "empty space) or auto (ignore for mask files, transparent for transparent pictures).",
-            "choices": ("auto", "ignore", "transparent"),
-        },
+    mask_means: str = setting(
+        "auto",
+        "How pixels outside a mask are treated: ignore (as unknown), transparent (as "
+        "empty space) or auto (ignore for mask files, transparent for transparent pictures).",
+        panel="Light and masks",
+        choices=("auto", "ignore", "transparent"),
     )
-    frames: int = field(
-        default=0,
-        metadata={
-            "panel": "Input",
-            "help": "Frames to take from each video, at most; 0 chooses by how far the camera "
-            "moves.",
-            "min": 0,
-            "max": 100_000,
-        },
+    frames: int = setting(
+        0,
+        "Frames to take from each video, at most; 0 chooses by how far the camera moves.",
+        panel="Input",
+        min=0,
+        max=100_000,
     )
 
 

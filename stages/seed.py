@@ -7,11 +7,12 @@ splat a point, as large as the mean distance to its three nearest neighbours, op
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 
 if TYPE_CHECKING:
@@ -35,14 +36,8 @@ _LARGEST_SCALE = 0.05  # x the distance to the nearest camera: 3 degrees to eith
 class SeedSettings:
     """Settings of the initial splats."""
 
-    keep_outliers: bool = field(
-        default=False,
-        metadata={"help": "Keep points that look misplaced or are far away."},
-    )
-    fill: bool = field(
-        default=True,
-        metadata={"help": "Add splats where photographs show surfaces without points."},
-    )
+    keep_outliers: bool = setting(False, "Keep points that look misplaced or are far away.")
+    fill: bool = setting(True, "Add splats where photographs show surfaces without points.")
 
 
 def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report: Report) -> Splats:

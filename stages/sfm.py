@@ -11,11 +11,12 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
 
@@ -32,97 +33,72 @@ _WORK = "work"
 class SfmSettings:
     """Settings of structure from motion."""
 
-    seed: int = field(
-        default=0,
-        metadata={
-            "panel": "Advanced",
-            "help": "Seed of every random choice; same seed, same result.",
-            "min": 0,
-            "max": 2**31 - 1,
-        },
+    seed: int = setting(
+        0,
+        "Seed of every random choice; same seed, same result.",
+        panel="Advanced",
+        min=0,
+        max=2**31 - 1,
     )
-    max_features: int = field(
-        default=12_288,
-        metadata={
-            "help": "Approximate number of SIFT features in each photograph.",
-            "min": 100,
-            "max": 1_000_000,
-        },
+    max_features: int = setting(
+        12_288, "Approximate number of SIFT features in each photograph.", min=100, max=1_000_000
     )
-    matching: str = field(
-        default="auto",
-        metadata={
-            "help": "Pairs of photographs to match: exhaustive (every pair), sequential "
-            "(neighbours in order of name) or auto (those with similar features).",
-            "choices": ("auto", "exhaustive", "sequential"),
-        },
+    matching: str = setting(
+        "auto",
+        "Pairs of photographs to match: exhaustive (every pair), sequential "
+        "(neighbours in order of name) or auto (those with similar features).",
+        choices=("auto", "exhaustive", "sequential"),
     )
-    allow_partial: bool = field(
-        default=False,
-        metadata={
-            "panel": "Advanced",
-            "help": "Use the best reconstruction found even if it fails the quality gates.",
-        },
+    allow_partial: bool = setting(
+        False,
+        "Use the best reconstruction found even if it fails the quality gates.",
+        panel="Advanced",
     )
-    cameras: Path | None = field(
-        default=None,
-        metadata={
-            "panel": "Known cameras",
-            "help": "File or folder of known camera poses, of COLMAP, nerfstudio, a synthetic NeRF "
-            "scene, LLFF, OpenSfM, Bundler, Metashape or RealityScan; they are not estimated.",
-            "affects_output": False,  # its content does, and that is an input
-        },
+    cameras: Path | None = setting(
+        None,
+        "File or folder of known camera poses, of COLMAP, nerfstudio, a synthetic NeRF "
+        "scene, LLFF, OpenSfM, Bundler, Metashape or RealityScan; they are not estimated.",
+        panel="Known cameras",
+        affects_output=False,  # its content does, and that is an input
     )
-    split: bool = field(
-        default=False,
-        metadata={
-            "panel": "Known cameras",
-            "help": "Use the split into training and test photographs of --cameras.",
-            "needs": "cameras",
-        },
+    split: bool = setting(
+        False,
+        "Use the split into training and test photographs of --cameras.",
+        panel="Known cameras",
+        needs="cameras",
     )
-    refine_cameras: bool = field(
-        default=False,
-        metadata={
-            "panel": "Known cameras",
-            "help": "Refine the poses of --cameras by bundle adjustment; intrinsics stay fixed.",
-            "needs": "cameras",
-        },
+    refine_cameras: bool = setting(
+        False,
+        "Refine the poses of --cameras by bundle adjustment; intrinsics stay fixed.",
+        panel="Known cameras",
+        needs="cameras",
     )
-    metres: bool = field(
-        default=False,
-        metadata={
-            "panel": "Known cameras",
-            "help": "The poses of --cameras are in metres, as those of phones' AR sessions are.",
-            "needs": "cameras",
-        },
+    metres: bool = setting(
+        False,
+        "The poses of --cameras are in metres, as those of phones' AR sessions are.",
+        panel="Known cameras",
+        needs="cameras",
     )
-    scale: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "panel": "Known cameras",
-            "help": "Two photographs and the distance between their cameras (metres).",
-            "together": "A B METRES",
-        },
+    scale: tuple[str, ...] = setting(
+        (),
+        "Two photographs and the distance between their cameras (metres).",
+        panel="Known cameras",
+        together="A B METRES",
     )
-    marker: float = field(
-        default=0.0,
-        metadata={
-            "panel": "Known cameras",
-            "help": "Side of the ArUco markers in the scene, alone or on a ChArUco board "
-            "(metres); 0: there are none.",
-            "min": 0.0,
-            "max": 1000.0,
-        },
+    marker: float = setting(
+        0.0,
+        "Side of the ArUco markers in the scene, alone or on a ChArUco board "
+        "(metres); 0: there are none.",
+        panel="Known cameras",
+        min=0.0,
+        max=1000.0,
     )
-    max_minutes: float = field(
-        default=120.0,
-        metadata={
-            "help": "Stop with an error after this time (minutes).",
-            "min": 0.1,
-            "max": 100_000,
-            "affects_output": False,
-        },
+    max_minutes: float = setting(
+        120.0,
+        "Stop with an error after this time (minutes).",
+        min=0.1,
+        max=100_000,
+        affects_output=False,
     )
 
 

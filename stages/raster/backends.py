@@ -10,11 +10,12 @@ A backend may run on several torch devices. Its full name then has the device af
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.lazy import load_object
+from stages.base.settings import setting
 from stages.raster.torch_device import CPU, DEVICES
 
 if TYPE_CHECKING:
@@ -164,16 +165,10 @@ def backend_setting() -> Any:
     """The field `backend` of a stage's settings."""
     choices = ", ".join(f"{backend.name} ({backend.summary})" for backend in BACKENDS)
     help = f"Rendering backend: {AUTO} (the fastest available), {choices}."
-    return field(
-        default=AUTO,
-        metadata={"help": help, "choices": CHOICES, "midway": True, "panel": "Advanced"},
-    )
+    return setting(AUTO, help, choices=CHOICES, midway=True, panel="Advanced")
 
 
 def device_setting() -> Any:
     """The field `device` of a stage's settings."""
     help = f"Torch device for --backend reference: {', '.join(DEVICES)}."
-    return field(
-        default=CPU,
-        metadata={"help": help, "choices": DEVICES, "midway": True, "panel": "Advanced"},
-    )
+    return setting(CPU, help, choices=DEVICES, midway=True, panel="Advanced")

@@ -41,7 +41,7 @@ class FineTuner:
         views: training views; each step uses one, in a new random order each epoch.
         extent: of the scene, in world units; the learning rate of the means scales with it.
         backend: name of the rasteriser.
-        report: asked before each step whether to stop.
+        report: says before each step whether to stop.
         dropout: whether to use dropout, and to refit colours afterwards, as training did.
     """
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from stages.training.trainer import Trainer
 
 DROPOUT_BELOW = 15  # training views
-MAX_VALIDATION_VIEWS = 4  # more of them would be missed more than their advice is worth
-MIN_VIEWS_FOR_VALIDATION = 8  # of fewer training views each is missed more than its advice is worth
+MAX_VALIDATION_VIEWS = 4  # each further one costs training more than it helps
+MIN_VIEWS_FOR_VALIDATION = 8  # with fewer, setting one aside costs too much
 EVALUATIONS = 10  # evenly spaced over the run
 
 
