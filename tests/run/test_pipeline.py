@@ -499,6 +499,22 @@ def test_interrupted_stage_goes_on_from_its_checkpoint(photos: Path, run_folder:
     assert pipeline.load("count") == "10 from 6"
 
 
+def test_incomplete_files_and_folders_of_a_killed_attempt_are_removed(
+    photos: Path, run_folder: Path
+) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    partial = run_folder / ".2-count.partial"
+    for folder in (partial / ".partial-0-1-scene.usdz", partial / "below" / ".partial-0-1-a"):
+        (folder / ".partial-0-1-inner").mkdir(parents=True)
+        (folder / ".partial-0-1-scene.usdc").write_text("half")
+    (partial / "below" / ".partial-0-1-b.ply").write_text("half")
+    pipeline.run()
+    assert pipeline.load("count") == "10 from 6"
+    assert not list(run_folder.rglob(".partial-*"))
+
+
 def test_failed_stage_is_told_with_its_reason_until_it_runs_again(
     photos: Path, run_folder: Path
 ) -> None:
