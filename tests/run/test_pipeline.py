@@ -243,6 +243,22 @@ def test_foreign_folder_is_refused_and_untouched(photos: Path, run_folder: Path)
     assert [p.name for p in run_folder.iterdir()] == ["thesis.txt"]
 
 
+def test_folder_whose_first_run_file_was_not_completed_is_not_foreign(
+    photos: Path, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(SplatError) as caught:
+            Pipeline(run_folder, photos, fake_stages()).run()
+    assert caught.value.code == "disk-full"
+    assert "run.json.tmp" in {path.name for path in run_folder.iterdir()}
+    assert ran(Pipeline(run_folder, photos, fake_stages())) == ["copy", "count", "sign"]
+    assert "run.json.tmp" not in {path.name for path in run_folder.iterdir()}
+
+
 def test_settings_out_of_bounds_are_refused_before_anything_is_made(
     photos: Path, run_folder: Path
 ) -> None:
