@@ -8,7 +8,7 @@ from stages.capacity.targets import held_out_loss_ratio
 from stages.scene import TrainedSplats
 
 _REASONS = {
-    RATE_DISTORTION: "removing more would cost more bits than it saves",
+    RATE_DISTORTION: "the remaining splats save more error than their bits cost",
     LOSS: "removing more would lose more than is allowed",
 }
 
@@ -23,7 +23,7 @@ def summarise(
     lines = [
         f"Rate-distortion: the training views hold {cost.samples:,} colour values, equivalent to "
         f"{cost.independent_samples:,.0f} independent ones. So a parameter costs "
-        f"{cost.bits_per_parameter:.1f} bits, and one dB costs {cost.bits_per_db / 8e3:,.0f} kB "
+        f"{cost.bits_per_parameter:.1f} bits, and one dB is worth {cost.bits_per_db / 8e3:,.0f} kB "
         f"(pruning strength {strength:g})."
     ]
     kept = [one for one in found.rounds if one.kept]
@@ -46,14 +46,14 @@ def summarise(
 def advise_more_splats(found: PruningResult, strength: float) -> str:
     """A sentence for a model that is too small, otherwise "".
 
-    A model is too small if nothing was removed because even its least useful tenth saves more bits
-    than it costs: a further tenth would contribute less than this one."""
+    A model is too small if nothing was removed and its least useful tenth is still worth its size:
+    a further tenth would be worth less than this one."""
     if not found.rounds or any(one.kept and one.removed for one in found.rounds):
         return ""
     if found.least_tenth_db <= 0.01 * strength:
         return ""
     return (
-        "No tenth of the splats can be removed: even the tenth that contributes least adds "
+        "No tenth of the splats can be removed: even the tenth that contributes least is worth "
         f"{found.least_tenth_db:.2f} dB, and another tenth would add at most as much. More splats "
         "would improve the pictures: train with a higher --max-splats."
     )

@@ -2,7 +2,7 @@
 
 Two-part code length (Rissanen's minimum description length): bits of the model + (n / 2) log2(MSE),
 where n is the number of independent colour samples in the photographs. A parameter that n samples
-determine takes log2(n) / 2 bits. It is kept if the squared error that it saves shortens
+determine takes log2(n) / 2 bits. It is worth keeping if the squared error that it saves shortens
 the second part by as many bits.
 """
 
@@ -48,7 +48,7 @@ class RateDistortion:
 
     @property
     def bits_per_db(self) -> float:
-        """Bits that one dB of PSNR may cost."""
+        """Bits equivalent to one dB of PSNR."""
         return self.independent_samples * 0.05 * math.log2(10)
 
     @property
