@@ -125,7 +125,7 @@ def _write_meshes(
     folder: Path,
     report: Report,
 ) -> list[ExportedFile]:
-    """Write the meshes that were asked for, and prove each; metric: mesh, see `CollisionMesh`.
+    """Write the requested meshes, and prove each; metric: mesh, see `CollisionMesh`.
     Raises SplatError "export-verify-failed"."""
     rows = mesh_formats(settings.formats)
     if not rows:

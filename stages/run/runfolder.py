@@ -13,6 +13,9 @@ from stages.run.manifest import MANIFEST, Manifest
 from stages.run.planning import PHOTOS
 from stages.run.runfile import RUN_FILE, RunFile
 
+# What a run that stopped before its run file was complete may leave.
+_WITHOUT_RUN_FILE = (LOCK, HOLDER, RUN_FILE + ".tmp")
+
 
 def is_run_folder(folder: Path) -> bool:
     """Whether splat made this folder."""
@@ -37,7 +40,7 @@ def opened(folder: Path, photos: Path | None) -> Iterator[None]:
     if not is_run_folder(folder):
         if photos is None:
             raise missing(folder)
-        if folder.exists() and any(path.name not in (LOCK, HOLDER) for path in folder.iterdir()):
+        if folder.exists() and any(path.name not in _WITHOUT_RUN_FILE for path in folder.iterdir()):
             raise _foreign(folder)
     RunFile.read(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -61,8 +61,11 @@ class Workspace:
         if self.partial.exists():
             (self.partial / _FAILURE).unlink(missing_ok=True)
             if request.matches(self.partial, settings_type):
-                for half in self.partial.rglob(".partial-*"):  # of a killed `replacing`
-                    half.unlink()
+                for half in list(self.partial.rglob(".partial-*")):  # a killed writer left these
+                    if half.is_dir() and not half.is_symlink():
+                        shutil.rmtree(half)
+                    else:
+                        half.unlink(missing_ok=True)  # it may lie in a folder just removed
                 return True
             shutil.rmtree(self.partial)
         self.partial.mkdir()

@@ -243,6 +243,22 @@ def test_foreign_folder_is_refused_and_untouched(photos: Path, run_folder: Path)
     assert [p.name for p in run_folder.iterdir()] == ["thesis.txt"]
 
 
+def test_folder_whose_first_run_file_was_not_completed_is_not_foreign(
+    photos: Path, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(SplatError) as caught:
+            Pipeline(run_folder, photos, fake_stages()).run()
+    assert caught.value.code == "disk-full"
+    assert "run.json.tmp" in {path.name for path in run_folder.iterdir()}
+    assert ran(Pipeline(run_folder, photos, fake_stages())) == ["copy", "count", "sign"]
+    assert "run.json.tmp" not in {path.name for path in run_folder.iterdir()}
+
+
 def test_settings_out_of_bounds_are_refused_before_anything_is_made(
     photos: Path, run_folder: Path
 ) -> None:
@@ -497,6 +513,22 @@ def test_interrupted_stage_goes_on_from_its_checkpoint(photos: Path, run_folder:
     pipeline.run(listener=heard)
     assert heard.events == [("skipped", "copy"), ("resumed", "count"), ("started", "sign")]
     assert pipeline.load("count") == "10 from 6"
+
+
+def test_incomplete_files_and_folders_of_a_killed_attempt_are_removed(
+    photos: Path, run_folder: Path
+) -> None:
+    pipeline = Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6)))
+    with pytest.raises(Interrupted):
+        pipeline.run()
+    partial = run_folder / ".2-count.partial"
+    for folder in (partial / ".partial-0-1-scene.usdz", partial / "below" / ".partial-0-1-a"):
+        (folder / ".partial-0-1-inner").mkdir(parents=True)
+        (folder / ".partial-0-1-scene.usdc").write_text("half")
+    (partial / "below" / ".partial-0-1-b.ply").write_text("half")
+    pipeline.run()
+    assert pipeline.load("count") == "10 from 6"
+    assert not list(run_folder.rglob(".partial-*"))
 
 
 def test_failed_stage_is_told_with_its_reason_until_it_runs_again(
