@@ -17,7 +17,7 @@ _HEADLINES = {
     "sfm": ("registered_images", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
     "train": ("splats", "psnr_db", "ssim", "trained_by"),
-    # Later stages measure at sizes of their own: their PSNR is no sequel of training's.
+    # Later stages measure at sizes of their own: it cannot be compared with that of training.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),
     "export": ("files", "splats"),
