@@ -1,5 +1,5 @@
 """Stage 6: chooses at which precision splats are stored, and fine-tunes them to the rounding of the
-file formats that are asked for.
+requested file formats.
 
 View-dependent colour takes up to three quarters of a file. The SH degree is lowered, for all splats
 and then for each, as far as training views do not show it. Held-out views measure the result and

@@ -102,7 +102,8 @@ class TrainSettings:
         metadata={
             "panel": "Light and masks",
             "help": "Bring all photographs to the median exposure and white balance before "
-            "training: auto (if they differ by more than a camera's noise), on or off.",
+            "training: auto (if they differ by more than a camera's noise and points agree), on or "
+            "off.",
             "choices": ("auto", "on", "off"),
         },
     )

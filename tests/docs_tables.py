@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from stages import STAGE_NAMES, load_stage
 from stages.base.settings import settings_of
-from tests.layers import LAYERS, STAGE_FILES
+from tests.layers import LAYERS
 
 if TYPE_CHECKING:
     from stages.formats.table import Format
@@ -51,11 +51,9 @@ def layers() -> str:
         for package in packages:
             if package == "stages":
                 continue
-            stage = package.removeprefix("stages.") in STAGE_FILES
             path = _path_of(package)
             name = f"{package.replace('.', '/')}{'.py' if path.name != '__init__.py' else '/'}"
-            title = "one stage: " if stage else ""
-            rows.append((str(number), f"`{name}`", title + _first_sentence(path)))
+            rows.append((str(number), f"`{name}`", _first_sentence(path)))
     return _table(("layer", "package", "contents"), rows)
 
 

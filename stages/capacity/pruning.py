@@ -65,7 +65,7 @@ class PruningResult:
         rate_distortion: at the start.
         start_db, end_db: mean PSNR of the measured views.
         least_tenth_db: what the tenth of the splats that contributes least contributed at first.
-        stopped_by: RATE_DISTORTION (what is left is worth its bits), LOSS or ROUNDS.
+        stopped_by: RATE_DISTORTION (the rest saves more bits than it costs), LOSS or ROUNDS.
         rounds: all that were tried.
     """
 

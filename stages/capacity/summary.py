@@ -8,7 +8,7 @@ from stages.capacity.targets import held_out_loss_ratio
 from stages.scene import TrainedSplats
 
 _REASONS = {
-    RATE_DISTORTION: "the remaining splats are worth their bits",
+    RATE_DISTORTION: "the remaining splats save more error than their bits cost",
     LOSS: "removing more would lose more than is allowed",
 }
 
@@ -39,7 +39,7 @@ def summarise(
         f"{found.end_db - found.start_db:+.2f} dB on the training views; other views lose at most "
         f"{held_out_loss_ratio(before.overfitted):.0%} of what these lose."
     )
-    reason = _REASONS.get(found.stopped_by, "all rounds that were asked for were done")
+    reason = _REASONS.get(found.stopped_by, "all requested rounds were done")
     return [*lines, f"Pruning stopped because {reason}."]
 
 

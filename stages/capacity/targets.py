@@ -88,7 +88,7 @@ class Targets:
         if self.min_psnr_db > psnr_db:
             raise SplatError(
                 "prune-targets-contradict",
-                given=f"--min-psnr {self.min_psnr_db:g} and the size asked for contradict each "
+                given=f"--min-psnr {self.min_psnr_db:g} and the requested size contradict each "
                 f"other: {counted(len(splats), 'splat')} reach {psnr_db:.2f} dB.",
                 wanted="Targets that this scene can meet together.",
                 hint=f"Ask for --min-psnr {np.floor(psnr_db * 100) / 100:.2f}, or allow more.",

@@ -79,7 +79,7 @@ class RayExecutor:
             num_gpus=need.gpus,
             memory=int(memory_mib * _MIB),
             max_retries=_MAX_RETRIES,
-            retry_exceptions=[Interrupted],  # of a worker that was asked to shut down
+            retry_exceptions=[Interrupted],  # of a worker that is being shut down
         )
         waiting = {remote_run.remote(task, cpus): number for number, task in enumerate(tasks)}
         while waiting:

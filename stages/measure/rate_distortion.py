@@ -48,7 +48,7 @@ class RateDistortion:
 
     @property
     def bits_per_db(self) -> float:
-        """Bits that one dB of PSNR is worth."""
+        """Bits equivalent to one dB of PSNR."""
         return self.independent_samples * 0.05 * math.log2(10)
 
     @property

@@ -80,7 +80,7 @@ def _file_of(path: Path) -> Path:
 
 
 def _read_array(file: BinaryIO, file_bytes: int, name: str) -> NDArray[np.generic]:
-    """One .npy block; its size is checked against the file before memory is asked for."""
+    """One .npy block; its size is checked against the file before memory is allocated."""
     if npy.read_magic(file) != (1, 0):
         raise ValueError(f"{name} has another version")
     try:

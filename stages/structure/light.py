@@ -25,18 +25,14 @@ from stages.structure.finish import SPARSE
 DOWNSCALE = 4  # of the pictures' sides; averages out their noise
 DARKEST, LIGHTEST = 0.06, 0.94  # sRGB values that are used
 REGULARISATION = 1e-6  # x the largest diagonal element; draws unconstrained views towards 0
-LARGEST_DISAGREEMENT = 0.5  # between halves of the points, in spreads of the light
 FEWEST_POINTS = 30  # of a photograph
 SUBSETS = 5  # all points; the greyer and the more saturated half; the darker and the lighter half
 ITERATIONS = 8  # of reweighted least squares
 
 
 def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction:
-    """The reconstruction with `View.light`, measured at the points of its COLMAP model.
-
-    It is returned unchanged if halves of the points disagree: then surfaces shine, and neither
-    exposure nor white balance changed.
-    """
+    """The reconstruction with `View.light`, measured at the points of its COLMAP model, and the
+    disagreement between halves of these points. Training decides whether the light is corrected."""
     model = read_model(reconstruction.folder / SPARSE)[1]
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
     observed = model.observed_points, model.observing_views, model.observed_px
@@ -48,13 +44,10 @@ def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction
         None if math.isnan(red) else (red, green, blue)
         for red, green, blue in found.round(4).tolist()
     ]
-    spread = spread_ev(lights)
-    report.metric("light_spread_ev", round(spread, 4))
+    report.metric("light_spread_ev", round(spread_ev(lights), 4))
     report.metric("light_disagreement_ev", round(disagreement, 4))
-    if disagreement > LARGEST_DISAGREEMENT * spread:
-        return reconstruction
     views = (replace(v, light=light) for v, light in zip(reconstruction.views, lights, strict=True))
-    return replace(reconstruction, views=tuple(views))
+    return replace(reconstruction, views=tuple(views), light_disagreement_ev=round(disagreement, 4))
 
 
 def measure_light(

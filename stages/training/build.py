@@ -11,7 +11,7 @@ from stages.base.text import counted
 from stages.measure.evaluation import load_evaluation_views
 from stages.raster.backends import backend_of_settings
 from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
-from stages.scene.light import NOISE_EV, spread_ev
+from stages.scene.light import LARGEST_DISAGREEMENT, NOISE_EV, spread_ev
 from stages.training.cap import cap_for, splats_determined
 from stages.training.schedule import Schedule
 from stages.training.trainer import Trainer
@@ -75,17 +75,42 @@ def make_trainer(
 
 
 def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
-    """Whether the views are brought to their median exposure and white balance. choice: "auto",
-    "on" or "off", see `TrainSettings.light`."""
+    """Whether the views are brought to their median exposure and white balance.
+
+    "auto" does so if the light differs by more than a camera's noise and halves of the points agree
+    about it: if they disagree, surfaces may shine while neither exposure nor white balance changed.
+
+    Args:
+        reconstruction: with the light of its views.
+        choice: "auto", "on" or "off", see `TrainSettings.light`.
+        report: receives metrics, and a warning if "auto" finds a difference, or "on" no light.
+    """
     lights = [view.light for view in reconstruction.views]
-    spread = spread_ev(lights)
-    corrects = choice == "on" or (choice == "auto" and spread > NOISE_EV)
+    known = any(light is not None for light in lights)
+    spread, disagreement = spread_ev(lights), reconstruction.light_disagreement_ev
+    differs, agree = spread > NOISE_EV, disagreement <= LARGEST_DISAGREEMENT * spread
+    corrects = choice == "on" or (choice == "auto" and differs and agree)
     report.metric("light_spread_ev", round(spread, 4))
-    report.metric("light_corrected", corrects and any(light is not None for light in lights))
-    if corrects and choice == "auto":
+    report.metric("light_corrected", corrects and known)
+    if choice == "on" and not known:
+        report.warn(
+            "train-light-unknown",
+            "--light on changes nothing: photographs share too few usable points to measure their "
+            "exposure and white balance.",
+        )
+    if choice != "auto" or not differs:
+        return corrects
+    if corrects:
         report.warn(
             "train-light-evened",
             f"Exposure or white balance differ between photographs (typically by {spread:.2f} EV): "
             "they are brought to the median photograph's. Lock both in the camera to lose nothing.",
+        )
+    else:
+        report.warn(
+            "train-light-not-evened",
+            f"Light differs between photographs (typically by {spread:.2f} EV) and is left as it "
+            f"is: halves of the points disagree by {disagreement:.2f} EV, which shiny surfaces "
+            "cause, too. If the camera changed its exposure or white balance, use --light on.",
         )
     return corrects

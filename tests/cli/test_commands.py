@@ -47,6 +47,14 @@ def test_process_makes_everything_and_says_where(splat) -> None:
     assert "Do it yourself" in result.stderr
 
 
+def test_warnings_are_repeated_at_the_end(splat) -> None:
+    splat("process", "photos")
+    result = splat("process", "photos")  # nothing runs
+    assert "7 warnings, of all stages:" in result.stderr
+    assert "Do it yourself" in result.stderr
+    assert "warnings" not in splat("process", "photos", "--quiet").stderr
+
+
 def test_asset_paths_are_not_broken_on_a_narrow_terminal(splat, monkeypatch) -> None:
     monkeypatch.setattr(console.out, "width", 40)
     long = "a folder with a name that is longer than any terminal is wide/run"

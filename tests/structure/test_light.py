@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView
 from stages.scene import Camera
-from stages.scene.light import NOISE_EV, spread_ev
-from stages.structure.light import LARGEST_DISAGREEMENT, measure_light
+from stages.scene.light import LARGEST_DISAGREEMENT, NOISE_EV, spread_ev
+from stages.structure import light as light_module
+from stages.structure.light import measure_light, with_light
+from stages.structure.reconstruction_files import load_reconstruction, save_reconstruction
+from tests.small_scene import small_scene
 
 SPOTS, VIEWS, CELL = 300, 6, 8
 COLUMNS = 20
@@ -59,6 +65,29 @@ def test_halves_of_the_points_agree_on_light_but_not_on_shine(tmp_path: Path) ->
     assert differ < 0.2 * spread_ev([tuple(row) for row in found.tolist()])
     found, differ = measure_light(*photographs(tmp_path, 0 * ev, hidden=0.0, shiny=True))
     assert differ > LARGEST_DISAGREEMENT * spread_ev([tuple(row) for row in found.tolist()])
+
+
+def test_light_is_stored_although_halves_of_the_points_disagree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, *observed = photographs(tmp_path, np.zeros((VIEWS, 3)), hidden=0.0, shiny=True)
+    observed_points, observing_views, observed_px = observed
+    model = SimpleNamespace(
+        observed_points=observed_points, observing_views=observing_views, observed_px=observed_px
+    )
+    monkeypatch.setattr(light_module, "read_model", lambda folder: (None, model))
+    whole = small_scene(tmp_path, VIEWS).reconstruction
+    views = tuple(
+        replace(view, image=file.name) for view, file in zip(whole.views, files, strict=True)
+    )
+    found = with_light(replace(whole, views=views), Report())
+    lights = [view.light for view in found.views]
+    assert None not in lights
+    assert found.light_disagreement_ev > LARGEST_DISAGREEMENT * spread_ev(lights)
+    save_reconstruction(tmp_path, found)
+    loaded = load_reconstruction(tmp_path)
+    assert loaded.light_disagreement_ev == found.light_disagreement_ev
+    assert [view.light for view in loaded.views] == lights
 
 
 def test_even_light_is_within_a_cameras_noise(tmp_path: Path) -> None:

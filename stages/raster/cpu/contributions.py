@@ -121,7 +121,7 @@ def contribution_tiles(
 def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, slot):
     zero, one, two = splat16(_F(0.0)), splat16(_F(1.0)), splat16(_F(2.0))
     change, total, largest, squares = zero, zero, zero, zero
-    pull_r, pull_g, pull_b = zero, zero, zero
+    residual_r, residual_g, residual_b = zero, zero, zero
     while blocks:
         block = lowest_bit(blocks)
         blocks &= blocks - 1
@@ -136,9 +136,9 @@ def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, s
         total = total + weight
         largest = vmax(largest, weight)
         squares = vfma(weight, weight, squares)
-        pull_r = vfma(weight, vload(work, RESIDUAL + at), pull_r)
-        pull_g = vfma(weight, vload(work, RESIDUAL + PIXELS + at), pull_g)
-        pull_b = vfma(weight, vload(work, RESIDUAL + 2 * PIXELS + at), pull_b)
+        residual_r = vfma(weight, vload(work, RESIDUAL + at), residual_r)
+        residual_g = vfma(weight, vload(work, RESIDUAL + PIXELS + at), residual_g)
+        residual_b = vfma(weight, vload(work, RESIDUAL + 2 * PIXELS + at), residual_b)
         ratio = alpha * inverse
         for channel in range(3):
             plane = channel * PIXELS + at
@@ -152,8 +152,11 @@ def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, s
         vsum(total),
         vsum(squares),
     )
-    out[slot, WEIGHTED_RESIDUAL], out[slot, WEIGHTED_RESIDUAL + 1] = vsum(pull_r), vsum(pull_g)
-    out[slot, WEIGHTED_RESIDUAL + 2] = vsum(pull_b)
+    out[slot, WEIGHTED_RESIDUAL], out[slot, WEIGHTED_RESIDUAL + 1] = (
+        vsum(residual_r),
+        vsum(residual_g),
+    )
+    out[slot, WEIGHTED_RESIDUAL + 2] = vsum(residual_b)
     vstore(lanes, 0, largest)
     top = lanes[0]
     for lane in range(1, 16):

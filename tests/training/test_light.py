@@ -1,0 +1,50 @@
+"""Whether training corrects the light of photographs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stages.base.stage import Report
+from stages.scene import Reconstruction
+from stages.scene.light import Light
+from stages.training.build import corrects_light
+from tests.small_scene import small_scene
+
+
+def lit(folder: Path, light: Light | None, disagreement: float) -> Reconstruction:
+    """Every second photograph has this light, the others 0."""
+    whole = small_scene(folder, views=4).reconstruction
+    lights = (light, light and (0.0, 0.0, 0.0)) * 2
+    views = (replace(v, light=each) for v, each in zip(whole.views, lights, strict=True))
+    return replace(whole, views=tuple(views), light_disagreement_ev=disagreement)
+
+
+@pytest.mark.parametrize(
+    ("ev", "disagreement", "choice", "corrects", "codes"),
+    [
+        (0.4, 0.02, "auto", True, ["train-light-evened"]),
+        (0.4, 0.3, "auto", False, ["train-light-not-evened"]),
+        (0.4, 0.3, "on", True, []),
+        (0.4, 0.3, "off", False, []),
+        (0.01, 0.3, "auto", False, []),
+        (0.01, 0.3, "on", True, []),
+        (None, 0.0, "auto", False, []),
+        (None, 0.0, "on", True, ["train-light-unknown"]),
+    ],
+)
+def test_on_is_obeyed_and_auto_says_what_it_leaves(
+    tmp_path: Path,
+    ev: float | None,
+    disagreement: float,
+    choice: str,
+    corrects: bool,
+    codes: list[str],
+) -> None:
+    report = Report()
+    light = None if ev is None else (ev, ev, ev)
+    assert corrects_light(lit(tmp_path, light, disagreement), choice, report) is corrects
+    assert [code for code, _ in report.warnings] == codes
+    assert report.metrics["light_corrected"] is (corrects and ev is not None)
