@@ -27,6 +27,7 @@ from stages.raster.backends import (
 )
 
 if TYPE_CHECKING:
+    from stages.formats import Format
     from stages.proof.prover import Prover
     from stages.scene import (
         ExportedAssets,
@@ -95,6 +96,7 @@ def run(
         path = folder / f"{settings.name}.{name}"
         held = splats_to_write(FORMATS[name], quantised)
         formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
+        _warn_of_losses(FORMATS[name], path, held, report)
         size = FORMATS[name].size_bytes(path)
         files.append(ExportedFile(name, path.name, size))
         figures[name] = {
@@ -167,6 +169,13 @@ def _warn_of_missing(count: int, dropped: int, report: Report) -> None:
         report.warn(
             "export-empty", "There is not one splat to export; look at the earlier stages' figures."
         )
+
+
+def _warn_of_losses(row: Format, path: Path, splats: Splats, report: Report) -> None:
+    from stages.formats.losses import losses_of
+
+    for loss in losses_of(row, path.name, splats):
+        report.warn(f"export-{row.ending.replace('.', '-')}-{loss.code}", loss.text)
 
 
 def _write_index(folder: Path, files: list[ExportedFile]) -> None:

@@ -144,6 +144,13 @@ def test_a_bad_8_bit_copy_is_a_warning(scene: SmallScene, tmp_path: Path) -> Non
     assert [code for code, _ in report.warnings] == ["export-splat-lossy"]
 
 
+def test_splats_out_of_range_are_a_warning(scene: SmallScene, tmp_path: Path) -> None:
+    splats = scene.splats.take(np.arange(len(scene.splats)))
+    splats.means[4] = 1e7
+    _, report = exported(scene, tmp_path, splats, formats=("ply", "spz"))
+    assert [code for code, _ in report.warnings] == ["export-spz-out-of-range"]
+
+
 def test_splats_that_cannot_be_drawn_are_left_out_and_counted(
     scene: SmallScene, tmp_path: Path
 ) -> None:

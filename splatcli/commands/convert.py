@@ -34,6 +34,7 @@ def convert(
     from stages import formats
     from stages.base import scratch
     from stages.base.atomic import make_folder
+    from stages.formats.losses import losses_of
     from stages.formats.values import drop_undrawable
 
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
@@ -44,6 +45,7 @@ def convert(
         splats = formats.read(source)
         begin(f"writing {target}")
         dropped = formats.write(target, splats)
+        warnings = [loss.text for loss in losses_of(rows[1], target.name, splats)]
         begin(f"comparing {target}")
         found = _proven(source, target, drop_undrawable(splats)[0])
     size = rows[1].size_bytes(target)
@@ -56,12 +58,15 @@ def convert(
         "bytes_per_splat": round(size / max(1, len(splats) - dropped), 2),
         "seconds": round(time.monotonic() - begun, 2),
         **found,
+        "warnings": warnings,
     }
     if as_json:
         console.emit("converted", **facts)
         return
     if dropped:
         console.warn(f"Warning: {dropped} splats that no viewer can draw were left out.")
+    for warning in warnings:
+        console.warn(f"Warning: {warning}")
     _show(facts, found, quiet)
 
 

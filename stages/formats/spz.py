@@ -2,10 +2,10 @@
 
 gzip around a header of 16 bytes (magic "NGSP", version, count, SH degree, fractional bits of
 positions, flags, 0) and one array after the other: positions 3 x 24-bit fixed point, opacities
-uint8, colours 3 x uint8 (0.15 dc + 0.5), scales 3 x uint8 (16 (ln + 10)), rotations (smallest
-three of x, y, z, w in 32 bits), SH uint8 (128 + 128 c), coefficients of one splat together, RGB
-last. Axes: right, up, back (y up). Specification: nianticlabs/spz,
-README.
+uint8 (255 sigmoid, kept within 1..254), colours 3 x uint8 (0.15 dc + 0.5), scales 3 x uint8
+(16 (ln + 10)), rotations (smallest three of x, y, z, w in 32 bits), SH uint8 (128 + 128 c),
+coefficients of one splat together, RGB last. Axes: right, up, back (y up). Specification:
+nianticlabs/spz, README.
 """
 
 from __future__ import annotations
@@ -21,15 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.blocks import reported_blocks
+from stages.base.blocks import blocks, reported_blocks
 from stages.formats import smallest_three
 from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
 from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import FLIP, flipped
+from stages.scene.spacing import median_spacing
 
 _LEVEL = 6  # 9 takes eight times as long for 1 % less
-_LEAST_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
+_USUAL_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23
+# Where 12 fractional bits do not hold the scene, fewer do: steps up to this share of the distance
+# between neighbouring splats.
+_STEP_OF_SPACING = 1 / 16
 _FIXED_LIMIT = (1 << 23) - 1
 _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip compresses
 
@@ -37,9 +41,9 @@ _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    The format has no field for units and the origin; they are lost. A splat farther than 2048
-    units from the centre is moved closer along its ray and scaled down, which looks the same from
-    the centre. Raises SplatError when the file cannot be written.
+    The format has no field for units and the origin; they are lost. A splat beyond the range of
+    24 bits (see `count_out_of_range`) is moved closer along its ray and scaled down, which looks
+    the same from the centre. Raises SplatError when the file cannot be written.
     """
     splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
@@ -50,7 +54,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         lambda block: _positions(block, bits),
         _opacities,
         lambda block: _byte(255 * (COLOUR_SCALE * block.sh[:, 0].astype(np.float64) + 0.5)),
-        lambda block: _byte(16 * (_within_reach(block).log_scales + 10)),
+        lambda block: _byte(16 * (_within_reach(block, bits).log_scales + 10)),
         lambda block: _pack_rotations(flipped(block.with_sh_degree(0)).quaternions),
         _sh,
     )
@@ -67,10 +71,25 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     return dropped
 
 
-def _within_reach(splats: Splats) -> Splats:
+def count_out_of_range(splats: Splats) -> int:
+    """The number of drawable splats that lie farther out than the file can hold."""
+    means = drop_undrawable(splats)[0].means
+    reach = _reach(_fractional_bits(means))
+    return sum(
+        int(np.count_nonzero(np.abs(means[rows]).max(axis=1, initial=0.0) > reach))
+        for rows in blocks(len(means))
+    )
+
+
+def _reach(bits: int) -> float:
+    """The largest coordinate that 24 bits hold."""
+    return _FIXED_LIMIT / (1 << bits)
+
+
+def _within_reach(splats: Splats, bits: int) -> Splats:
     """Splats beyond the range of 24 bits are scaled towards the centre; means and log_scales are
     float64."""
-    reach = _FIXED_LIMIT / (1 << _LEAST_FRACTIONAL_BITS)
+    reach = _reach(bits)
     means = splats.means.astype(np.float64)
     factors = reach / np.maximum(np.abs(means).max(axis=1, initial=0.0), reach)
     return replace(
@@ -81,17 +100,22 @@ def _within_reach(splats: Splats) -> Splats:
 
 
 def _fractional_bits(means: NDArray[np.floating]) -> int:
-    """As many as the largest coordinate allows: small scenes get finer steps."""
+    """As many as the largest coordinate allows: small scenes get finer steps. Scenes beyond 2048
+    units get coarser steps, as long as neighbouring splats are told apart."""
     largest = float(max(means.max(initial=0.0), -means.min(initial=0.0)))
     if largest == 0:
-        return _LEAST_FRACTIONAL_BITS
-    room = math.floor(math.log2(_FIXED_LIMIT / largest))
-    return min(max(room, _LEAST_FRACTIONAL_BITS), _MOST_FRACTIONAL_BITS)
+        return _USUAL_FRACTIONAL_BITS
+    most = min(math.floor(math.log2(_FIXED_LIMIT / largest)), _MOST_FRACTIONAL_BITS)
+    if most >= _USUAL_FRACTIONAL_BITS:
+        return most
+    spacing = median_spacing(means)
+    least = math.ceil(-math.log2(_STEP_OF_SPACING * spacing)) if spacing else 0
+    return max(most, min(max(least, 0), _USUAL_FRACTIONAL_BITS))
 
 
 def _positions(splats: Splats, bits: int) -> NDArray[np.uint8]:
     """[N, 3, 3] three bytes a coordinate, y up."""
-    y_up = _within_reach(splats).means * FLIP
+    y_up = _within_reach(splats, bits).means * FLIP
     fixed = np.rint(y_up * float(1 << bits)).astype("<i4")
     return np.ascontiguousarray(fixed).view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
 

@@ -29,6 +29,8 @@ class Format:
             format keeps the order.
         quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses
             repeated values; "" for the others.
+        out_of_range: (splats) -> the number of splats that lie farther out than a file can hold;
+            "" for formats that hold any position.
         loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
             back as float32.
         sh_degree: the highest SH degree that is kept.
@@ -47,6 +49,7 @@ class Format:
     reader: str
     order: str = ""
     quantiser: str = ""
+    out_of_range: str = ""
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
@@ -145,6 +148,7 @@ TABLE = (
         keeps="sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
+        out_of_range="stages.formats.spz:count_out_of_range",
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
         y_up=True,

@@ -94,6 +94,17 @@ def test_splats_that_cannot_be_drawn_are_counted(tmp_path: Path) -> None:
     assert "4 splats" in err
 
 
+def test_splats_out_of_range_are_counted_and_told(tmp_path: Path) -> None:
+    splats = many_splats(2000)
+    splats.means[4] = 1e6
+    formats.write(tmp_path / "a.ply", splats)
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.spz")
+    assert err.count("Warning") == 1
+    assert "1 splat of 2,000" in " ".join(err.split())
+    out, _ = converted(tmp_path / "a.ply", tmp_path / "b.spz", "--json")
+    assert "24 bits" in json.loads(out.splitlines()[-1])["warnings"][0]
+
+
 @pytest.mark.parametrize(("source", "target"), [("a.ply", "b.obj"), ("a.obj", "b.ply")])
 def test_unknown_endings_name_the_known_ones(tmp_path: Path, source: str, target: str) -> None:
     formats.write(tmp_path / "a.ply", many_splats(3))

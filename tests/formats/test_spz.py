@@ -13,10 +13,11 @@ import pytest
 
 from stages import formats
 from stages.base.errors import SplatError
-from stages.formats import spz_read
+from stages.formats import spz, spz_read
 from stages.proof.checks import read_back
 from stages.proof.prover import Prover, cameras_for
 from stages.scene import Splats
+from stages.scene.spacing import median_spacing
 from tests.formats.files import angles
 from tests.formats.truth import C0, extreme_splats, many_splats, red_splat
 
@@ -117,18 +118,40 @@ def test_a_small_scene_keeps_its_positions(tmp_path: Path) -> None:
     assert error < 1e-7
 
 
+def test_terrain_wider_than_2048_units_keeps_its_positions(tmp_path: Path) -> None:
+    splats = many_splats(2000)
+    splats.means[:] = np.random.default_rng(1).uniform(-3000, 3000, (2000, 3))
+    formats.write(tmp_path / "a.spz", splats)
+    assert content_of(tmp_path / "a.spz")[13] == 11
+    back = formats.read(tmp_path / "a.spz")
+    np.testing.assert_allclose(back.means, splats.means, atol=0.5 / 2**11 + 1e-3)
+    assert spz.count_out_of_range(splats) == 0
+
+
+def test_an_outlier_does_not_coarsen_the_steps_of_the_others(tmp_path: Path) -> None:
+    splats = many_splats(2000)
+    splats.means[4] = (1e6, -5e5, 2e5)
+    formats.write(tmp_path / "a.spz", splats)
+    bits = content_of(tmp_path / "a.spz")[13]
+    assert 2.0**-bits <= median_spacing(splats.means) / 16 < 2.0 ** (1 - bits)
+    error = np.abs(formats.read(tmp_path / "a.spz").means - splats.means)
+    assert np.delete(error, 4, axis=0).max() <= 0.5 / 2**bits + 1e-6
+    assert spz.count_out_of_range(splats) == 1
+
+
 def test_what_lies_beyond_reach_looks_the_same_from_the_middle(tmp_path: Path) -> None:
     splats = many_splats(9)
-    splats.means[4] = (1e4, -5e3, 2e3)
-    splats.log_scales[4] = 3
+    splats.means[4] = (1e9, -5e8, 2e8)
+    splats.log_scales[4] = 10
     formats.write(tmp_path / "a.spz", splats)
     back = formats.read(tmp_path / "a.spz")
-    assert np.abs(back.means[4]).max() == pytest.approx(2048, abs=0.01)
+    bits = content_of(tmp_path / "a.spz")[13]
+    assert np.abs(back.means[4]).max() == pytest.approx(2 ** (23 - bits), rel=1e-5)
     along = back.means[4] / np.linalg.norm(back.means[4])
     np.testing.assert_allclose(along, splats.means[4] / np.linalg.norm(splats.means[4]), atol=1e-6)
     size, wanted = (np.exp(s.log_scales[4]) / np.linalg.norm(s.means[4]) for s in (back, splats))
     np.testing.assert_allclose(size, wanted, rtol=1 / 32)
-    np.testing.assert_allclose(back.means[:4], splats.means[:4], atol=0.5 / 4096 + 1e-6)
+    np.testing.assert_allclose(back.means[:4], splats.means[:4], atol=0.5 / 2**bits + 1e-6)
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
