@@ -43,16 +43,16 @@ class Quiet(Listener):
     """Prints warnings, and the wait after Ctrl-C."""
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        warn(stage, manifest)
+        warn(manifest)
 
     def stopping(self) -> None:
         console.note(STOPPING)
 
 
-def warn(stage: Stage, manifest: Manifest) -> None:
+def warn(manifest: Manifest) -> None:
     """Print a stage's warnings."""
     for code, sentence in manifest.warnings:
-        console.note(f"Warning ({stage.name}): {sentence} ({code})", "yellow")
+        console.note(f"Warning ({manifest.stage}): {sentence} ({code})", "yellow")
 
 
 class Events(Listener):
@@ -148,7 +148,7 @@ class Lines(Listener):
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         console.note(f"{number}/7 {stage.name}: done in {console.duration(manifest.seconds)}")
-        warn(stage, manifest)
+        warn(manifest)
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
         console.note(f"{number}/7 {stage.name}: up to date")
@@ -213,7 +213,7 @@ class Bars(Listener):
         self._close()
         line = f"{number}/7 {stage.name:<8} done in {console.duration(manifest.seconds)}"
         self._screen.print(Text(line, style="green"))
-        warn(stage, manifest)
+        warn(manifest)
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
         self._screen.print(Text(f"{number}/7 {stage.name:<8} up to date", style="dim"))

@@ -6,7 +6,8 @@ from typing import Any
 
 from rich.text import Text
 
-from splatcli import console
+from splatcli import console, progress
+from stages.base.text import counted
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
 
@@ -16,7 +17,7 @@ _HEADLINES = {
     "sfm": ("registered_images", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
     "train": ("splats", "psnr_db", "ssim", "trained_by"),
-    # Later stages measure at sizes of their own: their PSNR is no sequel of training's.
+    # Later stages measure at sizes of their own: it cannot be compared with that of training.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),
     "export": ("files", "splats"),
@@ -24,7 +25,8 @@ _HEADLINES = {
 
 
 def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -> None:
-    """Print a table of the stages up to `until`, and the exported files."""
+    """Print a table of the stages up to `until`, the exported files, and after all stages their
+    warnings again."""
     reached = [stage.name for stage in pipeline.layout.up_to(until)]
     manifests = [m for m in map(pipeline.manifest, reached) if m is not None]
     assets = _assets(pipeline) if "export" in reached else []
@@ -49,6 +51,11 @@ def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -
         )
     else:
         console.out.print(Text(f"\nIn {pipeline.stage_folder(reached[-1])}"))
+    count = sum(len(manifest.warnings) for manifest in manifests)
+    if until is None and count:
+        console.note(f"\n{counted(count, 'warning')}, of all stages:")
+        for manifest in manifests:
+            progress.warn(manifest)
 
 
 def time_of(manifest: Manifest) -> str:

@@ -12,7 +12,12 @@ from stages.base.errors import SplatError
 
 
 class BadFileError(ValueError):
-    """What a reader found wrong; `reading` adds the file's name."""
+    """What a reader found wrong; `reading` adds the file's name. hint: what to do, where it is not
+    what the `FileKind` says."""
+
+    def __init__(self, reason: str, hint: str = "") -> None:
+        super().__init__(reason)
+        self.hint = hint
 
 
 @dataclass(frozen=True)
@@ -66,14 +71,15 @@ def reading(path: Path, kind: FileKind = SPLATS) -> Iterator[None]:
         RecursionError,
         struct.error,
     ) as error:
-        reason = str(error) if isinstance(error, BadFileError) else f"it is damaged ({error})"
-        raise _unreadable(path, kind, reason) from error
+        if isinstance(error, BadFileError):
+            raise _unreadable(path, kind, str(error), error.hint) from error
+        raise _unreadable(path, kind, f"it is damaged ({error})") from error
 
 
-def _unreadable(path: Path, kind: FileKind, reason: str) -> SplatError:
+def _unreadable(path: Path, kind: FileKind, reason: str, hint: str = "") -> SplatError:
     return SplatError(
         kind.code,
         given=f"{path} cannot be read as {kind.what}: {reason}.",
         wanted=kind.wanted,
-        hint=kind.hint,
+        hint=hint or kind.hint,
     )

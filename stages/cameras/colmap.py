@@ -1,8 +1,8 @@
 """COLMAP's sparse model: cameras, images and points, read as binary or text, written as binary.
 
 Layout: https://colmap.github.io/format.html (binary files hold the same fields as the text files,
-little-endian). Records are written in order of id, so that equal models give equal bytes. Axes and
-world are ours.
+little-endian). Records are written in order of id, so that equal models give equal bytes. Axes are
+the same as ours, and the world is not transformed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _PINHOLE = 1
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Pinhole views and points. Ids in the files are positions + 1.
+    """Pinhole views and points. Ids in the files that we write are positions + 1.
 
     Args:
         names: V picture paths, relative to the folder of pictures.
@@ -115,7 +115,7 @@ def read(folder: Path) -> CameraFile:
 
 
 def read_model(folder: Path) -> tuple[CameraFile, ColmapModel]:
-    """Cameras and points; 2D points that belong to none are left out. Raises SplatError
+    """Cameras and points; keypoints without a 3D point are left out. Raises SplatError
     "cameras-unreadable"."""
     found, images = _read(folder)
     path, text = _part(folder, "points3D")

@@ -2,10 +2,10 @@
 
 gzip around a header of 16 bytes (magic "NGSP", version, count, SH degree, fractional bits of
 positions, flags, 0) and one array after the other: positions 3 x 24-bit fixed point, opacities
-uint8, colours 3 x uint8 (0.15 dc + 0.5), scales 3 x uint8 (16 (ln + 10)), rotations (smallest
-three of x, y, z, w in 32 bits), SH uint8 (128 + 128 c), coefficients of one splat together, RGB
-last. Axes: right, up, back (y up). Specification: nianticlabs/spz,
-README.
+uint8 (255 sigmoid, kept within 1..254), colours 3 x uint8 (0.15 dc + 0.5), scales 3 x uint8
+(16 (ln + 10)), rotations (smallest three of x, y, z, w in 32 bits), SH uint8 (128 + 128 c),
+coefficients of one splat together, RGB last. Axes: right, up, back (y up). Specification:
+nianticlabs/spz, README.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ class PrecompileListener(Listener):
     """Starts the compiling process with the first stage and waits for it before the first stage
     that draws, because two processes must not compile the same kernels.
 
-    The run never depends on it: what the process did not compile is compiled later. It takes one
-    core for as long as 20 photographs take to register and seed on another core; it has the same
+    The run is correct without it: what the process did not compile is compiled later. Compiling
+    takes one core about as long as sfm and seed of 20 photographs take another. It has the same
     priority, because training waits for both.
 
     backend: the backend that the run will train with.
@@ -57,7 +57,7 @@ class PrecompileListener(Listener):
             self._process = subprocess.Popen(
                 # -P: the current folder may hold anything, also a file named numpy.py.
                 [sys.executable, "-P", "-m", "stages.training.compile_kernels", self._backend],
-                stdin=subprocess.PIPE,  # the process ends when this process does
+                stdin=subprocess.PIPE,  # the child ends when this pipe closes: with this process
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=os.environ | {"PYTHONPATH": paths},

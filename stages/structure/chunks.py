@@ -1,8 +1,8 @@
 """Features and matches of many photographs in chunks, which an executor may run on other machines.
 
-A chunk reads photographs, and features from the job's database, which nothing writes to meanwhile.
-It writes a database of its own to the work folder, completely or not at all, and the next step of
-the job merges that. The result does not depend on who ran which chunk: each photograph and each
+A chunk reads photographs, and features from the job's database, which stays unchanged while chunks
+run. It writes a database of its own to the work folder, completely or not at all, and the next step
+of the job merges that. The result does not depend on who ran which chunk: each photograph and each
 pair is processed independently, with a vocabulary that is built once.
 """
 
@@ -40,7 +40,7 @@ class Chunk:
         job: file of the whole job.
         out: the database to write.
         photographs: positions of photographs, for features.
-        pairs: positions of pairs, for matching.
+        pairs: pairs of positions of photographs, for matching.
     """
 
     job: Path
@@ -50,8 +50,8 @@ class Chunk:
 
 
 ChunkExecutor = Callable[[Sequence[Chunk], Callable[[], None]], None]
-"""Runs chunks (`run_chunk`) in any order, and calls its second argument after each. Passes on what
-either raises; raises Interrupted when it is stopped."""
+"""Runs chunks (`run_chunk`) in any order, and calls its second argument after each. Exceptions of
+either pass through; raises Interrupted when it is stopped."""
 
 
 def extract_features_in_chunks(

@@ -39,11 +39,11 @@ class ModelStatistics:
         distortion: k of SIMPLE_RADIAL, of the camera with the largest |k|.
         focal_over_prior: estimated focal length over that of EXIF, of the camera where this ratio
             is farthest from 1; None without EXIF.
-        pairs_checked: pairs of photographs with many verified matches.
+        pairs_checked: pairs of photographs with at least 30 verified matches.
         pairs_inconsistent: those of them whose matches do not fit the poses of the model.
         inconsistent_pair: the names of one such pair.
-        rotation_to_other_deg: largest disagreement between this model and another one about the
-            relative rotation of photographs that are in both.
+        rotation_to_other_deg: largest disagreement between this model and another of COLMAP's
+            models about the relative rotation of photographs that are in both.
         cut_points: points observed from both sides of the weakest cut of the view graph.
         cut_views: photographs on the smaller side of that cut; 0: the model is too small to cut.
     """
@@ -78,9 +78,9 @@ class Thresholds:
     stamp k = -8.6 and 3.9 times the focal length; a blank wall 15 points a photograph at 0.13 px;
     strong blur 76 keypoints a photograph (mild blur, which works, 257). Good captures: 450 and 250
     points a photograph at 0.34 and 1.02 px of 1600.
-    Good models are inconsistent with none of their pairs (of 150, 35 and 777), that of an object
-    turned over half-way with 15 of 67. The weakest cuts of good models hold 1,032, 222 and 1,406
-    points.
+    Good models are consistent with all of their pairs (150, 35 and 777). The model of an object
+    that was turned over half-way is inconsistent with 15 of 67. The weakest cuts of good models
+    hold 1,032, 222 and 1,406 points.
     """
 
     registered_share: float = 0.8

@@ -27,8 +27,8 @@ def site(
 
     Args:
         content: the splats as .ply, or the lod-meta.json of a streamed asset.
-        photos: the folder that `View.image` starts from; missing photographs are left out.
-        source: what `splat edit` would read, if it is not the content.
+        photos: the folder that `View.image` is relative to; missing photographs are left out.
+        source: the path shown as the input of `splat edit`; by default `content`.
 
     Raises SplatError.
     """
@@ -38,7 +38,9 @@ def site(
     items |= {f"/{name}": Item(file, "application/octet-stream") for name, file in files.items()}
     levels = streamed_sog.splat_widths(content, splats) if streams else []
     scene = document.scene_data(
-        *(title, splats, shots),
+        title,
+        splats,
+        shots,
         units=units,
         source=source or str(content),
         content=next(iter(files)),

@@ -123,6 +123,14 @@ def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -
     assert file in caught.value.given
 
 
+def test_bundlers_missing_list_may_be_written(tmp_path: Path) -> None:
+    path = MADE["bundler"](tmp_path)
+    (tmp_path / "list.txt").unlink()
+    with pytest.raises(SplatError, match="no list of pictures") as caught:
+        read_cameras(path)
+    assert f"Write {tmp_path / 'list.txt'}" in caught.value.hint
+
+
 @pytest.mark.parametrize("name", ["cameras.json", "cameras.xml", "cameras.csv", "cameras.out"])
 def test_gigabytes_are_refused_before_they_are_read(tmp_path: Path, name: str) -> None:
     with (tmp_path / name).open("wb") as file:

@@ -47,6 +47,14 @@ def test_process_makes_everything_and_says_where(splat) -> None:
     assert "Do it yourself" in result.stderr
 
 
+def test_warnings_are_repeated_at_the_end(splat) -> None:
+    splat("process", "photos")
+    result = splat("process", "photos")  # nothing runs
+    assert "7 warnings, of all stages:" in result.stderr
+    assert "Do it yourself" in result.stderr
+    assert "warnings" not in splat("process", "photos", "--quiet").stderr
+
+
 def test_asset_paths_are_not_broken_on_a_narrow_terminal(splat, monkeypatch) -> None:
     monkeypatch.setattr(console.out, "width", 40)
     long = "a folder with a name that is longer than any terminal is wide/run"
@@ -387,3 +395,19 @@ def test_option_out_of_two_run_folders_is_refused(splat) -> None:
     result = splat("process", "run", "--out", "other")
     assert result.exit_code == 2
     assert "--out" in result.stderr
+
+
+@pytest.mark.parametrize("text", [None, "{"])
+def test_run_folder_without_a_whole_run_file_is_continued_with_a_warning(
+    splat, tmp_path, text: str | None
+) -> None:
+    assert splat("process", "photos", "--out", "hill", "--steps", "70").exit_code == 0
+    run_file = tmp_path / "hill" / "run.json"
+    run_file.unlink() if text is None else run_file.write_text(text)
+    assert splat("status", "hill").exit_code == 0
+    again = splat("process", "hill")
+    assert again.exit_code == 0, again.output
+    assert "rebuilt" in again.stderr
+    assert '"steps": 70' in run_file.read_text()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hill", "photos"]
+    assert "rebuilt" not in splat("process", "hill").stderr

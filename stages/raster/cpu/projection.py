@@ -60,14 +60,21 @@ from stages.raster.kernels.simd64 import (
     spread8,
 )
 
-# Work of eight splats (float64[WORK_ROW x 8], one a thread): entry k of all lanes lies at 8 k.
+# Scratch array for eight splats (float64[WORK_ROW x 8]), one for each thread: entry k of all lanes
+# lies at 8 k.
 # Filled by `footprint`, read by `footprint_gradient`.
 X, Y, Z = 0, 1, 2  # position in the camera
-V0, V1 = 3, 6  # rows of V = J W R diag(s)
-AXES = 9  # 9:18 W R
+V0, V1 = 3, 6  # rows of V = J W Q diag(s): W the camera rotation cam[R], Q the splat rotation
+AXES = 9  # 9:18 W Q
 SCALES = 18  # 18:21
 CROSS = 21  # 21:24 V0 x V1
-A, B, C, DET, MINORS = 24, 25, 26, 27, 28
+A, B, C, DET, MINORS = (
+    24,
+    25,
+    26,
+    27,
+    28,
+)  # covariance in pixels (xx, xy, yy), determinant, 2x2 minors
 FULL_OPACITY, COMPENSATION = 29, 30
 NORM, QUATERNION = 31, 32  # 32:36 unit
 SLOPE = 36  # 36:38 clamped x/z, y/z
@@ -81,7 +88,7 @@ WORK_ROW = 44
 # A^2 of a footprint of 1e19 pixels); log2 of the opacity; variances.
 GEOMETRY_ROW = 8
 GX, GY, GA, GB, GK, GL, GVX, GVY = range(8)
-# What `footprint_gradient` gives, entries of 8 lanes: as a row of gradients up to the SH.
+# Entries of 8 lanes that `footprint_gradient` writes: laid out like a gradient row, without its SH.
 GRADIENTS = SH
 
 _LOG2E = 1.0 / math.log(2.0)
@@ -96,19 +103,19 @@ def drawable(rows, means, quaternions, log_scales, opacity_logits, smoothing):
     good = dge(LOG_SCALE_MAX, gather8(log_scales, rows, 3, 0))
     largest = zero
     # 0 x value is 0 for finite values only
-    nothing = 0.0 * gather8(opacity_logits, rows, 1, 0)
+    nan_if_not_finite = 0.0 * gather8(opacity_logits, rows, 1, 0)
     for k in range(3):
         log_scale = gather8(log_scales, rows, 3, k)
         good = dand(good, dge(LOG_SCALE_MAX, log_scale))
-        nothing = nothing + 0.0 * log_scale + 0.0 * gather8(means, rows, 3, k)
+        nan_if_not_finite = nan_if_not_finite + 0.0 * log_scale + 0.0 * gather8(means, rows, 3, k)
     for k in range(4):
         q = gather8(quaternions, rows, 4, k)
-        nothing = nothing + 0.0 * q
+        nan_if_not_finite = nan_if_not_finite + 0.0 * q
         largest = dmax(largest, dmax(q, -q))
     if len(smoothing) > 0:
         width = gather8(smoothing, rows, 1, 0)
         good = dand(good, dand(dge(width, 0.0), dge(SCALE_MAX, width)))
-    return dand(dand(good, deq(nothing, zero)), dge(largest, QUATERNION_MIN))
+    return dand(dand(good, deq(nan_if_not_finite, zero)), dge(largest, QUATERNION_MIN))
 
 
 @kernel
@@ -159,7 +166,7 @@ def _scales(rows, log_scales, smoothing, w):
 
 @kernel
 def _covariance(cam, u, v, z, w):
-    """V = J W R diag(s), cov2d = V V^T + e I, its determinant by Cauchy-Binet."""
+    """V = J W Q diag(s), cov2d = V V^T + e I, its determinant by Cauchy-Binet."""
     j00, j02 = cam[FX] / z, -cam[FX] * u / z
     j11, j12 = cam[FY] / z, -cam[FY] * v / z
     a, b, c = spread8(0.0), spread8(0.0), spread8(0.0)
@@ -191,7 +198,7 @@ def _covariance(cam, u, v, z, w):
 
 @kernel
 def _axes(rows, cam, quaternions, w):
-    """W R(q) into the work; scaled before it is normalised, so that no square overflows."""
+    """W Q(q) into the scratch array; q is scaled before it is normalised: no square overflows."""
     q0, q1 = gather8(quaternions, rows, 4, 0), gather8(quaternions, rows, 4, 1)
     q2, q3 = gather8(quaternions, rows, 4, 2), gather8(quaternions, rows, 4, 3)
     top = dmax(dmax(dmax(q0, -q0), dmax(q1, -q1)), dmax(dmax(q2, -q2), dmax(q3, -q3)))
@@ -279,7 +286,9 @@ def sums_origin(geometry, row, width, height):
 
 
 @kernel
-def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_near, g_opacity, smoothed, out):
+def footprint_gradient(
+    cam, w, g_x, g_y, g_exp_a, g_exp_b, g_exp_k, g_log_inverse_z, g_opacity, smoothed, out
+):
     """Chain rule from the footprints of eight splats to their parameters.
 
     Gradients of mean x, mean y (px), of A, B, K of the exponent A u^2 + B (v - K u)^2, of
@@ -287,15 +296,17 @@ def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_near, g_opacity, smoot
     smoothed: whether a smoothing filter was used.
     out (work of GRADIENTS entries): gradients of mean, quaternion, log-scales, opacity logit.
     """
-    a, b, c, det = at(w, A), at(w, B), at(w, C), at(w, DET)
-    major = dmax(a, c)
-    g_major = (0.5 * g_b / det) - (0.5 * g_a + g_k * b) / (major * major)
-    g_cov = g_k / major
-    g_det = -0.5 * g_b * major / (det * det)
-    wide = dge(a, c)
-    g_var_x, g_var_y = dselect(wide, g_major, 0.0), dselect(wide, 0.0, g_major)
+    cov_xx, cov_xy, cov_yy, det = at(w, A), at(w, B), at(w, C), at(w, DET)
+    larger_variance = dmax(cov_xx, cov_yy)
+    g_larger_variance = (0.5 * g_exp_b / det) - (0.5 * g_exp_a + g_exp_k * cov_xy) / (
+        larger_variance * larger_variance
+    )
+    g_cov = g_exp_k / larger_variance
+    g_det = -0.5 * g_exp_b * larger_variance / (det * det)
+    wide = dge(cov_xx, cov_yy)
+    g_var_x, g_var_y = dselect(wide, g_larger_variance, 0.0), dselect(wide, 0.0, g_larger_variance)
     g_minors = spread8(0.0)
-    opacity, drawn = at(w, FULL_OPACITY), used_opacity(w)
+    opacity, drawn_opacity = at(w, FULL_OPACITY), used_opacity(w)
     e = cam[DILATION]
     if cam[ANTIALIAS] != 0.0:
         g_compensation = g_opacity * opacity * at(w, SMOOTHING)
@@ -303,16 +314,16 @@ def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_near, g_opacity, smoot
         g_det = g_det - 0.5 * g_compensation * compensation / det
         thick = dgt(minors, 1e-60)
         g_minors = dselect(thick, 0.5 * g_compensation / (compensation * det), 0.0)
-        # of ln(compensation) by ln(1 / z), whose 4th power the minors grow with
-        growth = dselect(thick, e * (a + c), e * (a + c) - 2.0 * det)
-        g_near = g_near + g_compensation * compensation * growth / det
-    put(out, OPACITY, g_opacity * drawn * (1.0 - opacity))
+        # d ln(compensation) / d ln(1 / z): the minors grow as (1 / z)^4
+        growth = dselect(thick, e * (cov_xx + cov_yy), e * (cov_xx + cov_yy) - 2.0 * det)
+        g_log_inverse_z = g_log_inverse_z + g_compensation * compensation * growth / det
+    put(out, OPACITY, g_opacity * drawn_opacity * (1.0 - opacity))
     g_minors = g_minors + g_det
     e2 = 2.0 * e * g_det
     z = at(w, Z)
     fx, fy = cam[FX], cam[FY]
-    u, v = at(w, SLOPE), at(w, SLOPE + 1)
-    j00, j02, j11, j12 = fx / z, -fx * u / z, fy / z, -fy * v / z
+    slope_x, slope_y = at(w, SLOPE), at(w, SLOPE + 1)
+    j00, j02, j11, j12 = fx / z, -fx * slope_x / z, fy / z, -fy * slope_y / z
     g02, g12 = spread8(0.0), spread8(0.0)
     for k in range(3):
         n, m = (k + 1) % 3, (k + 2) % 3
@@ -325,21 +336,21 @@ def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_near, g_opacity, smoot
         g_log_scale = g_v0 * v0 + g_v1 * v1
         if smoothed:
             kept = at(w, RATIOS + k) * at(w, RATIOS + k)
-            g_log_scale = g_log_scale * kept + g_opacity * drawn * (1.0 - kept)
+            g_log_scale = g_log_scale * kept + g_opacity * drawn_opacity * (1.0 - kept)
         put(out, LOG_SCALE + k, g_log_scale)
         t0, t1 = g_v0 * at(w, SCALES + k), g_v1 * at(w, SCALES + k)
         z_axis = at(w, AXES + 6 + k)
         g02, g12 = g02 + t0 * z_axis, g12 + t1 * z_axis
-        # from here on these entries hold the gradient of W R
+        # from here on these entries hold the gradient of W Q
         put(w, AXES + k, j00 * t0)
         put(w, AXES + 3 + k, j11 * t1)
         put(w, AXES + 6 + k, j02 * t0 + j12 * t1)
     _quaternion_gradient(cam, w, out)
-    _mean_gradient(cam, w, g_x, g_y, g02, g12, g_near, out)
+    _mean_gradient(cam, w, g_x, g_y, g02, g12, g_log_inverse_z, out)
 
 
 @kernel
-def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_near, out):
+def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_log_inverse_z, out):
     """out[MEAN] from the gradients of the projected mean, of the Jacobian's last column, and of
     ln(1 / z) at fixed slopes."""
     fx, fy = cam[FX], cam[FY]
@@ -348,14 +359,14 @@ def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_near, out):
     g_u = dselect(dgt(at(w, INSIDE), 0.5), -g02 * fx / z, 0.0)
     g_v = dselect(dgt(at(w, INSIDE + 1), 0.5), -g12 * fy / z, 0.0)
     g_x, g_y = (g_px * fx + g_u) / z, (g_py * fy + g_v) / z
-    g_z = -(g_near + g_u * u + g_v * v) / z
+    g_z = -(g_log_inverse_z + g_u * u + g_v * v) / z
     for k in range(3):
         put(out, MEAN + k, cam[R + k] * g_x + cam[R + 3 + k] * g_y + cam[R + 6 + k] * g_z)
 
 
 @kernel
 def _quaternion_gradient(cam, w, out):
-    """out[ROTATION] from the gradient of W R, which is in the work's AXES."""
+    """out[ROTATION] from the gradient of W Q, which is in the scratch array's AXES."""
     q0, q1 = at(w, QUATERNION), at(w, QUATERNION + 1)
     q2, q3 = at(w, QUATERNION + 2), at(w, QUATERNION + 3)
     g0, g1, g2 = at(w, AXES), at(w, AXES + 3), at(w, AXES + 6)
