@@ -95,6 +95,7 @@ def fit(pictures, scene, steps, rates, degree=0):
     return renders
 
 
+@pytest.mark.slow
 def test_more_splats_fit_a_disc_and_a_square_better():
     """Mean squared error about 0.02 with 16 splats, low 1e-3 with 64, 0.001 to 0.002 with 256."""
     picture = disc_and_square()
