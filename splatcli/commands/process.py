@@ -18,6 +18,7 @@ from stages.run import runfolder
 from stages.run.listeners import Listeners
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.precompile import PrecompileListener
+from stages.run.runfile import RunFile
 
 
 def process(
@@ -166,6 +167,12 @@ def _run(
 ) -> None:
     """Run the pipeline and print the result. view: show the training on a page, too."""
     log.write_settings(settings)
+    recorded = RunFile.read(pipeline.run_folder)
+    if recorded is not None and recorded.rebuilt:
+        console.warn(
+            f"run.json of {pipeline.run_folder} is missing or damaged. It is rebuilt from the "
+            "folders of the stages; settings of stages that never began are the defaults."
+        )
     listeners: list[Listener] = [log.LogListener(), progress.listener_for(quiet, as_json)]
     if until is None:
         listeners.insert(0, PrecompileListener(settings["train"].backend))

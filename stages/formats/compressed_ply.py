@@ -1,12 +1,12 @@
 """The compressed .ply of the PlayCanvas tools (.compressed.ply): 16 bytes a splat, and 3 more for
 each SH coefficient above degree 0.
 
-Rows come in chunks of 256 neighbours. An element `chunk` holds the least and greatest
-position, scale logarithm and colour (0.5 + C0 dc) of each; `vertex` holds four uint a splat:
-packed_position and packed_scale, 11 + 10 + 11 bits of x, y, z within the chunk's range, x highest;
-packed_rotation, 2 bits for the index of the largest of w, x, y, z and 10 bits for each other;
-packed_color, 8 bits each of red, green, blue (within the chunk's range) and opacity. `sh` holds
-f_rest_0.. as uchar, channel-major as in the .ply. Axes as in memory (y down).
+Rows come in chunks of 256 neighbours, outliers at the end (see `order`). An element `chunk` holds
+the least and greatest position, scale logarithm and colour (0.5 + C0 dc) of each; `vertex` holds
+four uint a splat: packed_position and packed_scale, 11 + 10 + 11 bits of x, y, z within the chunk's
+range, x highest; packed_rotation, 2 bits for the index of the largest of w, x, y, z and 10 bits for
+each other; packed_color, 8 bits each of red, green, blue (within the chunk's range) and opacity.
+`sh` holds f_rest_0.. as uchar, channel-major as in the .ply. Axes as in memory (y down).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
-from stages.base.blocks import reported_blocks
+from stages.base.blocks import blocks, reported_blocks
 from stages.formats import smallest_three
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
 from stages.formats.values import (
@@ -33,11 +33,15 @@ from stages.formats.values import (
     unit_quaternions,
 )
 from stages.scene import SH_C0, Splats, morton
+from stages.scene.quantiles import quantiles
 
 CHUNK = 256
 # The logarithm -87 of a flat splat would take the precision of its whole chunk. Scales below
 # exp(-20) or above exp(20) units look the same at the limit.
 LOG_SCALE_LIMIT = 20.0
+# Splats farther from the median centre than this many extents of the scene are outliers. They are
+# sorted into shells, each this many times as wide as the one before.
+_OUTLIER_EXTENTS, _SHELL_RATIO = 4.0, 4.0
 SH_LIMIT = 4.0  # uchar 0..255 stand for -SH_LIMIT..SH_LIMIT
 _BLOCK = CHUNK * 256
 _AXES_BITS = (11, 10, 11)
@@ -59,7 +63,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """
     splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
-    splats, rows = splats.with_sh_degree(degree), morton.morton_order(splats)
+    splats, rows = splats.with_sh_degree(degree), order(splats)
     packed = [_pack(splats.take(rows[part])) for part in reported_blocks(len(splats), _BLOCK)]
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(_header_text(splats, degree, units))
@@ -67,6 +71,45 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
             for block in packed:
                 file.write(block[part].data)
     return dropped
+
+
+def order(splats: Splats) -> NDArray[np.intp]:
+    """[N] rows of `splats` as a file holds them: in Morton order, and after these the outliers, by
+    shells of distance.
+
+    The precision of a chunk is that of its range, so one outlier would ruin the positions of 255
+    neighbours. Chunks cannot be left incomplete: the one in which the outliers begin is filled with
+    the splats that are least visible.
+    """
+    rows, shells = morton.morton_order(splats), _shells(splats.means)
+    if not shells.any():
+        return rows
+    inliers = np.flatnonzero(shells == 0)
+    shells += shells > 0
+    if filling := len(inliers) % CHUNK:
+        shells[
+            inliers[np.argpartition(_visibility(splats.take(inliers)), filling - 1)[:filling]]
+        ] = 1
+    return rows[np.argsort(shells[rows], kind="stable")]
+
+
+def _shells(means: NDArray[np.floating]) -> NDArray[np.int64]:
+    """[N] 0 for splats of the scene; 1, 2, ... for outliers by their distance."""
+    low, centre, high = quantiles(means, (0.05, 0.5, 0.95))
+    limit = _OUTLIER_EXTENTS * float(np.linalg.norm(high - low))
+    shells = np.zeros(len(means), np.int64)
+    if limit > 0:
+        for part in blocks(len(means)):
+            far = np.linalg.norm(means[part] - centre, axis=1) / limit
+            shells[part] = np.ceil(np.log(np.maximum(far, 1)) / np.log(_SHELL_RATIO))
+    return shells
+
+
+def _visibility(splats: Splats) -> NDArray[np.float64]:
+    """[N] logarithm of opacity times the area of the largest side."""
+    area = np.sort(splats.log_scales, axis=1)[:, 1:].sum(axis=1, dtype=np.float64)
+    visibility: NDArray[np.float64] = area - np.logaddexp(0, -splats.opacity_logits)
+    return visibility
 
 
 def _header_text(splats: Splats, degree: int, units: str) -> bytes:

@@ -138,7 +138,7 @@ TABLE = (
         keeps="positions and sizes to 1/1000 of those of 256 neighbours, 8-bit colour",
         writer="stages.formats.compressed_ply:write",
         reader="stages.formats.compressed_ply:read",
-        order="stages.scene.morton:morton_order",
+        order="stages.formats.compressed_ply:order",
         loses="has positions and sizes of 10 and 11 bits, and 8-bit colours",
         needs_finetuning=True,
     ),

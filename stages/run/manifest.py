@@ -20,6 +20,7 @@ from stages.run.digests import FileRecords, records_from_data, records_to_data
 
 SCHEMA = 2  # of manifests and `run.json`; raised when their keys or settings are renamed
 MANIFEST = "manifest.json"
+EDITED = "manifest-edited"  # code of the error for a damaged manifest or `run.json`
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ def _edited(path: Path) -> SplatError:
     what = f"the folder {path.parent}" if path.name == MANIFEST else path
     again = "its stage runs again" if path.name == MANIFEST else "it is written again"
     return SplatError(
-        "manifest-edited",
+        EDITED,
         given=f"{path} was changed after it was written, or is damaged.",
         wanted="The file as splat wrote it: later stages depend on it.",
         hint=f"Restore the file, or delete {what}: then {again}. Nothing else is lost.",

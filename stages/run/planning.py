@@ -146,7 +146,9 @@ class Planner:
         if self.photos is None or not self.photos.exists():
             raise SplatError(
                 "photographs-missing",
-                given=f"The photographs are not at {self.photos}.",
+                given=f"The photographs are not at {self.photos}."
+                if self.photos
+                else "The run folder does not say where its photographs are.",
                 wanted="The folder of photographs that the run is made from.",
                 hint="Put it back, or name its new place: splat process PHOTOS --out RUN",
             )

@@ -1,36 +1,52 @@
 """`run.json`: the photographs of a run folder, and the settings last requested.
 
 A folder with this file is a run folder. `splat train` continues with the settings in it, and
-`splat status` tells from it what would run again.
+`splat status` tells from it what would run again. If the file is lost or damaged, the folders of
+the stages identify the run folder, and the settings are read from them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from stages.base.errors import SplatError
 from stages.base.stage import Stage
-from stages.run.manifest import read_sealed, write_sealed
-from stages.run.request import settings_from_data, settings_to_data
+from stages.run.manifest import EDITED, MANIFEST, read_sealed, write_sealed
+from stages.run.request import REQUEST, settings_from_data, settings_to_data
 
 RUN_FILE = "run.json"
 
 
 @dataclass(frozen=True)
 class RunFile:
-    """photographs: absolute path. settings: plain data by stage name."""
+    """photographs: absolute path. settings: plain data by stage name. rebuilt: whether it was read
+    from the stages' folders, because `run.json` is missing or damaged."""
 
     photographs: Path | None = None
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    rebuilt: bool = False
 
     @classmethod
     def read(cls, folder: Path) -> RunFile | None:
-        """The folder's `run.json`, or None. Raises SplatError (see `read_sealed`)."""
-        data = read_sealed(folder / RUN_FILE)
+        """The folder's `run.json`. If it is missing or damaged, it is rebuilt from the stages'
+        folders, without the place of the photographs. None if there is neither.
+
+        Raises SplatError as `read_sealed` does.
+        """
+        try:
+            data = read_sealed(folder / RUN_FILE)
+        except SplatError as error:
+            if error.code != EDITED or not (settings := settings_of_stages(folder)):
+                raise
+            return cls(settings=settings, rebuilt=True)
         if data is None:
-            return None
+            settings = settings_of_stages(folder)
+            return cls(settings=settings, rebuilt=True) if settings else None
         photographs = data.get("photographs")
         return cls(Path(photographs) if photographs else None, data.get("settings", {}))
 
@@ -50,3 +66,45 @@ class RunFile:
             stage.name: settings_from_data(stage.settings_type, self.settings.get(stage.name, {}))
             for stage in stages
         }
+
+
+def holds_stages(folder: Path) -> bool:
+    """Whether the folder holds a finished or unfinished stage of any version of splat."""
+    return any(_settings_in(name, path) is not None for name, path in _stage_files(folder))
+
+
+def settings_of_stages(folder: Path) -> dict[str, dict[str, Any]]:
+    """Settings as plain data by stage name: those of the finished stages, and over them those of
+    unfinished attempts, which were requested later. Damaged files are left out.
+
+    Raises SplatError: run-folder-older, run-folder-newer, run-folder-unreadable.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name, path in _stage_files(folder):
+        if (settings := _settings_in(name, path)) is None:
+            continue
+        try:
+            if path.name == MANIFEST:
+                read_sealed(path)
+        except SplatError as error:
+            if error.code != EDITED:
+                raise
+            continue
+        found[name] = {**found.get(name, {}), **settings}
+    return found
+
+
+def _stage_files(folder: Path) -> Iterator[tuple[str, Path]]:
+    """(stage name, manifest or request), manifests first."""
+    for pattern in (f"[1-9]-*/{MANIFEST}", f".[1-9]-*.partial/{REQUEST}"):
+        for path in sorted(folder.glob(pattern)):
+            yield path.parent.name.removeprefix(".").removesuffix(".partial")[2:], path
+
+
+def _settings_in(name: str, path: Path) -> dict[str, Any] | None:
+    """The settings in a manifest or request of the stage `name`; None if it is not one."""
+    with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
+        data = json.loads(path.read_text(encoding="utf-8"))
+        fits = data.get("stage", name) == name and {"version", "inputs"} <= data.keys()
+        return dict(data["settings"]) if fits else None
+    return None

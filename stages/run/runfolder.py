@@ -11,15 +11,15 @@ from stages.run.digests import combined_digest, record_files
 from stages.run.lock import HOLDER, LOCK, locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.planning import PHOTOS
-from stages.run.runfile import RUN_FILE, RunFile
+from stages.run.runfile import RUN_FILE, RunFile, holds_stages
 
 # What a run that stopped before its run file was complete may leave.
 _WITHOUT_RUN_FILE = (LOCK, HOLDER, RUN_FILE + ".tmp")
 
 
 def is_run_folder(folder: Path) -> bool:
-    """Whether splat made this folder."""
-    return (folder / RUN_FILE).is_file()
+    """Whether splat made this folder. Its `run.json` may be lost if it holds stages."""
+    return (folder / RUN_FILE).is_file() or holds_stages(folder)
 
 
 def has_finished_work(folder: Path) -> bool:
@@ -32,8 +32,8 @@ def opened(folder: Path, photos: Path | None) -> Iterator[None]:
     """Lock the run folder inside the block; make it if it is new.
 
     Without `photos` the folder must exist. Raises SplatError (photographs-missing,
-    run-folder-inside-photographs, run-folder-missing, run-folder-foreign, run-folder-busy, and
-    those of `RunFile.read`, before anything is written), OSError.
+    photographs-run-folder, run-folder-inside-photographs, run-folder-missing, run-folder-foreign,
+    run-folder-busy, and those of `RunFile.read`, before anything is written), OSError.
     """
     if photos is not None:
         _check_photos(folder, photos)
@@ -58,13 +58,10 @@ def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) ->
     recorded = RunFile.read(folder)
     if recorded is None:
         return RunFile(photos)
-    if photos is None or recorded.photographs in (None, photos):
-        return RunFile(recorded.photographs or photos, recorded.settings)
-    if (
-        has_finished_work(folder)
-        and recorded.photographs.exists()
-        and not _same(photos, first_stage_folder)
-    ):
+    if photos is None or recorded.photographs == photos:
+        return recorded
+    moved = recorded.photographs is not None and not recorded.photographs.exists()
+    if has_finished_work(folder) and not moved and not _same(photos, first_stage_folder):
         raise _other_photographs(folder, recorded.photographs, photos)
     return RunFile(photos, recorded.settings)
 
@@ -83,6 +80,14 @@ def _check_photos(folder: Path, photos: Path) -> None:
             given=f"{photos} does not exist.",
             wanted="A folder of photographs.",
             hint="Check the path; put quotes around one with spaces.",
+        )
+    if is_run_folder(photos):
+        raise SplatError(
+            "photographs-run-folder",
+            given=f"{photos} is a run folder that splat made, not a folder of photographs.",
+            wanted="A folder of photographs.",
+            hint=f"To continue the run: splat process {photos}",
+            family=Family.USAGE,
         )
     if folder.resolve().is_relative_to(photos.resolve()):
         raise SplatError(
@@ -104,10 +109,10 @@ def _foreign(folder: Path) -> SplatError:
     )
 
 
-def _other_photographs(folder: Path, recorded: Path, photos: Path) -> SplatError:
+def _other_photographs(folder: Path, recorded: Path | None, photos: Path) -> SplatError:
     return SplatError(
         "run-folder-other-photographs",
-        given=f"{folder} was made from {recorded}, not from {photos}.",
+        given=f"{folder} was made from {recorded or 'other photographs'}, not from {photos}.",
         wanted="One run folder for one set of photographs.",
         hint="Name another run folder with --out.",
         family=Family.RUN_FOLDER,

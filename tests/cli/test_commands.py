@@ -395,3 +395,19 @@ def test_option_out_of_two_run_folders_is_refused(splat) -> None:
     result = splat("process", "run", "--out", "other")
     assert result.exit_code == 2
     assert "--out" in result.stderr
+
+
+@pytest.mark.parametrize("text", [None, "{"])
+def test_run_folder_without_a_whole_run_file_is_continued_with_a_warning(
+    splat, tmp_path, text: str | None
+) -> None:
+    assert splat("process", "photos", "--out", "hill", "--steps", "70").exit_code == 0
+    run_file = tmp_path / "hill" / "run.json"
+    run_file.unlink() if text is None else run_file.write_text(text)
+    assert splat("status", "hill").exit_code == 0
+    again = splat("process", "hill")
+    assert again.exit_code == 0, again.output
+    assert "rebuilt" in again.stderr
+    assert '"steps": 70' in run_file.read_text()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hill", "photos"]
+    assert "rebuilt" not in splat("process", "hill").stderr

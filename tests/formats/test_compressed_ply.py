@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import compressed_ply
-from stages.scene import morton
+from stages.scene import Splats, morton
+from stages.scene.spacing import median_spacing
 from tests.formats.files import angles, three_splats
 from tests.formats.truth import C0, extreme_splats, many_splats
 
@@ -91,12 +93,44 @@ def test_values_come_back_within_half_a_step(tmp_path: Path, degree: int) -> Non
     assert size - header == 3 * 72 + 700 * (16 + 3 * ((degree + 1) ** 2 - 1))
 
 
-def test_one_splat_far_away_spoils_one_chunk_only(tmp_path: Path) -> None:
+def with_outliers(count: int) -> tuple[Splats, NDArray[np.intp]]:
+    """(splats, rows of the outliers): ten at 1,000 extents, one at 10,000."""
+    splats, rng = many_splats(count), np.random.default_rng(3)
+    rows = rng.choice(count, 11, replace=False)
+    directions = rng.normal(size=(11, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    extent = np.linalg.norm(np.ptp(splats.means, axis=0))
+    splats.means[rows] = directions * extent * np.array([[1e3]] * 10 + [[1e4]])
+    return splats, rows
+
+
+@pytest.mark.parametrize("count", [5120 + 11, 5000])
+def test_outliers_leave_the_positions_of_the_others(tmp_path: Path, count: int) -> None:
+    splats, outliers = with_outliers(count)
+    formats.write(tmp_path / "a.compressed.ply", splats)
+    rows = compressed_ply.order(splats)
+    assert sorted(rows) == list(range(count))
+    errors = np.abs(formats.read(tmp_path / "a.compressed.ply").means - splats.means[rows])
+    moved = rows[errors.max(axis=1) > median_spacing(splats.means)]
+    moved = moved[~np.isin(moved, outliers)]
+    assert len(moved) <= (count - 11) % 256
+    # what fills the chunk of the outliers is small and transparent
+    visibility = splats.opacities * np.exp(np.sort(splats.log_scales, axis=1)[:, 1:].sum(axis=1))
+    assert visibility[moved].sum() < 0.01 * visibility.sum()
+
+
+def test_a_scene_without_outliers_is_in_morton_order() -> None:
+    splats = many_splats(2000)
+    splats.means[7] *= 5
+    np.testing.assert_array_equal(compressed_ply.order(splats), morton.morton_order(splats))
+
+
+def test_a_flat_splat_spoils_no_positions(tmp_path: Path) -> None:
     splats = many_splats(2000)
     splats.means[77] = 1e9
     splats.log_scales[78] = -87
     formats.write(tmp_path / "a.compressed.ply", splats)
-    wanted = splats.take(morton.morton_order(splats))
+    wanted = splats.take(compressed_ply.order(splats))
     errors = np.abs(formats.read(tmp_path / "a.compressed.ply").means - wanted.means).max(axis=1)
     assert (errors > 0.01).sum() < 256
 
@@ -106,7 +140,7 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
     splats.sh[2, 0] = 3.4e38
     assert formats.write(tmp_path / "a.compressed.ply", splats) == 0
     back = formats.read(tmp_path / "a.compressed.ply")
-    wanted = splats.take(morton.morton_order(splats))
+    wanted = splats.take(compressed_ply.order(splats))
     limit = compressed_ply.LOG_SCALE_LIMIT
     np.testing.assert_allclose(
         back.log_scales, np.clip(wanted.log_scales, -limit, limit), atol=0.02

@@ -23,6 +23,7 @@ from stages.run.lock import HOLDER, locked
 from stages.run.manifest import SCHEMA, Manifest
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.runfile import RunFile
+from stages.run.runfolder import is_run_folder
 from tests.run.fakes import CopySettings, CountSettings, fake_stages, photographs
 
 
@@ -189,6 +190,56 @@ def test_damaged_output_runs_its_stage_again(
 def test_extra_file_beside_the_outputs_does_no_harm(finished: Pipeline, run_folder: Path) -> None:
     (run_folder / "3-sign" / "thumbnail.png").write_text("a viewer left this")
     assert ran(finished) == []
+
+
+@pytest.mark.parametrize("text", [None, "", "{", '{"schema": 2}'])
+def test_lost_or_damaged_run_file_is_rebuilt_from_the_stages(
+    photos: Path, run_folder: Path, text: str | None
+) -> None:
+    settings = {"copy": CopySettings(upper=True), "count": CountSettings(iterations=5)}
+    with pytest.raises(Interrupted):
+        Pipeline(run_folder, photos, fake_stages(count=checkpointing(10, 6))).run(settings)
+    run_file = run_folder / "run.json"
+    run_file.unlink() if text is None else run_file.write_text(text)
+    again = Pipeline(run_folder, stages=fake_stages(count=checkpointing(10, 6)))
+    assert is_run_folder(run_folder)
+    assert [step.reason for step in again.status()][:2] == ["", "was interrupted"]
+    heard = Heard()
+    again.run(listener=heard)
+    assert heard.events == [("skipped", "copy"), ("resumed", "count"), ("started", "sign")]
+    assert again.load("count") == "10 from 6"
+    recorded = RunFile.read(run_folder)
+    assert recorded is not None
+    assert recorded.settings["copy"]["upper"] is True
+    assert ran(Pipeline(run_folder, photos, fake_stages())) == []
+    run_file.unlink()
+    other = photographs(run_folder.with_name("other"), z="zzz")
+    with pytest.raises(SplatError) as caught:
+        Pipeline(run_folder, other, fake_stages()).run()
+    assert caught.value.code == "run-folder-other-photographs"
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_run_folder_in_place_of_photographs_is_refused(
+    finished: Pipeline, run_folder: Path, lost: bool
+) -> None:
+    if lost:
+        (run_folder / "run.json").unlink()
+    new = run_folder.with_name("new")
+    with pytest.raises(SplatError, match="is a run folder") as caught:
+        Pipeline(new, run_folder, fake_stages()).run()
+    assert caught.value.code == "photographs-run-folder"
+    assert int(caught.value.family) == 2
+    assert not new.exists()
+
+
+def test_run_file_of_another_program_is_refused_and_kept(photos: Path, run_folder: Path) -> None:
+    run_folder.mkdir()
+    (run_folder / "run.json").write_text('{"program": "other"}')
+    with pytest.raises(SplatError) as caught:
+        Pipeline(run_folder, photos, fake_stages()).run()
+    assert caught.value.code == "manifest-edited"
+    assert [path.name for path in run_folder.iterdir()] == ["run.json"]
 
 
 def test_copied_run_folder_stays_finished(finished: Pipeline, run_folder: Path) -> None:
