@@ -165,23 +165,27 @@ def _from_gps(
     there = earth[:, 0] + 1j * earth[:, 1]
     spread = float(np.sqrt(np.mean(np.abs(there - there.mean()) ** 2)))
     report.metric("gps_spread_m", round(spread, 3))
-    found = f"{len(rows)} of {len(photos)} photographs have GPS, spread over {spread:.0f} m (RMS)"
-    if len(rows) < _FEWEST_GPS:
-        return _gps_unused(found, spread, f"{_FEWEST_GPS} photographs are needed", report)
-    if not levelled:
-        return _gps_unused(found, spread, "the up direction was not found", report)
-    factor, inliers, residual = fit_similarity_2d(here, there)
-    if abs(factor) == 0:
-        return _gps_unused(found, spread, "most cameras or positions are at one place", report)
+    factor, inliers, residual = 0j, np.zeros(len(rows), np.bool_), math.inf
+    if levelled and len(rows) >= _FEWEST_GPS:
+        factor, inliers, residual = fit_similarity_2d(here, there)
     agreeing = int(inliers.sum())
-    report.metric("gps_residual_m", round(residual, 3))
-    report.metric("gps_agreeing", agreeing)
-    if agreeing < max(_FEWEST_GPS, _AGREEING_SHARE * len(rows)):
-        why = f"only {agreeing} of them agree with the cameras"
-        return _gps_unused(found, spread, why, report)
-    if residual > _WORST_RESIDUAL * spread:
-        why = f"they differ from the cameras by {residual:.1f} m (RMS)"
-        return _gps_unused(found, spread, why, report)
+    if abs(factor):
+        report.metric("gps_residual_m", round(residual, 3))
+        report.metric("gps_agreeing", agreeing)
+    unused = ""
+    if len(rows) < _FEWEST_GPS:
+        unused = f"{_FEWEST_GPS} photographs are needed"
+    elif not levelled:
+        unused = "the up direction was not found"
+    elif abs(factor) == 0:
+        unused = "most cameras or positions are at one place"
+    elif agreeing < max(_FEWEST_GPS, _AGREEING_SHARE * len(rows)):
+        unused = f"only {agreeing} of them agree with the cameras"
+    elif residual > _WORST_RESIDUAL * spread:
+        unused = f"they differ from the cameras by {residual:.1f} m (RMS)"
+    if unused:
+        _report_unused(unused, len(rows), len(photos), spread, report)
+        return None
     # (x + iz) e^(i angle) rotates x towards z; `turn` rotates the other way.
     return MetricScale(
         float(abs(factor)),
@@ -190,14 +194,22 @@ def _from_gps(
     )
 
 
-def _gps_unused(found: str, spread: float, why: str, report: Report) -> None:
-    """Report why GPS is not used; as a warning if it could have told the scale."""
+def _report_unused(why: str, count: int, total: int, spread: float, report: Report) -> None:
+    """Report why GPS is not used; as a warning if it could have told the scale.
+
+    Args:
+        why: the reason.
+        count, total: photographs with GPS, and all photographs.
+        spread: of the GPS positions, metres.
+        report: receives a metric and the warning.
+    """
     report.metric("gps_unused", why)
     if spread >= _GPS_ERROR_M:
         report.warn(
             "sfm-gps-unused",
-            f"{found}. It is not used for scale and north: {why}. Give a known distance with "
-            "--scale if the scene must be in metres.",
+            f"{count} of {total} photographs have GPS, spread over {spread:.0f} m (RMS). It is not "
+            f"used for scale and north: {why}. Give a known distance with --scale if the scene "
+            "must be in metres.",
         )
 
 
