@@ -29,7 +29,8 @@ _NO_CODES = {
     *("utf-8", "utf-8-sig", "no-store", "same-origin"),  # encodings, headers
     "allow-nonfinite",  # an argument of the USD reader's process
     *("in-use", "peak-memory"),  # parts of file names
-    *("no-rotation", "too-large", "out-of-range"),  # flags of `splat info`
+    *("no-rotation", "too-large"),  # flags of `splat info`
+    "out-of-range",  # the end of `export-FORMAT-out-of-range`
 }
 
 
