@@ -69,6 +69,7 @@ def test_the_capture_units_and_origin_travel_with_the_files(
     assert b"units: metres" in (tmp_path / "scene.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_equal_inputs_give_equal_files_and_load_gives_the_list(
     scene: SmallScene, tmp_path: Path
 ) -> None:

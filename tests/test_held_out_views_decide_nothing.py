@@ -55,6 +55,7 @@ def made(reconstruction: Reconstruction, folder: Path) -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.slow
 def test_no_pixel_of_a_held_out_view_reaches_the_asset(
     reconstruction: Reconstruction, tmp_path: Path
 ) -> None:

@@ -46,6 +46,7 @@ def reconstructed(
     return sfm.run(inputs, settings, folder, report), report
 
 
+@pytest.mark.slow
 def test_given_cameras_are_kept_and_points_are_triangulated(tmp_path: Path) -> None:
     cameras = model(tmp_path / "cameras", lambda pose: pose, 5)
     found, report = reconstructed(tmp_path / "sfm", cameras)
@@ -66,6 +67,7 @@ def test_given_cameras_are_kept_and_points_are_triangulated(tmp_path: Path) -> N
     assert not (tmp_path / "sfm" / "work").exists()
 
 
+@pytest.mark.slow
 def test_cameras_in_metres_stay_as_large_as_they_are(tmp_path: Path) -> None:
     cameras = model(tmp_path / "cameras", lambda pose: pose, 5)
     found, report = reconstructed(tmp_path / "sfm", cameras, metres=True)
@@ -75,6 +77,7 @@ def test_cameras_in_metres_stay_as_large_as_they_are(tmp_path: Path) -> None:
     assert (found.units, report.metrics["scale_source"]) == ("metres", "--metres")
 
 
+@pytest.mark.slow
 def test_a_file_that_knows_north_gives_the_world_its_directions(tmp_path: Path) -> None:
     """OpenSfM's world: x east, y north, z up; ours: x east, y down, z north."""
     file_from_truth = np.eye(4)
@@ -135,6 +138,7 @@ def off_by(pose: np.ndarray, degrees: float, metres: float, r: np.random.Generat
     return found
 
 
+@pytest.mark.slow
 def test_rough_cameras_are_moved_to_where_the_matches_want_them(tmp_path: Path) -> None:
     """Half a degree and a centimetre off at 1.3 m, as of a phone's own tracking."""
     r = np.random.default_rng(1)
@@ -171,6 +175,7 @@ def test_cameras_of_a_split_are_not_refined(tmp_path: Path) -> None:
     assert error.value.code == "cameras-split-and-refined"
 
 
+@pytest.mark.slow
 def test_opengl_axes_are_refused_by_their_name(tmp_path: Path) -> None:
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
     cameras = model(tmp_path / "cameras", lambda pose: turn @ pose, 5)
@@ -180,6 +185,7 @@ def test_opengl_axes_are_refused_by_their_name(tmp_path: Path) -> None:
     assert "y and z of each camera are negated" in caught.value.hint
 
 
+@pytest.mark.slow
 def test_the_test_photographs_of_a_split_are_held_out_and_give_no_points(tmp_path: Path) -> None:
     path = tmp_path / "transforms.json"
     names = split_file(path)

@@ -6,6 +6,7 @@ are the file's own; each module says what it changes.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,11 +147,25 @@ def content_of(path: Path) -> bytes:
     return path.read_bytes()
 
 
+def check_inside(root: Path, name: str, folder: Path) -> None:
+    """Raise BadFileError if the path `name`, seen from `folder`, leaves the folder `root`.
+
+    A camera file from elsewhere must not make the reader open other files of the user. Symbolic
+    links are followed: they are the user's own, and data sets often link to their pictures.
+    """
+    if not Path(os.path.abspath(folder / name)).is_relative_to(os.path.abspath(root)):
+        raise BadFileError(
+            f"it names {name[:80]}, which is outside {root}",
+            hint=f"Put that file into {root}, and change its path in the camera file.",
+        )
+
+
 def size_of_picture(folder: Path, name: str) -> tuple[int, int]:
     """(width, height) of a picture near a camera file in `folder`, for formats that do not say it.
-    Raises BadFileError if it is not found."""
+    Raises BadFileError if it is not found or outside the folder above."""
     from PIL import Image
 
+    check_inside(folder.parent, name, folder)
     for near in (folder, folder / "images", folder.parent, folder.parent / "images"):
         if (near / name).is_file():
             with Image.open(near / name) as picture:

@@ -103,7 +103,9 @@ def _east_north_up(position: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _parsed(path: Path) -> Element:
     data = content_of(path)
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # an entity may expand to gigabytes
+    ascii_part = data.replace(b"\0", b"")  # of UTF-16 too, in either byte order
+    # An entity may expand to gigabytes.
+    if b"<!DOCTYPE" in ascii_part or b"<!ENTITY" in ascii_part:
         raise BadFileError("it declares entities, which Metashape does not")
     try:
         return ElementTree.fromstring(data)

@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, FilePoints, content_of, make_views, poses_of
+from stages.cameras.camera_file import (
+    CameraFile,
+    FilePoints,
+    check_inside,
+    content_of,
+    make_views,
+    poses_of,
+)
 from stages.cameras.lens import Lens
 from stages.scene import View
 
@@ -115,11 +122,12 @@ def read_points(path: Path) -> FilePoints | None:
     "cameras-unreadable"."""
     with reading(path, CAMERAS):
         data = json.loads(content_of(path).decode("utf-8"))
-        named = data.get("ply_file_path")
-        if not named or not (path.parent / str(named)).is_file():
+        named = str(data.get("ply_file_path") or "")
+        check_inside(path.parent, named, path.parent)
+        if not named or not (path.parent / named).is_file():
             return None
-    with reading(path.parent / str(named), CAMERAS):
-        points, colours = _ply_points(path.parent / str(named))
+    with reading(path.parent / named, CAMERAS):
+        points, colours = _ply_points(path.parent / named)
         turn, shift, scale = _applied(data)
         none = np.zeros(len(points))
         points = (points / scale - shift) @ turn
@@ -204,6 +212,7 @@ def _picture_size(folder: Path, name: str, otherwise: tuple[int, int] | None) ->
     """Width and height of the picture itself, whose suffix may be missing from its name."""
     from PIL import Image
 
+    check_inside(folder, name, folder)
     for path in (folder / f"{name}{suffix}" for suffix in ("", *_SUFFIXES)):
         if path.is_file():
             with Image.open(path) as picture:

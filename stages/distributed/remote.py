@@ -244,7 +244,8 @@ def _fetched(photos: Location, target: Path) -> Path:
 
 
 class UploadListener(Listener):
-    """Uploads finished stages and the checkpoints of training."""
+    """Uploads finished stages and the newest checkpoint of training, whose own checksum tells
+    whether it arrived whole; without it, a resumed run begins training again."""
 
     def __init__(self, run_folder: Path, remote: RemoteFolder) -> None:
         self._local, self._remote = run_folder, remote

@@ -18,6 +18,7 @@ from stages.structure.markers import marker_sides
 _FEWEST_GPS = 5
 _AGREEING_SHARE = 0.6  # of the photographs with GPS
 _WORST_RESIDUAL = 0.15  # of the spread of the cameras; beyond, GPS is too inaccurate
+_GPS_ERROR_M = 10.0  # of a phone's receiver; positions that spread less say nothing of the scale
 _WORST_SPREAD = 0.05  # median relative deviation of the sides of markers, all of one size
 _HYPOTHESES = 2000  # of the robust fit, at most
 # WGS 84: half axis in metres, eccentricity squared
@@ -157,18 +158,33 @@ def _from_gps(
     """By horizontal positions alone: GPS heights are less accurate than levelling by cameras."""
     rows = [i for i, photo in enumerate(photos) if photo.gps is not None]
     report.metric("with_gps", len(rows))
-    if not levelled or len(rows) < _FEWEST_GPS:
+    if not rows:
         return None
     earth = east_north([photos[i].gps or (0.0, 0.0) for i in rows])
     here = centres[rows, 0] + 1j * centres[rows, 2]  # x and z become east and north
     there = earth[:, 0] + 1j * earth[:, 1]
-    factor, inliers, residual = fit_similarity_2d(here, there)
     spread = float(np.sqrt(np.mean(np.abs(there - there.mean()) ** 2)))
-    report.metric("gps_residual_m", round(residual, 3))
-    report.metric("gps_agreeing", int(inliers.sum()))
     report.metric("gps_spread_m", round(spread, 3))
-    agreed = inliers.sum() >= max(_FEWEST_GPS, _AGREEING_SHARE * len(rows))
-    if not agreed or residual > _WORST_RESIDUAL * spread or abs(factor) == 0:
+    factor, inliers, residual = 0j, np.zeros(len(rows), np.bool_), math.inf
+    if levelled and len(rows) >= _FEWEST_GPS:
+        factor, inliers, residual = fit_similarity_2d(here, there)
+    agreeing = int(inliers.sum())
+    if abs(factor):
+        report.metric("gps_residual_m", round(residual, 3))
+        report.metric("gps_agreeing", agreeing)
+    unused = ""
+    if len(rows) < _FEWEST_GPS:
+        unused = f"{_FEWEST_GPS} photographs are needed"
+    elif not levelled:
+        unused = "the up direction was not found"
+    elif abs(factor) == 0:
+        unused = "most cameras or positions are at one place"
+    elif agreeing < max(_FEWEST_GPS, _AGREEING_SHARE * len(rows)):
+        unused = f"only {agreeing} of them agree with the cameras"
+    elif residual > _WORST_RESIDUAL * spread:
+        unused = f"they differ from the cameras by {residual:.1f} m (RMS)"
+    if unused:
+        _report_unused(unused, len(rows), len(photos), spread, report)
         return None
     # (x + iz) e^(i angle) rotates x towards z; `turn` rotates the other way.
     return MetricScale(
@@ -176,6 +192,25 @@ def _from_gps(
         -float(np.angle(factor)),
         f"GPS of {int(inliers.sum())} photographs, {residual:.2g} m off",
     )
+
+
+def _report_unused(why: str, count: int, total: int, spread: float, report: Report) -> None:
+    """Report why GPS is not used; as a warning if it could have told the scale.
+
+    Args:
+        why: the reason.
+        count, total: photographs with GPS, and all photographs.
+        spread: of the GPS positions, metres.
+        report: receives a metric and the warning.
+    """
+    report.metric("gps_unused", why)
+    if spread >= _GPS_ERROR_M:
+        report.warn(
+            "sfm-gps-unused",
+            f"{count} of {total} photographs have GPS, spread over {spread:.0f} m (RMS). It is not "
+            f"used for scale and north: {why}. Give a known distance with --scale if the scene "
+            "must be in metres.",
+        )
 
 
 def fit_similarity_2d(

@@ -1,4 +1,6 @@
-"""The checkpoint of a run: everything that the next step depends on, in one file.
+"""The checkpoint of a run: everything that the next step depends on, in one file with a checksum.
+
+The two newest checkpoints are kept, so that a damaged file costs the steps since the one before it.
 
 Random numbers depend on the seed and the step alone, so no generator is stored.
 """
@@ -6,23 +8,29 @@ Random numbers depend on the seed and the step alone, so no generator is stored.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
 
+from stages.base.atomic import sync_folder
 from stages.raster.backends import backend_of
 from stages.training.clock import Elapsed
 from stages.training.optimiser import Model
 from stages.training.validation import EarlyStopping
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATC10"
+MAGIC = b"SPLATC11"
+_PREVIOUS = "checkpoint-previous.bin"
+_TEMPORARY = FILE_NAME + ".tmp"
+_CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -69,28 +77,79 @@ class TrainingState:
 
 
 def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
-    """Write the checkpoint; the previous one is replaced once the new one is complete."""
-    temporary = folder / (FILE_NAME + ".tmp")
+    """Write the checkpoint, once it is complete, under its name; the one before it is kept."""
+    path, temporary = folder / FILE_NAME, folder / _TEMPORARY
     with temporary.open("wb") as file:
+        hashing = _HashingWriter(file)
         header = json.dumps(dataclasses.asdict(state)).encode()
-        file.write(MAGIC + len(header).to_bytes(8, "little") + header)
+        hashing.write(MAGIC + len(header).to_bytes(8, "little") + header)
         for array in vars(model).values():
-            npy.write_array(file, array, allow_pickle=False)
+            npy.write_array(hashing, array, allow_pickle=False)
+        file.write(hashing.digest())
         file.flush()
         os.fsync(file.fileno())
-    os.replace(temporary, folder / FILE_NAME)
+    if path.exists():
+        os.replace(path, folder / _PREVIOUS)
+    os.replace(temporary, path)
+    sync_folder(folder)
 
 
-def load_checkpoint(folder: Path) -> tuple[Model, TrainingState] | None:
-    """What was saved; None if there is no checkpoint or it is damaged."""
-    try:
-        with (folder / FILE_NAME).open("rb") as file:
-            if file.read(8) != MAGIC:
-                return None
-            header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-            arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
-    except (OSError, ValueError, EOFError, MemoryError):
-        return None
+def load_checkpoint(
+    folder: Path, warn: Callable[[str, str], None]
+) -> tuple[Model, TrainingState] | None:
+    """The newest checkpoint that is whole, or None.
+
+    A damaged one is renamed, and reported as warn(code, message).
+    """
+    for name in (FILE_NAME, _PREVIOUS):
+        path = folder / name
+        if not path.exists():
+            continue
+        with suppress(OSError), path.open("rb") as file:
+            if _is_whole(file):
+                return _read(file)
+        aside = path.with_stem(f"{path.stem}-damaged")
+        with suppress(OSError):
+            os.replace(path, aside)
+        warn(
+            "train-checkpoint-damaged",
+            f"A checkpoint is damaged: its checksum does not fit. It was renamed to {aside.name}; "
+            "training goes on from the one before it, or from its start. Check the disk.",
+        )
+    return None
+
+
+class _HashingWriter:
+    """Writes to a file and computes the SHA-256 of what is written."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._sha256 = file, hashlib.sha256()
+
+    def write(self, data: bytes) -> None:
+        self._sha256.update(data)
+        self._file.write(data)
+
+    def digest(self) -> bytes:
+        return self._sha256.digest()
+
+
+def _is_whole(file: BinaryIO) -> bool:
+    """Whether the file ends in the SHA-256 of what is before it. Goes back to its start."""
+    sha256 = hashlib.sha256()
+    left = file.seek(0, os.SEEK_END) - sha256.digest_size
+    file.seek(0)
+    while left > 0 and (data := file.read(min(left, _CHUNK_BYTES))):
+        sha256.update(data)
+        left -= len(data)
+    whole = left == 0 and file.read() == sha256.digest()
+    file.seek(0)
+    return whole and file.read(len(MAGIC)) == MAGIC
+
+
+def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
+    """The contents of a whole checkpoint, read from the end of its magic number on."""
+    header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+    arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
     steps, since, share = header["plan"]
     stopping = header["early_stopping"]
     state = TrainingState(
@@ -105,6 +164,6 @@ def load_checkpoint(folder: Path) -> tuple[Model, TrainingState] | None:
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """Remove the files of a finished run."""
-    for name in (FILE_NAME, f"{FILE_NAME}.tmp"):
-        (folder / name).unlink(missing_ok=True)
+    """Remove the files of a finished run, damaged ones included: they are no output."""
+    for path in folder.glob("checkpoint*.bin*"):
+        path.unlink()

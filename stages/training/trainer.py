@@ -168,7 +168,7 @@ class Trainer:
 
     def _resume(self, start: Splats) -> int:
         """Load the checkpoint's model, or else the initial one; how many steps it has had."""
-        saved, step = load_checkpoint(self.folder), 0
+        saved, step = load_checkpoint(self.folder, self.report.warn), 0
         if saved is None:
             model = initial_model(start, self.schedule.sh_degree, self.cap)
         else:

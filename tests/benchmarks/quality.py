@@ -43,7 +43,7 @@ from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_ou
 from stages.sfm import SfmSettings
 from stages.train import PRESETS, TrainSettings
 from stages.training.build import corrects_light
-from tests.benchmarks.sample_test_views import render_test_views, test_views_in
+from tests.benchmarks.sample_test_views import held_out_views_in, render_test_views
 from tests.sample import PHOTOS
 
 SAMPLE = "sample"
@@ -85,7 +85,7 @@ class Capture:
         render_test_views(out / "test_views")
         return (
             *load_evaluation_views(
-                out / "test_views", test_views_in(self.reconstruction), draw_settings
+                out / "test_views", held_out_views_in(self.reconstruction), draw_settings
             ),
             *found,
         )

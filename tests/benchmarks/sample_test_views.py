@@ -53,7 +53,7 @@ def render_test_views(folder: Path) -> None:
             Image.fromarray(photograph(list(make.scene()), Light(), PINHOLE, pose)).save(path)
 
 
-def test_views_in(reconstruction: Reconstruction) -> tuple[View, ...]:
+def held_out_views_in(reconstruction: Reconstruction) -> tuple[View, ...]:
     """The test views in the world of this reconstruction."""
     truth = {
         photo["name"]: np.array(photo["world_to_camera"])

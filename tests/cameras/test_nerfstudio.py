@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from plyfile import PlyData
 
 from stages.base.errors import SplatError
 from stages.cameras.nerfstudio import write
-from stages.cameras.table import read_cameras
+from stages.cameras.table import read_cameras, read_points
 from stages.scene import Camera, View, look_at
 from tests.structure.synthetic import random_rotation
 
@@ -133,6 +134,28 @@ def test_a_frames_own_lens_comes_first(tmp_path: Path) -> None:
     found = read_back(tmp_path, data)
     assert [view.camera.fx for view in found.views] == [77, 500]
     assert found.distorted == 1
+
+
+@pytest.mark.parametrize("start", ["..", "a/../..", ""])
+def test_points_outside_the_files_folder_are_refused(tmp_path: Path, start: str) -> None:
+    inner, other = tmp_path / "inner", tmp_path / "other"
+    inner.mkdir()
+    other.mkdir()
+    write(other / "all.json", views(1), other, np.ones((1, 3)), np.zeros((1, 3), np.uint8))
+    where = f"{start or tmp_path}/other/all.ply"
+    (inner / "t.json").write_text(json.dumps(plain(ply_file_path=where)))
+    with pytest.raises(SplatError, match="which is outside") as caught:
+        read_points(inner / "t.json")
+    assert (caught.value.code, where[:80] in caught.value.given) == ("cameras-unreadable", True)
+
+
+def test_a_picture_outside_the_files_folder_is_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    Image.new("RGB", (640, 480)).save(tmp_path / "a.png")
+    data = without("w")
+    data["frames"][0]["file_path"] = "../a.png"
+    with pytest.raises(SplatError, match="which is outside"):
+        read_back(tmp_path / "inner", data)
 
 
 def turned(by: object) -> dict[str, Any]:

@@ -123,6 +123,28 @@ def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -
     assert file in caught.value.given
 
 
+def test_bundlers_pictures_outside_its_folder_are_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    path = MADE["bundler"](tmp_path / "a" / "b")
+    names = (path.parent / "list.txt").read_text().splitlines()
+    (path.parent / names[1]).rename(tmp_path / "other.png")
+    names[1] = "../../other.png"
+    (path.parent / "list.txt").write_text("\n".join(names))
+    with pytest.raises(SplatError, match="which is outside"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-le", "utf-16-be"])
+def test_entities_of_xml_are_refused_in_every_encoding(tmp_path: Path, encoding: str) -> None:
+    path = MADE["metashape"](tmp_path)
+    text = path.read_text(encoding="utf-8").partition("?>")
+    body = text[2] or text[0]
+    written = f"<?xml version='1.0'?><!DOCTYPE d [<!ENTITY a 'b'>]>{body.lstrip()}"
+    path.write_bytes(written.encode(encoding))
+    with pytest.raises(SplatError, match="entities"):
+        read_cameras(path)
+
+
 def test_bundlers_missing_list_may_be_written(tmp_path: Path) -> None:
     path = MADE["bundler"](tmp_path)
     (tmp_path / "list.txt").unlink()

@@ -52,6 +52,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return paths
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["splat", "glb", "usdz", "compressed.ply", "sog"])
 def test_memory_grows_by_little_more_than_the_splats(
     tmp_path: Path, sources: tuple[Path, Path], suffix: str

@@ -67,6 +67,7 @@ def failed(result: Any) -> str:
     return str(json.loads(result.stdout.splitlines()[-1])["code"])
 
 
+@pytest.mark.slow
 def test_the_trade_is_printed_and_its_report_lies_in_the_run(splat: Splat) -> None:
     made(splat, "run")
     result = splat("tradeoff", "run")
@@ -108,6 +109,7 @@ def test_a_run_compared_with_itself_is_not_told_apart(splat: Splat) -> None:
     assert Path("comparison/report.html").is_file()
 
 
+@pytest.mark.slow
 def test_runs_of_other_photographs_are_not_compared(splat: Splat) -> None:
     made(splat, "one")
     Path("photos/a.jpg").write_text("b")
@@ -115,6 +117,7 @@ def test_runs_of_other_photographs_are_not_compared(splat: Splat) -> None:
     assert failed(splat("compare", "one", "two", "--json")) == "compare-other-photographs"
 
 
+@pytest.mark.slow
 def test_two_runs_are_named_by_their_folders(splat: Splat) -> None:
     made(splat, "one")
     made(splat, "two", "--seed", "3")

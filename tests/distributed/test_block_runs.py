@@ -73,6 +73,7 @@ def digest(pipeline: Pipeline) -> str:
     return hashlib.sha256((pipeline.stage_folder("train") / "splats.bin").read_bytes()).hexdigest()
 
 
+@pytest.mark.slow
 def test_blocks_are_runs_of_their_own_and_one_in_the_end(tmp_path, photos) -> None:
     pipeline = trained(tmp_path / "run", photos, blocks="3")
     manifest = pipeline.manifest("train")
@@ -123,6 +124,7 @@ class Impatient(Listener):
             raise Interrupted("now")
 
 
+@pytest.mark.slow
 def test_stopped_blocks_go_on_and_end_in_the_same_bytes(tmp_path, photos) -> None:
     pipeline = trained(tmp_path / "run", photos, blocks="2")
     with pytest.raises(Interrupted):
@@ -133,6 +135,7 @@ def test_stopped_blocks_go_on_and_end_in_the_same_bytes(tmp_path, photos) -> Non
     assert finished.stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_blocks_cut_anew_leave_none_of_the_old_ones(tmp_path, photos) -> None:
     trained(tmp_path / "run", photos, blocks="3", steps=20)
     again = trained(tmp_path / "run", photos, blocks="2", steps=20)

@@ -103,7 +103,7 @@ def test_a_manifest_comes_last_and_goes_first(splat, store, monkeypatch) -> None
     assert own[-2:] == ["out.ply", "manifest.json"]
 
 
-def test_a_checkpoint_goes_with_the_models_put_aside_for_it_each_once(store, tmp_path) -> None:
+def test_each_checkpoint_is_uploaded_once_and_its_request_only_once(store, tmp_path) -> None:
     partial = tmp_path / ".4-train.partial"
     put: list[str] = []
     partial.mkdir()
@@ -119,10 +119,8 @@ def test_a_checkpoint_goes_with_the_models_put_aside_for_it_each_once(store, tmp
 
     store.put_file = putting
     try:
-        for steps, aside in ((1, []), (2, ["model-2.bin"]), (3, ["model-2.bin", "model-3.bin"])):
-            for name in (REQUEST, *aside[-1:]):
-                if not (partial / name).exists():
-                    (partial / name).write_text(name)
+        (partial / REQUEST).write_text(REQUEST)
+        for steps in (1, 2, 3):
             (partial / "checkpoint.bin").write_text(f"after {steps}")
             os.utime(partial / "checkpoint.bin", ns=(steps, steps))
             for _ in range(3):
@@ -130,9 +128,10 @@ def test_a_checkpoint_goes_with_the_models_put_aside_for_it_each_once(store, tmp
     finally:
         del store.put_file
     assert [PurePosixPath(path).name for path in put] == [
-        *(REQUEST, "checkpoint.bin"),
-        *("model-2.bin", "checkpoint.bin"),
-        *("model-3.bin", "checkpoint.bin"),
+        REQUEST,
+        "checkpoint.bin",
+        "checkpoint.bin",
+        "checkpoint.bin",
     ]
     assert store.cat("/runs/hill/.4-train.partial/checkpoint.bin") == b"after 3"
 

@@ -24,6 +24,7 @@ def test_the_gpu_column_was_measured_for_every_row_and_holds_its_bounds() -> Non
     assert not beyond
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)  # it measures every row on every backend, some in many digits
 def test_the_documented_listing_has_every_row_and_its_bounds() -> None:
     documented = promises(LISTING.read_text(encoding="utf-8"))

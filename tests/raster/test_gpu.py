@@ -138,6 +138,7 @@ def rows():
         yield pytest.param(row, id=row.name, marks=[pytest.mark.skipif(heavy, reason=why)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", list(rows()))
 def test_every_number_of_the_table_is_within_its_bound(row):
     beyond = [m for m in measured(row, "gpu") if not m.accepted]

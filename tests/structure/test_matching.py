@@ -54,6 +54,7 @@ def whole(features: Job, tmp_path_factory: pytest.TempPathFactory) -> tuple[Rows
     return found(job, "matches"), found(job, "two_view_geometries")
 
 
+@pytest.mark.slow
 def test_three_threads_find_what_one_finds(
     features: Job, whole: tuple[Rows, Rows], tmp_path: Path
 ) -> None:
@@ -64,6 +65,7 @@ def test_three_threads_find_what_one_finds(
     assert worker_progress.read_progress(Path(job.progress)) == ("matching", 36, 36)
 
 
+@pytest.mark.slow
 def test_what_was_found_before_is_kept_and_the_missing_added(
     features: Job, whole: tuple[Rows, Rows], tmp_path: Path
 ) -> None:

@@ -121,6 +121,43 @@ def test_gps_that_does_not_fit_is_refused() -> None:
     assert metric is None
     assert report.metrics["scale_source"] == "nothing"
     assert report.metrics["with_gps"] == 12
+    assert report.metrics["gps_unused"]
+    assert not report.warnings  # spread no farther than a receiver errs
+
+
+@pytest.mark.parametrize(
+    ("errors_m", "wrong", "fixes", "levelled", "why"),
+    [
+        (0, 0, 4, True, "5 photographs are needed"),
+        (0, 0, 12, False, "the up direction was not found"),
+        (400, 5, 12, True, "only 7 of them agree with the cameras"),
+        (15, 12, 12, True, "they differ from the cameras by"),
+    ],
+)
+def test_gps_that_is_not_used_is_reported_with_the_reason(
+    errors_m: float, wrong: int, fixes: int, levelled: bool, why: str
+) -> None:
+    poses, rng = cameras(), np.random.default_rng(5)
+    metres = 10.0 * true_east_north(poses)
+    metres[:wrong] += rng.uniform(-1, 1, (wrong, 2)) * errors_m
+    places = on_earth(metres)
+    metric, report = found(
+        capture_of([*places[:fixes], *[None] * (12 - fixes)]), poses, levelled=levelled
+    )
+    assert metric is None
+    assert why in report.metrics["gps_unused"]
+    ((code, message),) = report.warnings
+    assert code == "sfm-gps-unused"
+    assert f"{fixes} of 12 photographs have GPS" in message
+    assert why in message
+
+
+def test_gps_that_is_used_is_no_warning() -> None:
+    poses = cameras()
+    metric, report = found(capture_of(on_earth(10.0 * true_east_north(poses))), poses)
+    assert metric is not None
+    assert not report.warnings
+    assert "gps_unused" not in report.metrics
 
 
 def test_nothing_is_known_without_gps_a_distance_or_a_level() -> None:

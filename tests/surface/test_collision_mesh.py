@@ -84,6 +84,7 @@ def test_small_components_are_removed_and_counted() -> None:
     assert np.linalg.norm(found.mesh.vertices - CENTRE, axis=1).max() < 1.2
 
 
+@pytest.mark.slow
 def test_one_thing_far_away_does_not_take_the_voxels() -> None:
     far = ball(np.array([0.5, -1.0, 500.0]), 3.0, (1, 1, 1), 100)
     near_only, _ = made(sphere(), all_around())

@@ -52,6 +52,7 @@ def stepper(lag: int | None = None) -> GpuStep:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1])
 def test_two_steps_leave_what_the_definition_leaves(degree):
     settings = RasterSettings(near=0.1, sh_degree=degree)
@@ -101,6 +102,7 @@ def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
     assert apart <= LOSS_GRADIENT * top
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seen", "dropout"),
     [(level(), None), (masked(TRANSPARENT, (0.3, -0.2, 0.1)), Dropout(5, 7))],
@@ -133,6 +135,7 @@ def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
     assert waits["cpu"] > 0  # the counter counts
 
 
+@pytest.mark.slow
 def test_a_photograph_that_is_read_anew_is_sent_once(monkeypatch):
     made, seen = stepper(), level()
     made.step(seen, SETTINGS, RATES, smooth=False)
@@ -142,6 +145,7 @@ def test_a_photograph_that_is_read_anew_is_sent_once(monkeypatch):
     assert not sent
 
 
+@pytest.mark.slow
 def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
     made, seen = stepper(lag=1), level()
     for _ in range(2):
@@ -157,6 +161,7 @@ def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
     assert (made.model().steps > before.steps).any()
 
 
+@pytest.mark.slow
 def test_a_model_moves_between_backends_whole():
     """As a checkpoint of one backend that another goes on with."""
     made = stepper()

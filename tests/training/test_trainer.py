@@ -95,6 +95,7 @@ def fit(pictures, scene, steps, rates, degree=0):
     return renders
 
 
+@pytest.mark.slow
 def test_more_splats_fit_a_disc_and_a_square_better():
     """Mean squared error about 0.02 with 16 splats, low 1e-3 with 64, 0.001 to 0.002 with 256."""
     picture = disc_and_square()
@@ -256,11 +257,36 @@ def test_the_live_preview_is_what_the_reference_draws(tmp_path):
     assert np.abs(seen[0] - levels).mean() > 5  # the first step looked different
 
 
-def test_a_torn_checkpoint_means_a_fresh_start(tmp_path):
-    t, start = small_problem(tmp_path, "torn")
+def test_a_torn_checkpoint_means_a_fresh_start_and_a_warning(tmp_path):
+    report = Report()
+    t, start = small_problem(tmp_path, "torn", report)
     (t.folder / "checkpoint.bin").write_bytes(MAGIC + b"\x00" * 5)
     wanted, start2 = small_problem(tmp_path, "whole")
     assert t.run(start).means.tobytes() == wanted.run(start2).means.tobytes()
+    assert "train-checkpoint-damaged" in dict(report.warnings)
+
+
+def test_a_run_with_a_damaged_checkpoint_goes_on_from_the_one_before(tmp_path, monkeypatch):
+    monkeypatch.setattr("stages.training.hooks.CHECKPOINT_SECONDS", 0.0)
+    whole, start = small_problem(tmp_path, "whole", steps=30)
+    wanted = whole.run(start)
+    stopping, report = Report(), Report()
+    stopping.listener = lambda label, done, total, numbers: (
+        stopping.stop_requested.set() if done == 20 else None
+    )
+    first, start = small_problem(tmp_path, "parts", stopping, steps=30)
+    with pytest.raises(Interrupted):
+        first.run(start)
+    path = first.folder / "checkpoint.bin"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    second, start = small_problem(tmp_path, "parts", report, steps=30)
+    found = second.run(start)
+    assert 0 < report.metrics["resumed_from_step"] <= 20
+    assert "train-checkpoint-damaged" in dict(report.warnings)
+    for a, b in zip(vars(found).values(), vars(wanted).values(), strict=True):
+        assert a.tobytes() == b.tobytes()
 
 
 def test_the_reference_backend_trains_to_the_same_place(tmp_path):

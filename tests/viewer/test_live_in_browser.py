@@ -201,6 +201,7 @@ def test_the_picture_follows_training_untouched_and_the_end_is_told(
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_at_rest_a_picture_is_asked_for_seldom(browser: Browser, worker: Any) -> None:
     bare(browser, worker.address)
     shown(browser)

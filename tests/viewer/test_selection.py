@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 from splatcli.app import app
@@ -65,6 +66,7 @@ def edited(browser: Browser, page: Path) -> np.ndarray:
     return in_order(formats.read(out).means)
 
 
+@pytest.mark.slow
 def test_a_lasso_selects_on_the_command_line_what_it_did_by_eye(
     browser: Browser, tmp_path: Path
 ) -> None:
@@ -83,6 +85,7 @@ def test_a_lasso_selects_on_the_command_line_what_it_did_by_eye(
     np.testing.assert_array_equal(edited(browser, page), seen)
 
 
+@pytest.mark.slow
 def test_a_box_after_a_lasso_is_a_chain_and_the_last_is_taken_back(
     browser: Browser, tmp_path: Path
 ) -> None:

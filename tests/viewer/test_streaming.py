@@ -68,6 +68,7 @@ def address(asset: Path) -> Iterator[str]:
     thread.join()
 
 
+@pytest.mark.slow
 def test_three_distances_are_drawn_from_three_levels(
     browser: Browser, address: str, asset: Path
 ) -> None:

@@ -60,6 +60,7 @@ def tradeoff(inputs):
     return measure_tradeoff(inputs, lambda label: None)
 
 
+@pytest.mark.slow
 def test_every_format_is_written_and_evaluated(tradeoff) -> None:
     points = {point.label.removeprefix("."): point for point in tradeoff.formats}
     assert points.keys() == FORMATS.keys()
@@ -70,6 +71,7 @@ def test_every_format_is_written_and_evaluated(tradeoff) -> None:
     assert sizes == sorted(sizes)
 
 
+@pytest.mark.slow
 def test_formats_are_written_with_the_precision_that_the_run_chose(inputs, tmp_path) -> None:
     bits = {"position": 11, "rotation": 4, "scale": 4, "colour": 4, "opacity": 4, "palette": 5}
     decided = QuantisedSplats(inputs.splats, 2, {"bits": bits})
@@ -153,6 +155,7 @@ def test_plots_have_axes_with_units_and_legends(tradeoff, inputs, tmp_path, monk
         assert figure.axes[0].get_legend() is not None
 
 
+@pytest.mark.slow
 def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
     tradeoff = measure_tradeoff(replace(inputs, history=()), lambda label: None)
     files = write_report(tmp_path, "scene", tradeoff, inputs)
@@ -160,6 +163,7 @@ def test_a_run_without_a_log_gets_the_other_curves(inputs, tmp_path) -> None:
     assert summary.NO_TIMES in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_single_held_out_view_has_no_interval(scene, inputs, tmp_path) -> None:
     tradeoff = measure_tradeoff(replace(inputs, held_out=inputs.held_out[:1]), lambda label: None)
     write_report(tmp_path, "scene", tradeoff, inputs)
