@@ -47,7 +47,8 @@ def convert(
         dropped = formats.write(target, splats)
         warnings = [loss.text for loss in losses_of(rows[1], target.name, splats)]
         begin(f"comparing {target}")
-        found = _proven(source, target, drop_undrawable(splats)[0])
+        found, loss = _proven(source, target, drop_undrawable(splats)[0])
+        warnings += [loss] if loss else []
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
@@ -79,16 +80,19 @@ def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
         console.note(f"Largest differences: {console.figures(worst)}", "dim")
 
 
-def _proven(source: Path, target: Path, splats: Splats) -> dict[str, Any]:
-    """The figures of the comparison. Raises SplatError "convert-verify-failed"."""
+def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any], str]:
+    """(the figures of the comparison, a warning of what was lost or "").
+    Raises SplatError "convert-verify-failed"."""
     from stages.formats import format_of
     from stages.proof.prover import Prover, cameras_for
+    from stages.proof.reason import losses_shown
 
     cameras = cameras_for(splats, results.views_of(results.run_around(source)))
     proof = Prover.of(splats, cameras, source_format=format_of(source).ending).prove(target)
     if proof.fault:
         raise _failed(target, proof.fault)
-    return proof.figures
+    loss = losses_shown(format_of(target), proof, splats)
+    return proof.figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"
 
 
 def _failed(path: Path, reason: str) -> SplatError:

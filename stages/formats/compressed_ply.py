@@ -81,7 +81,7 @@ def order(splats: Splats) -> NDArray[np.intp]:
     neighbours. Chunks cannot be left incomplete: the one in which the outliers begin is filled with
     the splats that are least visible.
     """
-    rows, shells = morton.morton_order(splats), _shells(splats.means)
+    rows, shells = morton.morton_order(splats), outlier_shells(splats.means)
     if not shells.any():
         return rows
     inliers = np.flatnonzero(shells == 0)
@@ -93,7 +93,7 @@ def order(splats: Splats) -> NDArray[np.intp]:
     return rows[np.argsort(shells[rows], kind="stable")]
 
 
-def _shells(means: NDArray[np.floating]) -> NDArray[np.int64]:
+def outlier_shells(means: NDArray[np.floating]) -> NDArray[np.int64]:
     """[N] 0 for splats of the scene; 1, 2, ... for outliers by their distance."""
     low, centre, high = quantiles(means, (0.05, 0.5, 0.95))
     limit = _OUTLIER_EXTENTS * float(np.linalg.norm(high - low))

@@ -49,6 +49,7 @@ class Differences:
         worst_row: its row in the file.
         wrong: attributes that are wrong for most splats.
         rows: [N] for each row of the file the row of the original.
+        median_position_error: in world units.
     """
 
     largest: dict[str, float]
@@ -56,6 +57,7 @@ class Differences:
     worst_row: int
     wrong: tuple[str, ...]
     rows: Rows
+    median_position_error: float = 0.0
 
 
 def differences(splats: Splats, content: FileContent, *names: str) -> Differences:
@@ -143,13 +145,21 @@ def _summary(
     shows = largest[worst] > _ROUNDING * units[worst]
     row = int(errors[worst].argmax()) if shows else 0
     typical = {name: float(np.median(errors[name])) for name in _WRONG}
+    median_position_error = typical["position"]
     typical["position"] /= extent
     long = errors["anisotropy"] > _ANISOTROPIC
     typical["rotation"] = float(np.median(errors["rotation"][long])) if long.any() else 0.0
     wrong = [name for name in _WRONG if typical[name] > _WRONG[name]]
     if sums[0] > _WRONG_SH * max(sums[1], sums[2]):
         wrong.append("sh")
-    return Differences(_named(largest), worst if shows else "", row, tuple(wrong), rows)
+    return Differences(
+        _named(largest),
+        worst if shows else "",
+        row,
+        tuple(wrong),
+        rows,
+        median_position_error,
+    )
 
 
 def _named(largest: dict[str, float]) -> dict[str, float]:

@@ -48,12 +48,14 @@ class Proof:
             where nothing could be compared.
         fault: why the file is wrong; "" if it is not.
         loss_db: the PSNR of a lossy file where it calls for a warning, else None.
+        median_position_error: in world units.
     """
 
     splats: int
     figures: dict[str, Any]
     fault: str = ""
     loss_db: float | None = None
+    median_position_error: float = 0.0
 
 
 def cameras_for(splats: Splats, views: Sequence[View] = ()) -> tuple[Camera, ...]:
@@ -140,7 +142,7 @@ class Prover:
             drawn = f"drawn again it differs by {worst:.1f} dB"
             fault = f"{drawn}; {fault}" if fault else drawn
         loss_db = worst if lossy and worst < _WARN_LOSSY_DB and not fault else None
-        return Proof(len(content.splats), figures, fault, loss_db)
+        return Proof(len(content.splats), figures, fault, loss_db, found.median_position_error)
 
     def _psnr_by_camera(self, content: FileContent, rows: Rows) -> list[float]:
         """PSNR by camera. rows: see `Differences`. The camera is moved into the axes of the file

@@ -115,6 +115,41 @@ def test_an_origin_that_a_file_cannot_hold_is_told(tmp_path: Path, ending: str) 
     assert (tmp_path / f"b.{ending}.offset.json").is_file()
 
 
+def test_a_loss_below_30_db_is_told_with_its_cause(tmp_path: Path) -> None:
+    splats = replace(many_splats(200), origin=np.zeros(3))
+    splats.sh[:, 1:] = np.random.default_rng(0).normal(0, 1.5, splats.sh[:, 1:].shape)
+    splats.opacity_logits[:] = 3
+    formats.write(tmp_path / "a.ply", splats)
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.splat")
+    assert err.count("Warning") == 1
+    assert "8-bit colours that do not change with the view" in " ".join(err.split())
+
+
+@pytest.mark.parametrize(
+    ("outlier", "cause"),
+    [(0.0, "too few bits for splats so close together"), (30.0, "1 outlier widened the range")],
+)
+def test_positions_off_by_more_than_neighbours_are_told_with_their_cause(
+    tmp_path: Path, outlier: float, cause: str
+) -> None:
+    splats = replace(many_splats(200), origin=np.zeros(3))
+    splats.means[:] = np.random.default_rng(0).normal(0, 1e-4, splats.means.shape)
+    splats.means[100:] += 1
+    splats.means[7] += outlier
+    formats.write(tmp_path / "a.ply", splats)
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.compressed.ply")
+    text = " ".join(err.split())
+    assert "half of the splats are off by" in text
+    assert cause in text
+    assert err.count("Warning") == 1
+
+
+def test_a_conversion_that_loses_little_warns_of_nothing(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", replace(many_splats(2000), origin=np.zeros(3)))
+    for ending in ("spz", "compressed.ply", "glb"):
+        assert "Warning" not in converted(tmp_path / "a.ply", tmp_path / f"b.{ending}")[1]
+
+
 @pytest.mark.parametrize(("source", "target"), [("a.ply", "b.obj"), ("a.obj", "b.ply")])
 def test_unknown_endings_name_the_known_ones(tmp_path: Path, source: str, target: str) -> None:
     formats.write(tmp_path / "a.ply", many_splats(3))
