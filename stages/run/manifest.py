@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from stages.base.atomic import sync_folder
 from stages.base.errors import Family, SplatError
 from stages.run.digests import FileRecords, records_from_data, records_to_data
 
@@ -108,7 +109,10 @@ def plain(value: Any) -> Any:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write JSON under a temporary name, flush it to the disk, rename. Raises OSError."""
+    """Write JSON under a temporary name, flush it to the disk, rename it, and flush the folder.
+
+    Raises OSError.
+    """
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
         json.dump(plain(data), file, indent=1, ensure_ascii=False)
@@ -116,6 +120,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+    sync_folder(path.parent)
 
 
 def write_sealed(path: Path, data: Mapping[str, Any]) -> None:

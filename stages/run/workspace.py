@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from stages.base.atomic import sync_folder
 from stages.base.stage import Stage
 from stages.run.manifest import MANIFEST, Manifest, write_json
 from stages.run.request import REQUEST, Request
@@ -83,6 +84,7 @@ class Workspace:
             self._replace()
         elif self.old.exists() and not self.final.exists():
             self.old.rename(self.final)
+            sync_folder(self.run_folder)
         if self.old.exists():
             shutil.rmtree(self.old)
 
@@ -94,6 +96,7 @@ class Workspace:
                 shutil.rmtree(self.old)
             self.final.rename(self.old)
         self.partial.rename(self.final)
+        sync_folder(self.run_folder)  # before the old output goes
         if self.old.exists():
             shutil.rmtree(self.old, ignore_errors=True)
 

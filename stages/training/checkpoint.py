@@ -20,6 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.lib import format as npy
 
+from stages.base.atomic import sync_folder
 from stages.raster.backends import backend_of
 from stages.training.clock import Elapsed
 from stages.training.optimiser import Model
@@ -90,6 +91,7 @@ def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
     if path.exists():
         os.replace(path, folder / _PREVIOUS)
     os.replace(temporary, path)
+    sync_folder(folder)
 
 
 def load_checkpoint(

@@ -1,12 +1,16 @@
-"""Incomplete files of processes that ended are removed."""
+"""Files are replaced whole; incomplete files of processes that ended are removed."""
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-from stages.base.atomic import partial_prefix, remove_abandoned_files
+import pytest
+
+from stages.base.atomic import partial_prefix, remove_abandoned_files, replacing
 
 
 def ended() -> str:
@@ -32,3 +36,26 @@ def test_what_a_killed_process_left_goes_and_what_lives_stays(tmp_path: Path) ->
 
 def test_a_folder_that_is_not_there_is_no_error_of_its_own(tmp_path: Path) -> None:
     remove_abandoned_files(tmp_path / "none")
+
+
+def test_file_and_then_folder_are_flushed_to_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda file: flushed.append(os.fstat(file).st_ino))
+    with replacing(tmp_path / "a.txt") as path:
+        path.write_text("a")
+    assert flushed == [(tmp_path / "a.txt").stat().st_ino, tmp_path.stat().st_ino]
+
+
+def test_folder_that_cannot_be_flushed_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def files_only(file: int) -> None:
+        if os.fstat(file).st_ino == tmp_path.stat().st_ino:
+            raise OSError(errno.EINVAL, "Invalid argument")
+
+    monkeypatch.setattr(os, "fsync", files_only)
+    with replacing(tmp_path / "a.txt") as path:
+        path.write_text("a")
+    assert (tmp_path / "a.txt").read_text() == "a"

@@ -695,6 +695,35 @@ def test_crash_while_replacing_leaves_one_whole_result(
     assert isinstance(Manifest.read(final), Manifest)
 
 
+def test_folder_is_flushed_to_the_disk_after_each_rename_in_it(
+    finished: Pipeline, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events: list[tuple[str, int]] = []
+    fsync = os.fsync
+
+    def noting(rename):
+        def call(source: Path, target: Path) -> None:
+            rename(source, target)
+            events.append(("rename", Path(target).parent.stat().st_ino))
+
+        return call
+
+    def syncing(file: int) -> None:
+        fsync(file)
+        events.append(("sync", os.fstat(file).st_ino))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", noting(os.rename))
+        patch.setattr(os, "replace", noting(os.replace))
+        patch.setattr(os, "fsync", syncing)
+        finished.run({"count": CountSettings(iterations=5)})
+    renames = [(at, folder) for at, (kind, folder) in enumerate(events) if kind == "rename"]
+    assert len(renames) >= 5
+    assert run_folder.stat().st_ino in {folder for _, folder in renames}
+    for at, folder in renames:
+        assert ("sync", folder) in events[at:]
+
+
 def test_seconds_cpu_seconds_and_memory_of_all_attempts_are_added_up(
     photos: Path, run_folder: Path
 ) -> None:
