@@ -142,14 +142,20 @@ def test_a_bad_8_bit_copy_is_a_warning(scene: SmallScene, tmp_path: Path) -> Non
     sh[:, 1:] = np.random.default_rng(0).normal(0, 1.5, sh[:, 1:].shape)
     gaudy = replace(scene.splats, sh=sh)
     _, report = exported(scene, tmp_path, gaudy, formats=("splat", "ply"))
-    assert [code for code, _ in report.warnings] == ["export-splat-lossy"]
+    assert [code for code, _ in report.warnings] == [
+        "export-splat-origin",
+        "export-splat-lossy",
+    ]
 
 
 def test_splats_out_of_range_are_a_warning(scene: SmallScene, tmp_path: Path) -> None:
     splats = scene.splats.take(np.arange(len(scene.splats)))
     splats.means[4] = 1e7
     _, report = exported(scene, tmp_path, splats, formats=("ply", "spz"))
-    assert [code for code, _ in report.warnings] == ["export-spz-out-of-range"]
+    assert [code for code, _ in report.warnings] == [
+        "export-spz-range",
+        "export-spz-origin",
+    ]
 
 
 def test_splats_that_cannot_be_drawn_are_left_out_and_counted(
@@ -161,7 +167,7 @@ def test_splats_that_cannot_be_drawn_are_left_out_and_counted(
     _, report = exported(scene, tmp_path, bad)
     assert report.metrics["dropped"] == 2
     assert report.metrics["splats"] == len(bad) - 2
-    assert [code for code, _ in report.warnings] == ["export-splats-dropped"]
+    assert "export-splats-dropped" in [code for code, _ in report.warnings]
 
 
 def test_a_scene_without_splats_is_exported_with_a_warning(

@@ -53,6 +53,8 @@ def write(
 ) -> int:
     """Write `splats` in the format that the suffix of `path` stands for, completely or not at all.
 
+    Beside a format that cannot hold it, the origin is written to `offset.offset_path(path)`.
+
     Args:
         path: the file to write.
         splats: in our conventions: y down, ln scales, logit opacities.
@@ -63,12 +65,16 @@ def write(
     Returns how many splats could not be drawn (values not finite, or too large) and were left out.
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
+    from stages.formats.offset import write_offset
+
     row = format_of(path)
     remove_abandoned_files(Path(path).parent)
     more: dict[str, Any] = {"views": views} if row.takes_views else {}
     if row.streamed:
         more["coarser"] = coarser
     dropped: int = load_object(row.writer)(Path(path), splats, units=units, **more)
+    if not row.holds_origin:
+        write_offset(Path(path), row, splats, units)
     return dropped
 
 

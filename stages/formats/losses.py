@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from stages.base.lazy import load_object
 from stages.base.text import counted
+from stages.formats.offset import offset_path
 from stages.formats.table import Format
 from stages.scene import Splats
 
 
 @dataclass(frozen=True)
 class Loss:
-    """One thing that a file lacks: a stable code and a text for the user."""
+    """One thing that a file lacks: the end of a stable code, and a text for the user."""
 
     code: str
     text: str
@@ -20,15 +22,26 @@ class Loss:
 
 def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
     """What a file of the format `row` cannot hold of `splats`; most files hold everything."""
-    found = []
+    found: list[Loss] = []
+    if not len(splats):
+        return found
     if row.out_of_range and (count := load_object(row.out_of_range)(splats)):
         found.append(
             Loss(
-                "out-of-range",
+                "range",
                 f"{file_name} holds positions of 24 bits, and {counted(count, 'splat')} of "
                 f"{len(splats):,} lie farther out. These were moved towards the origin and scaled "
                 "down. If they are outliers, `splat edit --drop-floaters` removes them; else "
                 "write .ply, .glb or .usdz.",
+            )
+        )
+    if not row.holds_origin and splats.origin.any():
+        offset = ", ".join(f"{value:.10g}" for value in splats.origin)
+        found.append(
+            Loss(
+                "origin",
+                f"{file_name} has no field for the origin of the scene ({offset}), which was "
+                f"written to {offset_path(Path(file_name)).name}.",
             )
         )
     return found

@@ -85,7 +85,8 @@ def decode(records: NDArray[np.void]) -> Splats:
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    The format has no field for units, the origin and SH above degree 0; they are lost.
+    The format has no field for SH above degree 0, which is lost, and none for units and the
+    origin; `formats.write` writes these beside it.
     Raises SplatError when the file cannot be written.
     """
     splats, dropped = drop_undrawable(splats)

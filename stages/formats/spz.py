@@ -41,9 +41,9 @@ _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     """Write `splats`; return how many could not be drawn and were left out.
 
-    The format has no field for units and the origin; they are lost. A splat beyond the range of
-    24 bits (see `count_out_of_range`) is moved closer along its ray and scaled down, which looks
-    the same from the centre. Raises SplatError when the file cannot be written.
+    The format has no field for units and the origin; `formats.write` writes them beside it. A splat
+    beyond the range of 24 bits (see `count_out_of_range`) is moved closer along its ray and scaled
+    down, which looks the same from the centre. Raises SplatError when the file cannot be written.
     """
     splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))

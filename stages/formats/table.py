@@ -35,6 +35,8 @@ class Format:
             back as float32.
         sh_degree: the highest SH degree that is kept.
         y_up: whether the file's axes are y up, turned 180 degrees about x from ours.
+        holds_origin: whether a file holds the origin of a georeferenced scene; else it is written
+            beside, see `stages.formats.offset`.
         sidecar: the suffix of a file beside it that belongs to it; "" if there is none.
         takes_views: whether the file also holds cameras.
         needs_finetuning: whether rounding is so coarse that splats are fine-tuned to it.
@@ -53,6 +55,7 @@ class Format:
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
+    holds_origin: bool = True
     sidecar: str = ""
     takes_views: bool = False
     needs_finetuning: bool = False
@@ -117,6 +120,7 @@ TABLE = (
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
         needs_finetuning=True,
+        holds_origin=False,
     ),
     _GLB,
     replace(_GLB, ending="gltf", sidecar=".bin"),
@@ -149,6 +153,7 @@ TABLE = (
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
         out_of_range="stages.formats.spz:count_out_of_range",
+        holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
         y_up=True,

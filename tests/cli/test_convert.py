@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +96,7 @@ def test_splats_that_cannot_be_drawn_are_counted(tmp_path: Path) -> None:
 
 
 def test_splats_out_of_range_are_counted_and_told(tmp_path: Path) -> None:
-    splats = many_splats(2000)
+    splats = replace(many_splats(2000), origin=np.zeros(3))
     splats.means[4] = 1e6
     formats.write(tmp_path / "a.ply", splats)
     _, err = converted(tmp_path / "a.ply", tmp_path / "b.spz")
@@ -103,6 +104,15 @@ def test_splats_out_of_range_are_counted_and_told(tmp_path: Path) -> None:
     assert "1 splat of 2,000" in " ".join(err.split())
     out, _ = converted(tmp_path / "a.ply", tmp_path / "b.spz", "--json")
     assert "24 bits" in json.loads(out.splitlines()[-1])["warnings"][0]
+
+
+@pytest.mark.parametrize("ending", ["spz", "splat"])
+def test_an_origin_that_a_file_cannot_hold_is_told(tmp_path: Path, ending: str) -> None:
+    formats.write(tmp_path / "a.ply", replace(many_splats(30), origin=np.array([5e5, 0, -4])))
+    _, err = converted(tmp_path / "a.ply", tmp_path / f"b.{ending}")
+    assert err.count("Warning") == 1
+    assert f"(500000, 0, -4), which was written to b.{ending}.offset.json" in " ".join(err.split())
+    assert (tmp_path / f"b.{ending}.offset.json").is_file()
 
 
 @pytest.mark.parametrize(("source", "target"), [("a.ply", "b.obj"), ("a.obj", "b.ply")])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +58,31 @@ def test_where_a_survey_lies_survives_the_formats_that_hold_it(tmp_path: Path, s
     back = usd_read.parse(path) if suffix == "usdc" else formats.read(path)
     np.testing.assert_array_equal(back.origin, splats.origin)
     assert np.abs(back.means).max() < 100
+
+
+@pytest.mark.parametrize(("suffix", "axes"), [("splat", [1, 1, 1]), ("spz", [1, -1, -1])])
+def test_where_a_survey_lies_is_written_beside_formats_that_do_not_hold_it(
+    tmp_path: Path, suffix: str, axes: list[int]
+) -> None:
+    survey_ply(tmp_path / "a.ply")
+    splats = formats.read(tmp_path / "a.ply")
+    path, beside = tmp_path / f"b.{suffix}", tmp_path / f"b.{suffix}.offset.json"
+    formats.write(path, splats, units="metres")
+    found = json.loads(beside.read_text())
+    assert (found["file"], found["units"]) == (path.name, "metres")
+    np.testing.assert_array_equal(found["offset"], splats.origin * axes)
+    formats.write(path, replace(splats, origin=np.zeros(3)))
+    assert not beside.exists()
+
+
+@pytest.mark.parametrize("name", list(formats.BY_ENDING))
+def test_the_table_says_which_formats_hold_the_origin(tmp_path: Path, name: str) -> None:
+    row = formats.BY_ENDING[name]
+    splats = replace(many_splats(30), origin=UTM)
+    path = tmp_path / row.file_name("a")
+    formats.write(path, splats)
+    back = usd_read.parse(path) if name.startswith("usd") else formats.read(path)
+    assert row.holds_origin == bool(back.origin.any())
 
 
 def test_what_lies_near_zero_is_left_where_it_is() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,7 @@ def test_formats_lose_what_their_rows_declare_and_nothing_else(tmp_path: Path, r
 @pytest.mark.parametrize("row", FORMATS.values(), ids=lambda row: row.ending)
 def test_a_format_leaves_the_files_that_its_row_names(tmp_path: Path, row: Format) -> None:
     path = tmp_path / f"a b.{row.ending}"
-    formats.write(path, many_splats(9))
+    formats.write(path, replace(many_splats(9), origin=np.zeros(3)))
     assert sorted(row.files(path)) == sorted(tmp_path.iterdir())
     assert row.size_bytes(path) == sum(file.stat().st_size for file in tmp_path.iterdir())
 
