@@ -195,7 +195,7 @@ def _from_gps(
 
 
 def _report_unused(why: str, count: int, total: int, spread: float, report: Report) -> None:
-    """Report why GPS is not used; as a warning if it could have told the scale.
+    """Report why GPS is not used; as a warning if the scale could have come from it.
 
     Args:
         why: the reason.

@@ -61,20 +61,13 @@ from stages.raster.kernels.simd64 import (
 )
 
 # Scratch array for eight splats (float64[WORK_ROW x 8]), one for each thread: entry k of all lanes
-# lies at 8 k.
-# Filled by `footprint`, read by `footprint_gradient`.
+# lies at 8 k. Filled by `footprint`, read by `footprint_gradient`.
 X, Y, Z = 0, 1, 2  # position in the camera
 V0, V1 = 3, 6  # rows of V = J W Q diag(s): W the camera rotation cam[R], Q the splat rotation
 AXES = 9  # 9:18 W Q
 SCALES = 18  # 18:21
 CROSS = 21  # 21:24 V0 x V1
-A, B, C, DET, MINORS = (
-    24,
-    25,
-    26,
-    27,
-    28,
-)  # covariance in pixels (xx, xy, yy), determinant, 2x2 minors
+A, B, C, DET, MINORS = 24, 25, 26, 27, 28  # covariance in pixels (xx, xy, yy), determinant
 FULL_OPACITY, COMPENSATION = 29, 30
 NORM, QUATERNION = 31, 32  # 32:36 unit
 SLOPE = 36  # 36:38 clamped x/z, y/z
@@ -286,25 +279,21 @@ def sums_origin(geometry, row, width, height):
 
 
 @kernel
-def footprint_gradient(
-    cam, w, g_x, g_y, g_exp_a, g_exp_b, g_exp_k, g_log_inverse_z, g_opacity, smoothed, out
-):
+def footprint_gradient(cam, w, g_x, g_y, g_a, g_b, g_k, g_depth, g_opacity, smoothed, out):
     """Chain rule from the footprints of eight splats to their parameters.
 
     Gradients of mean x, mean y (px), of A, B, K of the exponent A u^2 + B (v - K u)^2, of
-    ln(1 / z) through that exponent, and of the drawn opacity.
+    ln(1 / z) through that exponent (g_depth), and of the drawn opacity.
     smoothed: whether a smoothing filter was used.
     out (work of GRADIENTS entries): gradients of mean, quaternion, log-scales, opacity logit.
     """
     cov_xx, cov_xy, cov_yy, det = at(w, A), at(w, B), at(w, C), at(w, DET)
-    larger_variance = dmax(cov_xx, cov_yy)
-    g_larger_variance = (0.5 * g_exp_b / det) - (0.5 * g_exp_a + g_exp_k * cov_xy) / (
-        larger_variance * larger_variance
-    )
-    g_cov = g_exp_k / larger_variance
-    g_det = -0.5 * g_exp_b * larger_variance / (det * det)
+    major = dmax(cov_xx, cov_yy)
+    g_major = (0.5 * g_b / det) - (0.5 * g_a + g_k * cov_xy) / (major * major)
+    g_cov = g_k / major
+    g_det = -0.5 * g_b * major / (det * det)
     wide = dge(cov_xx, cov_yy)
-    g_var_x, g_var_y = dselect(wide, g_larger_variance, 0.0), dselect(wide, 0.0, g_larger_variance)
+    g_var_x, g_var_y = dselect(wide, g_major, 0.0), dselect(wide, 0.0, g_major)
     g_minors = spread8(0.0)
     opacity, drawn_opacity = at(w, FULL_OPACITY), used_opacity(w)
     e = cam[DILATION]
@@ -316,7 +305,7 @@ def footprint_gradient(
         g_minors = dselect(thick, 0.5 * g_compensation / (compensation * det), 0.0)
         # d ln(compensation) / d ln(1 / z): the minors grow as (1 / z)^4
         growth = dselect(thick, e * (cov_xx + cov_yy), e * (cov_xx + cov_yy) - 2.0 * det)
-        g_log_inverse_z = g_log_inverse_z + g_compensation * compensation * growth / det
+        g_depth = g_depth + g_compensation * compensation * growth / det
     put(out, OPACITY, g_opacity * drawn_opacity * (1.0 - opacity))
     g_minors = g_minors + g_det
     e2 = 2.0 * e * g_det
@@ -346,11 +335,11 @@ def footprint_gradient(
         put(w, AXES + 3 + k, j11 * t1)
         put(w, AXES + 6 + k, j02 * t0 + j12 * t1)
     _quaternion_gradient(cam, w, out)
-    _mean_gradient(cam, w, g_x, g_y, g02, g12, g_log_inverse_z, out)
+    _mean_gradient(cam, w, g_x, g_y, g02, g12, g_depth, out)
 
 
 @kernel
-def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_log_inverse_z, out):
+def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_depth, out):
     """out[MEAN] from the gradients of the projected mean, of the Jacobian's last column, and of
     ln(1 / z) at fixed slopes."""
     fx, fy = cam[FX], cam[FY]
@@ -359,7 +348,7 @@ def _mean_gradient(cam, w, g_px, g_py, g02, g12, g_log_inverse_z, out):
     g_u = dselect(dgt(at(w, INSIDE), 0.5), -g02 * fx / z, 0.0)
     g_v = dselect(dgt(at(w, INSIDE + 1), 0.5), -g12 * fy / z, 0.0)
     g_x, g_y = (g_px * fx + g_u) / z, (g_py * fy + g_v) / z
-    g_z = -(g_log_inverse_z + g_u * u + g_v * v) / z
+    g_z = -(g_depth + g_u * u + g_v * v) / z
     for k in range(3):
         put(out, MEAN + k, cam[R + k] * g_x + cam[R + 3 + k] * g_y + cam[R + 6 + k] * g_z)
 
