@@ -233,7 +233,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=10,
+    version=11,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,

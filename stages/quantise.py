@@ -324,7 +324,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=7,
+    version=8,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     run=run,
