@@ -44,6 +44,7 @@ def test_a_checkout_that_is_not_installed_knows_its_dependencies(
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(libraries, "requires", not_installed)
+    monkeypatch.setattr(libraries, "_PYPROJECT", PYPROJECT)
     assert list(libraries.needed()) == declared()
 
 
