@@ -91,7 +91,7 @@ def test_the_photograph_stands_beside_and_moving_lets_go(browser: Browser, addre
     browser.run("document.getElementById('next').click()")
     assert browser.run(caption) == "day 1/<1>.png: used in training"
     for kind, x in (("mousePressed", 90), ("mouseMoved", 120), ("mouseReleased", 120)):
-        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=210, button="left", clickCount=1)
+        browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=180, button="left", clickCount=1)
     note = "document.getElementById('note').textContent"
     assert "Moved" in browser.run(note)
     browser.run("document.getElementById('back').click()")
