@@ -18,7 +18,7 @@ import pytest
 from stages.base.memory import descendants
 from tests import processes, sample
 
-pytest.importorskip("ray", reason='no Ray: pip install "splat[cluster]" brings it')
+pytest.importorskip("ray", reason='no Ray: pip install "splatcli[cluster]" brings it')
 
 pytestmark = [pytest.mark.cluster, pytest.mark.slow, pytest.mark.timeout(900)]
 
