@@ -24,7 +24,7 @@ from stages.run.runfile import RUN_FILE
 from tests import processes, sample
 from tests.cli.pretence import failing_at
 
-fsspec = pytest.importorskip("fsspec", reason='pip install "splat[cluster]" brings it')
+fsspec = pytest.importorskip("fsspec", reason='pip install "splatcli[cluster]" brings it')
 
 NAMES = ("hill", "room")
 
