@@ -101,7 +101,7 @@ def _within_reach(splats: Splats, bits: int) -> Splats:
 
 def _fractional_bits(means: NDArray[np.floating]) -> int:
     """As many as the largest coordinate allows: small scenes get finer steps. Scenes beyond 2048
-    units get coarser steps, as long as neighbouring splats are told apart."""
+    units get coarser steps, as long as neighbouring splats stay distinct."""
     largest = float(max(means.max(initial=0.0), -means.min(initial=0.0)))
     if largest == 0:
         return _USUAL_FRACTIONAL_BITS

@@ -95,7 +95,7 @@ class _EvaluationViews(Sequence[EvaluationView]):
     """The first views in memory, the others on disk."""
 
     def __init__(self, folder: Path, views: Iterable[View], draw_settings: DrawSettings) -> None:
-        self._folder, self._views, self._look = folder, tuple(views), draw_settings
+        self._folder, self._views, self._draw_settings = folder, tuple(views), draw_settings
         self._loaded: list[EvaluationView] = []
         free = IN_MEMORY_MIB * 2**20
         for number, view in enumerate(self._views):
@@ -119,7 +119,7 @@ class _EvaluationViews(Sequence[EvaluationView]):
         return self._loaded[number] if number < len(self._loaded) else self._load(number)
 
     def _load(self, number: int) -> EvaluationView:
-        view, draw_settings = self._views[number], self._look
+        view, draw_settings = self._views[number], self._draw_settings
         found = load_evaluation_view(self._folder, view, draw_settings.camera(view.camera))
         return found.in_median_light(view.light if draw_settings.light else None).over(
             draw_settings.background

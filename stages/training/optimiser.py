@@ -208,7 +208,7 @@ def adam_step(
     """
     n = len(visible)
     columns = gradients.shape[1]
-    stride, n_sh = moment1.shape[1], min(columns - SH, sh.shape[1])
+    row_width, n_sh = moment1.shape[1], min(columns - SH, sh.shape[1])
     shift = np.zeros(columns, np.float32)
     scales = np.empty((STEP_COUNTS, 2), np.float32)
     while True:
@@ -220,7 +220,7 @@ def adam_step(
             if _is_invalid(gradients, rank * columns, columns):
                 continue
             _count(steps, i, counts, corrections, scales)
-            at, own = rank * columns, np.int64(i) * stride
+            at, own = rank * columns, np.int64(i) * row_width
             _update_moments(
                 gradients, at, columns, moment1, moment2, own, rates, scales, counts, shift
             )

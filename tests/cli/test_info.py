@@ -35,22 +35,22 @@ BYTES = {
 def test_bytes_are_told_by_attribute(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     formats.write(path, many_splats(300))
-    told = info(path)
-    assert told["splats"] == 300
-    assert told["bytes_per_splat"].items() >= BYTES[suffix].items()
-    assert sum(told["bytes_per_splat"].values()) * 300 == pytest.approx(path.stat().st_size, 1e-3)
+    facts = info(path)
+    assert facts["splats"] == 300
+    assert facts["bytes_per_splat"].items() >= BYTES[suffix].items()
+    assert sum(facts["bytes_per_splat"].values()) * 300 == pytest.approx(path.stat().st_size, 1e-3)
 
 
 def test_bytes_of_packed_files_are_those_on_disk_where_parts_are_packed_alone(
     tmp_path: Path,
 ) -> None:
     formats.write(tmp_path / "a.sog", many_splats(300))
-    told = info(tmp_path / "a.sog")["bytes_per_splat"]
+    facts = info(tmp_path / "a.sog")["bytes_per_splat"]
     size = (tmp_path / "a.sog").stat().st_size
-    assert sum(told.values()) * 300 == pytest.approx(size, 1e-2)
+    assert sum(facts.values()) * 300 == pytest.approx(size, 1e-2)
     formats.write(tmp_path / "a.spz", many_splats(300))  # gzip packs all together
-    told = info(tmp_path / "a.spz")["bytes_per_splat_unpacked"]
-    assert told == {
+    facts = info(tmp_path / "a.spz")["bytes_per_splat_unpacked"]
+    assert facts == {
         "positions": 9,
         "opacities": 1,
         "colours": 3,
@@ -59,15 +59,15 @@ def test_bytes_of_packed_files_are_those_on_disk_where_parts_are_packed_alone(
         "SH": 45,
     }
     formats.write(tmp_path / "a.html", many_splats(300))  # a .ply, gzip and base64
-    told = info(tmp_path / "a.html")["bytes_per_splat_unpacked"]
-    assert (told["positions"], told["SH"]) == (12, 180)
+    facts = info(tmp_path / "a.html")["bytes_per_splat_unpacked"]
+    assert (facts["positions"], facts["SH"]) == (12, 180)
 
 
 def test_a_format_whose_parts_nobody_can_tell_says_so(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.usdc", many_splats(3))
-    told = info(tmp_path / "a.usdc")
-    assert "how many bytes" in told["bytes_per_splat_unknown"]
-    assert "bytes_per_splat" not in told
+    facts = info(tmp_path / "a.usdc")
+    assert "how many bytes" in facts["bytes_per_splat_unknown"]
+    assert "bytes_per_splat" not in facts
 
 
 def test_the_size_of_a_gltf_counts_its_bin(tmp_path: Path) -> None:
@@ -84,11 +84,11 @@ def test_values_that_are_not_finite_are_described_and_not_refused(tmp_path: Path
     table[:5, 0] = np.nan  # x
     table[7, 61] = np.inf  # rot_3
     path.write_bytes(head + b"end_header\n" + table.tobytes())
-    told = info(path)
-    assert told["not_finite"] == 6
-    assert told["warnings"]["not-finite-positions"].startswith("5 splats")
-    assert told["warnings"]["not-finite-rotations"].startswith("1 splats")
-    assert np.isfinite(told["bounds_high"]).all()
+    facts = info(path)
+    assert facts["not_finite"] == 6
+    assert facts["warnings"]["not-finite-positions"].startswith("5 splats")
+    assert facts["warnings"]["not-finite-rotations"].startswith("1 splats")
+    assert np.isfinite(facts["bounds_high"]).all()
     result = CliRunner().invoke(app, ["info", str(path)])
     assert result.exit_code == 0
     assert "5 splats (1.7 %) are not finite in their positions" in result.stderr
@@ -111,12 +111,12 @@ def test_a_usd_file_that_is_not_finite_is_described_too(tmp_path: Path) -> None:
 def test_what_a_splat_costs_is_told_at_its_own_degree(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.ply", many_splats(1000))  # degree 3
     formats.write(tmp_path / "a.splat", many_splats(1000))  # degree 0
-    told, plain = info(tmp_path / "a.ply"), info(tmp_path / "a.splat")
-    assert (told["floats_per_splat"], plain["floats_per_splat"]) == (59, 14)
-    assert told["floats_per_splat_by_degree"] == {"0": 14, "1": 23, "2": 38, "3": 59}
-    assert list(told["memory_bytes_per_splat"].values()) == [236, 118, 944]
-    assert list(told["memory_bytes"].values()) == [236_000, 118_000, 944_000]
-    shares = list(told["mass_share_within_sigmas"].values())
+    facts, plain = info(tmp_path / "a.ply"), info(tmp_path / "a.splat")
+    assert (facts["floats_per_splat"], plain["floats_per_splat"]) == (59, 14)
+    assert facts["floats_per_splat_by_degree"] == {"0": 14, "1": 23, "2": 38, "3": 59}
+    assert list(facts["memory_bytes_per_splat"].values()) == [236, 118, 944]
+    assert list(facts["memory_bytes"].values()) == [236_000, 118_000, 944_000]
+    shares = list(facts["mass_share_within_sigmas"].values())
     assert np.allclose(shares, [0.393, 0.865, 0.989], atol=1e-3)
 
 
@@ -125,7 +125,11 @@ def test_speed_is_measured_when_asked_for_and_says_of_what(tmp_path: Path) -> No
     formats.write(path, many_splats(300))
     assert "frames_a_second" not in info(path)
     result = CliRunner().invoke(app, ["info", str(path), "--speed", "--json"])
-    told = json.loads(result.stdout)
-    assert told["frames_a_second"] > 0
-    assert (told["frame_width"], told["frame_height"], told["frames_timed"]) == (960, 720, 8)
-    assert told["splats"] == 300
+    facts = json.loads(result.stdout)
+    assert facts["frames_a_second"] > 0
+    assert (facts["frame_width"], facts["frame_height"], facts["frames_timed"]) == (
+        960,
+        720,
+        8,
+    )
+    assert facts["splats"] == 300

@@ -103,9 +103,9 @@ def test_a_run_of_which_half_was_made_anew_is_told_in_words(splat: Splat) -> Non
 def test_a_run_compared_with_itself_is_not_told_apart(splat: Splat) -> None:
     made(splat, "run")
     result = splat("compare", "run", "run", "--json")
-    told = json.loads(result.stdout)
-    assert told["verdict"] == "no significant difference"
-    assert told["psnr_change_db"] == 0
+    reported = json.loads(result.stdout)
+    assert reported["verdict"] == "no significant difference"
+    assert reported["psnr_change_db"] == 0
     assert Path("comparison/report.html").is_file()
 
 

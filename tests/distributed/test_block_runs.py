@@ -78,14 +78,14 @@ def test_blocks_are_runs_of_their_own_and_one_in_the_end(tmp_path, photos) -> No
     pipeline = trained(tmp_path / "run", photos, blocks="3")
     manifest = pipeline.manifest("train")
     assert manifest is not None
-    told, splats = manifest.metrics["blocks"], pipeline.load("train").splats
-    assert [row["run_folder"] for row in told] == ["blocks/1", "blocks/2", "blocks/3"]
+    reported, splats = manifest.metrics["blocks"], pipeline.load("train").splats
+    assert [row["run_folder"] for row in reported] == ["blocks/1", "blocks/2", "blocks/3"]
     assert manifest.metrics["splats"] == len(splats)
-    given = sum(row["splats_in_cell"] for row in told)
+    given = sum(row["splats_in_cell"] for row in reported)
     assert given <= SMALL["max_splats"]
     assert len(splats) == given - manifest.metrics["pruned_at_seams"]
     assert len(splats) == sum(manifest.metrics["splats_by_block"])
-    for row in told:
+    for row in reported:
         block = Pipeline(tmp_path / "run" / row["run_folder"])
         states = {step.stage.name: step.will_run for step in block.status()}
         assert not any(states[name] for name in STAGE_NAMES[:4]), states

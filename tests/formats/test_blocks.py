@@ -19,15 +19,15 @@ QUICK = [name for name in formats.FORMATS if not name.startswith("usd")]
 @pytest.mark.parametrize("suffix", QUICK)
 def test_reading_and_writing_report_progress(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
-    told: list[tuple[int, int]] = []
-    with blocks.progress_reported_to(lambda done, total: told.append((done, total))):
+    reported: list[tuple[int, int]] = []
+    with blocks.progress_reported_to(lambda done, total: reported.append((done, total))):
         formats.write(path, many_splats(40))
         if suffix not in ("glb", "gltf", "quantised.glb"):
-            assert (40, 40) in told
-            told.clear()
+            assert (40, 40) in reported
+            reported.clear()
             formats.read(path)
-            assert told
-    assert all(0 < done <= total for done, total in told)
+            assert reported
+    assert all(0 < done <= total for done, total in reported)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "splat", "compressed.ply", "spz", "sog", "html", "usdc"])

@@ -80,10 +80,10 @@ def test_a_backend_that_was_asked_for_stops_and_goes_on_from_its_checkpoint(
 ) -> None:
     tight.room = 300
     monkeypatch.setattr(hooks.Densification, "after_step", _filled_after_ten)
-    with pytest.raises(SplatError) as told:
+    with pytest.raises(SplatError) as reported:
         trained(tmp_path, "cpu")
-    assert told.value.code == "raster-gpu-memory"
-    assert "at most 130 splats" in told.value.hint
+    assert reported.value.code == "raster-gpu-memory"
+    assert "at most 130 splats" in reported.value.hint
     assert (tmp_path / "work" / "checkpoint.bin").exists()
     assert json.loads((tmp_path / "work" / "cap.json").read_text())["splats"] == 130
     splats, report, _ = trained(tmp_path, "cpu")
@@ -121,7 +121,7 @@ def test_kernels_that_run_out_of_memory_go_on_with_half(monkeypatch: pytest.Monk
     from stages.training.gpu_step import GpuStep
 
     rasteriser = GpuRasteriser()
-    told: list[int] = []
+    reported: list[int] = []
     plain = rasteriser.gradients
 
     def scarce(scene, *rest):
@@ -131,13 +131,13 @@ def test_kernels_that_run_out_of_memory_go_on_with_half(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(rasteriser, "gradients", scarce)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    made = MemoryLimitedStep(GpuStep(rasteriser), told.append)
+    made = MemoryLimitedStep(GpuStep(rasteriser), reported.append)
     pixels = np.random.default_rng(0).integers(0, 256, (3, 15, 20)).astype(np.uint8)
     level = Level(camera(20, 15), pixels, channel_means(pixels))
     start = new_model(*(a.copy() for a in splat_arrays(cloud(12, 20, 15, degree=0))))
     made.load(start)
     made.step(level, RasterSettings(near=0.1, sh_degree=0), LearningRates(), smooth=False)
-    assert told == [6]
+    assert reported == [6]
     kept = most_opaque(start, 6)
     assert np.abs(made.model().means - kept.means).max() < 1e-2
     assert made.model().steps.max() == 1
