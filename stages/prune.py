@@ -188,7 +188,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=11,
+    version=12,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

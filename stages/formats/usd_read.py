@@ -84,8 +84,13 @@ def parse(path: Path) -> Splats:
         raise BadFileError(f"it holds no {_TYPE}")
     splats = concatenate(parts)
     del parts
-    means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
-    return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+    note = stage.GetRootLayer().customLayerData.get("splat")
+    note = note if isinstance(note, dict) else {}
+    origin = np.array(note.get("origin", np.zeros(3)), np.float64).reshape(3)
+    means, origin = recentred(splats.means.astype(np.float64), origin)
+    splats = replace(splats, means=means, origin=origin)
+    splats = splats.with_antialias(bool(note.get("antialiased", False)))
+    return check_finite(flipped(splats, reuse=True))
 
 
 def _open(path: Path) -> Any:
@@ -100,12 +105,6 @@ def _open(path: Path) -> Any:
     if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
         raise BadFileError("its up axis is not y, which is not supported")
     return stage
-
-
-def _origin(stage: Any) -> NDArray[np.float64]:
-    note = stage.GetRootLayer().customLayerData.get("splat", {})
-    origin = note.get("origin") if isinstance(note, dict) else None
-    return np.zeros(3) if origin is None else np.array(origin, np.float64).reshape(3)
 
 
 def _splats(prim: Any) -> Splats:
