@@ -90,13 +90,18 @@ def test_many_signals_leave_no_temporary_folder(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 def test_the_first_signal_stops_and_the_next_do_not_interrupt_what_is_removed() -> None:
     removed = False
-    with pytest.raises(KeyboardInterrupt), one_signal_stops():
+
+    def stopped_three_times() -> None:
+        nonlocal removed
         try:
             signal.raise_signal(signal.SIGTERM)
         finally:
             for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
                 signal.raise_signal(number)
             removed = True
+
+    with one_signal_stops(), pytest.raises(KeyboardInterrupt):
+        stopped_three_times()
     assert removed
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 

@@ -7,9 +7,7 @@ import http.client
 from stages.viewer.server import LocalServer
 
 
-def ask(
-    server: LocalServer, path: str, method: str = "GET"
-) -> tuple[int, bytes, dict[str, str]]:
+def ask(server: LocalServer, path: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
     connection.putrequest(method, server.root + path)
     connection.endheaders()
