@@ -110,6 +110,13 @@ class Prover:
             return replace(self, splats=splats)
         return Prover.of(splats, self.cameras, self.backend, self.source_format)
 
+    def plain_drawing_db(self) -> float:
+        """Mean PSNR between the pictures and those of a viewer that does not compensate opacities,
+        of splats that are to be drawn with compensation."""
+        plain = self.with_original(self.splats.with_antialias(False))
+        pairs = zip(plain.pictures, self.pictures, strict=True)
+        return float(np.mean([capped_psnr_db(a, np.clip(b, 0.0, 1.0)) for a, b in pairs]))
+
     def prove(self, path: Path, exact: bool = False) -> Proof:
         """Read `path` with an independent reader, draw it and compare. Nothing is raised for a
         wrong file.

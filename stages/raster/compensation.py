@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.raster.draw import raster_settings_of
-from stages.scene import Camera, Splats, logit
+from stages.scene import Camera, Splats, evenly_spaced, logit
 
 CAMERAS = 50  # at most, evenly spaced: more change the mean little
+_OPAQUE = 40.0  # a logit
+_OUTSIDE = 1e-3  # weight of a camera whose picture does not hold the mean of a splat
 
 
 def without_compensation(splats: Splats, cameras: Sequence[Camera]) -> Splats:
@@ -37,18 +39,20 @@ def without_compensation(splats: Splats, cameras: Sequence[Camera]) -> Splats:
 
 
 def mean_compensation(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """[N] factor of each splat's opacity, averaged over the cameras that show it; 1 for none."""
+    """[N] factor of each splat's opacity, averaged over the cameras whose picture holds its mean;
+    over the cameras in front of which it lies if there is none; 1 if there is none either."""
     from stages.raster.reference import parameters_of, project
-    from stages.scene import evenly_spaced
 
-    settings = replace(raster_settings_of(splats), antialias=True)
-    parameters = parameters_of(splats)
-    total, views = np.zeros(len(splats)), np.zeros(len(splats))
-    for camera in evenly_spaced(cameras, CAMERAS):
-        found = project(parameters, splats.local(camera), settings)
-        at, rows = found.means2d.detach().numpy(), found.index.numpy()
-        inside = ((at > 0) & (at < (camera.width, camera.height))).all(1)
-        rows = rows[inside]
-        total[rows] += found.opacities.detach().numpy()[inside] / splats.opacities[rows]
-        views[rows] += 1
-    return np.where(views > 0, total / np.maximum(views, 1), 1.0)
+    opaque = replace(splats, opacity_logits=np.full(len(splats), _OPAQUE, np.float32))
+    settings, parameters = raster_settings_of(splats.with_antialias(True)), parameters_of(opaque)
+    total, weights = np.zeros(len(splats)), np.zeros(len(splats))
+    for camera in map(splats.local, evenly_spaced(cameras, CAMERAS)):
+        pixels, z = camera.project(splats.means)
+        inside = ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(axis=1)
+        weight = np.where(z > settings.near, np.where(inside, 1.0, _OUTSIDE), 0.0)
+        found = project(parameters, camera, settings)  # without factors below 1/255
+        factors = np.zeros(len(splats))
+        factors[found.index.numpy()] = found.opacities.detach().numpy()
+        total += weight * factors
+        weights += weight
+    return np.where(weights > 0, total / np.maximum(weights, _OUTSIDE), 1.0)
