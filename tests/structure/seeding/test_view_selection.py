@@ -19,7 +19,7 @@ def ring(centre: float, count: int = AROUND) -> tuple[tuple[View, ...], np.ndarr
         name = f"{centre}-{number:03}"
         views.append(View(name, name, Camera(WIDTH, HEIGHT, FOCAL, FOCAL, 80.0, 60.0, matrix)))
     ball = np.random.default_rng(1).normal(0, 0.3, (400, 3))
-    return tuple(views), ball + [centre, 0.0, 0.0]
+    return tuple(views), ball + np.array([centre, 0.0, 0.0])
 
 
 def test_of_few_views_all_are_used() -> None:
@@ -50,7 +50,8 @@ def test_each_used_view_can_be_compared_with_others() -> None:
     observations = Observations([view.camera for view in chosen], points)
     for i in range(len(chosen)):
         angles = [np.median(observations.angles(i)[j]) for j in observations.sources(i)]
-        assert len(angles) >= 2 and 4 < np.sort(angles)[1] < 20
+        assert len(angles) >= 2
+        assert 4 < np.sort(angles)[1] < 20
 
 
 def test_the_order_of_views_does_not_matter() -> None:
