@@ -178,7 +178,7 @@ def run(
     views, draw_settings = trainer.held_out, trainer.draw_settings
     write_quality(trainer.render, views, draw_settings, reconstruction, folder, report)
     write_history(trainer.history, trainer.times, folder, report)
-    trained = TrainedSplats(splats, trainer.dropout, overfitted=trainer.dropout)
+    trained = TrainedSplats(splats, trainer.dropout)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
@@ -192,7 +192,8 @@ def run(
 def _report_course(trainer: Trainer, report: Report) -> None:
     """How many steps were made by which backends, and whether densification stopped early."""
     report.metric("steps", trainer.schedule.steps)
-    report.metric("overfitted", trainer.dropout)
+    report.metric("steps_skipped", int(trainer.stepper.skipped))
+    report.metric("dropout", trainer.dropout)
     stopping = trainer.early_stopping
     report.metric("validation_views", len(stopping.rows))
     if stopping.stopped_at:
@@ -272,8 +273,7 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _TRAINED) as temporary:
-        facts = {"dropout": trained.dropout, "overfitted": trained.overfitted}
-        temporary.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps({"dropout": trained.dropout}) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:
@@ -284,7 +284,7 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     try:
         facts = json.loads((folder / _TRAINED).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, bool(facts["dropout"]), bool(facts["overfitted"]))
+        return TrainedSplats(splats, bool(facts["dropout"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "train-folder-damaged",
@@ -296,5 +296,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=17, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=18, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -190,8 +190,8 @@ class Pruner:
             fewer = removal.apply(found.splats)
             measured = self._sse_change(fewer, state)
             predicted = removal.predicted_sse
+            after = self._measure(fewer, state, removal)
             kept = measured <= predicted + HARM_TOLERANCE * abs(predicted)
-            after = self._measure(fewer, state, removal) if kept else state
             found.add_round(removal, predicted, measured, float(after.psnr_db.mean()), kept)
             if kept:
                 found.splats = fewer
@@ -207,10 +207,8 @@ class Pruner:
         return measured.scaled(len(self.views) / max(1, len(self._measured)))
 
     def _measure_all(self, splats: Splats) -> Contributions:
-        others = None
-        if self._others:
-            views = (self.views[i] for i in self._others)
-            others = measure_contributions(splats, views, self.backend)
+        views = (self.views[i] for i in self._others)
+        others = measure_contributions(splats, views, self.backend) if self._others else None
         return measure_contributions(splats, self._measured_views(), self.backend, others)
 
     def _measure(self, splats: Splats, before: Contributions, removal: Removal) -> Contributions:

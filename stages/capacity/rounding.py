@@ -119,8 +119,7 @@ def _attribute(name: str, splats: Splats) -> NDArray[np.floating]:
         return splats.sh[:, :1]
     if name == "sh_rest":
         return splats.sh[:, 1:]
-    found: NDArray[np.floating] = getattr(splats, name)
-    return found
+    return np.asarray(getattr(splats, name))
 
 
 def _with_attribute(name: str, splats: Splats, source: Splats) -> Splats:

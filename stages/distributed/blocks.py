@@ -290,7 +290,7 @@ class _BlockTraining:
         self.report.metric("splats_by_block", by_block)
         self.report.metric("splats_at_seams", int(seam.sum()))
         self.report.metric("pruned_at_seams", int(removed.sum()))
-        return TrainedSplats(splats, dropout, overfitted=dropout)
+        return TrainedSplats(splats, dropout)
 
 
 class _BlockProgress(Listener):

@@ -113,13 +113,10 @@ class TrainedSplats:
     """The result of training.
 
     dropout: whether some splats were dropped from each of the last steps (`training.dropout`).
-    overfitted: whether training views are reproduced much better than other views. Other views
-        then hardly change when splats are removed that the training views need.
     """
 
     splats: Splats
     dropout: bool = False
-    overfitted: bool = False
 
 
 @dataclass(frozen=True)
