@@ -64,8 +64,8 @@ class TrainSettings:
         default=0.0,
         metadata={
             "panel": "Quality and time",
-            "help": "Time limit of training in seconds: makes as many steps as fit, whatever "
-            "--steps says. 0: no limit.",
+            "help": "Time limit in seconds, of the whole command: training makes as many steps as "
+            "fit, whatever --steps says, and pruning as many rounds. 0: no limit.",
             "min": 0,
             "max": 1e7,
         },

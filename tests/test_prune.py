@@ -192,6 +192,11 @@ def test_the_report_says_what_was_removed_and_why(scene, tmp_path) -> None:
     assert "more than is allowed" in why
 
 
+def test_no_round_begins_after_the_time_limit(scene, tmp_path) -> None:
+    _, report = run(scene, scene.splats, tmp_path, seconds=1e-6, strength=100)
+    assert report.metrics["stopped_by"] == "time"
+
+
 def test_no_rounds_remove_nothing(scene, tmp_path) -> None:
     trained = join(scene.splats, unseen(5))
     result, report = run(scene, trained, tmp_path, rounds=0)
