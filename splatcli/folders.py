@@ -51,12 +51,15 @@ def find_run_folder(named: Path | None = None) -> Path:
     )
 
 
-def load_target(target: Path | None, strict: bool = True) -> tuple[Splats, Pipeline | None]:
+def load_target(
+    target: Path | None, strict: bool = True, antialias: bool = True
+) -> tuple[Splats, Pipeline | None]:
     """(splats, the run's pipeline or None) of a splat file or of the newest stage of a run folder.
 
     Args:
         target: None for the run folder here.
         strict: whether a value that is not finite makes a file unreadable.
+        antialias: of a run, see `results.newest_splats`.
 
     Raises SplatError.
     """
@@ -70,4 +73,4 @@ def load_target(target: Path | None, strict: bool = True) -> tuple[Splats, Pipel
             hint="Check the path.",
         )
     pipeline = Pipeline(find_run_folder(target))
-    return results.newest_splats(pipeline), pipeline
+    return results.newest_splats(pipeline, antialias), pipeline

@@ -79,7 +79,7 @@ def _edit(
     with ExitStack() as stack:
         if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
-        scene = _load_scene(source)
+        scene = _load_scene(source, row.antialias)
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps = []
@@ -98,15 +98,16 @@ def _edit(
     return facts
 
 
-def _load_scene(source: Path) -> EditedScene:
-    """The splats, with the photographs of their run if there is one. Raises SplatError."""
+def _load_scene(source: Path, antialias: bool) -> EditedScene:
+    """The splats, with the photographs of their run if there is one. antialias: whether they may be
+    for antialiased drawing. Raises SplatError."""
     from stages.editing.scene import EditedScene
     from stages.formats import units_of
     from stages.formats.values import drop_undrawable
     from stages.measure.evaluation import load_evaluation_views
     from stages.scene import split_held_out
 
-    splats, pipeline = load_target(source)
+    splats, pipeline = load_target(source, antialias=antialias)
     pipeline = pipeline or results.run_around(source)
     splats = drop_undrawable(splats)[0]
     if pipeline is None or pipeline.manifest("sfm") is None:

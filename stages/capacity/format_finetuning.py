@@ -35,10 +35,14 @@ class FormatFinetuning:
 
     Attributes:
         rounding: fine-tunes to the rounding of formats.
+        plain: fine-tunes to plain drawing, on views of the size of training and half of it. In a
+            plain viewer the result is as good as splats that were trained for it at the size of
+            training, and better from farther away.
         settings, report: of the stage.
     """
 
     rounding: RoundingFinetuner
+    plain: FineTuner
     settings: QuantiseSettings
     report: Report
 
@@ -68,11 +72,13 @@ class FormatFinetuning:
         view_counts = np.zeros(len(splats), np.int32)
         if dropout and settings.formats:  # dropout alone depends on them
             view_counts = measure_contributions(splats, views, backend).view_counts
-        finetuner = FineTuner(views, training_extent(reconstruction), backend, report, dropout)
+        extent = training_extent(reconstruction)
+        finetuner = FineTuner(views, extent, backend, report, dropout)
         rounding = RoundingFinetuner(
             finetuner, deciding_views, backend, settings.rounding_steps, view_counts
         )
-        return cls(rounding, settings, report)
+        plain = FineTuner(views, extent, backend, report, dropout, half_size=True)
+        return cls(rounding, plain, settings, report)
 
     def to_plain_drawing(self, splats: Splats) -> Splats | None:
         """The splats for formats that are drawn without opacity compensation; None if no such
@@ -83,9 +89,8 @@ class FormatFinetuning:
         ):
             return None
         self.report.progress(0, 1, "fine-tuning to plain drawing")
-        finetuner = self.rounding.finetuner
-        found = without_compensation(drop_undrawable(splats)[0], finetuner.cameras)
-        return finetuner.finetune(found, self.settings.plain_steps, self.rounding.view_counts)
+        found = without_compensation(drop_undrawable(splats)[0], self.plain.cameras)
+        return self.plain.finetune(found, self.settings.plain_steps, self.rounding.view_counts)
 
     def to_rounding(self, quantised: QuantisedSplats) -> dict[str, Splats]:
         """By format that rounds, the splats that its file should hold. Metric: formats, by format

@@ -30,10 +30,20 @@ def newest_stage_with_splats(pipeline: Pipeline) -> str:
     )
 
 
-def newest_splats(pipeline: Pipeline) -> Splats:
-    """The splats of the last finished stage that has any. Raises SplatError (no-splats-yet)."""
+def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
+    """The splats of the last finished stage that has any.
+
+    Args:
+        pipeline: of the run.
+        antialias: whether splats for antialiased drawing are accepted; else those for plain drawing
+            are returned, if the run made them.
+
+    Raises SplatError (no-splats-yet).
+    """
     name = newest_stage_with_splats(pipeline)
     output = pipeline.load(name)
+    if name == "quantise" and not antialias and output.plain is not None:
+        output = replace(output, splats=output.plain)
     splats: Splats = output.splats if name in ("train", "quantise") else output
     return splats
 

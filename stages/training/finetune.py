@@ -43,6 +43,7 @@ class FineTuner:
         backend: name of the rasteriser.
         report: says before each step whether to stop.
         dropout: whether to use dropout, and to refit colours afterwards, as training did.
+        half_size: whether every second step uses its view at half the size.
     """
 
     def __init__(
@@ -52,11 +53,13 @@ class FineTuner:
         backend: str,
         report: Report,
         dropout: bool = False,
+        half_size: bool = False,
     ) -> None:
         self.views, self.extent, self.report, self.dropout = views, extent, report, dropout
-        self.cameras = [view.camera for view in views]
+        self.half_size, self.cameras = half_size, [view.camera for view in views]
         self.steps = 0  # done in all calls; the order of views and dropout depend on it
-        self._means: dict[int, NDArray[np.float32]] = {}  # steps tell views apart by this object
+        # By view and size: steps tell views apart by these objects.
+        self._means: dict[tuple[int, bool], NDArray[np.float32]] = {}
         self._stepper, self._rasteriser = step_of(backend), rasteriser_of(backend)
 
     def finetune(
@@ -113,11 +116,12 @@ class FineTuner:
         return Dropout(len(self.views), key)
 
     def _next_level(self) -> Level:
-        epoch, place = divmod(self.steps, len(self.views))
+        number, half = divmod(self.steps, 2) if self.half_size else (self.steps, 0)
+        epoch, place = divmod(number, len(self.views))
         self.steps += 1
         row = int(np.random.default_rng([7, epoch]).permutation(len(self.views))[place])
-        level = _level_of(self.views[row])
-        return replace(level, means=self._means.setdefault(row, level.means))
+        level = _level_of(self.views[row].scaled(0.5 if half else 1.0))
+        return replace(level, means=self._means.setdefault((row, bool(half)), level.means))
 
     def _to_splats(self, model: Model, before: Splats) -> Splats:
         """With unit quaternions, all N rows. No splat is finer than its views can show, unless it
