@@ -21,6 +21,7 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.cameras import nerfstudio, realityscan
 from stages.cameras.camera_file import size_of_picture
+from stages.formats import streamed_sog
 from stages.formats.spz_read import MAGIC
 from stages.photos.decode import PixelBudget, Unusable, decode, readers_set_up
 from stages.photos.exif import Exif
@@ -116,6 +117,13 @@ def test_a_list_that_names_a_chunk_twice_is_refused(tmp_path: Path) -> None:
     meta["tree"] = {"children": leaves}
     path.write_text(json.dumps(meta))
     refused(formats.read, path, "twice")
+
+
+def test_a_list_of_very_many_levels_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "lod-meta.json", 40)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "lodLevels": 200_000_000}))
+    splats = formats.read(path)
+    refused(lambda place: streamed_sog.splat_widths(place, splats), path, "levels")
 
 
 def test_a_gltf_whose_buffers_are_one_file_is_refused(tmp_path: Path) -> None:
