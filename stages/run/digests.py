@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from stages.base.text import printable_name
+
 UNREADABLE = "unreadable"
 
 
@@ -45,21 +47,22 @@ def record_files(
             without being read.
         leave_out: names to skip.
         users: whether the files are the user's own. Then names with a leading dot are left out,
-            because desktop programs write such files among photographs, and a file without read
-            permission is recorded as `UNREADABLE`.
+            because desktop programs write such files among photographs, a file without read
+            permission is recorded as `UNREADABLE`, and names are made printable, as ingest does.
 
     Raises OSError.
     """
     known = known or {}
     record = _record_if_readable if users else _record
     if folder.is_file():
-        return {folder.name: record(folder, known.get(folder.name))}
+        name = printable_name(folder.name)
+        return {name: record(folder, known.get(name))}
     found: FileRecords = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
         if users and any(part.startswith(".") for part in relative.parts):
             continue
-        name = relative.as_posix()
+        name = printable_name(relative.as_posix()) if users else relative.as_posix()
         if name not in leave_out and path.is_file():
             found[name] = record(path, known.get(name))
     return found

@@ -7,10 +7,18 @@ from pathlib import Path
 
 from stages.base.disk import DISK_FULL, is_full
 from stages.base.errors import Family, SplatError
+from stages.base.text import printable, printable_name
 
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _USER = (Family.USAGE, Family.INPUT, Family.RUN_FOLDER)
-_MEMORY_WORDS = ("can't allocate memory", "out of memory", "not enough memory")
+_MEMORY_WORDS = (
+    "can't allocate memory",
+    "out of memory",
+    "not enough memory",
+    "cannot allocate memory",
+    "can't start new thread",
+    "failed to map segment",
+)
 
 
 def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError | None:
@@ -34,9 +42,20 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
             return disk_full(doing, folder) if full and link.family not in _USER else link
         if isinstance(link, OSError) and link.errno in _DENIED:
             return not_writable(Path(link.filename or folder), link)
+        if isinstance(link, UnicodeEncodeError) and printable(link.object) != link.object:
+            return _not_utf8(link.object)
         if isinstance(link, MemoryError) or any(w in str(link).lower() for w in _MEMORY_WORDS):
             return out_of_memory(doing, link)
     return disk_full(doing, folder) if full else None
+
+
+def _not_utf8(name: str) -> SplatError:
+    return SplatError(
+        "name-not-utf-8",
+        given=f"{printable_name(name)} has a name that is not UTF-8.",
+        wanted="Names of files and folders in UTF-8, which a library needs here.",
+        hint="Rename it, or write to another folder.",
+    )
 
 
 def _chain(error: BaseException) -> list[BaseException]:

@@ -115,7 +115,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
-        json.dump(plain(data), file, indent=1, ensure_ascii=False)
+        json.dump(plain(data), file, indent=1)
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
