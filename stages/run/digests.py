@@ -106,10 +106,13 @@ def differences(old: Mapping[str, FileRecord], new: Mapping[str, FileRecord]) ->
     return changes
 
 
-def damage(folder: Path, recorded: Mapping[str, FileRecord]) -> list[str]:
+def damage(
+    folder: Path, recorded: Mapping[str, FileRecord], *, read_all: bool = False
+) -> list[str]:
     """Which recorded files under `folder` have changed, as text; [] if none has.
 
     Files that are not in `recorded` are ignored: a viewer may have written some beside ours.
+    read_all: whether to read files of the recorded size and time, too.
     """
     changes = []
     for name, record in sorted(recorded.items()):
@@ -117,7 +120,7 @@ def damage(folder: Path, recorded: Mapping[str, FileRecord]) -> list[str]:
         try:
             if not path.is_file():
                 changes.append(f"{name} is missing")
-            elif _record(path, record).sha256 != record.sha256:
+            elif _record(path, None if read_all else record).sha256 != record.sha256:
                 changes.append(f"{name} changed")
         except OSError as error:
             changes.append(f"{name} cannot be read ({error.strerror})")

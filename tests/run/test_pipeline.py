@@ -187,6 +187,26 @@ def test_damaged_output_runs_its_stage_again(
     assert victim.read_text() == "42000"
 
 
+def test_flipped_bit_of_the_same_size_and_time_is_found_by_reading_all(
+    finished: Pipeline, run_folder: Path
+) -> None:
+    finished.check_outputs()
+    path = run_folder / "2-count" / "count.txt"
+    stat = path.stat()
+    path.write_bytes(bytes([path.read_bytes()[0] ^ 1]) + path.read_bytes()[1:])
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert not any(step.will_run for step in finished.plan())
+    with pytest.raises(SplatError) as error:
+        finished.check_outputs()
+    assert error.value.code == "run-folder-damaged"
+    assert "2-count/count.txt changed" in error.value.given
+    assert str(run_folder / "2-count") in error.value.hint
+    shutil.rmtree(run_folder / "2-count")  # as the hint says
+    assert [step.stage.name for step in finished.plan() if step.will_run][0] == "count"
+    finished.run()
+    finished.check_outputs()
+
+
 def test_extra_file_beside_the_outputs_does_no_harm(finished: Pipeline, run_folder: Path) -> None:
     (run_folder / "3-sign" / "thumbnail.png").write_text("a viewer left this")
     assert ran(finished) == []
