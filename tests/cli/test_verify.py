@@ -108,6 +108,7 @@ def test_the_meshes_of_a_run_are_not_taken_for_splats(
     names = (*beside, "mesh.glb")
     files = tuple(ExportedFile(name, f"scene.{name}", 1) for name in names)
     assets = ExportedAssets(run / "7-export", files)
+    fake = SimpleNamespace(load=lambda name: assets, check_outputs=lambda: None)
     monkeypatch.setattr(
         command,
         "Pipeline",

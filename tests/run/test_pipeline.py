@@ -202,7 +202,7 @@ def test_flipped_bit_of_the_same_size_and_time_is_found_by_reading_all(
     assert "2-count/count.txt changed" in error.value.given
     assert str(run_folder / "2-count") in error.value.hint
     shutil.rmtree(run_folder / "2-count")  # as the hint says
-    assert [step.stage.name for step in finished.plan() if step.will_run][0] == "count"
+    assert next(step.stage.name for step in finished.plan() if step.will_run) == "count"
     finished.run()
     finished.check_outputs()
 
