@@ -203,7 +203,9 @@ def _finetune_to_formats(
         return {}
     backend, dropout = backend_of_settings(settings), inputs["train"].dropout
     training = split_held_out(reconstruction.views)[0]
-    views = load_evaluation_views(reconstruction.folder, training, splats.draw_settings)
+    views = load_evaluation_views(
+        reconstruction.folder, training, splats.draw_settings, report.stop_requested
+    )
     view_counts = np.zeros(len(splats), np.int32)
     if dropout:  # which alone depends on them
         view_counts = measure_contributions(splats, views, backend).view_counts
@@ -248,10 +250,11 @@ def _measures(
     deciding = tuple(evenly_spaced(training, settings.max_views))
     evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
     folder, backend = reconstruction.folder, backend_of_settings(settings)
-    return (
-        _Measure(load_evaluation_views(folder, deciding, draw_settings), backend, report),
-        _Measure(load_evaluation_views(folder, evaluated, draw_settings), backend, Report(), what),
+    decider, evaluator = (
+        load_evaluation_views(folder, views, draw_settings, report.stop_requested)
+        for views in (deciding, evaluated)
     )
+    return _Measure(decider, backend, report), _Measure(evaluator, backend, Report(), what)
 
 
 @dataclass

@@ -109,11 +109,7 @@ def test_the_meshes_of_a_run_are_not_taken_for_splats(
     files = tuple(ExportedFile(name, f"scene.{name}", 1) for name in names)
     assets = ExportedAssets(run / "7-export", files)
     fake = SimpleNamespace(load=lambda name: assets, check_outputs=lambda: None)
-    monkeypatch.setattr(
-        command,
-        "Pipeline",
-        lambda path: SimpleNamespace(load=lambda name: assets, check_outputs=lambda: None),
-    )
+    monkeypatch.setattr(command, "Pipeline", lambda path: fake)
     if beside:
         assert command._files(run) == [run / "7-export" / "scene.ply"]
     else:
