@@ -7,7 +7,9 @@ import os
 import signal
 import sys
 import threading
-from contextlib import suppress
+
+# What the system sends where memory is short, and what libraries get that use memory they lack.
+_LACK_OF_MEMORY = ("SIGKILL", "SIGSEGV", "SIGBUS")
 
 
 def die_with_parent(watch_input: bool = True) -> None:
@@ -27,10 +29,9 @@ def how_it_ended(status: int) -> str:
     is negative for a signal."""
     if status >= 0:
         return f"status {status}"
-    name = ""
-    with suppress(ValueError):
-        name = f" ({signal.Signals(-status).name})"
-    return f"signal {-status}{name}, probably because memory ran out,"
+    name = signal.Signals(-status).name
+    cause = ", probably because memory ran out," if name in _LACK_OF_MEMORY else ""
+    return f"signal {-status} ({name}){cause}"
 
 
 def _exit_at_end_of_input() -> None:

@@ -11,6 +11,7 @@ from stages.base.parent import how_it_ended
     ("status", "text"),
     [
         (3, "status 3"),
+        (-6, "signal 6 (SIGABRT)"),
         (-9, "signal 9 (SIGKILL), probably because memory ran out,"),
         (-11, "signal 11 (SIGSEGV), probably because memory ran out,"),
     ],
