@@ -43,18 +43,22 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
         if isinstance(link, OSError) and link.errno in _DENIED:
             return not_writable(Path(link.filename or folder), link)
         if isinstance(link, UnicodeEncodeError) and printable(link.object) != link.object:
-            return _not_utf8(link.object)
+            what = f"{printable_name(link.object)} has a name that is not UTF-8."
+            return _unusable_name("name-not-utf-8", what)
+        if isinstance(link, OSError) and link.errno == errno.ENAMETOOLONG:
+            what = f"{link.filename or folder}: the name or the whole path is too long."
+            return _unusable_name("name-too-long", what)
         if isinstance(link, MemoryError) or any(w in str(link).lower() for w in _MEMORY_WORDS):
             return out_of_memory(doing, link)
     return disk_full(doing, folder) if full else None
 
 
-def _not_utf8(name: str) -> SplatError:
+def _unusable_name(code: str, given: str) -> SplatError:
     return SplatError(
-        "name-not-utf-8",
-        given=f"{printable_name(name)} has a name that is not UTF-8.",
-        wanted="Names of files and folders in UTF-8, which a library needs here.",
-        hint="Rename it, or write to another folder.",
+        code,
+        given=given,
+        wanted="Names of files and folders that the system and its libraries can use.",
+        hint="Rename it, or use another folder.",
     )
 
 

@@ -6,6 +6,7 @@ its own contents, so that a manifest edited by hand is detected.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -140,6 +141,8 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:  # told where a name is used
+            raise
         raise SplatError(
             "run-folder-unreadable",
             given=f"{path} cannot be read: {error.strerror}.",
