@@ -75,7 +75,7 @@ def _killed(
 
 def _filled(run: SmallRun, stage: str, most: int, folder: Path) -> tuple[int, str, list[str]]:
     """(disks that became full, the first that did not, what was wrong)."""
-    full, wrong = 0, []
+    full, wrong = 0, list[str]()
     for room in itertools.islice(full_disk.sizes(_MOST_ROOM), most):
         end = full_disk.filled(run, stage, room, folder)
         if end == "enough":

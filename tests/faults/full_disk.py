@@ -39,8 +39,8 @@ def _tried(run: SmallRun, stage: str, room: int, disk: Path, log: Path) -> None:
     if mount is None or mount(disk, "64m", 0):
         os._exit(_NO_MOUNT)
     run.before(stage, folder)
-    status = os.statvfs(disk)
-    used = (status.f_blocks - status.f_bfree) * status.f_frsize
+    space = os.statvfs(disk)
+    used = (space.f_blocks - space.f_bfree) * space.f_frsize
     mount(disk, str(used + room), _REMOUNT)
     status, shown = forked(lambda: stage_command(stage, folder), log)
     if status == 0:
