@@ -141,7 +141,7 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:  # told where a name is used
+        if error.errno == errno.ENAMETOOLONG:  # reported where the name is used
             raise
         raise SplatError(
             "run-folder-unreadable",
