@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,7 +105,7 @@ def run(
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
             # pictures are compared with all SH coefficients, values with what the file should hold
-            **_prove(replace(prover, splats=held), path, report),
+            **_prove(prover.with_original(held), path, report),
         }
         report.progress(number + 1, len(chosen), f".{name}", verify_db=figures[name]["verify_db"])
     for file in _write_meshes(splats, reconstruction, settings, folder, report):

@@ -99,7 +99,7 @@ def verify(
             prover = Prover.of(original.splats, cameras, original.backend, original.source_format)
         del read
         for splats in original.candidates(file):
-            proof = replace(prover, splats=splats).prove(file, exact=original.itself)
+            proof = prover.with_original(splats).prove(file, exact=original.itself)
             if not proof.fault:
                 break
         found.append((file, proof))

@@ -84,14 +84,22 @@ def read(path: Path) -> Splats:
 def parse(path: Path) -> Splats:
     """`read`, in this process. Raises BadFileError, or what the USD library raises."""
     with accepted_path(path) as name:
-        stage = _open(name)
-        parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
-        if not parts:
-            raise BadFileError(f"it holds no {_TYPE}")
-        splats = concatenate(parts)
-        del parts
-        means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
-    return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+        return _parsed(_open(name))
+
+
+def _parsed(stage: Any) -> Splats:
+    parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
+    if not parts:
+        raise BadFileError(f"it holds no {_TYPE}")
+    splats = concatenate(parts)
+    del parts
+    note = stage.GetRootLayer().customLayerData.get("splat")
+    note = note if isinstance(note, dict) else {}
+    origin = np.array(note.get("origin", np.zeros(3)), np.float64).reshape(3)
+    means, origin = recentred(splats.means.astype(np.float64), origin)
+    splats = replace(splats, means=means, origin=origin)
+    splats = splats.with_antialias(bool(note.get("antialiased", False)))
+    return check_finite(flipped(splats, reuse=True))
 
 
 def _open(name: str) -> Any:
@@ -119,12 +127,6 @@ def _refuse_arcs(layer: Any) -> None:
             raise BadFileError("its prims are made of each other, which is not supported")
 
     layer.Traverse("/", check)
-
-
-def _origin(stage: Any) -> NDArray[np.float64]:
-    note = stage.GetRootLayer().customLayerData.get("splat", {})
-    origin = note.get("origin") if isinstance(note, dict) else None
-    return np.zeros(3) if origin is None else np.array(origin, np.float64).reshape(3)
 
 
 def _splats(prim: Any) -> Splats:

@@ -277,10 +277,17 @@ def image_renderer(splats: Splats, backend: str) -> ImageRenderer:
     return lambda camera: draw(camera).image
 
 
+def psnr_of_views_db(
+    splats: Splats, views: Iterable[EvaluationView], backend: str
+) -> NDArray[np.float64]:
+    """[V] PSNR of each view, dB."""
+    draw = image_renderer(splats, backend)
+    return np.array([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views])
+
+
 def mean_psnr_db(splats: Splats, views: Iterable[EvaluationView], backend: str) -> float:
     """Mean PSNR over the views, dB."""
-    draw = image_renderer(splats, backend)
-    return float(np.mean([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views]))
+    return float(psnr_of_views_db(splats, views, backend).mean())
 
 
 def seconds_per_frame(

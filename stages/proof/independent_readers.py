@@ -32,7 +32,8 @@ _PAGE_PIECE = 1 << 22  # characters: the parser scans an unfinished element once
 def ply(path: Path) -> Splats:
     from plyfile import PlyData
 
-    vertex = PlyData.read(str(path), mmap="c")["vertex"]
+    content = PlyData.read(str(path), mmap="c")
+    vertex = content["vertex"]
     names = [item.name for item in vertex.properties]
     per_channel = sum(name.startswith("f_rest_") for name in names) // 3
     count = len(vertex.data)
@@ -55,7 +56,7 @@ def ply(path: Path) -> Splats:
             arrays["quaternions"][part, i] = rows[f"rot_{i}"]
         arrays["opacity_logits"][part] = rows["opacity"]
         release_mapped_pages(vertex.data)
-    return splats_of(**arrays)
+    return splats_of(**arrays).with_antialias("SplatRenderMode: mip" in content.comments)
 
 
 class _Chunks(HTMLParser):
@@ -176,7 +177,8 @@ def gltf(path: Path) -> Splats:
                 sh=sh,
             )
         )
-    return _concatenated(parts)
+    antialias = (document.asset.extras or {}).get("antialiased", False)
+    return _concatenated(parts).with_antialias(antialias)
 
 
 def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
@@ -225,7 +227,8 @@ def _usd(name: str) -> Splats:
                 sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
             )
         )
-    return _concatenated(parts)
+    antialias = stage.GetRootLayer().customLayerData["splat"].get("antialiased", False)
+    return _concatenated(parts).with_antialias(antialias)
 
 
 def _concatenated(parts: list[Splats]) -> Splats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from stages.run.lock import holder
 from stages.run.manifest import Manifest
 from stages.run.planning import PHOTOS, Planner, Step
 from stages.run.runfile import RunFile
+from stages.run.time_limit import within_limit
 from stages.run.workspace import Layout
 
 __all__ = ["Listener", "Pipeline", "Step"]
@@ -124,7 +126,7 @@ class Pipeline:
         Args:
             settings: dataclasses by stage name; recorded for later runs. The recorded ones are
                 used where left out.
-            until: name of the last stage; None for all.
+            until: name of the last stage; None for all, which share a limit of time.
             may_run: names of the stages that may run; it is an error if another one has to.
             listener: receives the events of the run.
 
@@ -165,13 +167,13 @@ class Pipeline:
         stop: Event,
         listener: Listener,
     ) -> list[Manifest]:
-        manifests = []
+        manifests, began = [], time.monotonic() if until is None else None
         for stage in self.layout.up_to(until):
             step = planner.assess(stage, wanted[stage.name])
             if step.will_run or step.manifest is None:
                 if stop.is_set():
                     raise Interrupted(stage.name)
-                manifest = self._run_one(planner, step, wanted[stage.name], stop, listener)
+                manifest = self._run_one(planner, step, wanted[stage.name], stop, listener, began)
                 listener.finished(stage, step.number, manifest)
             else:
                 manifest = step.manifest
@@ -181,7 +183,13 @@ class Pipeline:
         return manifests
 
     def _run_one(
-        self, planner: Planner, step: Step, settings: Any, stop: Event, listener: Listener
+        self,
+        planner: Planner,
+        step: Step,
+        settings: Any,
+        stop: Event,
+        listener: Listener,
+        began: float | None,
     ) -> Manifest:
         stage = step.stage
         space = self.layout.workspace(stage)
@@ -191,6 +199,8 @@ class Pipeline:
         inputs = {name: self.load(name) for name in stage.reads} or {
             PHOTOS: planner.existing_photos()
         }
+        if began is not None:
+            settings = within_limit(stage.name, settings, time.monotonic() - began)
         return attempt(stage, settings, request, inputs, space, stop, listener)
 
     def _check_allowed(
