@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
@@ -92,6 +92,8 @@ def run(
     prover = Prover.of(splats, cameras, backend_of_settings(settings))
     files, figures = [], {}
     for number, name in enumerate(chosen):
+        if report.stop_requested.is_set():
+            raise Interrupted("stopped before a file")
         report.progress(number, len(chosen), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
         held = splats_to_write(FORMATS[name], quantised)

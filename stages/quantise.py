@@ -231,10 +231,11 @@ def _measures(
     deciding = tuple(evenly_spaced(training, settings.max_views))
     evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
     folder, backend = reconstruction.folder, backend_of_settings(settings)
-    return (
-        _Measure(load_evaluation_views(folder, deciding, draw_settings), backend, report),
-        _Measure(load_evaluation_views(folder, evaluated, draw_settings), backend, Report(), what),
+    decider, evaluator = (
+        load_evaluation_views(folder, views, draw_settings, report.stop_requested)
+        for views in (deciding, evaluated)
     )
+    return _Measure(decider, backend, report), _Measure(evaluator, backend, Report(), what)
 
 
 @dataclass

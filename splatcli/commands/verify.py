@@ -117,7 +117,9 @@ def _files(target: Path | None) -> list[Path]:
 
     if target is not None and not target.is_dir():
         return [target]
-    assets = Pipeline(find_run_folder(target)).load("export")
+    pipeline = Pipeline(find_run_folder(target))
+    pipeline.check_outputs()
+    assets = pipeline.load("export")
     files = [file for file in assets.files if file.format not in MESHES]
     if not files:
         raise SplatError(

@@ -68,7 +68,9 @@ class FormatFinetuning:
         """
         splats, backend = drop_undrawable(splats)[0], backend_of_settings(settings)
         training = split_held_out(reconstruction.views)[0]
-        views = load_evaluation_views(reconstruction.folder, training, splats.draw_settings)
+        views = load_evaluation_views(
+            reconstruction.folder, training, splats.draw_settings, report.stop_requested
+        )
         view_counts = np.zeros(len(splats), np.int32)
         if dropout and settings.formats:  # dropout alone depends on them
             view_counts = measure_contributions(splats, views, backend).view_counts

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.blocks import release_mapped_pages, reported_blocks
+from stages.base.usd_path import accepted_path
 from stages.proof.content import logits, splats_by_rows, splats_of
 from stages.scene import Splats
 
@@ -198,12 +199,17 @@ def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.float
 
 
 def usd(path: Path) -> Splats:
+    with accepted_path(path) as name:
+        return _usd(name)
+
+
+def _usd(name: str) -> Splats:
     from pxr import Gf, Sdf, Usd, Vt
 
     # The column in which each of w, x, y, z arrives, measured instead of assumed.
     columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
     # Without the library's cache, which may hold an older file of the same name.
-    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(str(path)))
+    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(name))
     parts = []
     for prim in stage.Traverse():
         if prim.GetTypeName() != "ParticleField3DGaussianSplat":
