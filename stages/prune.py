@@ -105,7 +105,9 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     trained: TrainedSplats = inputs["train"]
     splats, backend = trained.splats, backend_of_settings(settings)
     training, held_out = (
-        load_evaluation_views(reconstruction.folder, views, splats.draw_settings)
+        load_evaluation_views(
+            reconstruction.folder, views, splats.draw_settings, report.stop_requested
+        )
         for views in split_held_out(reconstruction.views)
     )
     evaluated = held_out or training

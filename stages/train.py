@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.capacity.output_formats import drawing_setting
+from stages.formats.table import PLAIN
 from stages.raster.backends import (
     backend_setting,
     device_setting,
@@ -107,6 +109,7 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
+    drawing: str = drawing_setting()
     blocks: str = field(
         default="1",
         metadata={
@@ -129,6 +132,11 @@ class TrainSettings:
     )
     backend: str = backend_setting()
     device: str = device_setting()
+
+    @property
+    def antialias(self) -> bool:
+        """Whether splats are trained to be drawn with opacity compensation."""
+        return self.drawing != PLAIN
 
 
 _TRAINED = "training.json"

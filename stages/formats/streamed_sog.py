@@ -23,14 +23,14 @@ from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
-from stages.formats.sog_read import Source, in_folder, in_zip
+from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
 from stages.formats.table import CHUNK
 from stages.formats.values import allocate, check_finite, drop_undrawable
 from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
 
 LEAF, CHUNK_SPLATS = 1 << 15, 1 << 17  # splats of the finest level; of a chunk, about
-_META_LIMIT_BYTES, _DEEPEST = 1 << 26, 64
+_META_LIMIT_BYTES, _DEEPEST, _MOST_LEVELS = 1 << 26, 64, 100
 _Rows = NDArray[np.intp]
 
 
@@ -258,7 +258,16 @@ def _read(path: Path) -> Splats:
             end += count
     asset = meta.get("asset")
     origin = asset.get("splat_origin") if isinstance(asset, dict) else None
-    return replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    splats = replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    return splats.with_antialias(_antialias(sources))
+
+
+def _antialias(sources: Sequence[Source]) -> bool:
+    """Whether the chunks ask for opacity compensation. Raises BadFileError if they disagree."""
+    found = {antialias_of(source.meta()) for source in sources}
+    if len(found) > 1:
+        raise BadFileError("its chunks disagree about antialiasing")
+    return True in found
 
 
 def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:
@@ -308,6 +317,8 @@ def splat_widths(path: Path, finest: Splats) -> list[float]:
     finest level, scaled by the square root of the ratio of counts. Raises SplatError."""
     with reading(path):
         meta = json.loads(path.read_text(encoding="utf-8"))
+        if not 0 <= meta["lodLevels"] <= _MOST_LEVELS:
+            raise BadFileError(f"it has more than {_MOST_LEVELS} levels")
         counts = np.zeros(meta["lodLevels"])
         for lods in _leaf_lods(meta["tree"]):
             for level, at in lods.items():

@@ -16,6 +16,7 @@ from stages.base.settings import check_settings
 from stages.base.stage import Stage
 from stages.run import runfolder
 from stages.run.attempt import Listener, attempt
+from stages.run.digests import damage
 from stages.run.failures import as_splat_error
 from stages.run.lock import holder
 from stages.run.manifest import Manifest
@@ -80,6 +81,26 @@ class Pipeline:
         if not runfolder.is_run_folder(self.run_folder):
             raise runfolder.missing(self.run_folder)
         return self.plan()
+
+    def check_outputs(self) -> None:
+        """Read all files of all finished stages. Raises SplatError (run-folder-damaged) if one is
+        not as it was written: a fault of the disk may change neither size nor time."""
+        damaged = {}
+        for stage in self.layout.stages:
+            manifest = self.manifest(stage.name)
+            folder = self.stage_folder(stage.name)
+            if manifest and (found := damage(folder, manifest.outputs, read_all=True)):
+                damaged[folder] = found
+        if damaged:
+            what = (f"{folder.name}/{change}" for folder in damaged for change in damaged[folder])
+            raise SplatError(
+                "run-folder-damaged",
+                given=f"In {self.run_folder}, {', '.join(what)}.",
+                wanted="The files as the stages wrote them.",
+                hint=f"Check the disk. Delete {', '.join(map(str, damaged))}; then `splat process "
+                f"{self.run_folder}` makes this again, and what depends on it if it differs.",
+                family=Family.RUN_FOLDER,
+            )
 
     def plan(self, settings: Mapping[str, Any] | None = None) -> list[Step]:
         """What `run` would do, one step for each stage. Changes nothing.
