@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.lazy import load_object
-from stages.base.text import counted
 from stages.formats.offset import offset_path
 from stages.formats.table import Format
 from stages.scene import Splats
@@ -25,16 +24,9 @@ def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
     found: list[Loss] = []
     if not len(splats):
         return found
-    if row.out_of_range and (count := load_object(row.out_of_range)(splats)):
-        found.append(
-            Loss(
-                "range",
-                f"{file_name} holds positions of 24 bits, and {counted(count, 'splat')} of "
-                f"{len(splats):,} lie farther out. These were moved towards the origin and scaled "
-                "down. If they are outliers, `splat edit --drop-floaters` removes them; else "
-                "write .ply, .glb or .usdz.",
-            )
-        )
+    if row.position_loss and (loss := load_object(row.position_loss)(splats)):
+        advice = "`splat edit --drop-floaters` removes outliers; .ply, .glb and .usdz hold them."
+        found.append(Loss("range", f"{file_name} {loss}. {advice}"))
     if not row.holds_origin and splats.origin.any():
         offset = ", ".join(f"{value:.10g}" for value in splats.origin)
         found.append(

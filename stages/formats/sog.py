@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from stages.base import scratch
 from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
+from stages.base.text import counted
 from stages.formats import codebook, smallest_three
+from stages.formats.compressed_ply import outlier_shells
 from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
 from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
@@ -33,6 +35,7 @@ LOG_SCALE_LIMIT = 20.0
 _PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
 _DC_LIMIT = 1e4
 STEPS = 65535  # of a position, along each axis
+_COARSER_TOLD = 2.0
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
@@ -120,6 +123,21 @@ def _positions(
     files = ["means_l.webp", "means_u.webp"]
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
     return {name: _picture(half) for name, half in zip(files, halves, strict=True)}
+
+
+def position_loss(splats: Splats) -> str:
+    """By how much outliers coarsen the positions of the others; "" if by less than a factor of
+    `_COARSER_TOLD`."""
+    means = drop_undrawable(splats)[0].means
+    outliers = outlier_shells(means) > 0
+    if not outliers.any():
+        return ""
+    spans = [np.ptp(symmetric_log(some), axis=0) for some in (means, means[~outliers])]
+    factor = float((spans[0] / np.maximum(spans[1], 1e-30)).max())
+    if factor < _COARSER_TOLD:
+        return ""
+    count = counted(int(np.count_nonzero(outliers)), "outlier")
+    return f"holds positions {min(factor, STEPS):,.0f} times as coarse as without {count}"
 
 
 def symmetric_log(means: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.blocks import blocks, reported_blocks
+from stages.base.text import counted
 from stages.formats import smallest_three
 from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
 from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
@@ -78,6 +79,16 @@ def count_out_of_range(splats: Splats) -> int:
     return sum(
         int(np.count_nonzero(np.abs(means[rows]).max(axis=1, initial=0.0) > reach))
         for rows in blocks(len(means))
+    )
+
+
+def position_loss(splats: Splats) -> str:
+    """What happens to the splats that lie farther out than the file can hold; "" if none does."""
+    if not (count := count_out_of_range(splats)):
+        return ""
+    return (
+        f"holds positions of 24 bits, and {counted(count, 'splat')} of {len(splats):,} lie farther "
+        "out: they were moved towards the origin and scaled down"
     )
 
 
