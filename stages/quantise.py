@@ -104,7 +104,7 @@ def run(
     decider, evaluator = _measures(inputs["sfm"], splats.draw_settings, settings, report)
     kept, by_degree, threshold = _choose_sh_degrees(splats, settings, decider)
     flat = _flat_colours(kept, inputs["sfm"], settings)
-    quantised = QuantisedSplats(kept, kept.sh_degree, {}, flat)
+    quantised = QuantisedSplats(kept, {}, flat)
     bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
     figures = {
         "psnr_raw_db": evaluator.psnr(splats),
@@ -311,7 +311,7 @@ def load(folder: Path) -> QuantisedSplats:
     try:
         decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
-        return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions, flat, finetuned)
+        return QuantisedSplats(splats, decisions, flat, finetuned)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "quantise-folder-damaged",

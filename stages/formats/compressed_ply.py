@@ -20,14 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import blocks, reported_blocks
 from stages.formats import smallest_three
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
 from stages.formats.values import (
     allocate,
-    check_finite,
-    drop_undrawable,
     linear_opacities,
     logits_of,
     unit_quaternions,
@@ -54,14 +52,13 @@ _RANGES = (
 )
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     Positions stay relative to `splats.origin`, which a comment holds. All splats get one SH
     degree, and coefficients are clipped to -4..4. Raises SplatError when the file cannot be
     written.
     """
-    splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
     splats, rows = splats.with_sh_degree(degree), order(splats)
     packed = [_pack(splats.take(rows[part])) for part in reported_blocks(len(splats), _BLOCK)]
@@ -70,7 +67,6 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         for part in range(3):  # all chunks, then all vertices, then all SH
             for block in packed:
                 file.write(block[part].data)
-    return dropped
 
 
 def order(splats: Splats) -> NDArray[np.intp]:
@@ -187,15 +183,13 @@ def _unpack_bits(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.
 def read(path: Path) -> Splats:
     """The splats of a compressed .ply, float32; SH and colour ranges are optional.
 
-    Raises SplatError "splats-unreadable" for a damaged file or another kind of .ply.
+    Raises BadFileError for a damaged file or another kind of .ply.
     """
-    path = Path(path)
-    with reading(path):
-        with path.open("rb") as file:
-            header = read_header(file)
-        if not header.is_compressed:
-            raise BadFileError("it is no compressed .ply: its name should end in .ply alone")
-        return unpack(path, header)
+    with path.open("rb") as file:
+        header = read_header(file)
+    if not header.is_compressed:
+        raise BadFileError("it is no compressed .ply: its name should end in .ply alone")
+    return unpack(path, header)
 
 
 def unpack(path: Path, header: Header) -> Splats:
@@ -220,7 +214,7 @@ def unpack(path: Path, header: Header) -> Splats:
         _unpack_block(splats.take(rows), vertices[rows], chunks)
         if degree and rest is not None:
             splats.sh[rows, 1:] = _sh_values(rest[rows])
-    return check_finite(splats)
+    return splats
 
 
 def _unpack_block(out: Splats, vertices: NDArray[Any], ranges: NDArray[Any]) -> None:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from stages.base.blocks import blocks
 from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
 from stages.formats.values import (
-    drop_undrawable,
     linear_opacities,
     linear_scales,
     unit_quaternions,
@@ -25,20 +24,17 @@ from stages.scene import Splats, dc_to_rgb
 from stages.scene.flip import SH_SIGNS, flipped
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats` as `path` (.glb, or .gltf with its .bin); return how many could not be drawn
-    and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats` as `path` (.glb, or .gltf with its .bin).
 
     One primitive holds all splats, at the highest SH degree in use: three.js 0.187 and Babylon.js
     9.28 sort and draw each primitive separately, so overlapping splats must share one.
 
     Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
     """
-    splats, dropped = drop_undrawable(splats)
     splats = splats.with_sh_degree(int(splats.sh_degrees.max(initial=0)))
     primitives = [_attributes(splats)] if len(splats) else []
     write_file(Path(path), primitives, flipped(splats.take(slice(0))).origin, units)
-    return dropped
 
 
 def _attributes(splats: Splats) -> dict[str, Attribute]:

@@ -21,7 +21,6 @@ from stages.base.blocks import blocks
 from stages.formats.gltf import fallback_colours, sh_attributes
 from stages.formats.gltf_file import EXTENSION, Attribute, write_file
 from stages.formats.values import (
-    drop_undrawable,
     linear_opacities,
     linear_scales,
     unit_quaternions,
@@ -35,18 +34,16 @@ _U16 = 65535
 _MAX_STEP = 0.01
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats` as `path`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats` as `path`.
 
     Normalised scales end at 1, so the node scales them up by a power of two; positions are divided
     by it, which is exact. Raises SplatError as `gltf.write`.
     """
-    splats, dropped = drop_undrawable(splats)
     unit = _unit(linear_scales(splats))
     primitives = [_attributes(group, unit) for group in _groups(splats)]
     origin = flipped(splats.take(slice(0))).origin
     write_file(Path(path), primitives, origin, units, node_scale=unit or 1.0)
-    return dropped
 
 
 def order(splats: Splats) -> NDArray[np.intp]:

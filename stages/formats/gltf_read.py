@@ -18,8 +18,8 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
-from stages.formats.values import check_finite, concatenate, log_scales_of, logits_of
+from stages.base.bad_files import BadFileError
+from stages.formats.values import concatenate, log_scales_of, logits_of
 from stages.scene import Splats
 from stages.scene.flip import flipped
 from stages.scene.recentring import recentred
@@ -34,31 +34,29 @@ def read(path: Path) -> Splats:
     """All splats of the scene, y down, float32.
 
     Nodes may be translated and uniformly scaled; positions far from zero keep their precision in
-    `origin`. Raises SplatError "splats-unreadable" for a damaged file, one without splats, one that
-    refers to files outside its folder, or an unsupported feature (sparse accessors, compression,
+    `origin`. Raises BadFileError for a damaged file, one without splats, one that refers to files
+    outside its folder, or an unsupported feature (sparse accessors, compression,
     rotated nodes).
     """
-    path = Path(path)
-    with reading(path):
-        document, chunk = _parse(path)
-        buffers = _Buffers(path, _list(document, "buffers"), chunk)
-        source = _Source(document, buffers)
-        parts: list[Splats] = []
-        for node, transform in _nodes(document):
-            for part in source.splats(node, transform):
-                parts.append(part)
-                # Splats that are not shared cannot be more than this, which bounds the memory.
-                if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
-                    raise BadFileError("its nodes share meshes, which is not supported")
-        extras = document["asset"].get("extras")
-        origin = extras.get("splat_origin") if isinstance(extras, dict) else None
-        origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
-        if not parts and "meshes" in document:
-            raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
-        splats = concatenate(parts)
-        del parts
-        means, origin = recentred(splats.means.astype(np.float64), origin)
-        return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+    document, chunk = _parse(path)
+    buffers = _Buffers(path, _list(document, "buffers"), chunk)
+    source = _Source(document, buffers)
+    parts: list[Splats] = []
+    for node, transform in _nodes(document):
+        for part in source.splats(node, transform):
+            parts.append(part)
+            # Splats that are not shared cannot be more than this, which bounds the memory.
+            if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
+                raise BadFileError("its nodes share meshes, which is not supported")
+    extras = document["asset"].get("extras")
+    origin = extras.get("splat_origin") if isinstance(extras, dict) else None
+    origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
+    if not parts and "meshes" in document:
+        raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
+    splats = concatenate(parts)
+    del parts
+    means, origin = recentred(splats.means.astype(np.float64), origin)
+    return flipped(replace(splats, means=means, origin=origin), reuse=True)
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from stages.base.lazy import load_object
 from stages.formats.offset import offset_path
 from stages.formats.table import Format
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats
 
 
@@ -22,6 +23,7 @@ class Loss:
 def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
     """What a file of the format `row` cannot hold of `splats`; most files hold everything."""
     found: list[Loss] = []
+    splats = drop_undrawable(splats)[0]
     if not len(splats):
         return found
     if row.position_loss and (loss := load_object(row.position_loss)(splats)):

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import release_mapped_pages, reported_blocks
 from stages.formats import compressed_ply
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
-from stages.formats.values import allocate, check_finite, drop_undrawable
+from stages.formats.values import allocate
 from stages.scene import Splats
 from stages.scene.recentring import recentred
 
@@ -44,17 +44,15 @@ def property_names(degree: int) -> list[str]:
     ]
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     Positions stay relative to `splats.origin`, which a comment holds.
     Raises SplatError when the file cannot be written.
     """
-    splats, dropped = drop_undrawable(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
         for block in blocks(splats, units):
             file.write(block)
-    return dropped
 
 
 def blocks(splats: Splats, units: str) -> Iterator[bytes]:
@@ -88,15 +86,8 @@ def read(path: Path) -> Splats:
 
     Properties may be in any order and of any numeric type, with others between them; ascii or
     either byte order; SH degree 0 to 3; compressed files, too (see `compressed_ply`). Raises
-    SplatError "splats-unreadable" for a damaged file or one without splats.
+    BadFileError for a damaged file or one without splats.
     """
-    path = Path(path)
-    with reading(path):
-        return parse(path)
-
-
-def parse(path: Path) -> Splats:
-    """As `read`, but raises BadFileError."""
     with path.open("rb") as file:
         header = read_header(file)
         if header.is_compressed:
@@ -122,9 +113,9 @@ def parse(path: Path) -> Splats:
             else:
                 splats.means[rows] = columns.floats(["x", "y", "z"])
     if exact is None:
-        return check_finite(replace(splats, origin=header.origin))
+        return replace(splats, origin=header.origin)
     means, origin = recentred(exact, header.origin)
-    return check_finite(replace(splats, means=means, origin=origin))
+    return replace(splats, means=means, origin=origin)
 
 
 def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:

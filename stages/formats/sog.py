@@ -27,7 +27,7 @@ from stages.base.text import counted
 from stages.formats import codebook, smallest_three
 from stages.formats.compressed_ply import outlier_shells
 from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
-from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
+from stages.formats.values import linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
 
 # Log scales beyond this look the same; clipping leaves more codebook entries for the others.
@@ -38,18 +38,16 @@ STEPS = 65535  # of a position, along each axis
 _COARSER_TOLD = 2.0
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     Positions stay relative to `splats.origin`, which meta.json holds. Raises SplatError when the
     file cannot be written.
     """
-    splats, dropped = drop_undrawable(splats)
     found = sog_members(splats, morton.morton_order(splats), units)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
         for name, content in found.items():
             _add(package, name, content)
-    return dropped
 
 
 def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, bytes]:
@@ -128,7 +126,7 @@ def _positions(
 def position_loss(splats: Splats) -> str:
     """By how much outliers coarsen the positions of the others; "" if by less than a factor of
     `_COARSER_TOLD`."""
-    means = drop_undrawable(splats)[0].means
+    means = splats.means
     outliers = outlier_shells(means) > 0
     if not outliers.any():
         return ""

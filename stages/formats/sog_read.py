@@ -12,7 +12,6 @@ import math
 import struct
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.values import allocate, check_finite, logits_of
+from stages.formats.values import allocate, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16
@@ -37,17 +36,10 @@ Member = Callable[[Any, int], bytes]  # (name, largest size) -> content, up to a
 
 
 def read(path: Path) -> Splats:
-    """The splats of a .sog, float32. Raises SplatError "splats-unreadable" for a damaged file,
-    another version, or a missing member."""
-    path = Path(path)
-    with reading(path):
-        try:
-            with zipfile.ZipFile(path) as package:
-                return check_finite(Source(in_zip(package), path.stat().st_size).splats())
-        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-            raise BadFileError(f"it is not a complete zip ({error})") from error
-        except (NotImplementedError, RuntimeError) as error:  # encrypted, or packed in another way
-            raise BadFileError(f"its zip cannot be unpacked ({error})") from error
+    """The splats of a .sog, float32. Raises BadFileError for a damaged file, another version, or a
+    missing member."""
+    with zipfile.ZipFile(path) as package:
+        return Source(in_zip(package), path.stat().st_size).splats()
 
 
 def in_zip(package: zipfile.ZipFile) -> Member:
@@ -58,8 +50,11 @@ def in_zip(package: zipfile.ZipFile) -> Member:
             raise BadFileError(f"it does not hold {str(name)[:80]!r}")
         if package.getinfo(name).file_size > limit:
             raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
-        with package.open(name) as file:
-            return file.read(limit + 1)
+        try:
+            with package.open(name) as file:
+                return file.read(limit + 1)
+        except RuntimeError as error:  # encrypted, or packed in another way
+            raise BadFileError(f"its zip cannot be unpacked ({error})") from error
 
     return member
 

@@ -16,11 +16,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
 from stages.formats.inflate import GzipReader, check_size, read_zstd_frame
-from stages.formats.values import allocate, check_finite, logits_of, unit_quaternions
+from stages.formats.values import allocate, logits_of, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import flipped
 
@@ -52,17 +52,15 @@ class _Content:
 def read(path: Path) -> Splats:
     """The splats of an .spz, y down, float32.
 
-    The antialiasing flag is ignored. Raises SplatError "splats-unreadable" for a damaged file or
-    another version.
+    The antialiasing flag is ignored. Raises BadFileError for a damaged file or another version.
     """
-    path = Path(path)
-    with reading(path), path.open("rb") as file:
+    with path.open("rb") as file:
         plain = file.read(len(MAGIC)) == MAGIC
         file.seek(0)
         size = path.stat().st_size
         content = _plain(file, size) if plain else _gzipped(file, size)
         splats = _decoded(content)
-        return check_finite(flipped(splats, reuse=True) if content.y_up else splats)
+        return flipped(splats, reuse=True) if content.y_up else splats
 
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:

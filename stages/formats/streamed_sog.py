@@ -25,7 +25,7 @@ from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
 from stages.formats.sog_read import Source, in_folder, in_zip
 from stages.formats.table import CHUNK
-from stages.formats.values import allocate, check_finite, drop_undrawable
+from stages.formats.values import allocate, fill
 from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
 
@@ -57,7 +57,7 @@ def write(
     units: str = "arbitrary",
     views: tuple[View, ...] = (),
     coarser: Sequence[Splats] = (),
-) -> int:
+) -> None:
     """Write a streamed SOG and, beside it, a page that shows it on any web server.
 
     Args:
@@ -67,13 +67,10 @@ def write(
         views: cameras of the page.
         coarser: coarser levels of detail of the same scene, finest first, all drawable.
 
-    Returns how many of `splats` could not be drawn and were left out. Raises SplatError when the
-    asset cannot be written.
+    Raises SplatError when the asset cannot be written.
     """
-    kept, dropped = drop_undrawable(splats)
-    write_levels(path, [kept, *coarser], units)
-    html.write_beside(path, kept, units, views, splat_widths(path, kept))
-    return dropped
+    write_levels(path, [splats, *coarser], units)
+    html.write_beside(path, splats, units, views, splat_widths(path, splats))
 
 
 def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
@@ -219,17 +216,8 @@ def _around(boxes: Sequence[tuple[list[float], list[float]]]) -> dict[str, list[
 
 
 def read(path: Path) -> Splats:
-    """The finest level of each leaf, and the environment if there is one. Raises SplatError
-    "splats-unreadable" for a damaged asset or a missing chunk."""
-    path = Path(path)
-    with reading(path):
-        try:
-            return check_finite(_read(path))
-        except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-            raise BadFileError(f"one of its chunks is not a complete zip ({error})") from error
-
-
-def _read(path: Path) -> Splats:
+    """The finest level of each leaf, and the environment if there is one. Raises BadFileError for a
+    damaged asset or a missing chunk."""
     if path.stat().st_size > _META_LIMIT_BYTES:
         raise BadFileError("it is too large for a list of chunks")
     meta = json.loads(path.read_text(encoding="utf-8"))
@@ -251,7 +239,7 @@ def _read(path: Path) -> Splats:
     for source, (_, each) in zip(sources, ranges, strict=True):
         chunk = source.splats().with_sh_degree(degree)
         for offset, count in each:
-            _fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
+            fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
             end += count
     asset = meta.get("asset")
     origin = asset.get("splat_origin") if isinstance(asset, dict) else None
@@ -350,8 +338,3 @@ def _checked(
     if end > meta["count"]:
         raise BadFileError("its tree refers to rows that a chunk does not have")
     return min(degree, 3) if isinstance(degree, int) else 0, rows
-
-
-def _fill(out: Splats, values: Splats) -> None:
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-        getattr(out, name)[:] = getattr(values, name)

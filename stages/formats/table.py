@@ -22,9 +22,9 @@ class Format:
     Attributes:
         ending: what a file's name ends in, without the dot; also the value of `--format`.
         opens_in, keeps: two cells of README's table.
-        writer: (path, splats, *, units) -> number of splats that could not be drawn and were left
-            out. It also takes `views` if `takes_views`, and `coarser` if `streamed`.
-        reader: (path) -> Splats, y down; raises SplatError "splats-unreadable".
+        writer: (path, splats, *, units), with drawable splats. It also takes `views` if
+            `takes_views`, and `coarser` if `streamed`.
+        reader: (path) -> Splats, y down; raises BadFileError, or what damaged bytes cause.
         order: (splats) -> [N] the row of `splats` that each row of the file comes from; "" if the
             format keeps the order.
         quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses

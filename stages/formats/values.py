@@ -150,6 +150,12 @@ def allocate(count: int, degree: int) -> Splats:
     )
 
 
+def fill(out: Splats, values: Splats) -> None:
+    """Copy all values but the degrees into `out`, which are views of some rows."""
+    for name in _FIELDS[:-1]:
+        getattr(out, name)[:] = getattr(values, name)
+
+
 def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
     """[N] the highest degree with a nonzero coefficient in `sh` [N, (L + 1)^2, 3]."""
     degrees = np.zeros(len(sh), np.uint8)
@@ -173,7 +179,7 @@ def check_finite(splats: Splats) -> Splats:
         logits[opaque] = np.clip(logits[opaque], LOGIT_MIN, LOGIT_MAX)
         np.clip(logits, -1e30, 1e30, out=logits)
     clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
+    for name in (*_FIELDS[:-1], "origin"):
         bad = count_nonfinite(getattr(clean, name))
         if bad and not allows_nonfinite():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")

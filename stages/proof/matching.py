@@ -15,8 +15,8 @@ from stages.scene.quantiles import quantiles
 Rows = NDArray[np.intp]
 
 # Two rows match if their distance is less than this share of the scene's extent, and have like
-# values if at most one of those below differs more. These are several times the errors of the packed
-# formats.
+# values if at most one of those below differs more. These are several times the errors of the
+# packed formats.
 _APART = 0.005
 _OPACITY, _COLOUR, _LOG_SCALE = 1 / 64, 0.05, 0.25
 _EXACT = 1e-6  # of the extent: positions that only rounding moved
