@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.formats.gltf_file import EXTENSION, Attribute, Negated, write_file
+from stages.formats.gltf_file import EXTENSION, Attribute, write_file
 from stages.formats.values import (
     linear_opacities,
     linear_scales,
@@ -63,9 +63,9 @@ def sh_attributes(splats: Splats) -> dict[str, Attribute]:
     for degree in range(splats.sh_degree + 1):
         for i in range(2 * degree + 1):
             k = degree * degree + i
-            values = splats.sh[:, k].astype("<f4", copy=False)
-            rows = Negated(values) if SH_SIGNS[k] < 0 else values
-            found[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = Attribute(rows, 3)
+            rows = splats.sh[:, k].astype("<f4", copy=False)
+            name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"
+            found[name] = Attribute(rows, 3, negated=SH_SIGNS[k] < 0)
     return found
 
 

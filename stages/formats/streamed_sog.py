@@ -23,6 +23,7 @@ from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
+from stages.formats.json_fields import origin_field, origin_of, whole
 from stages.formats.sog_read import Source, in_folder, in_zip
 from stages.formats.table import CHUNK
 from stages.formats.values import allocate, fill
@@ -82,13 +83,10 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
     try:
         make_folder(partial)
         places = _write_chunks(partial, tree, levels, units)
-        asset: dict[str, Any] = {"generator": "splat", "units": units}
-        if levels[0].origin.any():
-            asset["splat_origin"] = [float(v) for v in levels[0].origin]
         counts = [len(level) for level in levels]
         meta = {
             "version": 1,
-            "asset": asset,
+            "asset": {"generator": "splat", "units": units} | origin_field(levels[0].origin),
             "count": sum(counts),
             "counts": counts,
             "lodLevels": len(levels),
@@ -241,9 +239,7 @@ def read(path: Path) -> Splats:
         for offset, count in each:
             fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
             end += count
-    asset = meta.get("asset")
-    origin = asset.get("splat_origin") if isinstance(asset, dict) else None
-    return replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    return replace(splats, origin=origin_of(meta.get("asset")))
 
 
 def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:
@@ -265,12 +261,8 @@ def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]
     found: dict[int, list[tuple[int, int]]] = {}
     for lods in _leaf_lods(tree):
         at = lods[min(lods, key=int)]
-        values = [at[name] for name in ("file", "offset", "count")]
-        if not all(isinstance(v, int) and 0 <= v < 1 << 40 for v in values):
-            raise BadFileError("its tree refers to rows by something that is not a number")
-        if values[0] >= files:
-            raise BadFileError("its tree refers to a chunk that is not listed")
-        found.setdefault(values[0], []).append((values[1], values[2]))
+        file = whole(at, "file", most=files - 1)
+        found.setdefault(file, []).append((whole(at, "offset"), whole(at, "count")))
     return {file: sorted(ranges) for file, ranges in found.items()}
 
 
@@ -327,7 +319,7 @@ def _checked(
     """(SH degree, rows) of a chunk, checked for overlaps; None stands for all rows."""
     meta = source.meta()
     rest = meta.get("shN")
-    degree = rest.get("bands", 0) if isinstance(rest, dict) else 0
+    degree = whole(rest, "bands", 0, most=3) if isinstance(rest, dict) else 0
     if rows is None:
         return degree, [(0, meta["count"])]
     end = 0
@@ -337,4 +329,4 @@ def _checked(
         end = offset + count
     if end > meta["count"]:
         raise BadFileError("its tree refers to rows that a chunk does not have")
-    return min(degree, 3) if isinstance(degree, int) else 0, rows
+    return degree, rows
