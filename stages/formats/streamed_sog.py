@@ -12,7 +12,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -37,9 +37,10 @@ _Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class _Leaf:
-    """rows: of each level, in the order of the file."""
+    """rows: of each level, in the order of the file. lods: by level, where the rows are."""
 
     rows: tuple[_Rows, ...]
+    lods: dict[str, dict[str, int]] = field(default_factory=dict)
 
 
 _Tree = _Leaf | tuple["_Tree", "_Tree"]
@@ -82,7 +83,7 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
     partial = path.with_name(partial_prefix() + "chunks")
     try:
         make_folder(partial)
-        places = _write_chunks(partial, tree, levels, units)
+        names = _write_chunks(partial, list(_leaves(tree)), levels, units)
         counts = [len(level) for level in levels]
         meta = {
             "version": 1,
@@ -90,8 +91,8 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
             "count": sum(counts),
             "counts": counts,
             "lodLevels": len(levels),
-            "filenames": places.names,
-            "tree": _described(tree, levels, places),
+            "filenames": names,
+            "tree": _described(tree, levels),
         }
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
@@ -103,14 +104,6 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
                 new.rename(path.with_name(new.name))
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-@dataclass(frozen=True)
-class _Places:
-    """names: of the chunks. lods: by leaf and level, the location of its rows."""
-
-    names: list[str]
-    lods: dict[tuple[int, int], dict[str, int]]
 
 
 def _cut(levels: Sequence[Splats]) -> _Tree:
@@ -140,33 +133,27 @@ def _leaves(tree: _Tree) -> Iterator[_Leaf]:
         yield from _leaves(side)
 
 
-def _write_chunks(folder: Path, tree: _Tree, levels: Sequence[Splats], units: str) -> _Places:
-    places, leaves = _Places([], {}), list(_leaves(tree))
+def _write_chunks(
+    folder: Path, leaves: list[_Leaf], levels: Sequence[Splats], units: str
+) -> list[str]:
+    """Write the chunks and fill `lods` of the leaves; returns the names of the chunks."""
+    names: list[str] = []
     for level, splats in enumerate(levels):
+        used = [leaf for leaf in leaves if len(leaf.rows[level])]
         held: list[_Rows] = []
-        number = 0
-
-        def flush(level: int = level, splats: Splats = splats) -> None:
-            nonlocal held, number
-            rows = np.concatenate(held)
-            _write_chunk(folder / f"{level}_{number}", splats.take(rows), units)
-            number, held = number + 1, []
-
-        for index in reported_blocks(len(leaves), 1):
-            rows = leaves[index.start].rows[level]
-            if not len(rows):
-                continue
+        first = len(names)
+        for index in reported_blocks(len(used), 1):
             if not held:
-                places.names.append(f"{level}_{number}/meta.json")
-            before = sum(map(len, held))
-            at = {"file": len(places.names) - 1, "offset": before, "count": len(rows)}
-            places.lods[index.start, level] = at
-            held.append(rows)
-            if before + len(rows) >= CHUNK_SPLATS:
-                flush()
-        if held:
-            flush()
-    return places
+                names.append(f"{level}_{len(names) - first}/meta.json")
+            leaf, before = used[index.start], sum(map(len, held))
+            held.append(leaf.rows[level])
+            count = len(leaf.rows[level])
+            leaf.lods[str(level)] = {"file": len(names) - 1, "offset": before, "count": count}
+            if before + count >= CHUNK_SPLATS or index.stop == len(used):
+                rows = np.concatenate(held)
+                _write_chunk((folder / names[-1]).parent, splats.take(rows), units)
+                held = []
+    return names
 
 
 def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
@@ -176,23 +163,14 @@ def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
             temporary.write_bytes(content)
 
 
-def _described(tree: _Tree, levels: Sequence[Splats], places: _Places) -> dict[str, Any]:
+def _described(part: _Tree, levels: Sequence[Splats]) -> dict[str, Any]:
     """The tree for lod-meta.json, with the bounding box of the ellipsoids of each node."""
-    number = 0
-
-    def node(part: _Tree) -> dict[str, Any]:
-        nonlocal number
-        if isinstance(part, _Leaf):
-            every = range(len(levels))
-            lods = {str(i): places.lods[number, i] for i in every if (number, i) in places.lods}
-            number += 1
-            boxes = [_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
-            return {"bound": _around(boxes), "lods": lods}
-        children = [node(side) for side in part]
-        ends = [(c["bound"]["min"], c["bound"]["max"]) for c in children]
-        return {"bound": _around(ends), "children": children}
-
-    return node(tree)
+    if isinstance(part, _Leaf):
+        boxes = [_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
+        return {"bound": _around(boxes), "lods": part.lods}
+    children = [_described(side, levels) for side in part]
+    ends = [(c["bound"]["min"], c["bound"]["max"]) for c in children]
+    return {"bound": _around(ends), "children": children}
 
 
 def _box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
