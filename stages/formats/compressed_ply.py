@@ -130,7 +130,7 @@ def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     colour, colour_ranges = _within_chunks(colours)
     rgba = np.concatenate([colour, linear_opacities(splats)[:, None]], axis=1)
     largest, others = smallest_three.split(unit_quaternions(splats.quaternions))
-    rotations = _pack_bits(0.5 + others / (2 * smallest_three.LIMIT), (10, 10, 10))
+    rotations = _pack_bits(smallest_three.fractions_of(others), (10, 10, 10))
     words = (
         _pack_bits(positions, _AXES_BITS),
         rotations | largest.astype(np.uint32) << np.uint32(30),
@@ -223,7 +223,7 @@ def _unpack_block(out: Splats, vertices: NDArray[Any], ranges: NDArray[Any]) -> 
     rgba = _unpack_bits(words[3], _COLOUR_BITS)
     colours = _in_range(rgba[:, :3], ranges, _RANGES[2])
     largest_float = float(np.finfo(np.float32).max)
-    rotations = (_unpack_bits(words[1], (2, 10, 10, 10))[:, 1:] - 0.5) * 2 * smallest_three.LIMIT
+    rotations = smallest_three.from_fractions(_unpack_bits(words[1], (2, 10, 10, 10))[:, 1:])
     out.means[:] = _in_range(_unpack_bits(words[0], _AXES_BITS), ranges, _RANGES[0])
     out.quaternions[:] = smallest_three.join(words[1] >> np.uint32(30), rotations)
     out.log_scales[:] = _in_range(_unpack_bits(words[2], _AXES_BITS), ranges, _RANGES[1])

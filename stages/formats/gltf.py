@@ -1,13 +1,13 @@
 """glTF 2.0 with KHR_gaussian_splatting, as .glb or as .gltf with a .bin beside it: float32.
 
 Linear scales and opacities, quaternions x, y, z, w, SH coefficients, y up. The extension is used
-but
-not required: a viewer without it shows coloured points.
+but not required: a viewer without it shows coloured points.
 Specification: KHR_gaussian_splatting in the Khronos glTF registry.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,31 +33,49 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     Raises SplatError when a file cannot be written or a .glb would pass 4 GiB.
     """
     splats = splats.with_sh_degree(int(splats.sh_degrees.max(initial=0)))
-    primitives = [_attributes(splats)] if len(splats) else []
+    primitives = [attributes(splats)] if len(splats) else []
     write_file(Path(path), primitives, flipped(splats.take(slice(0))).origin, units)
 
 
-def _attributes(splats: Splats) -> dict[str, Attribute]:
-    """The attributes of a primitive. splats: y down, all of one SH degree."""
+def plain(name: str, values: NDArray[np.float32]) -> Attribute:
+    """An attribute as float32."""
+    return Attribute(values.astype("<f4"), values.shape[1])
+
+
+def attributes(
+    splats: Splats,
+    encoded: Callable[[str, NDArray[np.float32]], Attribute] = plain,
+    colour_type: str = "<u2",
+    unit: float = 1.0,
+) -> dict[str, Attribute]:
+    """The attributes of a primitive.
+
+    Args:
+        splats: y down, all of one SH degree.
+        encoded: (name, values [N, W]) -> the attribute ROTATION, SCALE or OPACITY.
+        colour_type: integers of the fallback colours.
+        unit: positions are divided by it.
+    """
     y_up = flipped(splats.with_sh_degree(0))
     opacities = linear_opacities(splats)
-    colours = np.empty((len(splats), 4), "<u2")
+    colours = np.empty((len(splats), 4), colour_type)
     for rows in blocks(len(splats)):
         linear = fallback_colours(splats.take(rows), opacities[rows])
-        colours[rows] = np.rint(65535 * linear)
+        colours[rows] = np.rint(np.iinfo(colours.dtype).max * linear)
+    values = {
+        "ROTATION": unit_quaternions(y_up.quaternions)[:, [1, 2, 3, 0]],
+        "SCALE": linear_scales(splats),
+        "OPACITY": opacities[:, None],
+    }
     return {
-        "POSITION": Attribute(y_up.means.astype("<f4"), 3),
+        "POSITION": plain("POSITION", y_up.means / np.float32(unit)),
         "COLOR_0": Attribute(colours, 4),
-        f"{EXTENSION}:ROTATION": Attribute(
-            unit_quaternions(y_up.quaternions)[:, [1, 2, 3, 0]].astype("<f4"), 4
-        ),
-        f"{EXTENSION}:SCALE": Attribute(linear_scales(splats).astype("<f4"), 3),
-        f"{EXTENSION}:OPACITY": Attribute(opacities[:, None].astype("<f4"), 1),
-        **sh_attributes(splats),
+        **{f"{EXTENSION}:{name}": encoded(name, array) for name, array in values.items()},
+        **_sh_attributes(splats),
     }
 
 
-def sh_attributes(splats: Splats) -> dict[str, Attribute]:
+def _sh_attributes(splats: Splats) -> dict[str, Attribute]:
     """The SH attributes of `splats` (y down), float32 as the specification requires."""
     found = {}
     for degree in range(splats.sh_degree + 1):

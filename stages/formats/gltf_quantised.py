@@ -17,14 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks
-from stages.formats.gltf import fallback_colours, sh_attributes
-from stages.formats.gltf_file import EXTENSION, Attribute, write_file
-from stages.formats.values import (
-    linear_opacities,
-    linear_scales,
-    unit_quaternions,
-)
+from stages.formats.gltf import attributes, plain
+from stages.formats.gltf_file import Attribute, write_file
+from stages.formats.values import linear_scales
 from stages.scene import Splats
 from stages.scene.flip import flipped
 
@@ -69,28 +64,19 @@ def _unit(scales: NDArray[np.float32]) -> float | None:
 
 def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
     """The attributes of a primitive. splats: y down, all of one SH degree. unit: see `_unit`."""
-    y_up = flipped(splats.with_sh_degree(0))
-    opacities = linear_opacities(splats)
-    colours = np.empty((len(splats), 4), "u1")
-    for rows in blocks(len(splats)):
-        colours[rows] = np.rint(255 * fallback_colours(splats.take(rows), opacities[rows]))
-    rotations = np.rint(32767.0 * unit_quaternions(y_up.quaternions)).astype("<i2")
-    scales = linear_scales(splats)
-    if unit is None:
-        scale = Attribute(scales.astype("<f4"), 3)
-    else:
+
+    def encoded(name: str, values: NDArray[np.float32]) -> Attribute:
+        if name == "ROTATION":
+            return Attribute(np.rint(32767.0 * values).astype("<i2"), 4)
+        if name == "OPACITY":
+            return Attribute(_padded(np.rint(float(_U16) * values).astype("<u2"), 2), 1)
+        if unit is None:
+            return plain(name, values)
         # never 0, which some viewers take for a flat splat
-        steps = np.maximum(np.rint(scales / np.float64(unit) * _U16), 1)
-        scale = Attribute(_padded(steps.astype("<u2"), 4), 3)
-    opacity = np.rint(float(_U16) * opacities[:, None]).astype("<u2")
-    return {
-        "POSITION": Attribute((y_up.means / np.float32(unit or 1.0)).astype("<f4"), 3),
-        "COLOR_0": Attribute(colours, 4),
-        f"{EXTENSION}:ROTATION": Attribute(rotations[:, [1, 2, 3, 0]], 4),
-        f"{EXTENSION}:SCALE": scale,
-        f"{EXTENSION}:OPACITY": Attribute(_padded(opacity, 2), 1),
-        **sh_attributes(splats),
-    }
+        steps = np.maximum(np.rint(values / np.float64(unit) * _U16), 1)
+        return Attribute(_padded(steps.astype("<u2"), 4), 3)
+
+    return attributes(splats, encoded, "u1", unit or 1.0)
 
 
 def _padded(rows: NDArray[np.uint16], width: int) -> NDArray[np.uint16]:

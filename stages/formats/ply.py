@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
@@ -106,25 +107,24 @@ def read(path: Path) -> Splats:
         wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
         exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
         for rows, table in tables:
-            columns = _Columns(names, table)
-            _fill(splats.take(rows), columns, count)
+            _fill(splats.take(rows), table, count)
             if exact is not None:
-                exact[rows] = columns.take(["x", "y", "z"])
+                exact[rows] = _columns(table, ["x", "y", "z"])
             else:
-                splats.means[rows] = columns.floats(["x", "y", "z"])
+                splats.means[rows] = _floats(table, ["x", "y", "z"])
     if exact is None:
         return replace(splats, origin=header.origin)
     means, origin = recentred(exact, header.origin)
     return replace(splats, means=means, origin=origin)
 
 
-def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:
+def _fill(splats: Splats, table: NDArray[Any], rest_count: int) -> None:
     """Fill all but the means of `splats`, which are views of some rows."""
-    splats.quaternions[:] = columns.floats([f"rot_{i}" for i in range(4)])
-    splats.log_scales[:] = columns.floats([f"scale_{i}" for i in range(3)])
-    splats.opacity_logits[:] = columns.floats(["opacity"])[:, 0]
-    splats.sh[:, 0] = columns.floats(["f_dc_0", "f_dc_1", "f_dc_2"])
-    rest = columns.floats([f"f_rest_{i}" for i in range(rest_count)])
+    splats.quaternions[:] = _floats(table, [f"rot_{i}" for i in range(4)])
+    splats.log_scales[:] = _floats(table, [f"scale_{i}" for i in range(3)])
+    splats.opacity_logits[:] = _floats(table, ["opacity"])[:, 0]
+    splats.sh[:, 0] = _floats(table, ["f_dc_0", "f_dc_1", "f_dc_2"])
+    rest = _floats(table, [f"f_rest_{i}" for i in range(rest_count)])
     splats.sh[:, 1:] = rest.reshape(len(rest), 3, rest_count // 3).transpose(0, 2, 1)
 
 
@@ -140,14 +140,11 @@ def _check_is_splats(header: Header) -> None:
 
 
 def _binary_tables(mapped: NDArray[Any]) -> _Tables:
-    """The rows of a binary file in blocks: [M, P] where all columns have one type, else [M]
-    structured."""
-    kinds = {mapped.dtype[name] for name in mapped.dtype.names or ()}
+    """The rows of a binary file in blocks."""
     for rows in reported_blocks(len(mapped), _ROWS_AT_ONCE):
         block = np.array(mapped[rows])
         release_mapped_pages(mapped)
-        plain = block.view(block.dtype[0]).reshape(len(block), -1) if len(kinds) == 1 else block
-        yield rows, plain
+        yield rows, block
 
 
 def _ascii_numbers(header: Header) -> tuple[int, int]:
@@ -163,7 +160,7 @@ def _check_ascii_size(path: Path, header: Header) -> None:
 
 
 def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
-    """The rows of a text file in blocks: [M, P] float64."""
+    """The rows of a text file in blocks, all columns float64."""
     skipped, declared = _ascii_numbers(header)
     width = len(header.vertex.properties)
     file.seek(header.data_starts)
@@ -185,7 +182,7 @@ def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
             there += len(more)
         whole = np.concatenate(parts)
         held = whole[wanted:]
-        yield rows, whole[:wanted].reshape(-1, width)
+        yield rows, whole[:wanted].view([(name, "f8") for name, _ in header.vertex.properties])
 
 
 def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
@@ -201,27 +198,19 @@ def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
     yield np.array(rest.split(), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class _Columns:
-    names: list[str]
-    table: NDArray[Any]  # [M, P], or [M] structured
+def _columns(table: NDArray[Any], names: list[str]) -> NDArray[Any]:
+    """[M, len(names)] of a structured table [M], in the common type of the columns."""
+    if not names:
+        return np.empty((len(table), 0), np.float32)
+    return structured_to_unstructured(table[names])
 
-    def take(self, names: list[str]) -> NDArray[Any]:
-        """[M, len(names)] in the common type of the columns."""
-        if self.table.ndim == 2:
-            return self.table[:, [self.names.index(name) for name in names]]
-        kind = np.result_type(*(self.table.dtype[name] for name in names)) if names else "f4"
-        out = np.empty((len(self.table), len(names)), kind)
-        for i, name in enumerate(names):
-            out[:, i] = self.table[name]
-        return out
 
-    def floats(self, names: list[str]) -> NDArray[np.float32]:
-        """[M, len(names)] float32. Raises BadFileError for values that float32 cannot hold."""
-        exact = self.take(names)
-        with np.errstate(over="ignore"):
-            out = exact.astype(np.float32)
-        if exact.dtype.itemsize == 8 and (lost := np.isinf(out) & np.isfinite(exact)).any():
-            name = names[int(lost.any(axis=0).argmax())]
-            raise BadFileError(f"values of {name} are too large")
-        return out
+def _floats(table: NDArray[Any], names: list[str]) -> NDArray[np.float32]:
+    """`_columns` as float32. Raises BadFileError for values that float32 cannot hold."""
+    exact = _columns(table, names)
+    with np.errstate(over="ignore"):
+        out = exact.astype(np.float32)
+    if exact.dtype.itemsize == 8 and (lost := np.isinf(out) & np.isfinite(exact)).any():
+        name = names[int(lost.any(axis=0).argmax())]
+        raise BadFileError(f"values of {name} are too large")
+    return out

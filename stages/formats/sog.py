@@ -107,9 +107,7 @@ def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _positions(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
-    low, high = (np.zeros(3), np.zeros(3))
-    if len(splats):  # the logarithm is monotonic, so it maps the bounds to the bounds
-        low, high = (symmetric_log(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
+    low, high = position_range(splats.means)
     span = np.where(high > low, high - low, 1.0)
     halves = np.empty((2, len(splats), 3), np.uint8)
     for rows in reported_blocks(len(splats)):
@@ -122,6 +120,14 @@ def _positions(
     return {name: _picture(half) for name, half in zip(files, halves, strict=True)}
 
 
+def position_range(means: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """([3], [3]) least and greatest symmetric logarithm on each axis; 0 without splats."""
+    if not len(means):
+        return np.zeros(3), np.zeros(3)
+    # the logarithm is monotonic, so it maps the bounds to the bounds
+    return symmetric_log(means.min(axis=0)), symmetric_log(means.max(axis=0))
+
+
 def position_loss(splats: Splats) -> str:
     """By how much outliers coarsen the positions of the others; "" if by less than a factor of
     `_COARSER_TOLD`."""
@@ -129,8 +135,9 @@ def position_loss(splats: Splats) -> str:
     outliers = outlier_shells(means) > 0
     if not outliers.any():
         return ""
-    spans = [np.ptp(symmetric_log(some), axis=0) for some in (means, means[~outliers])]
-    factor = float((spans[0] / np.maximum(spans[1], 1e-30)).max())
+    all_low, all_high = position_range(means)
+    low, high = position_range(means[~outliers])
+    factor = float(((all_high - all_low) / np.maximum(high - low, 1e-30)).max())
     if factor < _COARSER_TOLD:
         return ""
     count = counted(int(np.count_nonzero(outliers)), "outlier")
@@ -158,7 +165,7 @@ def _shapes(
         part = splats.take(places[rows])
         scales[rows] = codebook.nearest(book, part.log_scales)
         largest, others = smallest_three.split(unit_quaternions(part.quaternions))
-        rotations[rows, :3] = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
+        rotations[rows, :3] = np.rint(255 * smallest_three.fractions_of(others))
         rotations[rows, 3] = 252 + largest
     meta["quats"] = {"files": ["quats.webp"]}
     return {"scales.webp": _picture(scales), "quats.webp": _picture(rotations)}
@@ -182,6 +189,14 @@ def palette_size(count: int) -> int:
     return min(PALETTE_LIMIT, max(_PALETTE_LEAST, count // _SPLATS_PER_ENTRY))
 
 
+def palette_of(
+    rest: NDArray[np.float32], bits: int = 16
+) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """(palette [entries, 3K], labels [N]) of coefficients [N, K, 3]; bits: of a label."""
+    size = min(palette_size(len(rest)), 1 << bits)
+    return codebook.vector_palette(rest.reshape(len(rest), -1), size)
+
+
 def _sh_palette(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
@@ -189,8 +204,7 @@ def _sh_palette(
     vectors = scratch.empty((len(splats), count, 3))
     for rows in reported_blocks(len(splats)):
         vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
-    size = palette_size(len(splats))
-    palette, labels = codebook.vector_palette(vectors.reshape(len(splats), -1), size)
+    palette, labels = palette_of(vectors)
     book = codebook.scalar_codebook(palette)
     book[np.abs(book).argmin()] = 0.0  # keep zero exact
     book.sort()

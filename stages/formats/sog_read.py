@@ -105,7 +105,7 @@ class Source:
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
             encoded = ends[0] + (ends[1] - ends[0]) * steps
-            others = (rotations[rows, :3] / 255.0 - 0.5) * 2 * smallest_three.LIMIT
+            others = smallest_three.from_fractions(rotations[rows, :3] / 255.0)
             with np.errstate(over="ignore", invalid="ignore"):
                 out.means[:] = np.sign(encoded) * np.expm1(np.abs(encoded))
                 out.sh[:, 0] = books[0][colours[rows, :3]]
