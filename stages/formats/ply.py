@@ -98,18 +98,14 @@ def read(path: Path) -> Splats:
         count = sum(1 for name in names if name.startswith("f_rest_"))
         if count not in (0, 9, 24, 45):
             raise BadFileError(f"it has {count} f_rest properties, not 0, 9, 24 or 45")
-        if header.encoding == "ascii":
-            _check_ascii_size(path, header)
-            tables = _ascii_tables(file, header)
-        else:
-            tables = _binary_tables(binary_rows(path, header, "vertex"))
+        blocks_of_rows = tables(file, path, header)
         splats = allocate(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
         wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
         exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
-        for rows, table in tables:
+        for rows, table in blocks_of_rows:
             _fill(splats.take(rows), table, count)
             if exact is not None:
-                exact[rows] = _columns(table, ["x", "y", "z"])
+                exact[rows] = columns(table, ["x", "y", "z"])
             else:
                 splats.means[rows] = _floats(table, ["x", "y", "z"])
     if exact is None:
@@ -135,8 +131,17 @@ def _check_is_splats(header: Header) -> None:
         raise BadFileError("it is a mesh of triangles, not splats")
     if missing:
         raise BadFileError(f"its vertices lack {', '.join(missing)}: they are no splats")
+
+
+def tables(file: BinaryIO, path: Path, header: Header) -> _Tables:
+    """The vertices of a .ply in blocks: (rows, structured table [M]), for `columns`. Raises
+    BadFileError if the file cannot hold what it declares, or if its vertices hold lists."""
     if header.vertex.has_lists:
         raise BadFileError("its vertices hold lists")
+    if header.encoding == "ascii":
+        _check_ascii_size(path, header)
+        return _ascii_tables(file, header)
+    return _binary_tables(binary_rows(path, header, "vertex"))
 
 
 def _binary_tables(mapped: NDArray[Any]) -> _Tables:
@@ -198,7 +203,7 @@ def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
     yield np.array(rest.split(), dtype=np.float64)
 
 
-def _columns(table: NDArray[Any], names: list[str]) -> NDArray[Any]:
+def columns(table: NDArray[Any], names: list[str]) -> NDArray[Any]:
     """[M, len(names)] of a structured table [M], in the common type of the columns."""
     if not names:
         return np.empty((len(table), 0), np.float32)
@@ -206,8 +211,8 @@ def _columns(table: NDArray[Any], names: list[str]) -> NDArray[Any]:
 
 
 def _floats(table: NDArray[Any], names: list[str]) -> NDArray[np.float32]:
-    """`_columns` as float32. Raises BadFileError for values that float32 cannot hold."""
-    exact = _columns(table, names)
+    """`columns` as float32. Raises BadFileError for values that float32 cannot hold."""
+    exact = columns(table, names)
     with np.errstate(over="ignore"):
         out = exact.astype(np.float32)
     if exact.dtype.itemsize == 8 and (lost := np.isinf(out) & np.isfinite(exact)).any():

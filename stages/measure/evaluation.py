@@ -7,7 +7,7 @@ the splats were trained at, drawn by the run's backend with the near plane of th
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.measure.image_metrics import capped_psnr_db, flip, ssim
-from stages.photos.load import load_image, mask_of
+from stages.photos.load import load_image, mask_of, scaled_image, scaled_mask
 from stages.raster.draw import renderer
 from stages.scene import IGNORE, TRANSPARENT, Camera, DrawSettings, Splats, View
 from stages.scene.light import BRIGHT, Light, gains_and_offsets
 
 IN_MEMORY_MIB = 512  # of photographs; further ones are read from disk each time
 LARGEST_SUBSET = 24  # held-out views for what is too slow, or takes too much room, for all
+SIZES = {"full": 1.0, "half": 0.5, "quarter": 0.25}  # of the pictures, by name; each side's scale
 _TIMED_RUNS = 3
 ImageRenderer = Callable[[Camera], NDArray[np.floating]]  # a picture [H, W, 3]
 
@@ -71,6 +72,23 @@ class EvaluationView:
         even = (self.image - offsets * solid) / gains
         pixels = np.rint(even * 255).clip(0, 255).astype(np.uint8)
         return replace(self, pixels=pixels, saturated=np.asarray((self.image >= BRIGHT).any(2)))
+
+    def scaled(self, scale: float) -> EvaluationView:
+        """At `scale` (at most 1) times the size along each side, by area averaging as in
+        `photos.load`. A pixel is compared if all that it averages is."""
+        if scale == 1:
+            return self
+        camera = self.camera.resized(
+            *(max(1, round(scale * side)) for side in (self.camera.width, self.camera.height))
+        )
+        size = camera.width, camera.height
+        mask, saturated = self.mask, self.saturated
+        if mask is not None:
+            mask = scaled_mask(mask, *size, self.outside)
+        if saturated is not None:
+            saturated = scaled_image(saturated.astype(np.float32), *size) > 0
+        pixels = np.rint(scaled_image(self.image, *size) * 255).astype(np.uint8)
+        return replace(self, camera=camera, pixels=pixels, mask=mask, saturated=saturated)
 
     def over(self, grey: float) -> EvaluationView:
         """Composited over `grey` (0 to 1) instead of black, where it has transparency."""
@@ -164,14 +182,36 @@ def evaluate(
         with_flip: also compute FLIP, which takes five times as long as PSNR and SSIM, for the
             `evaluation_subset` of the views.
     """
-    scores = []
+    return evaluate_at_sizes(draw, views, {"full": 1.0}, with_flip)["full"]
+
+
+def evaluate_at_sizes(
+    draw: ImageRenderer,
+    views: Sequence[EvaluationView],
+    sizes: Mapping[str, float] = SIZES,
+    with_flip: bool = False,
+) -> dict[str, list[Score]]:
+    """`evaluate` the views at several sizes: a viewer does not draw at the size of training.
+
+    Args:
+        draw: draws a camera's picture, at the camera's size.
+        views: at the full size; smaller photographs are area averages, see `EvaluationView.scaled`.
+        sizes: the scale of each side, at most 1, by name.
+        with_flip: as in `evaluate`.
+
+    Returns:
+        The scores of the views by the name of the size.
+    """
+    scores: dict[str, list[Score]] = {name: [] for name in sizes}
     with_flip_too = evaluation_subset(len(views)) if with_flip else ()
-    for number, view in enumerate(views):
-        image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
-        valid = view.valid
-        error = flip(image, truth, valid) if number in with_flip_too else None
-        psnr_db, similarity = capped_psnr_db(image, truth, valid), ssim(image, truth, valid)
-        scores.append(Score(view.name, psnr_db, similarity, error))
+    for number, full in enumerate(views):
+        for name, scale in sizes.items():
+            view = full.scaled(scale)
+            image, truth = np.clip(draw(view.camera), 0.0, 1.0), view.image
+            valid = view.valid
+            error = flip(image, truth, valid) if number in with_flip_too else None
+            psnr_db, similarity = capped_psnr_db(image, truth, valid), ssim(image, truth, valid)
+            scores[name].append(Score(view.name, psnr_db, similarity, error))
     return scores
 
 

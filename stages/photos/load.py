@@ -34,9 +34,17 @@ def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
     if full is None:
         raise _unreadable(path, f"its samples are {image.dtype}, not 8 or 16 bit integers")
     pixels: NDArray[Any] = image.astype(np.float32) / np.float32(full)
-    if pixels.shape[:2] != (height, width):
-        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(np.clip(pixels, 0.0, 1.0), dtype=np.float32)
+    scaled = scaled_image(pixels, width, height)
+    return np.ascontiguousarray(np.clip(scaled, 0.0, 1.0), dtype=np.float32)
+
+
+def scaled_image(pixels: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+    """[height, width, ...] means of `pixels` over the area of each new pixel."""
+    import cv2
+
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def load_mask(path: Path, width: int, height: int, outside: str) -> NDArray[np.uint8]:
@@ -46,7 +54,19 @@ def load_mask(path: Path, width: int, height: int, outside: str) -> NDArray[np.u
     new pixel; where the outside is ignored, a new pixel that holds any of it is ignored. Raises
     SplatError "photo-unreadable".
     """
-    mask = np.round(load_image(path, width, height)[..., 0] * 255).astype(np.uint8)
+    return _mask_values(load_image(path, width, height)[..., 0], outside)
+
+
+def scaled_mask(
+    mask: NDArray[np.uint8], width: int, height: int, outside: str
+) -> NDArray[np.uint8]:
+    """[height, width] `mask` at a smaller size, as `load_mask` scales it."""
+    return _mask_values(scaled_image(mask * np.float32(1 / 255), width, height), outside)
+
+
+def _mask_values(shares: NDArray[np.float32], outside: str) -> NDArray[np.uint8]:
+    """A mask in 8 bits from the share of each pixel that is inside."""
+    mask = np.round(shares * 255).astype(np.uint8)
     return mask if outside == TRANSPARENT else np.where(mask == 255, mask, np.uint8(0))
 
 

@@ -14,6 +14,7 @@ from stages.measure.evaluation import (
     LARGEST_SUBSET,
     EvaluationView,
     evaluate,
+    evaluate_at_sizes,
     evaluation_subset,
     image_renderer,
     load_evaluation_views,
@@ -89,6 +90,45 @@ def test_views_are_compared_at_the_size_of_training(scene: SmallScene) -> None:
     (full, *_) = load_evaluation_views(folder, views, DrawSettings(0.01))
     with Image.open(Path(folder) / views[0].image) as picture:
         np.testing.assert_array_equal(full.pixels, np.asarray(picture))
+
+
+def test_a_scaled_view_is_the_photograph_at_that_size(scene: SmallScene) -> None:
+    """Area means of area means: but for the rounding of the first, what `load_image` gives."""
+    views, folder = scene.reconstruction.views, scene.reconstruction.folder
+    (full, *_) = load_evaluation_views(folder, views, DrawSettings(0.01))
+    for scale, side in ((0.5, 36), (0.25, 18)):
+        (small, *_) = load_evaluation_views(folder, views, DrawSettings(0.01, side))
+        found = full.scaled(scale)
+        assert (found.camera.width, found.camera.height) == (
+            small.camera.width,
+            small.camera.height,
+        )
+        assert found.camera.fx == pytest.approx(small.camera.fx)
+        assert np.abs(found.pixels.astype(int) - small.pixels).max() <= 1
+
+
+def test_a_pixel_counts_at_a_smaller_size_if_all_that_it_averages_counts() -> None:
+    camera = Camera(8, 8, 10.0, 10.0, 4.0, 4.0, np.eye(4))
+    mask, saturated = np.full((8, 8), 255, np.uint8), np.zeros((8, 8), bool)
+    mask[0, 1], saturated[7, 7] = 0, True
+    view = EvaluationView("a", camera, np.zeros((8, 8, 3), np.uint8), mask, IGNORE, saturated)
+    wanted = np.ones((4, 4), bool)
+    wanted[0, 0] = wanted[3, 3] = False
+    np.testing.assert_array_equal(view.scaled(0.5).valid, wanted)
+
+
+def test_an_evaluation_at_sizes_draws_each_size_and_begins_with_the_full_one(
+    scene: SmallScene,
+) -> None:
+    views = load_evaluation_views(
+        scene.reconstruction.folder, scene.reconstruction.views, scene.splats.draw_settings
+    )
+    draw = image_renderer(scene.splats, "cpu")
+    found = evaluate_at_sizes(draw, views, with_flip=True)
+    assert list(found) == ["full", "half", "quarter"]
+    assert found["full"] == evaluate(draw, views, with_flip=True)
+    for name, scale in (("half", 0.5), ("quarter", 0.25)):
+        assert found[name] == evaluate(draw, [view.scaled(scale) for view in views], with_flip=True)
 
 
 def test_the_near_plane_of_the_look_decides_what_is_drawn() -> None:
