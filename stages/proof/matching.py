@@ -43,8 +43,8 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
 
     The first order that matches nearly all rows is taken; else the order in which the most rows
     match, if nearly all have like values: a format that moved many positions has kept the order.
-    Rows of unlike values are then matched among themselves, each to the most similar of its nearest
-    neighbours.
+    Its mismatched rows are then matched among themselves, each to the most similar of its nearest
+    neighbours, or of like values although it moved.
 
     Args:
         truth, file: N splats each, in the same axes.
@@ -52,7 +52,8 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
     """
     n, extent = len(truth), extent_of(truth)
     values = _values(truth), _values(file)
-    found, fewest = (np.arange(n), np.arange(n)), n + 1
+    every = np.arange(n)
+    found, fewest = (every, every, np.zeros(n, bool)), n + 1
     for index in (np.arange(n), *orders) if n else ():
         distance, unlike = np.empty(n, np.float32), np.empty(n, bool)
         for rows in reported_blocks(n):
@@ -60,17 +61,17 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
             distance[rows] = moved.max(axis=1, initial=0.0)
             unlike[rows] = _unlike(values[0][index[rows]], values[1][rows])
         far = distance > _APART * extent
-        mismatches, most = np.count_nonzero(far | unlike), _MAX_MISMATCHED * n
+        mismatched, most = far | unlike, _MAX_MISMATCHED * n
+        count = np.count_nonzero(mismatched)
         like = np.count_nonzero(unlike) <= most and np.count_nonzero(far) <= n - most
-        if like and mismatches < fewest:
+        if like and count < fewest:
             if np.median(distance) <= _EXACT * extent:  # then neighbours can be distinguished
-                unlike |= (distance > _EXACT * extent) & ~far
-            found, fewest = (index, np.flatnonzero(unlike)), mismatches
+                mismatched |= distance > _EXACT * extent
+            found, fewest = (index, np.flatnonzero(mismatched), far[mismatched]), count
         if fewest <= most:
             break
-    index, mismatched = found
-    _match_neighbours(truth, file, index, mismatched, _APART * extent / _DISTANCE_WEIGHT, *values)
-    return index
+    _match_neighbours(truth, file, *found, _APART * extent / _DISTANCE_WEIGHT, *values)
+    return found[0]
 
 
 def _values(splats: Splats) -> NDArray[np.float32]:
@@ -98,6 +99,7 @@ def _match_neighbours(
     file: Splats,
     index: Rows,
     mismatched: Rows,
+    moved: NDArray[np.bool_],
     unit: float,
     truths: NDArray[np.float32],
     files: NDArray[np.float32],
@@ -105,7 +107,8 @@ def _match_neighbours(
     """Match the rows `mismatched` among themselves, changing `index` in place.
 
     In each round every remaining row proposes to the most similar of its nearest neighbours; of
-    several proposals for one row the most similar wins.
+    several proposals for one row the most similar wins. In the first round a row that has `moved`
+    may also propose to its own, at the cost of one allowed difference instead of its distance.
     """
     import cv2
 
@@ -121,8 +124,9 @@ def _match_neighbours(
         )
         queries = np.ascontiguousarray(file.means[mine], np.float32)
         places, squares = tree.knnSearch(queries, count, params={"checks": -1})
-        cost = np.full(len(mine), np.inf)
-        choice = np.zeros(len(mine), np.intp)
+        choice = np.arange(len(mine))
+        unlike = np.square(truths[theirs] - files[mine]).sum(axis=1)
+        cost = np.where(moved, unlike + 1, np.inf)
         for place, square in zip(places.T, squares.T, strict=True):
             unlike = np.square(truths[theirs[place]] - files[mine]).sum(axis=1)
             total = square.astype(np.float64) / unit**2 + unlike
@@ -133,6 +137,7 @@ def _match_neighbours(
         matched = by_cost[first]
         index[mine[matched]] = theirs[taken]
         mine, theirs = np.delete(mine, matched), np.delete(theirs, taken)
+        moved = np.zeros(len(mine), bool)
         if len(matched) * 10 < len(mine):
             break
     index[mine] = theirs

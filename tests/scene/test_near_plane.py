@@ -39,7 +39,7 @@ def test_one_outlier_among_few_splats_does_not_hide_the_others(count: int) -> No
     means = np.concatenate([OBJECT[: count - 1], [[0.0, 0.0, 1e4]]])
     assert near_plane_of(means) < 0.02
     picture = render(coloured(means, 0.2), CAMERA, backend="cpu")
-    assert picture.alpha.max() > 0.5
+    assert picture.alpha.max() > 0.4
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
