@@ -34,7 +34,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """
     splats = splats.with_sh_degree(int(splats.sh_degrees.max(initial=0)))
     primitives = [attributes(splats)] if len(splats) else []
-    write_file(Path(path), primitives, flipped(splats.take(slice(0))).origin, units)
+    write_file(Path(path), primitives, splats, units)
 
 
 def plain(name: str, values: NDArray[np.float32]) -> Attribute:

@@ -18,6 +18,8 @@ from stages.base.blocks import reported_blocks
 from stages.base.distribution import VERSION
 from stages.base.errors import Family, SplatError
 from stages.formats.json_fields import origin_field
+from stages.scene import Splats
+from stages.scene.flip import flipped
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121, "<u4": 5125}
@@ -45,7 +47,7 @@ class Attribute:
 def write_file(
     path: Path,
     primitives: list[dict[str, Attribute]],
-    origin: NDArray[np.float64],
+    splats: Splats,
     units: str,
     *,
     node_scale: float = 1.0,
@@ -55,24 +57,24 @@ def write_file(
     Args:
         path: the file.
         primitives: attributes by name, all with the same number of rows, y up.
-        origin: [3] in the axes of the file; asset.extras holds it, because positions relative to 0
-            would exceed the precision of float32.
+        splats: for what asset.extras holds: the origin, in the axes of the file, because positions
+            relative to 0 would exceed the precision of float32; whether they are to be drawn with
+            opacity compensation, of which KHR_gaussian_splatting says nothing.
         units: "metres" or "arbitrary".
         node_scale: scale of the node.
 
     Raises SplatError when a file cannot be written or a .glb would exceed 4 GiB.
     """
-    document = _document(primitives, origin, units, node_scale)
+    more: dict[str, Any] = {"antialiased": True} if splats.draw_settings.antialias else {}
+    made_of = asset(units, flipped(splats.take(slice(0))).origin, **more)
+    document = _document(primitives, made_of, node_scale)
     written = [attribute for attributes in primitives for attribute in attributes.values()]
     write = write_glb if path.suffix.lower() == ".glb" else _write_pair
     write(path, document, written)
 
 
 def _document(
-    primitives: list[dict[str, Attribute]],
-    origin: NDArray[np.float64],
-    units: str,
-    node_scale: float,
+    primitives: list[dict[str, Attribute]], made_of: dict[str, Any], node_scale: float
 ) -> dict[str, Any]:
     """The JSON, whose buffer has no size and name yet."""
     accessors: list[dict[str, Any]] = []
@@ -86,7 +88,7 @@ def _document(
             views.append(buffer_view(attribute, offset))
             offset += attribute.rows.nbytes
     document: dict[str, Any] = {
-        "asset": asset(units, origin),
+        "asset": made_of,
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0] if described else []}],

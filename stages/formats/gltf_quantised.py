@@ -21,7 +21,6 @@ from stages.formats.gltf import attributes, plain
 from stages.formats.gltf_file import Attribute, write_file
 from stages.formats.values import linear_scales
 from stages.scene import Splats
-from stages.scene.flip import flipped
 
 _U16 = 65535
 # Largest step of the scales relative to the median size. Where a few huge splats would make the
@@ -37,8 +36,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """
     unit = _unit(linear_scales(splats))
     primitives = [_attributes(group, unit) for group in _groups(splats)]
-    origin = flipped(splats.take(slice(0))).origin
-    write_file(Path(path), primitives, origin, units, node_scale=unit or 1.0)
+    write_file(Path(path), primitives, splats, units, node_scale=unit or 1.0)
 
 
 def order(splats: Splats) -> NDArray[np.intp]:

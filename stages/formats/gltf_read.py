@@ -49,13 +49,16 @@ def read(path: Path) -> Splats:
             # Splats that are not shared cannot be more than this, which bounds the memory.
             if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
                 raise BadFileError("its nodes share meshes, which is not supported")
-    origin = origin_of(document["asset"].get("extras"))
+    extras = document["asset"].get("extras")
+    extras = extras if isinstance(extras, dict) else {}
     if not parts and "meshes" in document:
         raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
     splats = concatenate(parts)
     del parts
-    means, origin = recentred(splats.means.astype(np.float64), origin)
-    return flipped(replace(splats, means=means, origin=origin), reuse=True)
+    means, origin = recentred(splats.means.astype(np.float64), origin_of(extras))
+    splats = replace(splats, means=means, origin=origin)
+    splats = splats.with_antialias(bool(extras.get("antialiased", False)))
+    return flipped(splats, reuse=True)
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:

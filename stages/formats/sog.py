@@ -27,7 +27,7 @@ from stages.base.text import counted
 from stages.formats import codebook, smallest_three
 from stages.formats.compressed_ply import outlier_shells
 from stages.formats.json_fields import origin_field
-from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
+from stages.formats.sog_read import ANTIALIASED, PALETTE_LIMIT, PER_LINE
 from stages.formats.values import linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
 
@@ -61,7 +61,10 @@ def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[st
     """
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
-    meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": False}
+    antialias = splats.draw_settings.antialias
+    meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": antialias}
+    if antialias:
+        meta["model"] = ANTIALIASED  # as splat-transform writes and reads it
     meta["asset"] = {"generator": "splat", "units": units} | origin_field(splats.origin)
     pictures: dict[str, NDArray[np.uint8]] = {}
     for part in (_positions, _shapes, _colours):

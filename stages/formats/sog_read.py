@@ -28,6 +28,7 @@ from stages.formats.values import allocate, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16
+ANTIALIASED = "antialiased"  # a value of `model`
 PER_LINE = 64  # entries of the palette in a line of its image
 _META_LIMIT_BYTES = 1 << 20
 # Real files take 10 bytes a splat. A file that declares more splats than bytes is refused before
@@ -105,6 +106,7 @@ class Source:
         palette, labels = self._palette(meta, count)
         splats = allocate(count, math.isqrt(1 + palette.shape[1]) - 1)
         splats = replace(splats, origin=origin_of(meta.get("asset")))
+        splats = splats.with_antialias(antialias_of(meta))
         for rows in reported_blocks(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
@@ -191,3 +193,13 @@ def _part(meta: dict[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(part, dict):
         raise BadFileError(f"its meta.json lacks {name}")
     return part
+
+
+def antialias_of(meta: dict[str, Any]) -> bool:
+    """Whether meta.json asks for opacity compensation: `antialias` of the specification, `model` of
+    splat-transform."""
+    said = {bool(meta["antialias"])} if "antialias" in meta else set()
+    said |= {meta["model"] == ANTIALIASED} if "model" in meta else set()
+    if len(said) > 1:
+        raise BadFileError("its meta.json contradicts itself: antialias and model disagree")
+    return True in said

@@ -24,7 +24,7 @@ from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
 from stages.formats.json_fields import origin_field, origin_of, whole
-from stages.formats.sog_read import Source, in_folder, in_zip
+from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
 from stages.formats.table import CHUNK
 from stages.formats.values import allocate, fill
 from stages.scene import Splats, View, morton
@@ -220,7 +220,16 @@ def read(path: Path) -> Splats:
         for offset, count in each:
             fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
             end += count
-    return replace(splats, origin=origin_of(meta.get("asset")))
+    splats = replace(splats, origin=origin_of(meta.get("asset")))
+    return splats.with_antialias(_antialias(sources))
+
+
+def _antialias(sources: Sequence[Source]) -> bool:
+    """Whether the chunks ask for opacity compensation. Raises BadFileError if they disagree."""
+    found = {antialias_of(source.meta()) for source in sources}
+    if len(found) > 1:
+        raise BadFileError("its chunks disagree about antialiasing")
+    return True in found
 
 
 def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import release_mapped_pages
+from stages.base.usd_path import accepted_path
 from stages.formats.values import concatenate
 from stages.proof.content import logits, splats_by_rows, splats_of
 from stages.scene import Splats
@@ -31,7 +32,8 @@ _PAGE_PIECE = 1 << 22  # characters: the parser scans an unfinished element once
 def ply(path: Path) -> Splats:
     from plyfile import PlyData
 
-    vertex = PlyData.read(str(path), mmap="c")["vertex"]
+    content = PlyData.read(str(path), mmap="c")
+    vertex = content["vertex"]
     per_channel = sum(item.name.startswith("f_rest_") for item in vertex.properties) // 3
 
     def values_of(part: slice) -> dict[str, NDArray[np.floating]]:
@@ -51,7 +53,8 @@ def ply(path: Path) -> Splats:
         release_mapped_pages(vertex.data)
         return found
 
-    return splats_by_rows(len(vertex.data), values_of, _PLY_ROWS)
+    splats = splats_by_rows(len(vertex.data), values_of, _PLY_ROWS)
+    return splats.with_antialias("SplatRenderMode: mip" in content.comments)
 
 
 class _Chunks(HTMLParser):
@@ -172,7 +175,8 @@ def gltf(path: Path) -> Splats:
                 sh=sh,
             )
         )
-    return concatenate(parts)
+    antialias = (document.asset.extras or {}).get("antialiased", False)
+    return concatenate(parts).with_antialias(antialias)
 
 
 def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
@@ -193,12 +197,17 @@ def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.float
 
 
 def usd(path: Path) -> Splats:
+    with accepted_path(path) as name:
+        return _usd(name)
+
+
+def _usd(name: str) -> Splats:
     from pxr import Gf, Sdf, Usd, Vt
 
     # The column in which each of w, x, y, z arrives, measured instead of assumed.
     columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
     # Without the library's cache, which may hold an older file of the same name.
-    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(str(path)))
+    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(name))
     parts = []
     for prim in stage.Traverse():
         if prim.GetTypeName() != "ParticleField3DGaussianSplat":
@@ -216,4 +225,5 @@ def usd(path: Path) -> Splats:
                 sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
             )
         )
-    return concatenate(parts)
+    antialias = stage.GetRootLayer().customLayerData["splat"].get("antialiased", False)
+    return concatenate(parts).with_antialias(antialias)
