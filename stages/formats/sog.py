@@ -36,7 +36,7 @@ LOG_SCALE_LIMIT = 20.0
 _PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
 _DC_LIMIT = 1e4
 STEPS = 65535  # of a position, along each axis
-_COARSER_TOLD = 2.0
+_COARSER_WARNED = 2.0
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
@@ -133,7 +133,7 @@ def position_range(means: NDArray[np.floating]) -> tuple[NDArray[np.float64], ND
 
 def position_loss(splats: Splats) -> str:
     """By how much outliers coarsen the positions of the others; "" if by less than a factor of
-    `_COARSER_TOLD`."""
+    `_COARSER_WARNED`."""
     means = splats.means
     outliers = outlier_shells(means) > 0
     if not outliers.any():
@@ -141,7 +141,7 @@ def position_loss(splats: Splats) -> str:
     all_low, all_high = position_range(means)
     low, high = position_range(means[~outliers])
     factor = float(((all_high - all_low) / np.maximum(high - low, 1e-30)).max())
-    if factor < _COARSER_TOLD:
+    if factor < _COARSER_WARNED:
         return ""
     count = counted(int(np.count_nonzero(outliers)), "outlier")
     return f"holds positions {min(factor, STEPS):,.0f} times as coarse as without {count}"
