@@ -98,6 +98,7 @@ def run(
     from stages.capacity.bits import choose_bits
     from stages.capacity.rounding import write_and_read
     from stages.formats.quantisation import splats_to_write
+    from stages.measure.evaluation import SIZES, psnr_name
     from stages.scene import QuantisedSplats
 
     splats: Splats = inputs["prune"]
@@ -108,7 +109,7 @@ def run(
     bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
     figures = {
         "psnr_raw_db": evaluator.psnr(splats),
-        "psnr_kept_db": evaluator.psnr(kept),
+        **{psnr_name(s, "psnr_kept"): evaluator.psnr(kept, scale) for s, scale in SIZES.items()},
         "psnr_splat32_db": evaluator.psnr(
             write_and_read(FORMATS["splat"], splats_to_write(FORMATS["splat"], quantised))
         ),
@@ -264,11 +265,11 @@ class _Measure:
     what: str = "training"
     done: int = 0
 
-    def psnr(self, splats: Splats) -> float:
-        """Mean PSNR over the views (dB)."""
+    def psnr(self, splats: Splats, scale: float = 1.0) -> float:
+        """Mean PSNR over the views at `scale` times their size (dB)."""
         from stages.measure.evaluation import mean_psnr_db
 
-        mean = round(mean_psnr_db(splats, self.views, self.backend), 4)
+        mean = round(mean_psnr_db(splats, self.views, self.backend, scale), 4)
         self.done += 1
         # As it is, three lower degrees, each threshold, and about as many bit depths.
         total = 5 + len(_THRESHOLDS_OF_255) + _BIT_DEPTH_MEASUREMENTS
@@ -324,7 +325,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=8,
+    version=9,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     run=run,

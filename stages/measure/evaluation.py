@@ -266,10 +266,17 @@ def image_renderer(splats: Splats, backend: str) -> ImageRenderer:
     return lambda camera: draw(camera).image
 
 
-def mean_psnr_db(splats: Splats, views: Iterable[EvaluationView], backend: str) -> float:
-    """Mean PSNR over the views, dB."""
-    draw = image_renderer(splats, backend)
-    return float(np.mean([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views]))
+def mean_psnr_db(
+    splats: Splats, views: Iterable[EvaluationView], backend: str, scale: float = 1.0
+) -> float:
+    """Mean PSNR over the views, each `EvaluationView.scaled`, dB."""
+    draw, scaled = image_renderer(splats, backend), (view.scaled(scale) for view in views)
+    return float(np.mean([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in scaled]))
+
+
+def psnr_name(size: str, stem: str = "psnr") -> str:
+    """The name of a metric at one of `SIZES`: psnr_db, psnr_half_db, psnr_quarter_db."""
+    return f"{stem}_db" if size == "full" else f"{stem}_{size}_db"
 
 
 def seconds_per_frame(
