@@ -233,7 +233,7 @@ def load(folder: Path) -> ExportedAssets:
 
 STAGE = Stage(
     name="export",
-    version=11,
+    version=12,
     reads=("sfm", "quantise"),
     settings_type=ExportSettings,
     run=run,

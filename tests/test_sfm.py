@@ -273,6 +273,14 @@ def test_zooming_has_no_parallax(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_zoom_to_a_half_that_fits_a_flat_poster_is_refused(tmp_path: Path) -> None:
+    capture = bad_captures.zooming_into_detail(tmp_path / "in")
+    error = failure(capture, tmp_path, max_features=3000)
+    assert error.code == "sfm-no-parallax"
+    assert "in one plane" in error.given
+
+
+@pytest.mark.slow
 def test_two_scenes_are_separated_and_one_may_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -108,6 +108,7 @@ class _Buffers:
     def __init__(self, path: Path, described: list[Any], chunk: memoryview | None) -> None:
         self._path, self._described, self._chunk = path, described, chunk
         self._loaded: dict[int, memoryview] = {}
+        self._files: dict[Path, memoryview] = {}  # a file counts once, however many buffers it is
 
     def get(self, index: int) -> memoryview:
         if index not in self._loaded:
@@ -119,7 +120,7 @@ class _Buffers:
         return self._loaded[index]
 
     def total_bytes(self) -> int:
-        return sum(len(content) for content in self._loaded.values())
+        return sum({id(content): len(content) for content in self._loaded.values()}.values())
 
     def _load(self, described: dict[str, Any], index: int) -> memoryview:
         uri = described.get("uri")
@@ -134,7 +135,8 @@ class _Buffers:
             if not head.endswith(";base64"):
                 raise BadFileError(f"buffer {index} has an encoding that is not read")
             return memoryview(base64.b64decode(body, validate=True))
-        return _mapped(_file_beside(self._path, uri))
+        file = _file_beside(self._path, uri)
+        return self._files.setdefault(file, _mapped(file))
 
 
 def _file_beside(path: Path, uri: str) -> Path:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError
 
 HEADER_LIMIT_BYTES = 1 << 20
+_MOST_PROPERTIES = 1000
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -120,6 +121,8 @@ def _with_property(element: Element, words: list[str]) -> Element:
         case ["list", _, _, name]:
             return Element(element.name, element.count, element.properties, True)
         case [kind, name] if kind in TYPES:
+            if len(element.properties) == _MOST_PROPERTIES:
+                raise BadFileError(f"it declares more than {_MOST_PROPERTIES} properties")
             if any(name == known for known, _ in element.properties):
                 raise BadFileError(f"it declares the property {name[:40]!r} twice")
             properties = (*element.properties, (name, TYPES[kind]))

@@ -134,15 +134,15 @@ def widths(version: int, degree: int, bits: int) -> tuple[int, ...]:
 def _is_y_up(records: bytes) -> bool:
     """Whether the axes are right, up, back; False if they are ours. Other extensions (limits for
     cameras) are ignored. Raises BadFileError for other axes."""
-    while len(records) >= _RECORD.size:
-        kind, length = _RECORD.unpack_from(records)
-        value = records[_RECORD.size : _RECORD.size + length]
+    at = 0
+    while len(records) >= at + _RECORD.size:
+        kind, length = _RECORD.unpack_from(records, at)
+        at += _RECORD.size + length
         if kind == _AXES_EXTENSION:
-            axes = int.from_bytes(value, "little")
+            axes = int.from_bytes(records[at - length : at], "little")
             if axes not in (*_Y_UP, _OURS):
                 raise BadFileError(f"its axes are number {axes} of SPZ, which is not supported")
             return axes != _OURS
-        records = records[_RECORD.size + length :]
     return True
 
 

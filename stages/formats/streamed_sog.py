@@ -243,7 +243,10 @@ def _read(path: Path) -> Splats:
     chunks = [(names[file], wanted) for file, wanted in sorted(rows.items())]
     if meta.get("environment"):
         chunks.append((meta["environment"], None))
-    sources = [_source(path.parent, name) for name, _ in chunks]
+    places = [_place(path.parent, name) for name, _ in chunks]
+    if len(set(places)) < len(places):
+        raise BadFileError("it names a chunk twice")
+    sources = [_source(place) for place in places]
     ranges = [_checked(source, wanted) for source, (_, wanted) in zip(sources, chunks, strict=True)]
     degree = max((found for found, _ in ranges), default=0)
     splats = allocate(sum(n for _, each in ranges for _, n in each), degree)
@@ -324,9 +327,8 @@ def _place(folder: Path, name: Any) -> Path:
     return place
 
 
-def _source(folder: Path, name: Any) -> Source:
+def _source(place: Path) -> Source:
     """A chunk: a folder's meta.json, or a .sog."""
-    place = _place(folder, name)
     if place.name == "meta.json":
         files = [file for file in place.parent.iterdir() if file.is_file()]
         return Source(in_folder(place.parent), sum(file.stat().st_size for file in files))

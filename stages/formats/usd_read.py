@@ -33,10 +33,12 @@ from stages.scene.flip import flipped
 from stages.scene.recentring import recentred
 
 _TYPE = "ParticleField3DGaussianSplat"
+_ARCS = ("references", "payload", "inheritPaths", "specializes", "clips")
 _REFUSED = 3  # exit status of the child when it printed a reason
 _TIMEOUT_SECONDS = 600
-# Address space of the child: of the library, and per byte of the file (arrays may be compressed).
-_BASE_BYTES, _BYTES_PER_BYTE = 4 << 30, 64
+# Memory of the child: beyond the library's, and per byte of the file (arrays may be compressed).
+_BASE_BYTES, _BYTES_PER_BYTE = 192 << 20, 64
+_THREADS = "4"  # of the library; the stack of each counts as memory
 
 
 def read(path: Path) -> Splats:
@@ -62,7 +64,7 @@ def read(path: Path) -> Splats:
                 command,
                 capture_output=True,
                 # The library writes crash reports there; they are deleted with the folder.
-                env={**os.environ, "TMPDIR": folder},
+                env={**os.environ, "TMPDIR": folder, "PXR_WORK_THREAD_LIMIT": _THREADS},
                 cwd=Path(__file__).resolve().parents[2],
                 timeout=_TIMEOUT_SECONDS,
                 check=False,
@@ -96,10 +98,23 @@ def _open(path: Path) -> Any:
         raise BadFileError("it is not USD")
     if layer.GetCompositionAssetDependencies():
         raise BadFileError("it refers to other files, which are not supported")
+    _refuse_arcs(layer)
     stage = Usd.Stage.Open(layer)
     if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
         raise BadFileError("its up axis is not y, which is not supported")
     return stage
+
+
+def _refuse_arcs(layer: Any) -> None:
+    """Raise BadFileError if a prim is composed of others: a few kilobytes of prims that refer to
+    each other twice make millions."""
+
+    def check(path: Any) -> None:
+        spec = layer.GetPrimAtPath(path) if path.IsPrimPath() else None
+        if spec and any(spec.HasInfo(name) for name in _ARCS):
+            raise BadFileError("its prims are made of each other, which is not supported")
+
+    layer.Traverse("/", check)
 
 
 def _origin(stage: Any) -> NDArray[np.float64]:
@@ -159,11 +174,15 @@ def _placement(prim: Any) -> tuple[float, NDArray[np.float64]]:
 
 
 def _limit_memory(path: Path) -> None:
-    with suppress(ImportError, ValueError, OSError):  # not on Windows; or limited already
+    with suppress(ImportError, ValueError, OSError):  # on Linux only; or limited already
         import resource
 
-        wanted = _BASE_BYTES + _BYTES_PER_BYTE * path.stat().st_size
-        resource.setrlimit(resource.RLIMIT_AS, (wanted, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        from pxr import Sdf, Usd, UsdGeom  # noqa: F401 - loaded before it is measured
+
+        now = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+        wanted = now + _BASE_BYTES + _BYTES_PER_BYTE * path.stat().st_size
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        resource.setrlimit(resource.RLIMIT_DATA, (wanted, hard))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 

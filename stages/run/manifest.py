@@ -147,7 +147,7 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
             hint="Check the permissions of the folder.",
             family=Family.RUN_FOLDER,
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise _edited(path) from error
     if not isinstance(data, dict) or not isinstance(data.get("schema"), int):
         raise _edited(path)

@@ -105,8 +105,8 @@ class Reconstruction:
         origin: [3] float64, added to positions to get back to the coordinates of `units`.
         units: "metres", or "arbitrary" if the scale of the scene is unknown.
         levelled: whether the up direction (-Y) was found from the cameras.
-        light_disagreement_ev: RMS difference between the lights of the views as measured at the
-            greyer and the more saturated, or the darker and the lighter half of the points.
+        light_explained: by which share the variance of a point's values over its views falls when
+            the lights of the views are corrected.
     """
 
     folder: Path
@@ -118,7 +118,7 @@ class Reconstruction:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     units: str = "arbitrary"
     levelled: bool = False
-    light_disagreement_ev: float = 0.0
+    light_explained: float = 0.0
 
 
 def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:

@@ -63,7 +63,7 @@ def load_splats(path: Path) -> Splats:
                 raise ValueError("bytes follow its end")
         draw_settings = DrawSettings(float(near), int(side), float(grey), bool(light))
         return Splats(**arrays, draw_settings=draw_settings)  # type: ignore[arg-type]
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, OverflowError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise SplatError(
             "splats-file-damaged",

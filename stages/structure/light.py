@@ -5,7 +5,6 @@ Exposure and white balance add to the logarithm of an sRGB value plus 0.055 (`sc
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median
 from scipy.sparse import csr_array
 
 from stages.base.stage import Report
@@ -26,28 +26,29 @@ DOWNSCALE = 4  # of the pictures' sides; averages out their noise
 DARKEST, LIGHTEST = 0.06, 0.94  # sRGB values that are used
 REGULARISATION = 1e-6  # x the largest diagonal element; draws unconstrained views towards 0
 FEWEST_POINTS = 30  # of a photograph
-SUBSETS = 5  # all points; the greyer and the more saturated half; the darker and the lighter half
 ITERATIONS = 8  # of reweighted least squares
 
 
 def with_light(reconstruction: Reconstruction, report: Report) -> Reconstruction:
     """The reconstruction with `View.light`, measured at the points of its COLMAP model, and the
-    disagreement between halves of these points. Training decides whether the light is corrected."""
+    share of the points' scatter that it explains. Training decides whether it is corrected."""
     model = read_model(reconstruction.folder / SPARSE)[1]
     pictures = [reconstruction.folder / view.image for view in reconstruction.views]
-    observed = model.observed_points, model.observing_views, model.observed_px
-    steps, total = itertools.count(1), len(pictures) + SUBSETS * 3
-    found, disagreement = measure_light(
-        pictures, *observed, tick=lambda: report.progress(next(steps), total, "measuring light")
+    found, explained = measure_light(
+        pictures,
+        model.observed_points,
+        model.observing_views,
+        model.observed_px,
+        tick=lambda done: report.progress(done, len(pictures), "measuring light"),
     )
     lights = [
         None if math.isnan(red) else (red, green, blue)
         for red, green, blue in found.round(4).tolist()
     ]
     report.metric("light_spread_ev", round(spread_ev(lights), 4))
-    report.metric("light_disagreement_ev", round(disagreement, 4))
+    report.metric("light_explained", round(explained, 4))
     views = (replace(v, light=light) for v, light in zip(reconstruction.views, lights, strict=True))
-    return replace(reconstruction, views=tuple(views), light_disagreement_ev=round(disagreement, 4))
+    return replace(reconstruction, views=tuple(views), light_explained=round(explained, 4))
 
 
 def measure_light(
@@ -55,66 +56,52 @@ def measure_light(
     points: NDArray[np.int32],
     views: NDArray[np.int32],
     px: NDArray[np.float64],
-    tick: Callable[[], None] = lambda: None,
+    tick: Callable[[int], None] = lambda done: None,
 ) -> tuple[NDArray[np.float64], float]:
-    """(light [V, 3], disagreement): by how many EV each photograph is lighter than the median one
-    in red, green and blue, NaN for a view with too few usable points; and the RMS difference in EV
-    between halves of the points: the greyer and the more saturated, the darker and the lighter.
+    """(light [V, 3], explained): by how many EV each photograph is lighter than the median one in
+    red, green and blue, NaN for a view with too few usable points; and by which share the variance
+    of a point's values over its views falls when they are corrected by it (robust: of the median
+    absolute deviations). Exposure explains most of it; of surfaces that shine it explains little.
 
     Args:
         pictures: [V] files.
         points, views, px: [O], [O], [O, 2] observations, in pixels of the picture.
-        tick: called after each picture, and after each channel of each of `SUBSETS`.
+        tick: called after each picture, with how many are done.
     """
     values = _values(pictures, views, px, tick)
     usable = ((values > DARKEST) & (values < LIGHTEST)).all(axis=1)
     counts = np.bincount(views[usable], minlength=len(pictures))
     usable &= counts[views] >= FEWEST_POINTS
     points, views, values = points[usable], views[usable], values[usable]
+    light = np.full((len(pictures), 3), np.nan)
     if not len(points):
-        return np.full((len(pictures), 3), np.nan), 0.0
-    ev = POWER * np.log2(values.astype(np.float64) + OFFSET)
-    saturation = (values.max(axis=1) - values.min(axis=1)) / values.max(axis=1)
-    subsets = [np.ones(len(points), np.bool_)]
-    for kind in (saturation, values.mean(axis=1)):
-        _, point = np.unique(points, return_inverse=True)
-        mean = (np.bincount(point, kind) / np.bincount(point))[point]
-        subsets += [mean < np.median(mean), mean >= np.median(mean)]
-    light, grey, saturated, dark, bright = (
-        _centred_offsets(points[s], views[s], ev[s], len(pictures), tick) for s in subsets
-    )
-    difference = np.array([grey - saturated, dark - bright])
-    if not np.isfinite(difference).any():
         return light, 0.0
-    return light, float(np.sqrt(np.nanmean(difference**2)))
+    ev = POWER * np.log2(values.astype(np.float64) + OFFSET)
+    seen = np.unique(views)
+    offsets = np.array([_offsets(points, views, channel, len(pictures)) for channel in ev.T]).T
+    light[seen] = offsets[seen] - np.median(offsets[seen], axis=0)
+    before, after = _variance(points, ev), _variance(points, ev - light[views])
+    return light, 1.0 - after / before if before else 0.0
 
 
-def _centred_offsets(
-    points: NDArray[np.int32],
-    views: NDArray[np.int32],
-    ev: NDArray[np.float64],
-    count: int,
-    tick: Callable[[], None],
-) -> NDArray[np.float64]:
-    """[count, 3] `_offsets` of each channel, with median 0; NaN for views without points."""
-    found = np.empty((count, 3))
-    for channel in range(3):
-        found[:, channel] = _offsets(points, views, ev[:, channel], count)
-        tick()
-    found[np.bincount(views, minlength=count) == 0] = np.nan
-    return np.asarray(found - np.nanmedian(found, axis=0))
+def _variance(points: NDArray[np.int32], ev: NDArray[np.float64]) -> float:
+    """Sum over channels of the squared median absolute deviation of `ev` [O, 3] from the median of
+    each point."""
+    ids, point = np.unique(points, return_inverse=True)
+    middle = np.stack([median(channel, point, np.arange(len(ids)))[point] for channel in ev.T], 1)
+    return float((np.median(np.abs(ev - middle), axis=0) ** 2).sum())
 
 
 def _values(
     pictures: Sequence[Path],
     views: NDArray[np.int32],
     px: NDArray[np.float64],
-    tick: Callable[[], None],
+    tick: Callable[[int], None],
 ) -> NDArray[np.float32]:
     """[O, 3] sRGB values of each observation, 0 to 1; NaN outside the picture."""
     found = np.full((len(views), 3), np.nan, np.float32)
     for number, path in enumerate(pictures):
-        tick()
+        tick(number + 1)
         mine = np.flatnonzero(views == number)
         picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is None or not len(mine):

@@ -29,7 +29,7 @@ def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
         "units": reconstruction.units,
         "levelled": reconstruction.levelled,
         "origin": [float(value) for value in reconstruction.origin],
-        "light_disagreement_ev": float(reconstruction.light_disagreement_ev),
+        "light_explained": float(reconstruction.light_explained),
         "points": len(reconstruction.points),
         "views": [_view_to_dict(view) for view in reconstruction.views],
     }
@@ -54,7 +54,7 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             origin=np.array(data["origin"], np.float64).reshape(3),
             units=str(data["units"]),
             levelled=bool(data["levelled"]),
-            light_disagreement_ev=float(data.get("light_disagreement_ev", 0.0)),
+            light_explained=float(data.get("light_explained", 0.0)),
             **arrays,
         )
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:

@@ -214,6 +214,24 @@ def baseline_over_depth(model: SparseModel) -> float:
     return 2.0 * float(np.percentile(spread, 90)) / max(depth, 1e-300)
 
 
+def flatness(points: NDArray[np.float64]) -> float:
+    """Standard deviation of points [P, 3] across their best plane over the smaller one within it;
+    the tenth of the points that is farthest from their median is left out."""
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    core = points[away <= np.percentile(away, 90)]
+    variances = np.linalg.eigvalsh(np.cov(core.T))
+    return float(np.sqrt(max(variances[0], 0.0) / max(variances[1], 1e-300)))
+
+
+def sideways_share(model: SparseModel) -> float:
+    """Motion of the cameras from their median position: RMS of its part across each optical axis,
+    over RMS of the whole."""
+    moved = model.centres - np.median(model.centres, axis=0)
+    along = np.einsum("vi,vi->v", moved, model.world_to_camera[:, 2, :3])
+    whole = float((moved**2).sum())
+    return float(np.sqrt(max(0.0, 1.0 - (along**2).sum() / whole))) if whole else 0.0
+
+
 def model_statistics(result: MappingResult, photographs: int, mapper: str) -> ModelStatistics:
     """The statistics that the gates check. photographs: how many were given."""
     model = result.model
@@ -240,6 +258,8 @@ def model_statistics(result: MappingResult, photographs: int, mapper: str) -> Mo
         mean_track_length=float(model.tracks.mean()) if len(model.points) else 0.0,
         median_triangulation_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         baseline_over_depth=baseline_over_depth(model),
+        flatness=flatness(model.points) if len(model.points) > 3 else 1.0,
+        sideways_share=sideways_share(model),
         weak_photographs=int(np.sum(seen < _WEAK_OBSERVATIONS)),
         distortion=_largest(model.camera_params[:, 3]),
         focal_over_prior=_focal_over_prior(model),

@@ -11,7 +11,7 @@ from stages.base.text import counted
 from stages.measure.evaluation import load_evaluation_views
 from stages.raster.backends import backend_of_settings
 from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
-from stages.scene.light import LARGEST_DISAGREEMENT, NOISE_EV, spread_ev
+from stages.scene.light import LEAST_EXPLAINED, NOISE_EV, spread_ev
 from stages.training.cap import cap_for, splats_determined
 from stages.training.schedule import Schedule
 from stages.training.trainer import Trainer
@@ -77,8 +77,8 @@ def make_trainer(
 def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) -> bool:
     """Whether the views are brought to their median exposure and white balance.
 
-    "auto" does so if the light differs by more than a camera's noise and halves of the points agree
-    about it: if they disagree, surfaces may shine while neither exposure nor white balance changed.
+    "auto" does so if the light differs by more than a camera's noise and explains most of what
+    points differ by between views: otherwise surfaces shine, and a correction costs quality.
 
     Args:
         reconstruction: with the light of its views.
@@ -87,9 +87,9 @@ def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) 
     """
     lights = [view.light for view in reconstruction.views]
     known = any(light is not None for light in lights)
-    spread, disagreement = spread_ev(lights), reconstruction.light_disagreement_ev
-    differs, agree = spread > NOISE_EV, disagreement <= LARGEST_DISAGREEMENT * spread
-    corrects = choice == "on" or (choice == "auto" and differs and agree)
+    spread, explained = spread_ev(lights), reconstruction.light_explained
+    differs = spread > NOISE_EV
+    corrects = choice == "on" or (choice == "auto" and differs and explained >= LEAST_EXPLAINED)
     report.metric("light_spread_ev", round(spread, 4))
     report.metric("light_corrected", corrects and known)
     if choice == "on" and not known:
@@ -110,7 +110,8 @@ def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) 
         report.warn(
             "train-light-not-evened",
             f"Light differs between photographs (typically by {spread:.2f} EV) and is left as it "
-            f"is: halves of the points disagree by {disagreement:.2f} EV, which shiny surfaces "
-            "cause, too. If the camera changed its exposure or white balance, use --light on.",
+            f"is: it explains only {max(0.0, explained):.0%} of what points differ by between "
+            "photographs, which shiny surfaces cause, too. If the camera changed its exposure or "
+            "white balance, use --light on.",
         )
     return corrects

@@ -94,6 +94,19 @@ def zooming(folder: Path, count: int = 12) -> Capture:
     return capture_of(folder, images)
 
 
+def zooming_into_detail(folder: Path, count: int = 10) -> Capture:
+    """One place, closer to a half: crops of 16 photographs side by side, which show detail at each
+    zoom. COLMAP finds a flat poster, and triangulation angles of several degrees."""
+    row = [np.hstack(pictures(16)[i : i + 4]) for i in range(0, 16, 4)]
+    image = np.vstack(row)
+    images = {}
+    for i in range(count):
+        x, y = (round(side / 4 * i / (count - 1)) for side in (2560, 1920))
+        crop = image[y : 1920 - y, x : 2560 - x]
+        images[f"{i:02d}.png"] = cv2.resize(crop, (800, 600), interpolation=cv2.INTER_AREA)
+    return capture_of(folder, images)
+
+
 def duplicates(folder: Path, count: int = 10) -> Capture:
     """One photograph many times, with other noise in each."""
     image = pictures(1)[0]

@@ -81,6 +81,8 @@ def test_good_captures_pass(statistics: ModelStatistics) -> None:
             {"photographs": 16, "registered": 16, "baseline_over_depth": 0.01, "mapper": "global"},
             "sfm-no-parallax",
         ),
+        # zoom to a half, incremental: 16 of 16 at 0.07 px and 5 degrees, as towards a poster
+        ({"flatness": 0.03, "sideways_share": 0.03}, "sfm-no-parallax"),
         # near-duplicates, darkness: nothing
         ({"registered": 0, "models": (), "points": 0}, "sfm-no-model"),
         # strong blur: 2 registered
@@ -124,6 +126,12 @@ def test_measured_bad_captures_are_caught(changes: dict[str, object], code: str)
 def test_one_photograph_of_sixteen_may_be_left_out_but_not_four() -> None:
     assert codes(BANANA) == []
     assert codes(replace(BANANA, registered=12)) == ["sfm-too-few-registered"]
+
+
+@pytest.mark.parametrize("other", [{"flatness": 0.3}, {"sideways_share": 0.3}])
+def test_a_flat_scene_and_a_walk_straight_on_pass_each_alone(other: dict[str, float]) -> None:
+    zoom = replace(BANANA, flatness=0.03, sideways_share=0.03)
+    assert codes(replace(zoom, **other)) == []  # type: ignore[arg-type]
 
 
 def test_a_few_inconsistent_pairs_are_accepted() -> None:

@@ -11,10 +11,12 @@ import pytest
 from stages.structure.sparse_model import (
     MappingResult,
     SparseModel,
+    flatness,
     load_result,
     model_statistics,
     reprojection_errors,
     save_model,
+    sideways_share,
     triangulation_angles,
     without_implausible_views,
 )
@@ -47,6 +49,17 @@ def test_figures_of_a_half_circle() -> None:
     assert statistics.weak_photographs == 0
     assert (statistics.pairs_checked, statistics.pairs_inconsistent) == (6, 0)
     assert (statistics.cut_points, statistics.cut_views) == (200, 3)
+
+
+def test_a_poster_is_flat_and_a_step_towards_it_is_not_sideways() -> None:
+    model = orbit_model(views=6, points=200)
+    poses = np.repeat(model.world_to_camera[:1], 6, axis=0)
+    poses[:, 2, 3] -= 0.3 * np.arange(6)  # closer along the optical axis
+    straight = replace(model, world_to_camera=poses, points=model.points * [1, 1, 0.02])
+    assert flatness(straight.points) == pytest.approx(0.02, rel=0.3)
+    assert sideways_share(straight) < 1e-6
+    assert flatness(model.points) > 0.8
+    assert 0.5 < sideways_share(model) <= 1.0
 
 
 def test_inconsistent_pairs_are_counted_and_one_is_named() -> None:

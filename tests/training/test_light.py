@@ -14,18 +14,18 @@ from stages.training.build import corrects_light
 from tests.small_scene import small_scene
 
 
-def lit(folder: Path, light: Light | None, disagreement: float) -> Reconstruction:
+def lit(folder: Path, light: Light | None, explained: float) -> Reconstruction:
     """Every second photograph has this light, the others 0."""
     whole = small_scene(folder, views=4).reconstruction
     lights = (light, light and (0.0, 0.0, 0.0)) * 2
     views = (replace(v, light=each) for v, each in zip(whole.views, lights, strict=True))
-    return replace(whole, views=tuple(views), light_disagreement_ev=disagreement)
+    return replace(whole, views=tuple(views), light_explained=explained)
 
 
 @pytest.mark.parametrize(
-    ("ev", "disagreement", "choice", "corrects", "codes"),
+    ("ev", "explained", "choice", "corrects", "codes"),
     [
-        (0.4, 0.02, "auto", True, ["train-light-evened"]),
+        (0.4, 0.8, "auto", True, ["train-light-evened"]),
         (0.4, 0.3, "auto", False, ["train-light-not-evened"]),
         (0.4, 0.3, "on", True, []),
         (0.4, 0.3, "off", False, []),
@@ -38,13 +38,13 @@ def lit(folder: Path, light: Light | None, disagreement: float) -> Reconstructio
 def test_on_is_obeyed_and_auto_says_what_it_leaves(
     tmp_path: Path,
     ev: float | None,
-    disagreement: float,
+    explained: float,
     choice: str,
     corrects: bool,
     codes: list[str],
 ) -> None:
     report = Report()
     light = None if ev is None else (ev, ev, ev)
-    assert corrects_light(lit(tmp_path, light, disagreement), choice, report) is corrects
+    assert corrects_light(lit(tmp_path, light, explained), choice, report) is corrects
     assert [code for code, _ in report.warnings] == codes
     assert report.metrics["light_corrected"] is (corrects and ev is not None)
