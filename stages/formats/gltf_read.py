@@ -51,14 +51,17 @@ def read(path: Path) -> Splats:
                 if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
                     raise BadFileError("its nodes share meshes, which is not supported")
         extras = document["asset"].get("extras")
-        origin = extras.get("splat_origin") if isinstance(extras, dict) else None
+        extras = extras if isinstance(extras, dict) else {}
+        origin = extras.get("splat_origin")
         origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
         if not parts and "meshes" in document:
             raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
         splats = concatenate(parts)
         del parts
         means, origin = recentred(splats.means.astype(np.float64), origin)
-        return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+        splats = replace(splats, means=means, origin=origin)
+        splats = splats.with_antialias(bool(extras.get("antialiased", False)))
+        return check_finite(flipped(splats, reuse=True))
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:

@@ -66,7 +66,8 @@ def blocks(splats: Splats, units: str) -> Iterator[bytes]:
 
 def _header_text(splats: Splats, units: str) -> bytes:
     properties = [f"property float {name}" for name in property_names(splats.sh_degree)]
-    return header_text(units, splats.origin, [f"element vertex {len(splats)}", *properties])
+    elements = [f"element vertex {len(splats)}", *properties]
+    return header_text(units, splats.origin, elements, antialias=splats.draw_settings.antialias)
 
 
 def _table(splats: Splats, rows: slice) -> NDArray[np.float32]:
@@ -108,6 +109,7 @@ def parse(path: Path) -> Splats:
             raise BadFileError(f"it has {count} f_rest properties, not 0, 9, 24 or 45")
         blocks_of_rows = tables(file, path, header)
         splats = allocate(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
+        splats = splats.with_antialias(header.antialias)
         wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
         exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
         for rows, table in blocks_of_rows:

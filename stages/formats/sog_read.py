@@ -28,6 +28,7 @@ from stages.formats.values import allocate, check_finite, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16
+ANTIALIASED = "antialiased"  # a value of `model`
 PER_LINE = 64  # entries of the palette in a line of its image
 _META_LIMIT_BYTES = 1 << 20
 # Real files take 10 bytes a splat. A file that declares more splats than bytes is refused before
@@ -107,9 +108,8 @@ class Source:
         colours, scales = (self._pixels(meta, part, 0, count) for part in ("sh0", "scales"))
         books = [_numbers(meta, part, "codebook", 256) for part in ("sh0", "scales")]
         palette, labels = self._palette(meta, count)
-        splats = replace(
-            allocate(count, math.isqrt(1 + palette.shape[1]) - 1), origin=_origin(meta)
-        )
+        splats = allocate(count, math.isqrt(1 + palette.shape[1]) - 1)
+        splats = replace(splats, origin=_origin(meta)).with_antialias(antialias_of(meta))
         for rows in reported_blocks(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
@@ -216,3 +216,13 @@ def _origin(meta: dict[str, Any]) -> NDArray[np.float64]:
     asset = meta.get("asset")
     origin = asset.get("splat_origin") if isinstance(asset, dict) else None
     return np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
+
+
+def antialias_of(meta: dict[str, Any]) -> bool:
+    """Whether meta.json asks for opacity compensation: `antialias` of the specification, `model` of
+    splat-transform."""
+    said = {bool(meta["antialias"])} if "antialias" in meta else set()
+    said |= {meta["model"] == ANTIALIASED} if "model" in meta else set()
+    if len(said) > 1:
+        raise BadFileError("its meta.json contradicts itself: antialias and model disagree")
+    return True in said

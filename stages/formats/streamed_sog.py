@@ -23,7 +23,7 @@ from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
-from stages.formats.sog_read import Source, in_folder, in_zip
+from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
 from stages.formats.table import CHUNK
 from stages.formats.values import allocate, check_finite, drop_undrawable
 from stages.scene import Splats, View, morton
@@ -258,7 +258,16 @@ def _read(path: Path) -> Splats:
             end += count
     asset = meta.get("asset")
     origin = asset.get("splat_origin") if isinstance(asset, dict) else None
-    return replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    splats = replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    return splats.with_antialias(_antialias(sources))
+
+
+def _antialias(sources: Sequence[Source]) -> bool:
+    """Whether the chunks ask for opacity compensation. Raises BadFileError if they disagree."""
+    found = {antialias_of(source.meta()) for source in sources}
+    if len(found) > 1:
+        raise BadFileError("its chunks disagree about antialiasing")
+    return True in found
 
 
 def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:
