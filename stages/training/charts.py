@@ -17,7 +17,8 @@ ERROR_GAIN = 4.0
 
 
 def contact_sheet(
-    path: Path, rows: list[tuple[str, Sequence[float], NDArray[np.float32], NDArray[np.float32]]]
+    path: Path,
+    rows: Sequence[tuple[str, Sequence[float], NDArray[np.float32], NDArray[np.float32]]],
 ) -> None:
     """A PNG with a numbered row for each (name, PSNR in dB at each of `SIZES`, render,
     photograph): photograph, render, absolute error x 4; and a .txt beside it that says which number

@@ -133,9 +133,9 @@ def _in_words(change: Difference, digits: int, unit: str = "") -> str:
 def fact_rows(comparison: Comparison) -> list[tuple[str, str, str]]:
     """(name, of the first, of the second)."""
     first, second = (candidate.facts for candidate in comparison.candidates)
-    both = comparison.by_size
+    a, b = comparison.by_size
     means = [
-        (f"held-out PSNR, {size} size", *(f"{mean_db(one[size]):.2f} dB" for one in both))
+        (f"held-out PSNR, {size} size", f"{mean_db(a[size]):.2f} dB", f"{mean_db(b[size]):.2f} dB")
         for size in SIZES
     ]
     rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in first | second]
