@@ -57,7 +57,7 @@ def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np
     unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
     try:
         with unpacker.stream_reader(packed) as stream:
-            out = read_rows(stream, 1, count)[0]
+            out = read_rows(stream, count, 1).ravel()
             if count and stream.read(1):
                 raise BadFileError("it holds more than its header declares")
     except zstandard.ZstdError as error:

@@ -138,4 +138,4 @@ def _opacities(splats: Splats, bits: int) -> NDArray[np.float32]:
 def _coarse(fractions: NDArray[np.floating], top: int, dropped: int) -> NDArray[np.floating]:
     """The nearest of 0..top, without the lowest `dropped` bits; `top` itself stays."""
     coarse = 1 << dropped
-    return np.minimum(np.rint(top * fractions / coarse) * coarse, top)
+    return np.asarray(np.minimum(np.rint(top * fractions / coarse) * coarse, top))

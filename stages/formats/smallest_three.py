@@ -35,12 +35,12 @@ def join(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[
 
 def fractions_of(others: NDArray[np.floating]) -> NDArray[np.floating]:
     """-LIMIT..LIMIT as 0..1, which most formats store in integers."""
-    return 0.5 + others / (2 * LIMIT)
+    return np.asarray(0.5 + others / (2 * LIMIT))
 
 
 def from_fractions(fractions: NDArray[np.floating]) -> NDArray[np.floating]:
     """The inverse of `fractions_of`."""
-    return (fractions - 0.5) * 2 * LIMIT
+    return np.asarray((fractions - 0.5) * 2 * LIMIT)
 
 
 def _columns(largest: NDArray[np.integer]) -> NDArray[np.intp]:

@@ -67,7 +67,9 @@ def read(path: Path) -> Splats:
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:
     stream = gzip.GzipFile(fileobj=file)
-    magic, version, count, degree, bits, flags, _ = HEADER.unpack(read_rows(stream, 1, HEADER.size))
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack(
+        read_rows(stream, 1, HEADER.size).tobytes()
+    )
     if magic != MAGIC:
         raise BadFileError("it does not hold 'NGSP'")
     if version not in (2, 3):

@@ -122,7 +122,7 @@ def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
         if not ((p >= 0) & (p <= 1)).all() and not allows_nonfinite():
             raise BadFileError("opacities lie outside 0..1")
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX)
+            return np.asarray(np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX))
 
     return _by_blocks(opacities, logits)
 

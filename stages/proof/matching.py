@@ -62,7 +62,7 @@ def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
             unlike[rows] = _unlike(values[0][index[rows]], values[1][rows])
         far = distance > _APART * extent
         mismatched, most = far | unlike, _MAX_MISMATCHED * n
-        count = np.count_nonzero(mismatched)
+        count = int(np.count_nonzero(mismatched))
         like = np.count_nonzero(unlike) <= most and np.count_nonzero(far) <= n - most
         if like and count < fewest:
             if np.median(distance) <= _EXACT * extent:  # then neighbours can be distinguished

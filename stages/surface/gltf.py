@@ -55,7 +55,9 @@ def _attributes(mesh: Mesh) -> dict[str, Attribute]:
 
 
 def _described(attributes: dict[str, Attribute], indices: Attribute) -> dict[str, Any]:
-    accessors, views, offset = [], [], 0
+    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, Any]] = []
+    offset = 0
     for name, attribute in [*attributes.items(), ("", indices)]:
         target = ARRAY_BUFFER if name else _ELEMENT_ARRAY_BUFFER
         accessors.append(accessor(name, attribute, len(views)))

@@ -282,7 +282,8 @@ class CpuRasteriser:
         starts = get("tile_starts", (n_tiles + 1,), np.int64)
         binning.scan_counts(positions, starts)
         columns = (((total,), np.int32), ((total,), np.int32), ((total,), np.uint16))
-        lists = TileLists(starts, *self.buffers.carve(*columns, name="lists"), places)
+        members, slots, masks_of = self.buffers.carve(*columns, name="lists")
+        lists = TileLists(starts, members, slots, masks_of, places)
         share(
             binning.fill_tiles,
             order,
