@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.capacity.output_formats import drawing_setting
+from stages.formats.table import PLAIN
 from stages.raster.backends import (
     backend_setting,
     device_setting,
@@ -62,8 +64,8 @@ class TrainSettings:
         default=0.0,
         metadata={
             "panel": "Quality and time",
-            "help": "Time limit of training in seconds: makes as many steps as fit, whatever "
-            "--steps says. 0: no limit.",
+            "help": "Time limit in seconds, of the whole command: training makes as many steps as "
+            "fit, whatever --steps says, and pruning as many rounds. 0: no limit.",
             "min": 0,
             "max": 1e7,
         },
@@ -107,6 +109,7 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
+    drawing: str = drawing_setting()
     blocks: str = field(
         default="1",
         metadata={
@@ -129,6 +132,11 @@ class TrainSettings:
     )
     backend: str = backend_setting()
     device: str = device_setting()
+
+    @property
+    def antialias(self) -> bool:
+        """Whether splats are trained to be drawn with opacity compensation."""
+        return self.drawing != PLAIN
 
 
 _TRAINED = "training.json"
@@ -178,7 +186,7 @@ def run(
     views, draw_settings = trainer.held_out, trainer.draw_settings
     write_quality(trainer.render, views, draw_settings, reconstruction, folder, report)
     write_history(trainer.history, trainer.times, folder, report)
-    trained = TrainedSplats(splats, trainer.dropout, overfitted=trainer.dropout)
+    trained = TrainedSplats(splats, trainer.dropout)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
@@ -192,7 +200,8 @@ def run(
 def _report_course(trainer: Trainer, report: Report) -> None:
     """How many steps were made by which backends, and whether densification stopped early."""
     report.metric("steps", trainer.schedule.steps)
-    report.metric("overfitted", trainer.dropout)
+    report.metric("steps_skipped", int(trainer.stepper.skipped))
+    report.metric("dropout", trainer.dropout)
     stopping = trainer.early_stopping
     report.metric("validation_views", len(stopping.rows))
     if stopping.stopped_at:
@@ -272,8 +281,7 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _TRAINED) as temporary:
-        facts = {"dropout": trained.dropout, "overfitted": trained.overfitted}
-        temporary.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps({"dropout": trained.dropout}) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:
@@ -284,7 +292,7 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     try:
         facts = json.loads((folder / _TRAINED).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, bool(facts["dropout"]), bool(facts["overfitted"]))
+        return TrainedSplats(splats, bool(facts["dropout"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SplatError(
             "train-folder-damaged",
@@ -296,5 +304,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=17, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=18, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

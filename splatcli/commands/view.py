@@ -5,7 +5,10 @@ from __future__ import annotations
 import signal
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -41,7 +44,7 @@ def view(
     from stages.formats.values import drop_undrawable
     from stages.viewer.server import LocalServer
 
-    with tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
+    with one_signal_stops(), tempfile.TemporaryDirectory(prefix="splat-view-") as folder:
         with scratch.scratch_in(Path(folder), spare=True):
             splats, pipeline = load_target(target)
             splats, _ = drop_undrawable(splats)
@@ -92,7 +95,6 @@ def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
     from stages.viewer.server import open_in_browser
 
     try:
-        _end_like_ctrl_c()
         console.out.print(server.address)
         console.note(f"{count:,} splats. Ctrl-C ends it.")
         if open_browser and not open_in_browser(server.address):
@@ -102,12 +104,29 @@ def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
         console.note("Ended.")
 
 
-def _end_like_ctrl_c() -> None:
-    """Handle a closed terminal as Ctrl-C, so that the temporary folder is removed."""
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), signal.default_int_handler)
+@contextmanager
+def one_signal_stops() -> Iterator[None]:
+    """Handle the end of the terminal or of the session as Ctrl-C, and ignore what follows the first
+    signal, so that the temporary folder is removed. Signals that are ignored already stay so."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {getattr(signal, name): signal.getsignal(getattr(signal, name)) for name in names}
+    handled = [one for one, handler in before.items() if handler != signal.SIG_IGN]
+
+    def stop(received: int, frame: FrameType | None) -> None:
+        for one in handled:
+            signal.signal(one, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for one in handled:
+        signal.signal(one, stop)
+    try:
+        yield
+    finally:
+        for one in handled:
+            signal.signal(one, before[one])
 
 
 def _port_refused(port: int, error: OSError) -> SplatError:

@@ -1,14 +1,18 @@
-"""Serves a list of files to browsers on this machine, and nothing else.
+"""Serves a list of files to browsers of this user on this machine, and nothing else.
 
-A request's path is only looked up in a dictionary of addresses, so that no request can reach
-another file. An address may also stand for a function that computes the response.
+Every address starts with a random token, so that neither another user of the machine nor another
+site's page can request anything. A request's path is only looked up in a dictionary of addresses,
+so that no request can reach another file. An address may also stand for a function that computes
+the response.
 """
 
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import sys
+import threading
 import webbrowser
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,9 +21,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl
 
 LOOPBACK = "127.0.0.1"
+MOST_CONNECTIONS = 64  # each has a thread; a browser opens six at a time
+TIMEOUT_S = 20.0  # for a client to send its request, or to take 64 kB of the response
 
 
 @dataclass(frozen=True)
@@ -42,11 +48,11 @@ accept."""
 
 
 class LocalServer(ThreadingHTTPServer):
-    """Listens on 127.0.0.1 only.
+    """Listens on 127.0.0.1 only. A connection beyond `MOST_CONNECTIONS` is closed.
 
     Args:
-        items: the responses by address, such as "/" or "/scene.ply". Functions are called in a
-            thread of each request, and only for pages of this server.
+        items: the responses by address behind the token, such as "/" or "/scene.ply". Functions
+            are called in a thread of each request.
         port: 0 for any that is free.
 
     Raises OSError if the port is taken.
@@ -55,13 +61,29 @@ class LocalServer(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(self, items: Mapping[str, Item | Response], port: int = 0) -> None:
-        self.items = dict(items)
+        self.root = f"/{secrets.token_urlsafe(16)}"
+        self.items = {self.root + address: item for address, item in items.items()}
+        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__((LOOPBACK, port), _Handler)
 
     @property
     def address(self) -> str:
         """The URL of the page."""
-        return f"http://{LOOPBACK}:{self.server_port}/"
+        return f"http://{LOOPBACK}:{self.server_port}{self.root}/"
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own, if one is free."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer, and free the thread."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing when a browser closes the connection early."""
@@ -69,6 +91,7 @@ class LocalServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     server: LocalServer
+    timeout = TIMEOUT_S
 
     def do_GET(self) -> None:
         self._answer(with_body=True)
@@ -77,35 +100,24 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=False)
 
     def _answer(self, *, with_body: bool) -> None:
-        # Against DNS rebinding: another site's name may resolve to this machine.
-        host = self.headers.get("Host", "")
-        if host not in (f"{name}:{self.server.server_port}" for name in (LOOPBACK, "localhost")):
-            self.send_error(HTTPStatus.FORBIDDEN)
-            return
-        url = urlsplit(self.path)
-        item = self.server.items.get(url.path)
-        if item is not None and not isinstance(item, Item):
-            # Another site's page could not read the response, but must not cause the work either.
-            if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-                self.send_error(HTTPStatus.FORBIDDEN)
-                return
-            try:
-                item = item(dict(parse_qsl(url.query)))
-            except ValueError:
-                self.send_error(HTTPStatus.BAD_REQUEST)
-                return
+        path, _, query = self.path.partition("?")
         try:
-            source, size = item.open() if item is not None else (None, 0)
-        except OSError:
-            source, size = None, 0
-        if source is None or item is None:
+            item = self.server.items[path]
+            if not isinstance(item, Item):
+                item = item(dict(parse_qsl(query)))
+            source, size = item.open()
+        except (KeyError, OSError):
             self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        except ValueError:
+            self.send_error(HTTPStatus.BAD_REQUEST)
             return
         with source:
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", item.kind)
             self.send_header("Content-Length", str(size))
             self.send_header("Cache-Control", "no-store")
+            self.send_header("Referrer-Policy", "no-referrer")
             self.send_header("X-Content-Type-Options", "nosniff")
             self.end_headers()
             if with_body:

@@ -7,12 +7,14 @@ import re
 import signal
 import socket
 import sys
+import time
 import urllib.request
 import webbrowser
 from pathlib import Path
 
 import pytest
 
+from splatcli.commands.view import one_signal_stops
 from stages import formats
 from stages.viewer import server
 from tests import processes
@@ -40,7 +42,7 @@ def test_a_file_is_served_until_ctrl_c(tmp_path: Path, suffix: str, stop: signal
     command = processes.splat("view", str(path), "--no-open")
     with errors.open("w") as told, running(command, stderr=told, env=environment) as it:
         address = line_of(it).strip()
-        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", address)
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{22}/", address)
         page = urllib.request.urlopen(address, timeout=20).read().decode()
         content = urllib.request.urlopen(address + "scene.ply", timeout=20).read()
         it.send_signal(stop)
@@ -67,6 +69,41 @@ def test_a_server_in_the_background_is_deaf_to_ctrl_c_and_ends_when_it_is_told_t
         assert urllib.request.urlopen(address, timeout=20).status == 200
         it.send_signal(signal.SIGTERM)
         assert it.wait(timeout=20) == 0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_many_signals_leave_no_temporary_folder(tmp_path: Path) -> None:
+    formats.write(tmp_path / "a.ply", many_splats(7))
+    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONUNBUFFERED": "1"}
+    with running(
+        processes.splat("view", str(tmp_path / "a.ply"), "--no-open"), env=environment
+    ) as it:
+        line_of(it)
+        assert len(list(tmp_path.iterdir())) == 2
+        deadline = time.monotonic() + 20
+        while it.poll() is None and time.monotonic() < deadline:
+            it.send_signal(signal.SIGTERM)
+            time.sleep(0.001)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_the_first_signal_stops_and_the_next_do_not_interrupt_what_is_removed() -> None:
+    removed = False
+
+    def stopped_three_times() -> None:
+        nonlocal removed
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+                signal.raise_signal(number)
+            removed = True
+
+    with one_signal_stops(), pytest.raises(KeyboardInterrupt):
+        stopped_three_times()
+    assert removed
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_what_is_missing_is_said(splat, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""One request to a server, as any program could make it."""
+"""One request to a server, as a program that knows its token could make it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ import http.client
 from stages.viewer.server import LocalServer
 
 
-def ask(
-    server: LocalServer, path: str, method: str = "GET", host: str | None = None
-) -> tuple[int, bytes, dict[str, str]]:
+def ask(server: LocalServer, path: str, method: str = "GET") -> tuple[int, bytes, dict[str, str]]:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
-    connection.putrequest(method, path, skip_host=True)
-    connection.putheader("Host", host or f"127.0.0.1:{server.server_port}")
+    connection.putrequest(method, server.root + path)
     connection.endheaders()
     answer = connection.getresponse()
     body = answer.read()

@@ -48,7 +48,7 @@ def test_training_is_served_from_its_start_to_the_end_of_the_run(watcher, said) 
     watcher.started(PRUNE, 5, "has not run yet", False)
     assert said == []
     watcher.started(TRAIN, 4, "has not run yet", False)
-    (address,) = re.findall(r"http://127\.0\.0\.1:\d+/", said[0])
+    (address,) = re.findall(r"http://127\.0\.0\.1:\d+/[\w-]+/", said[0])
     assert b"<title>run</title>" in urllib.request.urlopen(address, timeout=20).read()
     watcher.progressed(TRAIN, "training", 1, 2, {"splats": 250})
     watcher.progressed(PRUNE, "pruning", 1, 9, {})

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.viewer.server import Item, LocalServer
+from stages.viewer.server import MOST_CONNECTIONS, Item, LocalServer
 from tests.viewer.asking import ask
 
 
@@ -68,20 +68,45 @@ def test_nothing_can_be_changed(server: LocalServer, method: str) -> None:
     assert ask(server, "/scene.ply", method)[0] == 501
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "10.0.0.1:80"])
-def test_a_page_elsewhere_with_a_name_for_this_machine_gets_nothing(
-    server: LocalServer, host: str
-) -> None:
-    assert ask(server, "/", host=host)[0] == 403
+@pytest.mark.parametrize("prefix", ["", "/", "/wrong", "/" + 22 * "A"])
+def test_whoever_does_not_know_the_token_gets_nothing(server: LocalServer, prefix: str) -> None:
+    """Another user of this machine, and a page elsewhere whose name resolves to this machine."""
+    host = f"127.0.0.1:{server.server_port}"
+    for path in ("/", "/scene.ply"):
+        for name in (host, "evil.example"):
+            request = f"GET {prefix}{path} HTTP/1.0\r\nHost: {name}\r\n\r\n"
+            with socket.create_connection(("127.0.0.1", server.server_port), timeout=10) as client:
+                client.sendall(request.encode())
+                answer = client.makefile("rb").read()
+            assert answer.split()[1] == b"404"
+            assert b"doctype html>" not in answer.split(b"\r\n\r\n")[0]
+            assert server.root[1:].encode() not in answer
 
 
-def test_this_machine_may_call_itself_localhost(server: LocalServer) -> None:
-    assert ask(server, "/", host=f"localhost:{server.server_port}")[0] == 200
+def test_each_server_has_a_token_of_its_own() -> None:
+    with LocalServer({}) as one, LocalServer({}) as other:
+        assert one.root != other.root
+        assert len(one.root) > 20
 
 
 def test_only_this_machine_is_listened_to(server: LocalServer) -> None:
     assert server.server_address[0] == "127.0.0.1"
-    assert server.address == f"http://127.0.0.1:{server.server_port}/"
+    assert server.address == f"http://127.0.0.1:{server.server_port}{server.root}/"
+
+
+def test_idle_connections_are_bounded_in_number_and_time(
+    server: LocalServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stages.viewer.server._Handler.timeout", 1.0)
+    before = threading.active_count()
+    idle = []
+    for _ in range(300):
+        idle.append(socket.create_connection(("127.0.0.1", server.server_port), timeout=10))
+        assert threading.active_count() - before <= MOST_CONNECTIONS
+    assert all(client.recv(1) == b"" for client in idle)  # closed by the server
+    for client in idle:
+        client.close()
+    assert ask(server, "/")[0] == 200
 
 
 def test_a_port_that_is_taken_is_refused() -> None:
