@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,12 @@ from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
-from stages.capacity.output_formats import DEFAULT_FORMATS, formats_setting, mesh_formats
+from stages.capacity.output_formats import (
+    DEFAULT_FORMATS,
+    drawing_setting,
+    formats_setting,
+    mesh_formats,
+)
 from stages.formats.table import FORMATS
 from stages.raster.backends import (
     backend_of_settings,
@@ -60,6 +65,7 @@ class ExportSettings:
     )
     backend: str = backend_setting()
     device: str = device_setting()
+    drawing: str = drawing_setting()
     mesh_triangles: int = setting(
         50_000, "Triangles of the mesh, at most about.", min=100, max=100_000_000
     )
@@ -82,7 +88,7 @@ def run(
     from stages.proof.prover import Prover, cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
-    quantised: QuantisedSplats = inputs["quantise"]
+    quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
     reconstruction: Reconstruction = inputs["sfm"]
     _clear(folder)
     splats, dropped = drop_undrawable(quantised.splats)

@@ -116,9 +116,13 @@ def _run_stage(
     if "formats" in given:
         given["formats"] = _with_exported(pipeline, given["formats"])
     settings = run_settings.combined({name: base[name]}, given, preset)
-    if name == "export" and "formats" in given:  # `quantise` may have to fine-tune for them
-        formats = (*base["quantise"].formats, *given["formats"])
-        settings["quantise"] = options.changed(base["quantise"], {"formats": formats})
+    if name == "export":  # `quantise` may have to fine-tune for the formats
+        changes: dict[str, Any] = {
+            key: given[key] for key in ("formats", "drawing") if key in given
+        }
+        if "formats" in changes:
+            changes["formats"] = (*base["quantise"].formats, *given["formats"])
+        settings["quantise"] = options.changed(base["quantise"], changes)
     if not is_known:
         settings = {**base, **settings}
     if name == "train" and not (quiet or as_json):

@@ -38,7 +38,7 @@ def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
                 f"programs draw .{row.ending} plainly: splats look too strong there, the more the "
                 "farther away. A viewer that compensates opacities (Spark, Brush, PlayCanvas with "
                 "antialiasing switched on) draws it right. For others, in the run's folder: "
-                f"`splat export --format {row.ending} --drawing plain`.",
+                f"`splat export run --format {row.ending} --drawing plain`.",
             )
         )
     if not row.holds_origin and splats.origin.any():
