@@ -23,6 +23,7 @@ from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 
 HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
+OVERLAP = 1.25  # splats that are removed together cost more: they could replace each other
 MAX_VIEWS = 48  # measured in a round; what the others showed at first goes on counting
 # Of the measured views, the fifth of every eight is set aside: it does not decide which splats are
 # removed, because what others do not need can be seen there, as in views that are not trained on.
@@ -79,6 +80,7 @@ class PruningResult:
         self, removal: Removal, measured: float, psnr_db: Sequence[Psnr], kept: bool
     ) -> None:
         """Record a round that started from `splats`."""
+        predicted = removal.predicted_sse * (OVERLAP if removal.predicted_sse > 0 else 1)
         reduced = (removal.degrees < self.splats.sh_degrees) & ~removal.removed
         self.rounds.append(
             PruningRound(
@@ -86,7 +88,7 @@ class PruningResult:
                 removed=int(removal.removed.sum()),
                 floaters=removal.floaters,
                 sh_reduced=int(reduced.sum()),
-                predicted_sse=round(removal.predicted_sse, 3),
+                predicted_sse=round(predicted, 3),
                 measured_sse=round(measured, 3),
                 psnr_db=round(_mean(psnr_db), 4),
                 kept=kept,
@@ -138,7 +140,7 @@ class Pruner:
         found = PruningResult(splats, rate_distortion, mean_db, mean_db, _least_tenth_db(state))
         planned, share = self._planned_rounds(splats), ROUND_SHARE
         if planned:
-            state = self._remove_harmful(found, state, best_db)
+            state = self._remove_harmful(found, state)
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
             excess = self.targets.excess(found.splats)
@@ -166,13 +168,11 @@ class Pruner:
         self.targets.check_end(found.splats, found.end_db)
         return found
 
-    def _remove_harmful(
-        self, found: PruningResult, state: Contributions, best_db: list[Psnr]
-    ) -> Contributions:
+    def _remove_harmful(self, found: PruningResult, state: Contributions) -> Contributions:
         """Remove splats without which the views are matched better. Of those that seem so one by
         one, some are missed once all are gone: then fewer are removed."""
         share, sh = ROUND_SHARE, state.truncated_sse_change
-        errors = replace(state, picture_change=state.sse_change, truncated_picture_change=truncated)
+        errors = replace(state, picture_change=state.sse_change, truncated_picture_change=sh)
         for _ in range(HALVINGS + 1):
             most = min(max(1, int(share * len(found.splats))), len(found.splats) - 1)
             removal = select_removal(found.splats, errors, self._cameras, -TINY, most, share)
@@ -180,10 +180,9 @@ class Pruner:
                 return state
             fewer = removal.apply(found.splats)
             measured = self._sse_change(fewer, state)
-            after = self._measure(fewer, state, removal)
-            now_db = self._psnr_db(fewer, after)
-            kept = measured <= 0 and self.targets.allows(now_db, best_db)
-            found.add_round(removal, measured, now_db, kept)
+            kept = measured <= 0
+            after = self._measure(fewer, state, removal) if kept else state
+            found.add_round(removal, measured, [after.psnr_db], kept)
             if kept:
                 found.splats = fewer
                 return after
@@ -229,13 +228,13 @@ class Pruner:
     def _select(
         self, found: PruningResult, state: Contributions, excess: int, share: float
     ) -> Removal | None:
-        forced = excess > 0 or self.targets.min_psnr_db > 0
         limit = found.rate_distortion.sse_per_parameter * self.targets.strength
+        if excess > 0 or self.targets.min_psnr_db > 0:
+            limit = math.inf
         most = max(1, int((ROUND_SHARE if excess else share) * len(found.splats)))
         most = min(most, excess or most, len(found.splats) - 1)
-        return select_removal(
-            found.splats, state, self._cameras, math.inf if forced else limit, most, share
-        )
+        first = found.stopped_by != LOSS  # floaters go first, unless that cost too much
+        return select_removal(found.splats, state, self._cameras, limit, most, share, first)
 
 
 def _mean(psnr_db: Sequence[Psnr]) -> float:

@@ -54,6 +54,7 @@ def select_removal(
     sse_per_parameter: float,
     most: int,
     share: float = ROUND_SHARE,
+    floaters_first: bool = True,
 ) -> Removal | None:
     """The splats and SH coefficients that contribute less than `sse_per_parameter` for each of
     their parameters, least first; None if there are none.
@@ -74,11 +75,12 @@ def select_removal(
         sse_per_parameter: the Lagrange multiplier of the rate-distortion cost.
         most: splats to remove.
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
+        floaters_first: whether floaters are removed whatever they contribute.
     """
     seen, near = contributions.view_counts > 0, near_view_frusta(splats, list(cameras))
     measured = cameras[: len(contributions.scene_depth)]
     floaters = near_camera_floaters(splats, contributions, measured)
-    free = floaters | (~seen & ~near)
+    free = (floaters & floaters_first) | (~seen & ~near)
     ratio = contributions.picture_change / parameters_per_splat(splats.sh_degrees)
     ratio[~seen & near] = np.finfo(np.float64).max
     ratio[free] = -np.inf
