@@ -12,7 +12,6 @@ from stages import formats, prune
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.capacity import pruning
-from stages.capacity.targets import WORST_VIEW_DB
 from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.measure.floaters import near_camera_floaters
@@ -99,16 +98,6 @@ def test_the_loss_stays_below_what_the_strength_allows(scene, tmp_path) -> None:
         )
         sizes.append(len(result))
     assert sizes[1] < sizes[0]
-
-
-def test_held_out_views_lose_no_more_than_promised_where_nothing_is_overfitted(
-    scene, tmp_path
-) -> None:
-    result, report = run(scene, scene.splats, tmp_path)
-    assert len(result) < len(scene.splats)
-    assert report.metrics["psnr_change_db"] >= -0.1
-    assert report.metrics["psnr_change_worst_view_db"] >= -WORST_VIEW_DB
-    assert not report.warnings
 
 
 def test_held_out_views_that_lose_more_are_in_a_warning(scene, tmp_path) -> None:

@@ -9,25 +9,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from stages.base.stage import Report
 from stages.capacity.selection import ROUND_SHARE, Removal, select_removal
-from stages.capacity.targets import Psnr, Targets
+from stages.capacity.targets import Targets
 from stages.measure.contribution import Contributions, measure_contributions, squared_error
-from stages.measure.evaluation import EvaluationView, image_renderer, psnr_of_views_db
+from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
 from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 
 HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
-OVERLAP = 1.25  # splats that are removed together cost more: they could replace each other
+# Splats that are removed together cost more than the sum of each alone, because they could replace
+# each other: this factor at first, then what the last round measured whose predicted change was at
+# least SIGNIFICANT (of the squared error).
+OVERLAP, SIGNIFICANT = 1.25, 0.01
 MAX_VIEWS = 48  # measured in a round; what the others showed at first goes on counting
-# Of the measured views, the fifth of every eight is set aside: it does not decide which splats are
-# removed, because what others do not need can be seen there, as in views that are not trained on.
-ASIDE_FROM, ASIDE_EVERY = 4, 8
+HARM_TOLERANCE = 0.5  # of the predicted gain that removing harmful splats may miss
 TINY = float(np.finfo(np.float64).tiny)
 RATE_DISTORTION, LOSS, ROUNDS = "rate_distortion", "loss", "rounds"  # why pruning stopped
 
@@ -77,10 +78,9 @@ class PruningResult:
     rounds: list[PruningRound] = field(default_factory=list)
 
     def add_round(
-        self, removal: Removal, measured: float, psnr_db: Sequence[Psnr], kept: bool
+        self, removal: Removal, predicted: float, measured: float, psnr_db: float, kept: bool
     ) -> None:
         """Record a round that started from `splats`."""
-        predicted = removal.predicted_sse * (OVERLAP if removal.predicted_sse > 0 else 1)
         reduced = (removal.degrees < self.splats.sh_degrees) & ~removal.removed
         self.rounds.append(
             PruningRound(
@@ -90,7 +90,7 @@ class PruningResult:
                 sh_reduced=int(reduced.sum()),
                 predicted_sse=round(predicted, 3),
                 measured_sse=round(measured, 3),
-                psnr_db=round(_mean(psnr_db), 4),
+                psnr_db=round(psnr_db, 4),
                 kept=kept,
             )
         )
@@ -101,8 +101,8 @@ class Pruner:
     """Prunes a model in rounds.
 
     Args:
-        views: training views. All are trained on. Of very many, `MAX_VIEWS` are measured in each
-            round. Some are set aside, see ASIDE_EVERY.
+        views: training views. All are trained on, and all decide what is removed first; of very
+            many, `MAX_VIEWS` are measured in each round.
         targets: what pruning may cost and must reach.
         backend: name of the rasteriser.
         finetuner: on the same views.
@@ -124,23 +124,21 @@ class Pruner:
         every = range(len(self.views))
         self._measured = evenly_spaced(every, MAX_VIEWS)
         self._others = sorted(set(every) - set(self._measured))
-        self._aside = self._measured[ASIDE_FROM::ASIDE_EVERY]
-        del self._measured[ASIDE_FROM::ASIDE_EVERY]
-        # in the order of `Contributions.scene_depth`, and then those set aside
-        rows = (*self._others, *self._measured, *self._aside)
-        self._cameras = [self.finetuner.cameras[i] for i in rows]
+        # in the order of `Contributions.scene_depth`
+        self._cameras = [self.finetuner.cameras[i] for i in (*self._others, *self._measured)]
 
     def prune(self, splats: Splats) -> PruningResult:
         """The smaller model. Raises SplatError for targets that cannot be met, and Interrupted."""
         state = self._measure_all(splats)
-        best_db = self._psnr_db(splats, state)
-        mean_db = _mean(best_db)
+        best_db = state.psnr_db
+        mean_db = float(best_db.mean())
         self.targets.check_start(mean_db)
         rate_distortion = self._rate_distortion(splats)
         found = PruningResult(splats, rate_distortion, mean_db, mean_db, _least_tenth_db(state))
-        planned, share = self._planned_rounds(splats), ROUND_SHARE
+        planned, share, overlap = self._planned_rounds(splats), ROUND_SHARE, OVERLAP
         if planned:
             state = self._remove_harmful(found, state)
+            best_db = max(best_db, state.psnr_db, key=np.mean)
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
             excess = self.targets.excess(found.splats)
@@ -153,36 +151,40 @@ class Pruner:
             steps = self.finetune_steps * self.rounds // planned
             fewer = self.finetuner.finetune(fewer, steps, state.view_counts[~removal.removed])
             after = self._measure(fewer, state, removal)
-            now_db = self._psnr_db(fewer, after)
-            kept = excess > 0 or self.targets.allows(now_db, best_db)
-            found.add_round(removal, measured, now_db, kept)
+            kept = excess > 0 or self.targets.allows(after.psnr_db, best_db)
+            predicted = removal.predicted_sse * (overlap if removal.predicted_sse > 0 else 1)
+            found.add_round(removal, predicted, measured, float(after.psnr_db.mean()), kept)
+            if removal.predicted_sse > SIGNIFICANT * state.sse:
+                overlap = max(1.0, measured / removal.predicted_sse)
             if kept:
                 found.splats, state = fewer, after
                 # what fine-tuning gains is not added to the loss allowed
-                best_db = [max(*pair, key=np.mean) for pair in zip(best_db, now_db, strict=True)]
+                best_db = max(best_db, after.psnr_db, key=np.mean)
                 continue
             share, found.stopped_by = share / 2, LOSS
             if share < ROUND_SHARE / 2**HALVINGS:
                 break
-        found.end_db = _mean(self._psnr_db(found.splats, state))
+        found.end_db = float(state.psnr_db.mean())
         self.targets.check_end(found.splats, found.end_db)
         return found
 
     def _remove_harmful(self, found: PruningResult, state: Contributions) -> Contributions:
         """Remove splats without which the views are matched better. Of those that seem so one by
         one, some are missed once all are gone: then fewer are removed."""
-        share, sh = ROUND_SHARE, state.truncated_sse_change
-        errors = replace(state, picture_change=state.sse_change, truncated_picture_change=sh)
+        share = ROUND_SHARE
         for _ in range(HALVINGS + 1):
             most = min(max(1, int(share * len(found.splats))), len(found.splats) - 1)
-            removal = select_removal(found.splats, errors, self._cameras, -TINY, most, share)
+            removal = select_removal(
+                found.splats, state, self._cameras, -TINY, most, share, by_error=True
+            )
             if removal is None:
                 return state
             fewer = removal.apply(found.splats)
             measured = self._sse_change(fewer, state)
-            kept = measured <= 0
-            after = self._measure(fewer, state, removal) if kept else state
-            found.add_round(removal, measured, [after.psnr_db], kept)
+            predicted = removal.predicted_sse
+            after = self._measure(fewer, state, removal)
+            kept = measured <= predicted + HARM_TOLERANCE * abs(predicted)
+            found.add_round(removal, predicted, measured, float(after.psnr_db.mean()), kept)
             if kept:
                 found.splats = fewer
                 return after
@@ -194,12 +196,7 @@ class Pruner:
 
     def _rate_distortion(self, splats: Splats) -> RateDistortion:
         measured = rate_distortion_of(image_renderer(splats, self.backend), self._measured_views())
-        return measured.scaled(1 + len(self._others) / max(1, len(self._measured)))
-
-    def _psnr_db(self, splats: Splats, state: Contributions) -> list[Psnr]:
-        """Of the measured views, and of those set aside if there are any."""
-        aside = psnr_of_views_db(splats, (self.views[i] for i in self._aside), self.backend)
-        return [state.psnr_db, aside] if len(aside) else [state.psnr_db]
+        return measured.scaled(len(self.views) / max(1, len(self._measured)))
 
     def _measure_all(self, splats: Splats) -> Contributions:
         views = (self.views[i] for i in self._others)
@@ -228,17 +225,13 @@ class Pruner:
     def _select(
         self, found: PruningResult, state: Contributions, excess: int, share: float
     ) -> Removal | None:
+        forced = excess > 0 or self.targets.min_psnr_db > 0
         limit = found.rate_distortion.sse_per_parameter * self.targets.strength
-        if excess > 0 or self.targets.min_psnr_db > 0:
-            limit = math.inf
         most = max(1, int((ROUND_SHARE if excess else share) * len(found.splats)))
         most = min(most, excess or most, len(found.splats) - 1)
-        first = found.stopped_by != LOSS  # floaters go first, unless that cost too much
-        return select_removal(found.splats, state, self._cameras, limit, most, share, first)
-
-
-def _mean(psnr_db: Sequence[Psnr]) -> float:
-    return float(np.concatenate(psnr_db).mean())
+        return select_removal(
+            found.splats, state, self._cameras, math.inf if forced else limit, most, share
+        )
 
 
 def _least_tenth_db(state: Contributions) -> float:
