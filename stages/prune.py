@@ -5,6 +5,8 @@ See `capacity.pruning`. The PSNR of the held-out views before and after is in th
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -75,6 +77,9 @@ class PruneSettings:
         min=0,
         max=100_000,
     )
+    seconds: float = setting(
+        0.0, "Time limit in seconds: no round begins after it. 0: no limit.", min=0, max=1e7
+    )
     backend: str = backend_setting()
     device: str = device_setting()
 
@@ -95,11 +100,14 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     from stages.scene.storage import save_splats
     from stages.training.finetune import FineTuner
 
+    deadline = time.monotonic() + (settings.seconds or math.inf)
     reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
     splats, backend = trained.splats, backend_of_settings(settings)
     training, held_out = (
-        load_evaluation_views(reconstruction.folder, views, splats.draw_settings)
+        load_evaluation_views(
+            reconstruction.folder, views, splats.draw_settings, report.stop_requested
+        )
         for views in split_held_out(reconstruction.views)
     )
     evaluated = held_out or training
@@ -115,7 +123,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
         size_bytes=_size_measure(settings, splats, training, reconstruction),
     )
     limits = settings.rounds, settings.finetune_steps
-    found = Pruner(training, targets, backend, finetuner, *limits, report).prune(splats)
+    pruner = Pruner(training, targets, backend, finetuner, *limits, report, deadline)
+    found = pruner.prune(splats)
     loss_db = before_db - psnr_of_views_db(found.splats, evaluated, backend)
     report_backend(report, backend)
     report.metric("evaluated_side_px", splats.draw_settings.side)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.capacity.output_formats import drawing_setting
+from stages.formats.table import PLAIN
 from stages.raster.backends import (
     backend_setting,
     device_setting,
@@ -62,8 +64,8 @@ class TrainSettings:
         default=0.0,
         metadata={
             "panel": "Quality and time",
-            "help": "Time limit of training in seconds: makes as many steps as fit, whatever "
-            "--steps says. 0: no limit.",
+            "help": "Time limit in seconds, of the whole command: training makes as many steps as "
+            "fit, whatever --steps says, and pruning as many rounds. 0: no limit.",
             "min": 0,
             "max": 1e7,
         },
@@ -107,6 +109,7 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
+    drawing: str = drawing_setting()
     blocks: str = field(
         default="1",
         metadata={
@@ -129,6 +132,11 @@ class TrainSettings:
     )
     backend: str = backend_setting()
     device: str = device_setting()
+
+    @property
+    def antialias(self) -> bool:
+        """Whether splats are trained to be drawn with opacity compensation."""
+        return self.drawing != PLAIN
 
 
 _TRAINED = "training.json"
@@ -296,5 +304,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=18, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=19, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -3,15 +3,17 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from stages import formats, prune
-from stages.base.errors import SplatError
+from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.capacity import pruning
+from stages.measure import contribution, evaluation
 from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.measure.floaters import near_camera_floaters
@@ -55,6 +57,25 @@ def training_db(scene: SmallScene, found: Splats) -> float:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> SmallScene:
     return small_scene(tmp_path_factory.mktemp("photographs"))
+
+
+@pytest.mark.parametrize("drawn", [1, 2, 9])
+def test_stopping_is_heeded_before_the_next_view(scene, tmp_path, monkeypatch, drawn: int) -> None:
+    """Two views are held out, and drawn first; with many views each pass takes long."""
+    report, scored = Report(), []
+
+    def score(*words: Any) -> float:
+        scored.append(1)
+        if len(scored) == drawn:
+            report.stop_requested.set()
+        return 20.0
+
+    for module in (evaluation, contribution):
+        monkeypatch.setattr(module, "capped_psnr_db", score)
+    inputs = {"sfm": scene.reconstruction, "train": TrainedSplats(scene.splats)}
+    with pytest.raises(Interrupted):
+        prune.run(inputs, prune.PruneSettings(), tmp_path, report)
+    assert len(scored) == drawn
 
 
 @pytest.mark.parametrize(
@@ -190,6 +211,11 @@ def test_the_report_says_what_was_removed_and_why(scene, tmp_path) -> None:
     assert "independent" in cost
     assert f"of {len(scene.splats):,}" in removed
     assert "more than is allowed" in why
+
+
+def test_no_round_begins_after_the_time_limit(scene, tmp_path) -> None:
+    _, report = run(scene, scene.splats, tmp_path, seconds=1e-6, strength=100)
+    assert report.metrics["stopped_by"] == "time"
 
 
 def test_no_rounds_remove_nothing(scene, tmp_path) -> None:

@@ -14,9 +14,12 @@ from stages import quantise
 from stages.base.errors import Family, SplatError
 from stages.base.settings import check_settings
 from stages.base.stage import Report
+from stages.formats.quantisation import splats_to_write
+from stages.formats.table import FORMATS
+from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.measure.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.quantise import QuantiseSettings
-from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb
+from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -45,7 +48,7 @@ def test_matt_splats_lose_their_sh_degrees_and_shiny_ones_keep_them(
 ) -> None:
     result, metrics = decide(scene, tmp_path)
     shiny = np.arange(len(scene.splats)) % 10 == 0
-    assert result.degree == 2
+    assert result.splats.sh_degree == 2
     assert (result.splats.sh_degrees[~shiny] == 0).all()
     assert result.splats.sh_degrees[shiny].mean() > 1
     assert metrics["psnr_raw_db"] - metrics["psnr_kept_db"] < 0.02
@@ -62,6 +65,7 @@ def test_the_cost_of_8_bits_without_view_dependence_is_reported(
     _, metrics = decide(scene, tmp_path)
     assert 25 < metrics["psnr_splat32_db"] < metrics["psnr_raw_db"] - 0.05
     assert 32 < metrics["psnr_raw_db"] < 36  # noise of 0.02 is 34.0 dB
+    assert metrics["psnr_kept_quarter_db"] < metrics["psnr_kept_db"]  # splats thicken
 
 
 def test_a_scene_without_view_dependence_keeps_sh_degree_0(
@@ -70,7 +74,7 @@ def test_a_scene_without_view_dependence_keeps_sh_degree_0(
     matt = replace(scene.splats.with_sh_degree(0).with_sh_degree(2))
     flat = SmallScene(matt, scene.reconstruction)
     result, metrics = decide(flat, tmp_path)
-    assert result.degree == result.splats.sh_degree == metrics["sh_degree"] == 0
+    assert result.splats.sh_degree == metrics["sh_degree"] == 0
     # 14 numbers instead of 38
     assert metrics["kept_mib"] == pytest.approx(metrics["raw_mib"] * 14 / 38, abs=2e-3)
 
@@ -78,11 +82,11 @@ def test_a_scene_without_view_dependence_keeps_sh_degree_0(
 def test_no_allowance_keeps_what_shows(scene: SmallScene, tmp_path: Path) -> None:
     result, metrics = decide(scene, tmp_path, max_loss_db=0.0)
     assert metrics["psnr_kept_db"] >= metrics["psnr_raw_db"]
-    assert result.degree == 2
+    assert result.splats.sh_degree == 2
 
 
 def test_a_large_allowance_keeps_nothing(scene: SmallScene, tmp_path: Path) -> None:
-    assert decide(scene, tmp_path, max_loss_db=50.0)[0].degree == 0
+    assert decide(scene, tmp_path, max_loss_db=50.0)[0].splats.sh_degree == 0
 
 
 def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(
@@ -98,18 +102,55 @@ def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(
     assert contents[0] == contents[1]
     loaded = quantise.load(folders[0])
     np.testing.assert_array_equal(loaded.splats.sh, result.splats.sh)
-    assert (loaded.degree, loaded.decisions) == (result.degree, result.decisions)
+    assert loaded.decisions == result.decisions
     assert set(loaded.finetuned) == {"splat", "sog"}
     for name, splats in loaded.finetuned.items():
         np.testing.assert_array_equal(splats.means, result.finetuned[name].means)
 
 
 def test_a_format_that_does_not_round_changes_no_setting() -> None:
-    assert QuantiseSettings(formats=("ply", "sog", "mesh", "splat")).formats == ("splat", "sog")
+    assert QuantiseSettings(formats=("ply", "sog", "mesh", "splat")) == QuantiseSettings(
+        formats=("splat", "usdc", "sog", "glb")
+    )
+    assert QuantiseSettings(formats=("html", "mesh")).formats == ()
     assert QuantiseSettings(formats=("sog", "splat")) == QuantiseSettings(formats=("splat", "sog"))
     check_settings(QuantiseSettings(formats=("ply",)))
     with pytest.raises(SplatError, match="--format ksplat"):
         check_settings(QuantiseSettings(formats=("ply", "ksplat")))
+
+
+def test_formats_that_are_drawn_plainly_get_splats_that_were_finetuned_to_it(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    small = replace(scene.splats, log_scales=scene.splats.log_scales - 1).with_antialias(True)
+    antialiased = SmallScene(small, scene.reconstruction)
+    result, metrics = decide(antialiased, tmp_path, formats=("glb",))
+    assert result.plain is not None
+    assert splats_to_write(FORMATS["glb"], result) is result.plain
+    assert not result.plain.draw_settings.antialias
+    assert splats_to_write(FORMATS["html"], result) is result.splats
+    assert result.splats.draw_settings.antialias
+    views = split_held_out(scene.reconstruction.views)[1]
+    held_out = load_evaluation_views(scene.reconstruction.folder, views, small.draw_settings)
+    as_they_are_db = mean_psnr_db(result.splats.with_antialias(False), held_out, "cpu")
+    assert metrics["psnr_plain_db"] > as_they_are_db + 1
+    assert quantise.load(tmp_path).plain is not None
+
+
+@pytest.mark.parametrize(
+    ("antialias", "settings"),
+    [
+        (False, {"formats": ("ply", "splat")}),
+        (True, {"formats": ("html",)}),
+        (True, {"formats": ("ply",), "drawing": "antialiased"}),
+    ],
+)
+def test_nothing_is_finetuned_to_plain_drawing_without_need(
+    antialias: bool, settings: dict[str, Any], scene: SmallScene, tmp_path: Path
+) -> None:
+    splats = scene.splats.with_antialias(antialias)
+    result, _ = decide(SmallScene(splats, scene.reconstruction), tmp_path, **settings)
+    assert result.plain is None
 
 
 def test_the_report_says_what_finetuning_to_a_format_gained(
@@ -142,7 +183,7 @@ def test_splats_that_cannot_be_drawn_do_not_stop_it(scene: SmallScene, tmp_path:
 
 def test_no_splats_at_all_do_not_stop_it(scene: SmallScene, tmp_path: Path) -> None:
     nothing = scene.splats.take(np.zeros(len(scene.splats), bool))
-    assert decide(SmallScene(nothing, scene.reconstruction), tmp_path)[0].degree == 0
+    assert decide(SmallScene(nothing, scene.reconstruction), tmp_path)[0].splats.sh_degree == 0
 
 
 def test_a_missing_photograph_is_named(scene: SmallScene, tmp_path: Path) -> None:
@@ -156,7 +197,7 @@ def test_a_damaged_decision_is_an_error_of_the_run_folder(
     scene: SmallScene, tmp_path: Path
 ) -> None:
     decide(scene, tmp_path)
-    (tmp_path / "decisions.json").write_text(json.dumps({"sh_degree": "x"}))
+    (tmp_path / "decisions.json").write_text('{"sh_degree": ')
     with pytest.raises(SplatError) as caught:
         quantise.load(tmp_path)
     assert caught.value.family == Family.RUN_FOLDER

@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.text import counted
-from stages.capacity.pruning import LOSS, RATE_DISTORTION, PruningResult
+from stages.capacity.pruning import LOSS, RATE_DISTORTION, TIME, PruningResult
 from stages.capacity.targets import WORST_VIEW_DB, Targets
 from stages.scene import TrainedSplats
 
 _REASONS = {
     RATE_DISTORTION: "the remaining splats save more error than their bits cost",
     LOSS: "removing more would lose more than is allowed",
+    TIME: "its share of --seconds was over",
 }
 
 

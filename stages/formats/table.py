@@ -13,6 +13,8 @@ from pathlib import Path
 
 from stages.base.errors import Family, SplatError
 
+AUTO, PLAIN, ANTIALIASED = DRAWINGS = "auto", "plain", "antialiased"
+
 
 @dataclass(frozen=True)
 class Format:
@@ -22,15 +24,15 @@ class Format:
     Attributes:
         ending: what a file's name ends in, without the dot; also the value of `--format`.
         opens_in, keeps: two cells of README's table.
-        writer: (path, splats, *, units) -> number of splats that could not be drawn and were left
-            out. It also takes `views` if `takes_views`, and `coarser` if `streamed`.
-        reader: (path) -> Splats, y down; raises SplatError "splats-unreadable".
+        writer: (path, splats, *, units), with drawable splats. It also takes `views` if
+            `takes_views`, and `coarser` if `streamed`.
+        reader: (path) -> Splats, y down; raises BadFileError, or what damaged bytes cause.
         order: (splats) -> [N] the row of `splats` that each row of the file comes from; "" if the
             format keeps the order.
         quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses
             repeated values; "" for the others.
-        out_of_range: (splats) -> the number of splats that lie farther out than a file can hold;
-            "" for formats that hold any position.
+        position_loss: (splats) -> what far splats do to the positions, as the end of "the file
+            ...", or ""; "" for formats in which they do nothing.
         loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
             back as float32.
         sh_degree: the highest SH degree that is kept.
@@ -40,6 +42,8 @@ class Format:
         sidecar: the suffix of a file beside it that belongs to it; "" if there is none.
         takes_views: whether the file also holds cameras.
         needs_finetuning: whether rounding is so coarse that splats are fine-tuned to it.
+        antialias: whether programs that the format is for draw it with opacity compensation.
+        says_antialias: whether a file says that its splats are to be drawn so.
         streamed: whether the asset has levels of detail. Its file name is `ending` alone, its
             chunks lie in folders beside it, and a folder holds one such asset.
     """
@@ -51,7 +55,7 @@ class Format:
     reader: str
     order: str = ""
     quantiser: str = ""
-    out_of_range: str = ""
+    position_loss: str = ""
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
@@ -59,11 +63,18 @@ class Format:
     sidecar: str = ""
     takes_views: bool = False
     needs_finetuning: bool = False
+    antialias: bool = False
+    says_antialias: bool = True
     streamed: bool = False
 
     def matches(self, name: str) -> bool:
         """Whether a file of this lower-case name is of this format."""
         return name == self.ending if self.streamed else name.endswith("." + self.ending)
+
+    def antialiased(self, drawing: str) -> bool:
+        """Whether a file of the format holds splats for opacity compensation, under a choice among
+        `DRAWINGS`."""
+        return drawing == ANTIALIASED or (drawing == AUTO and self.antialias)
 
     def file_name(self, stem: str) -> str:
         """The name of a file of this format."""
@@ -120,6 +131,7 @@ TABLE = (
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
         needs_finetuning=True,
+        says_antialias=False,
         holds_origin=False,
     ),
     _GLB,
@@ -152,10 +164,11 @@ TABLE = (
         keeps="sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
-        out_of_range="stages.formats.spz:count_out_of_range",
+        position_loss="stages.formats.spz:position_loss",
         holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
+        antialias=True,
         y_up=True,
     ),
     Format(
@@ -166,6 +179,7 @@ TABLE = (
         reader="stages.formats.sog_read:read",
         order="stages.scene.morton:morton_order",
         quantiser="stages.formats.quantisation:quantise_for_sog",
+        position_loss="stages.formats.sog:position_loss",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         needs_finetuning=True,
     ),
@@ -188,6 +202,7 @@ TABLE = (
         writer="stages.formats.html:write",
         reader="stages.formats.html:read",
         takes_views=True,
+        antialias=True,
     ),
 )
 BY_ENDING = {row.ending: row for row in TABLE}

@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
+from stages.base.parent import how_it_ended
+from stages.base.usd_path import accepted_path
 from stages.formats.values import (
     allows_nonfinite,
     check_finite,
@@ -45,11 +47,10 @@ def read(path: Path) -> Splats:
     """All Gaussian splats of a USD file, y down, float32.
 
     Prims may be translated and uniformly scaled; the up axis must be y. Positions far from zero
-    keep their precision in `origin`. Raises SplatError "splats-unreadable" for a damaged file, one
-    without splats, one that refers to other files, or one with rotated prims.
+    keep their precision in `origin`. Raises BadFileError for a damaged file, one without splats,
+    one that refers to other files, or one with rotated prims.
     """
-    path = Path(path)
-    with reading(path), tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "splats.bin"
         command = [
             sys.executable,
@@ -74,26 +75,36 @@ def read(path: Path) -> Splats:
         if child.returncode == _REFUSED:
             raise BadFileError(child.stdout.decode("utf-8", "replace").strip()[:300])
         if child.returncode != 0:
-            raise BadFileError("it is damaged: the USD library crashed on it")
+            how = how_it_ended(child.returncode)
+            raise BadFileError(f"it is damaged: the USD library ended with {how} on it")
         return load_splats(output)
 
 
 def parse(path: Path) -> Splats:
     """`read`, in this process. Raises BadFileError, or what the USD library raises."""
-    stage = _open(path)
+    with accepted_path(path) as name:
+        return _parsed(_open(name))
+
+
+def _parsed(stage: Any) -> Splats:
     parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
     if not parts:
         raise BadFileError(f"it holds no {_TYPE}")
     splats = concatenate(parts)
     del parts
-    means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
-    return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+    note = stage.GetRootLayer().customLayerData.get("splat")
+    note = note if isinstance(note, dict) else {}
+    origin = np.array(note.get("origin", np.zeros(3)), np.float64).reshape(3)
+    means, origin = recentred(splats.means.astype(np.float64), origin)
+    splats = replace(splats, means=means, origin=origin)
+    splats = splats.with_antialias(bool(note.get("antialiased", False)))
+    return check_finite(flipped(splats, reuse=True))
 
 
-def _open(path: Path) -> Any:
+def _open(name: str) -> Any:
     from pxr import Sdf, Usd, UsdGeom
 
-    layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    layer = Sdf.Layer.OpenAsAnonymous(name)
     if layer is None:
         raise BadFileError("it is not USD")
     if layer.GetCompositionAssetDependencies():
@@ -115,12 +126,6 @@ def _refuse_arcs(layer: Any) -> None:
             raise BadFileError("its prims are made of each other, which is not supported")
 
     layer.Traverse("/", check)
-
-
-def _origin(stage: Any) -> NDArray[np.float64]:
-    note = stage.GetRootLayer().customLayerData.get("splat", {})
-    origin = note.get("origin") if isinstance(note, dict) else None
-    return np.zeros(3) if origin is None else np.array(origin, np.float64).reshape(3)
 
 
 def _splats(prim: Any) -> Splats:

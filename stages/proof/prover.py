@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.formats import BY_ENDING, format_of
-from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
+from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
@@ -103,6 +103,20 @@ class Prover:
         pictures = tuple(draw(camera).image for camera in cameras)
         return cls(splats, drawn, cameras, pictures, backend, source_format)
 
+    def with_original(self, splats: Splats) -> Prover:
+        """This prover for other values of the same splats. The pictures stay, so that all losses
+        show in them, unless `splats` are to be drawn in another way."""
+        if splats.draw_settings.antialias == self.splats.draw_settings.antialias:
+            return replace(self, splats=splats)
+        return Prover.of(splats, self.cameras, self.backend, self.source_format)
+
+    def plain_drawing_db(self) -> float:
+        """Mean PSNR between the pictures and those of a viewer that does not compensate opacities,
+        of splats that are to be drawn with compensation."""
+        plain = self.with_original(self.splats.with_antialias(False))
+        pairs = zip(plain.pictures, self.pictures, strict=True)
+        return float(np.mean([capped_psnr_db(a, np.clip(b, 0.0, 1.0)) for a, b in pairs]))
+
     def prove(self, path: Path, exact: bool = False) -> Proof:
         """Read `path` with an independent reader, draw it and compare. Nothing is raised for a
         wrong file.
@@ -149,7 +163,10 @@ class Prover:
         instead of the splats into ours, so that the rotation of positions, quaternions and SH is
         checked by other code than itself."""
         drawn = self.drawn if isinstance(self.drawn, slice) else self.drawn[rows]
-        draw = renderer(content.splats.take(drawn), raster_settings_of(self.splats), self.backend)
+        settings = replace(
+            raster_settings_of(self.splats), antialias=content.splats.draw_settings.antialias
+        )
+        draw = renderer(content.splats.take(drawn), settings, self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
             capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))
@@ -173,20 +190,8 @@ def _central_rows(splats: Splats) -> NDArray[np.bool_] | slice:
 def _drawable(content: FileContent) -> FileContent:
     """The drawable splats. Infinite logarithms of flat and opaque splats become finite, as in our
     readers."""
-    splats = content.splats
-    if not (np.isfinite(splats.log_scales).all() and np.isfinite(splats.opacity_logits).all()):
-        splats = replace(
-            splats,
-            log_scales=np.where(
-                np.isneginf(splats.log_scales), np.float32(LOG_SCALE_MIN), splats.log_scales
-            ),
-            opacity_logits=np.where(
-                np.isinf(splats.opacity_logits),
-                np.clip(splats.opacity_logits, LOGIT_MIN, LOGIT_MAX),
-                splats.opacity_logits,
-            ),
-        )
-    return replace(content, splats=drop_undrawable(splats)[0])
+    with nonfinite_allowed():
+        return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])
 
 
 def _message(error: Exception) -> str:

@@ -6,6 +6,7 @@ its own contents, so that a manifest edited by hand is detected.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -89,7 +90,7 @@ class Manifest:
             data["input_files"] = {k: records_from_data(v) for k, v in files.items()}
             return cls(**{f.name: data[f.name] for f in fields(cls)})
         except (KeyError, TypeError, AttributeError) as error:
-            raise _edited(folder / MANIFEST) from error
+            raise edited(folder / MANIFEST) from error
 
 
 def plain(value: Any) -> Any:
@@ -115,7 +116,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
-        json.dump(plain(data), file, indent=1, ensure_ascii=False)
+        json.dump(plain(data), file, indent=1)
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
@@ -140,6 +141,8 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:  # reported where the name is used
+            raise
         raise SplatError(
             "run-folder-unreadable",
             given=f"{path} cannot be read: {error.strerror}.",
@@ -148,9 +151,9 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
             family=Family.RUN_FOLDER,
         ) from error
     except (ValueError, RecursionError) as error:
-        raise _edited(path) from error
+        raise edited(path) from error
     if not isinstance(data, dict) or not isinstance(data.get("schema"), int):
-        raise _edited(path)
+        raise edited(path)
     if data["schema"] < SCHEMA:
         raise SplatError(
             "run-folder-older",
@@ -169,7 +172,7 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
         )
     digest = data.pop("digest", None)
     if digest != _seal(data):
-        raise _edited(path)
+        raise edited(path)
     return data
 
 
@@ -178,7 +181,8 @@ def _seal(body: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
-def _edited(path: Path) -> SplatError:
+def edited(path: Path) -> SplatError:
+    """The error for a file of a run folder that is not as splat wrote it."""
     what = f"the folder {path.parent}" if path.name == MANIFEST else path
     again = "its stage runs again" if path.name == MANIFEST else "it is written again"
     return SplatError(

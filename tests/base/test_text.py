@@ -1,10 +1,10 @@
-"""Words that depend on a number."""
+"""Words that depend on a number, and names that a terminal can show."""
 
 from __future__ import annotations
 
 import pytest
 
-from stages.base.text import counted
+from stages.base.text import counted, printable, printable_name
 
 
 @pytest.mark.parametrize(
@@ -17,3 +17,23 @@ def test_noun_agrees_with_its_number(count: int, text: str) -> None:
 def test_plural_that_takes_more_than_an_s() -> None:
     assert counted(1, "box", "boxes") == "1 box"
     assert counted(2, "box", "boxes") == "2 boxes"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("été 雪.jpg", "été 雪.jpg"),
+        ("a\x1b[31mb", "a\\x1b[31mb"),
+        ("bell\x07, C1 \x9b2J", "bell\\x07, C1 \\x9b2J"),
+        ("gnp.\u202ejpg", "gnp.\\u202ejpg"),
+        ("bad\udcff.jpg", "bad\\xff.jpg"),
+        ("two\nlines", "two\nlines"),
+    ],
+)
+def test_what_a_terminal_would_act_on_is_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown
+    shown.encode()
+
+
+def test_printable_name_is_one_line() -> None:
+    assert printable_name("two\nlines") == r"two\nlines"
