@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.base.text import reason_of
 from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
@@ -269,7 +270,7 @@ def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     try:
         rows = PlyData.read(str(path))["vertex"].data
     except PlyParseError as error:
-        raise BadFileError(f"it is damaged ({error})") from error
+        raise BadFileError(f"it is damaged ({reason_of(error)})") from error
     points = np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
     if not np.isfinite(points).all():
         raise BadFileError("a point has a value that is not a number")

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
+from stages.base.text import reason_of
 from stages.formats.values import (
     allows_nonfinite,
     check_finite,
@@ -178,7 +179,7 @@ def main(arguments: list[str]) -> int:
         print(error)
         return _REFUSED
     except Exception as error:  # errors of the library, and consequences of damaged values
-        print(f"it is damaged ({' '.join(str(error).split())[:160]})")
+        print(f"it is damaged ({reason_of(error)})")
         return _REFUSED
     save_splats(output, splats)
     return 0

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
+from stages.base.text import reason_of
 from stages.formats import BY_ENDING, format_of
 from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
@@ -115,7 +116,7 @@ class Prover:
             content = _drawable(checks.read_back(path))
             errors = checks.CHECKS[row.ending].validate(path)
         except Exception as error:  # whatever the reader raises: the file is wrong
-            return Proof(0, {}, f"another reader refused it ({_message(error)})")
+            return Proof(0, {}, f"another reader refused it ({reason_of(error)})")
         count = len(content.splats)
         if errors:
             return Proof(count, {}, f"its validator says: {errors[0]}")
@@ -187,7 +188,3 @@ def _drawable(content: FileContent) -> FileContent:
             ),
         )
     return replace(content, splats=drop_undrawable(splats)[0])
-
-
-def _message(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -11,7 +11,7 @@ from stages.run.digests import combined_digest, record_files
 from stages.run.lock import HOLDER, LOCK, locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.planning import PHOTOS
-from stages.run.runfile import RUN_FILE, RunFile, holds_stages
+from stages.run.runfile import RUN_FILE, RunFile, holds_stages, stage_folder_around
 
 # What a run that stopped before its run file was complete may leave.
 _WITHOUT_RUN_FILE = (LOCK, HOLDER, RUN_FILE + ".tmp")
@@ -81,12 +81,15 @@ def _check_photos(folder: Path, photos: Path) -> None:
             wanted="A folder of photographs.",
             hint="Check the path; put quotes around one with spaces.",
         )
-    if is_run_folder(photos):
+    stage_folder = stage_folder_around(photos)
+    if stage_folder is not None or is_run_folder(photos):
+        what = f"belongs to {stage_folder}, which splat made" if stage_folder else "is a run folder"
+        run = stage_folder.parent if stage_folder else photos
         raise SplatError(
             "photographs-run-folder",
-            given=f"{photos} is a run folder that splat made, not a folder of photographs.",
-            wanted="A folder of photographs.",
-            hint=f"To continue the run: splat process {photos}",
+            given=f"{photos} {what}.",
+            wanted="A folder of photographs as they were taken.",
+            hint=f"To continue the run: splat process {run}",
             family=Family.USAGE,
         )
     if folder.resolve().is_relative_to(photos.resolve()):
