@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import raster_settings_of, render
+from stages.raster.draw import raster_settings_of, render, renderer
 from stages.scene import Camera, Splats, look_at
 
 MIN_VIEWS = 3  # one shows a surface, two measure its depth, the third confirms it
@@ -24,14 +24,15 @@ PATCHES_ACROSS = 32  # along the diagonal of the middle nine tenths of what is s
 MIN_PX = 2.0  # summed blend weight: a patch that covers less of a picture is not seen
 MIN_SHARE = 0.1  # of the area that the best view shows
 SUBJECT_SHARE = 0.5  # of the largest view count: patches seen so often are the subject
-_SIDE_PX = 240  # of the pictures that visibility is measured in
+SIDE_PX = 240  # of the pictures that visibility is measured in
 _PROBE_PX = 96
 INWARD_ELEVATIONS_DEG = (0.0, 80.0)  # where somebody may hold a camera around a subject
 OUTWARD_ELEVATIONS_DEG = (-50.0, 50.0)  # where cameras look outward
 MIN_GAP_DEG = 40.0  # to the nearest view
 _DIRECTIONS = 400
-_CONE_DEG = 15.0
-_BLOCKED_SHARE = 0.1  # of a cone's cross-section
+_PROBED_SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)  # of the way from the middle to a camera
+_IN_FRONT = 0.97  # of a surface's depth: nearer than that is in front of it
+_UNSEEN, _HIDDEN, _FREE = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Patches:
 
 def patches_of(splats: Splats, cameras: Sequence[Camera], backend: str) -> Patches:
     """The patches that the cameras see of `splats`; none where they see nothing."""
-    small = [camera.fitted(_SIDE_PX) for camera in cameras]
+    small = [camera.fitted(SIDE_PX) for camera in cameras]
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
     settings = raster_settings_of(splats)
     pixels = np.zeros((len(splats), len(small)), np.float32)
@@ -222,16 +223,36 @@ class Gap:
     nearest: int
 
 
-def find_gaps(layout: CameraLayout, patches: Patches, most: int = 3) -> tuple[Gap, ...]:
+def surface_depths(
+    splats: Splats, cameras: Sequence[Camera], backend: str
+) -> list[NDArray[np.float64]]:
+    """[H, W] of each picture; inf where it shows no surface."""
+    drawn = map(renderer(splats, backend=backend), cameras)
+    return [np.where(one.alpha > 0.5, one.depth, np.inf) for one in drawn]
+
+
+def find_gaps(
+    layout: CameraLayout,
+    cameras: Sequence[Camera],
+    depths: Sequence[NDArray[np.float64]],
+    most: int = 3,
+) -> tuple[Gap, ...]:
     """The emptiest directions, largest gap first; each is found as if the gaps before it were
     filled. Directions where a surface is in the way, or where nobody could hold a camera, are left
-    out."""
+    out.
+
+    Args:
+        layout: of the training views.
+        cameras: those that surfaces are measured from.
+        depths: [H, W] of the surfaces in the picture of each camera; inf where there is none.
+        most: how many gaps to return.
+    """
     tried = _sphere(_DIRECTIONS)
     elevations = layout.elevations_deg(tried)
     lowest, highest = INWARD_ELEVATIONS_DEG if layout.inward else OUTWARD_ELEVATIONS_DEG
     tried = tried[(elevations >= lowest) & (elevations <= highest)]
     if layout.inward:
-        tried = tried[[not _blocked(layout, patches, direction) for direction in tried]]
+        tried = tried[_reachable(layout, tried, cameras, depths)]
     known, found = layout.directions, []
     for _ in range(most):
         if not len(tried):
@@ -256,15 +277,30 @@ def _sphere(count: int) -> NDArray[np.float64]:
     return np.stack([across * np.cos(turn), y, across * np.sin(turn)], axis=1)
 
 
-def _blocked(layout: CameraLayout, patches: Patches, direction: NDArray[np.float64]) -> bool:
-    """Whether a surface is between the middle and where a camera would be."""
-    offsets = patches.centres - layout.middle
-    along = offsets @ direction
-    beside = np.linalg.norm(offsets - along[:, None] * direction, axis=1)
-    cone = np.tan(np.radians(_CONE_DEG))
-    inside = (along > 0.5 * layout.distance) & (along < layout.distance) & (beside < cone * along)
-    cross_section = np.pi * (cone * layout.distance) ** 2
-    return bool(patches.area[inside].sum() > _BLOCKED_SHARE * cross_section)
+def _reachable(
+    layout: CameraLayout,
+    directions: NDArray[np.float64],
+    cameras: Sequence[Camera],
+    depths: Sequence[NDArray[np.float64]],
+) -> NDArray[np.bool_]:
+    """[D] where no surface hides the way from the middle to a camera in each direction [D, 3].
+
+    Of the points on the outer half of that way, the outermost that is inside any picture decides:
+    it is hidden if it lies behind a surface in every picture that it is in. depths: of the surfaces
+    in each camera's picture.
+    """
+    state = np.full(len(directions), _UNSEEN)
+    for share in _PROBED_SHARES:
+        points = layout.middle + share * layout.distance * directions
+        found = np.full(len(points), _UNSEEN)
+        for camera, depth in zip(cameras, depths, strict=True):
+            pixels, z = camera.project(points)
+            inside = np.flatnonzero((z > 0) & camera.shows(pixels))
+            column, row = pixels[inside].astype(int).T
+            free = z[inside] * _IN_FRONT < depth[row, column]
+            found[inside] = np.maximum(found[inside], np.where(free, _FREE, _HIDDEN))
+        state = np.where(state == _UNSEEN, found, state)
+    return np.asarray(state != _HIDDEN)
 
 
 @dataclass(frozen=True)

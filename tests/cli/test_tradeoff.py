@@ -75,7 +75,7 @@ def test_the_trade_is_printed_and_its_report_lies_in_the_run(splat: Splat) -> No
     assert Path("run/tradeoff/report.html").is_file()
     assert str(Path("run/tradeoff/report.html")) in result.stdout
     assert "CPU" in result.stdout  # the log of training has times
-    assert "nothing was fine-tuned" in result.stdout
+    assert "splat prune --max-splats" in result.stdout
     status = json.loads(splat("status", "run", "--json").stdout)
     assert {row["state"] for row in status["stages"]} == {"finished"}
 

@@ -16,7 +16,14 @@ from stages import formats
 from stages.formats.quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
 from stages.measure.contribution import Contributions, measure_contributions
-from stages.measure.coverage import camera_layout, find_gaps, patches_of, poorly_covered_regions
+from stages.measure.coverage import (
+    SIDE_PX,
+    camera_layout,
+    find_gaps,
+    patches_of,
+    poorly_covered_regions,
+    surface_depths,
+)
 from stages.measure.evaluation import (
     EvaluationView,
     Score,
@@ -58,6 +65,8 @@ COVERAGE_VIEWS = 200  # at most, that coverage is measured by
 FRAMED_VIEWS = 3  # that extreme framings start from
 
 ProgressCallback = Callable[[str], None]
+FineTune = Callable[[Splats, NDArray[np.int32]], Splats]
+"""Continues the training of splats [N] that are visible in so many views [N] each."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,7 @@ class TradeoffInputs:
         history: as training logged it.
         exported: formats that the run wrote.
         quantised: the precision that was chosen for files; None where none was.
+        finetune: what `splat prune` does after each removal; None does nothing.
     """
 
     splats: Splats
@@ -87,6 +97,7 @@ class TradeoffInputs:
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
     quantised: QuantisedSplats | None = None
+    finetune: FineTune | None = None
 
     @property
     def on_cpu(self) -> bool:
@@ -183,7 +194,8 @@ def _pruned(
     contributions: Contributions,
     progress: ProgressCallback,
 ) -> list[OperatingPoint]:
-    """Fewer and fewer splats: those that change the training pictures least are removed first.
+    """Fewer and fewer splats, as `splat prune --max-splats` leaves them: those that change the
+    training pictures least are removed first, and the rest is fine-tuned each time.
     contributions: of all splats."""
     splats, points = inputs.splats, []
     for share in SHARES:
@@ -194,7 +206,10 @@ def _pruned(
         if len(splats) < len(inputs.splats):
             contributions = measure_contributions(splats, inputs.training, inputs.backend)
         order = np.argsort(-contributions.picture_change, kind="stable")
-        splats = splats.take(np.sort(order[:count]))
+        kept = np.sort(order[:count])
+        splats = splats.take(kept)
+        if inputs.finetune is not None:
+            splats = inputs.finetune(splats, contributions.view_counts[kept])
         points.append(_point(inputs, f"{share:.0%}", splats, _scores(inputs, splats), own))
     return points
 
@@ -211,12 +226,13 @@ def measure_coverage(
     cameras = tuple(splats.draw_settings.camera(view.camera) for view in chosen)
     patches = patches_of(splats, cameras, backend)
     layout = camera_layout(cameras, patches, levelled) if len(patches.centres) else None
+    small = [camera.fitted(SIDE_PX) for camera in cameras]
     return Coverage(
         names=tuple(view.name for view in chosen),
         cameras=cameras,
         patches=patches,
         layout=layout,
-        gaps=find_gaps(layout, patches) if layout else (),
+        gaps=find_gaps(layout, small, surface_depths(splats, small, backend)) if layout else (),
         regions=poorly_covered_regions(splats, patches, cameras, backend) if layout else (),
         floaters=splats.means[is_floater].astype(np.float64),
     )
