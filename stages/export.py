@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.bad_files import output_of, reading
+from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Family, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
@@ -216,7 +216,7 @@ def load(folder: Path) -> ExportedAssets:
     """The files of a finished folder. Raises SplatError if its index is damaged."""
     from stages.scene import ExportedAssets, ExportedFile
 
-    with reading(folder / _INDEX, output_of("export")):
+    with reading(folder / _INDEX, stage_output("export-folder-damaged")):
         entries = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         files = tuple(
             ExportedFile(str(e["format"]), str(e["path"]), int(e["size_bytes"])) for e in entries

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.bad_files import output_of, reading
+from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Family, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
@@ -309,7 +309,7 @@ def load(folder: Path) -> QuantisedSplats:
         for path in sorted((folder / _FINETUNED).glob("*"))
         if path.is_dir()
     }
-    with reading(folder / _DECISIONS, output_of("quantise")):
+    with reading(folder / _DECISIONS, stage_output("quantise-folder-damaged")):
         decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
         return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions, flat, finetuned)

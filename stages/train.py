@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.bad_files import output_of, reading
+from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.raster.backends import (
@@ -283,7 +283,7 @@ def load(folder: Path) -> TrainedSplats:
     from stages.scene.storage import load_splats
 
     splats = load_splats(folder)
-    with reading(folder / _TRAINED, output_of("train")):
+    with reading(folder / _TRAINED, stage_output("train-folder-damaged")):
         facts = json.loads((folder / _TRAINED).read_text(encoding="utf-8"))
         return TrainedSplats(splats, bool(facts["dropout"]), bool(facts["overfitted"]))
 

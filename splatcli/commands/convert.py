@@ -12,7 +12,6 @@ import typer
 
 from splatcli import console
 from splatcli.arguments import ENDINGS, AsJson, Quiet
-from stages.base.errors import Family, SplatError
 from stages.run import results
 
 if TYPE_CHECKING:
@@ -88,21 +87,10 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
     from stages.proof.reason import losses_shown
 
     cameras = cameras_for(splats, results.views_of(results.run_around(source)))
-    proof = Prover.of(splats, cameras, source_format=format_of(source).ending).prove(target)
-    if proof.fault:
-        raise _failed(target, proof.fault)
+    prover = Prover.of(splats, cameras, source_format=format_of(source).ending)
+    proof = prover.require(target, "convert-verify-failed")
     loss = losses_shown(format_of(target), proof, splats)
     return proof.figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"
-
-
-def _failed(path: Path, reason: str) -> SplatError:
-    return SplatError(
-        "convert-verify-failed",
-        given=f"{path} came out wrong: {reason}.",
-        wanted="A file that another program reads as the same splats.",
-        hint="Convert to another format, and report this with the file that was read.",
-        family=Family.QUALITY,
-    )
 
 
 @contextlib.contextmanager

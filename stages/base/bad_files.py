@@ -47,11 +47,11 @@ CAMERAS = FileKind(
 )
 
 
-def output_of(stage: str) -> FileKind:
-    """A file that the stage wrote into a run folder."""
+def stage_output(code: str) -> FileKind:
+    """A file that a stage wrote into a run folder. code: of the error."""
     return FileKind(
-        f"{stage}-folder-damaged",
-        f"the output of `splat {stage}`",
+        code,
+        "the output of its stage",
         "The file as the stage wrote it.",
         "Delete the stage's folder and run the command again; it is then made again.",
         Family.RUN_FOLDER,

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
+from stages.base.errors import Family, SplatError
 from stages.base.text import reason_of
 from stages.formats import BY_ENDING, format_of
 from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
@@ -103,6 +104,19 @@ class Prover:
         draw = renderer(splats.take(drawn), raster_settings_of(splats), backend)
         pictures = tuple(draw(camera).image for camera in cameras)
         return cls(splats, drawn, cameras, pictures, backend, source_format)
+
+    def require(self, path: Path, code: str) -> Proof:
+        """The proof of a file that was just written. Raises SplatError `code` if it is wrong."""
+        proof = self.prove(path)
+        if proof.fault:
+            raise SplatError(
+                code,
+                given=f"{path} came out wrong: {proof.fault}.",
+                wanted="A file that another program reads as the same splats.",
+                hint="Write another format, and report this with the file that was read.",
+                family=Family.QUALITY,
+            )
+        return proof
 
     def prove(self, path: Path, exact: bool = False) -> Proof:
         """Read `path` with an independent reader, draw it and compare. Nothing is raised for a

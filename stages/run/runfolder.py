@@ -41,7 +41,13 @@ def opened(folder: Path, photos: Path | None) -> Iterator[None]:
         if photos is None:
             raise missing(folder)
         if folder.exists() and any(path.name not in _WITHOUT_RUN_FILE for path in folder.iterdir()):
-            raise _foreign(folder)
+            raise SplatError(
+                "run-folder-foreign",
+                given=f"{folder} exists and holds other things.",
+                wanted="A new folder, an empty one, or a run folder that splat made.",
+                hint="Name another folder with --out.",
+                family=Family.RUN_FOLDER,
+            )
     RunFile.read(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
@@ -62,7 +68,14 @@ def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) ->
         return recorded
     moved = recorded.photographs is not None and not recorded.photographs.exists()
     if has_finished_work(folder) and not moved and not _same(photos, first_stage_folder):
-        raise _other_photographs(folder, recorded.photographs, photos)
+        before = recorded.photographs or "other photographs"
+        raise SplatError(
+            "run-folder-other-photographs",
+            given=f"{folder} was made from {before}, not from {photos}.",
+            wanted="One run folder for one set of photographs.",
+            hint="Name another run folder with --out.",
+            family=Family.RUN_FOLDER,
+        )
     return RunFile(photos, recorded.settings)
 
 
@@ -100,26 +113,6 @@ def _check_photos(folder: Path, photos: Path) -> None:
             hint="Name one with --out, for example --out ../run",
             family=Family.USAGE,
         )
-
-
-def _foreign(folder: Path) -> SplatError:
-    return SplatError(
-        "run-folder-foreign",
-        given=f"{folder} exists and holds other things.",
-        wanted="A new folder, an empty one, or a run folder that splat made.",
-        hint="Name another folder with --out.",
-        family=Family.RUN_FOLDER,
-    )
-
-
-def _other_photographs(folder: Path, recorded: Path | None, photos: Path) -> SplatError:
-    return SplatError(
-        "run-folder-other-photographs",
-        given=f"{folder} was made from {recorded or 'other photographs'}, not from {photos}.",
-        wanted="One run folder for one set of photographs.",
-        hint="Name another run folder with --out.",
-        family=Family.RUN_FOLDER,
-    )
 
 
 def missing(folder: Path) -> SplatError:
