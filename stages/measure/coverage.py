@@ -7,7 +7,7 @@ is not seen, and a patch seen edge-on hardly is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import raster_settings_of, render, renderer
+from stages.raster.draw import raster_settings_of, render
 from stages.scene import Camera, Splats, look_at
 
 MIN_VIEWS = 3  # one shows a surface, two measure its depth, the third confirms it
@@ -24,15 +24,16 @@ PATCHES_ACROSS = 32  # along the diagonal of the middle nine tenths of what is s
 MIN_PX = 2.0  # summed blend weight: a patch that covers less of a picture is not seen
 MIN_SHARE = 0.1  # of the area that the best view shows
 SUBJECT_SHARE = 0.5  # of the largest view count: patches seen so often are the subject
-SIDE_PX = 240  # of the pictures that visibility is measured in
+_SIDE_PX = 240  # of the pictures that visibility is measured in
 _PROBE_PX = 96
 INWARD_ELEVATIONS_DEG = (0.0, 80.0)  # where somebody may hold a camera around a subject
 OUTWARD_ELEVATIONS_DEG = (-50.0, 50.0)  # where cameras look outward
 MIN_GAP_DEG = 40.0  # to the nearest view
 _DIRECTIONS = 400
-_PROBED_SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)  # of the way from the middle to a camera
-_IN_FRONT = 0.97  # of a surface's depth: nearer than that is in front of it
-_UNSEEN, _HIDDEN, _FREE = 0, 1, 2
+_CONE_DEG = 15.0
+_BLOCKED_SHARE = 0.1  # of a cone's cross-section
+_WALL_SHARE, _BEHIND_SHARE = 0.3, 0.05  # of the area: on a wall, at least; behind it, at most
+_WALLS, _TRIED_PLANES = 3, 300
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Patches:
 
 def patches_of(splats: Splats, cameras: Sequence[Camera], backend: str) -> Patches:
     """The patches that the cameras see of `splats`; none where they see nothing."""
-    small = [camera.fitted(SIDE_PX) for camera in cameras]
+    small = [camera.fitted(_SIDE_PX) for camera in cameras]
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
     settings = raster_settings_of(splats)
     pixels = np.zeros((len(splats), len(small)), np.float32)
@@ -223,36 +224,21 @@ class Gap:
     nearest: int
 
 
-def surface_depths(
-    splats: Splats, cameras: Sequence[Camera], backend: str
-) -> list[NDArray[np.float64]]:
-    """[H, W] of each picture; inf where it shows no surface."""
-    drawn = map(renderer(splats, backend=backend), cameras)
-    return [np.where(one.alpha > 0.5, one.depth, np.inf) for one in drawn]
-
-
 def find_gaps(
-    layout: CameraLayout,
-    cameras: Sequence[Camera],
-    depths: Sequence[NDArray[np.float64]],
-    most: int = 3,
+    layout: CameraLayout, patches: Patches, cameras: Sequence[Camera], most: int = 3
 ) -> tuple[Gap, ...]:
     """The emptiest directions, largest gap first; each is found as if the gaps before it were
-    filled. Directions where a surface is in the way, or where nobody could hold a camera, are left
-    out.
-
-    Args:
-        layout: of the training views.
-        cameras: those that surfaces are measured from.
-        depths: [H, W] of the surfaces in the picture of each camera; inf where there is none.
-        most: how many gaps to return.
-    """
+    filled. Left out are directions where a surface is in the way, which are behind a wall, or where
+    nobody could hold a camera."""
     tried = _sphere(_DIRECTIONS)
     elevations = layout.elevations_deg(tried)
     lowest, highest = INWARD_ELEVATIONS_DEG if layout.inward else OUTWARD_ELEVATIONS_DEG
     tried = tried[(elevations >= lowest) & (elevations <= highest)]
     if layout.inward:
-        tried = tried[_reachable(layout, tried, cameras, depths)]
+        tried = tried[[not _blocked(layout, patches, direction) for direction in tried]]
+        for normal, offset in _walls(patches, np.array([camera.centre for camera in cameras])):
+            places = layout.middle + layout.distance * tried
+            tried = tried[places @ normal > offset]
     known, found = layout.directions, []
     for _ in range(most):
         if not len(tried):
@@ -277,30 +263,45 @@ def _sphere(count: int) -> NDArray[np.float64]:
     return np.stack([across * np.cos(turn), y, across * np.sin(turn)], axis=1)
 
 
-def _reachable(
-    layout: CameraLayout,
-    directions: NDArray[np.float64],
-    cameras: Sequence[Camera],
-    depths: Sequence[NDArray[np.float64]],
-) -> NDArray[np.bool_]:
-    """[D] where no surface hides the way from the middle to a camera in each direction [D, 3].
+def _blocked(layout: CameraLayout, patches: Patches, direction: NDArray[np.float64]) -> bool:
+    """Whether a surface is between the middle and where a camera would be."""
+    offsets = patches.centres - layout.middle
+    along = offsets @ direction
+    beside = np.linalg.norm(offsets - along[:, None] * direction, axis=1)
+    cone = np.tan(np.radians(_CONE_DEG))
+    inside = (along > 0.5 * layout.distance) & (along < layout.distance) & (beside < cone * along)
+    cross_section = np.pi * (cone * layout.distance) ** 2
+    return bool(patches.area[inside].sum() > _BLOCKED_SHARE * cross_section)
 
-    Of the points on the outer half of that way, the outermost that is inside any picture decides:
-    it is hidden if it lies behind a surface in every picture that it is in. depths: of the surfaces
-    in each camera's picture.
-    """
-    state = np.full(len(directions), _UNSEEN)
-    for share in _PROBED_SHARES:
-        points = layout.middle + share * layout.distance * directions
-        found = np.full(len(points), _UNSEEN)
-        for camera, depth in zip(cameras, depths, strict=True):
-            pixels, z = camera.project(points)
-            inside = np.flatnonzero((z > 0) & camera.shows(pixels))
-            column, row = pixels[inside].astype(int).T
-            free = z[inside] * _IN_FRONT < depth[row, column]
-            found[inside] = np.maximum(found[inside], np.where(free, _FREE, _HIDDEN))
-        state = np.where(state == _UNSEEN, found, state)
-    return np.asarray(state != _HIDDEN)
+
+def _walls(
+    patches: Patches, eyes: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """(normal [3] towards the cameras, offset) of planes that hold much of the area, that hide
+    nearly none of it, and that all cameras, with centres `eyes` [V, 3], are before. Planes through
+    three random patches are tried (RANSAC)."""
+    total = patches.area / max(patches.area.sum(), 1e-12)
+    share = total
+    for number in range(_WALLS):
+        if share.sum() < _WALL_SHARE:
+            return
+        chances = share / share.sum()
+        draw = np.random.default_rng(number).choice(len(share), (_TRIED_PLANES, 3), p=chances)
+        a, b, c = patches.centres[draw].transpose(1, 0, 2)
+        normals = _normalised(np.cross(b - a, c - a))
+        offsets = (normals * a).sum(axis=1)
+        towards = np.sign(eyes.mean(axis=0) @ normals.T - offsets)
+        normals, offsets = normals * towards[:, None], offsets * towards
+        heights = patches.centres @ normals.T - offsets
+        on = np.abs(heights) < patches.side
+        fits = (eyes @ normals.T > offsets).all(axis=0)
+        fits &= total @ (heights < -patches.side) <= _BEHIND_SHARE
+        held = np.where(fits, share @ on, 0.0)
+        best = int(held.argmax())
+        if held[best] < _WALL_SHARE:
+            return
+        yield normals[best], float(offsets[best])
+        share = np.where(on[:, best], 0.0, share)
 
 
 @dataclass(frozen=True)

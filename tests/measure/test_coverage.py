@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from stages.formats.values import concatenate
 from stages.measure.coverage import (
+    CameraLayout,
+    Patches,
     camera_layout,
     find_gaps,
     patches_of,
     poorly_covered_regions,
-    surface_depths,
 )
 from stages.scene import Camera, Splats
-from tests.measure.rings import ball, camera, place, ring, surface
+from tests.measure.rings import MIDDLE, ball, camera, place, ring, surface
 
 
 def sides(splats: Splats, cameras: list[Camera]):
     patches = patches_of(splats, cameras, "cpu")
     layout = camera_layout(cameras, patches, levelled=True)
-    return layout, find_gaps(layout, cameras, surface_depths(splats, cameras, "cpu"))
+    return layout, find_gaps(layout, patches, cameras)
 
 
 def test_a_scene_seen_from_one_side_has_its_gap_at_the_back() -> None:
@@ -45,28 +49,32 @@ def test_a_ring_that_stays_low_has_its_gap_above() -> None:
     assert float(seen.elevations_deg(found[0].direction)) > 65
 
 
-def wall(z: float, half: float = 6.0) -> np.ndarray:
-    """Points of a plane across the way of the cameras at heading 0."""
-    line = np.arange(-half, half, 0.1)
+def test_no_gap_is_behind_a_wall() -> None:
+    directions = np.array([place(heading, 20, 1.0) for heading in range(-80, 81, 20)])
+    seen = CameraLayout(True, MIDDLE, directions, np.array([0.0, -1.0, 0.0]), 4.0)
+    across, up = (
+        axis.ravel() for axis in np.meshgrid(np.arange(-8, 8, 0.5), np.arange(-8, 8, 0.5))
+    )
+    wall, n = np.stack([across, up, np.full(len(up), -2.5)], axis=1), len(up)
+    once = np.ones((n, 1), bool)
+    patches = Patches(wall, 0.5, np.full(n, 0.25), once, np.zeros(n, np.intp), np.zeros(n))
+    cameras = ring([-80, 80])
+    free = find_gaps(seen, replace(patches, area=np.zeros(n)), cameras)
+    assert 4 * free[0].direction[2] < -2.5
+    found = find_gaps(seen, patches, cameras)
+    assert found
+    assert all(4 * gap.direction[2] > -2.5 for gap in found)
+
+
+@pytest.mark.parametrize("headings", [range(-60, 61, 20), range(-30, 31, 15)])
+def test_no_gap_is_behind_the_wall_that_a_thing_hangs_on(headings: range) -> None:
+    """No picture shows the wall's edge, nor how high it is."""
+    line = np.arange(-40.0, 40.0, 0.5)
     across, up = (axis.ravel() for axis in np.meshgrid(line, line))
-    return np.stack([across, up, np.full(len(up), z)], axis=1)
-
-
-@pytest.mark.parametrize(
-    ("z", "half", "headings"),
-    [
-        (-2.5, 8.0, range(-80, 81, 20)),  # a wall behind a thing that stands before it
-        (-1.0, 6.0, range(-60, 61, 20)),  # a thing that hangs on the wall
-        (-0.9, 2.5, range(-30, 31, 15)),  # of a wall, only what pictures show is known
-    ],
-)
-def test_no_gap_is_behind_a_wall(z: float, half: float, headings: range) -> None:
-    cameras = ring([*headings])
-    _, free = sides(surface(ball()), cameras)
-    assert any(4 * gap.direction[2] < z for gap in free)
-    scene = surface(np.concatenate([ball(), wall(z, half)]), 0.1)
-    _, found = sides(scene, cameras)
-    assert all(4 * gap.direction[2] > z for gap in found)
+    wall = surface(np.stack([across, up, np.full(len(up), -1.0)], axis=1), 0.4)
+    seen, found = sides(concatenate([surface(ball()), wall]), ring([*headings]))
+    assert found
+    assert all((seen.middle + seen.distance * gap.direction)[2] > -1 for gap in found)
 
 
 def test_cameras_that_look_outward_have_a_gap_where_none_looks() -> None:

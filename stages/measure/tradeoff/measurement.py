@@ -16,14 +16,7 @@ from stages import formats
 from stages.formats.quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
 from stages.measure.contribution import Contributions, measure_contributions
-from stages.measure.coverage import (
-    SIDE_PX,
-    camera_layout,
-    find_gaps,
-    patches_of,
-    poorly_covered_regions,
-    surface_depths,
-)
+from stages.measure.coverage import camera_layout, find_gaps, patches_of, poorly_covered_regions
 from stages.measure.evaluation import (
     EvaluationView,
     Score,
@@ -226,13 +219,12 @@ def measure_coverage(
     cameras = tuple(splats.draw_settings.camera(view.camera) for view in chosen)
     patches = patches_of(splats, cameras, backend)
     layout = camera_layout(cameras, patches, levelled) if len(patches.centres) else None
-    small = [camera.fitted(SIDE_PX) for camera in cameras]
     return Coverage(
         names=tuple(view.name for view in chosen),
         cameras=cameras,
         patches=patches,
         layout=layout,
-        gaps=find_gaps(layout, small, surface_depths(splats, small, backend)) if layout else (),
+        gaps=find_gaps(layout, patches, cameras) if layout else (),
         regions=poorly_covered_regions(splats, patches, cameras, backend) if layout else (),
         floaters=splats.means[is_floater].astype(np.float64),
     )
