@@ -31,7 +31,7 @@ def is_full(place: Path) -> bool:
 def not_permitted(path: Path, error: OSError) -> SplatError:
     """The error "not-permitted": `path` may not be read if the system says so, else not written."""
     place = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
-    needed = os.R_OK | os.X_OK if place.is_dir() else os.R_OK
+    needed = os.R_OK | os.X_OK if os.path.isdir(place) else os.R_OK
     reads = error.errno != errno.EROFS and not os.access(place, needed)
     return SplatError(
         "not-permitted",
