@@ -26,6 +26,7 @@ from splatcli.commands import (
 from splatcli.console import guarded
 from splatcli.operation_options import OrderedCommand, operation_parameters
 from splatcli.options import with_parameters
+from splatcli.watched import watched
 from stages import STAGE_NAMES
 from stages.base.distribution import NAME, VERSION
 
@@ -117,4 +118,4 @@ _add("doctor", doctor.doctor, "splat doctor")
 
 def main() -> None:
     """Entry point of the `splat` command."""
-    app()
+    watched(app)

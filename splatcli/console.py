@@ -7,28 +7,42 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from splatcli import log
 from stages.base.errors import CRASHED, STOPPED, Interrupted, SplatError
+from stages.base.text import printable, printable_name
 from stages.run.failures import as_splat_error
 
-out = Console(highlight=False, soft_wrap=True)
-err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+class _Screen(Console):
+    """Prints nothing that a terminal would act on except its own styles: names of files may hold
+    escape sequences."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        for part in super().render(renderable, options):
+            yield part if part.control else Segment(printable(part.text), part.style)
+
+
+out = _Screen(highlight=False, soft_wrap=True)
+err = _Screen(stderr=True, highlight=False, soft_wrap=True)
 
 LOSSLESS_DB = 99.0  # the PSNR that is recorded for equal pictures
 
 
 def emit(event: str, **values: Any) -> None:
     """One line of JSON on standard output."""
-    sys.stdout.write(json.dumps({"event": event, **values}, ensure_ascii=False) + "\n")
+    sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
     sys.stdout.flush()
 
 
@@ -76,9 +90,9 @@ def show_error(error: SplatError, as_json: bool = False) -> int:
     if as_json:
         emit("error", **error.as_dict())
         return int(error.family)
-    err.print(Text("Error: ", style="bold red") + Text(error.given))
-    err.print(Text("Wanted: ", style="bold") + Text(error.wanted))
-    err.print(Text("Next: ", style="bold") + Text(error.hint))
+    err.print(Text("Error: ", style="bold red") + Text(printable_name(error.given)))
+    err.print(Text("Wanted: ", style="bold") + Text(printable_name(error.wanted)))
+    err.print(Text("Next: ", style="bold") + Text(printable_name(error.hint)))
     err.print(Text(f"({error.code}, exit status {int(error.family)})", style="dim"))
     return int(error.family)
 

@@ -33,7 +33,7 @@ def start() -> Path | None:
     try:
         descriptor, name = tempfile.mkstemp(prefix="splat-", suffix=".log")
         os.close(descriptor)
-        _handler = logging.FileHandler(name, encoding="utf-8")
+        _handler = logging.FileHandler(name, encoding="utf-8", errors="backslashreplace")
     except OSError:
         return None
     _handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s"))

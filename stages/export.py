@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
-from stages.base.errors import Family, SplatError
+from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
@@ -93,6 +93,8 @@ def run(
     prover = Prover.of(splats, cameras, backend_of_settings(settings))
     files, figures = [], {}
     for number, name in enumerate(chosen):
+        if report.stop_requested.is_set():
+            raise Interrupted("stopped before a file")
         report.progress(number, len(chosen), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
         held = splats_to_write(FORMATS[name], quantised)
@@ -104,7 +106,7 @@ def run(
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
             # pictures are compared with all SH coefficients, values with what the file should hold
-            **_prove(replace(prover, splats=held), path, report),
+            **_prove(prover.with_original(held), path, report),
         }
         report.progress(number + 1, len(chosen), f".{name}", verify_db=figures[name]["verify_db"])
     for file in _write_meshes(splats, reconstruction, settings, folder, report):

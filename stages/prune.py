@@ -5,6 +5,8 @@ See `capacity.pruning`. The PSNR of the held-out views before and after is in th
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -43,8 +45,7 @@ class PruneSettings:
     )
     max_loss_db: float = setting(
         0.1,
-        "PSNR that views which were not trained on may lose, as estimated from the "
-        "training views, at strength 1 (dB).",
+        "Mean PSNR that training views may lose, at strength 1 (dB); none may lose more than 0.3.",
         min=0,
         max=100,
     )
@@ -76,6 +77,9 @@ class PruneSettings:
         min=0,
         max=100_000,
     )
+    seconds: float = setting(
+        0.0, "Time limit in seconds: no round begins after it. 0: no limit.", min=0, max=1e7
+    )
     backend: str = backend_setting()
     device: str = device_setting()
 
@@ -89,44 +93,52 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     import numpy as np
 
     from stages.capacity.pruning import Pruner
-    from stages.capacity.summary import advise_more_splats, summarise
-    from stages.capacity.targets import Targets, held_out_loss_ratio
-    from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
+    from stages.capacity.summary import advise_more_splats, describe_loss, summarise
+    from stages.capacity.targets import Targets
+    from stages.measure.evaluation import load_evaluation_views, psnr_of_views_db
     from stages.scene import split_held_out, training_extent
     from stages.scene.storage import save_splats
     from stages.training.finetune import FineTuner
 
+    deadline = time.monotonic() + (settings.seconds or math.inf)
     reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
     splats, backend = trained.splats, backend_of_settings(settings)
     training, held_out = (
-        load_evaluation_views(reconstruction.folder, views, splats.draw_settings)
+        load_evaluation_views(
+            reconstruction.folder, views, splats.draw_settings, report.stop_requested
+        )
         for views in split_held_out(reconstruction.views)
     )
     evaluated = held_out or training
-    before_db = mean_psnr_db(splats, evaluated, backend)
+    before_db = psnr_of_views_db(splats, evaluated, backend)
     extent = training_extent(reconstruction)
     finetuner = FineTuner(training, extent, backend, report, trained.dropout)
     targets = Targets(
         strength=settings.strength,
         max_loss_db=settings.max_loss_db,
-        loss_ratio=held_out_loss_ratio(trained.overfitted),
         max_splats=settings.max_splats,
         max_bytes=settings.max_mb * 1e6,
         min_psnr_db=settings.min_psnr,
         size_bytes=_size_measure(settings, splats, training, reconstruction),
     )
     limits = settings.rounds, settings.finetune_steps
-    found = Pruner(training, targets, backend, finetuner, *limits, report).prune(splats)
-    after_db = mean_psnr_db(found.splats, evaluated, backend)
+    pruner = Pruner(training, targets, backend, finetuner, *limits, report, deadline)
+    found = pruner.prune(splats)
+    loss_db = before_db - psnr_of_views_db(found.splats, evaluated, backend)
     report_backend(report, backend)
     report.metric("evaluated_side_px", splats.draw_settings.side)
-    report.metric("psnr_before_db", round(before_db, 3))
-    report.metric("psnr_db", round(after_db, 3))
-    report.metric("psnr_change_db", round(after_db - before_db, 3))
+    mean_db, lost_db = float(before_db.mean()), float(loss_db.mean())
+    report.metric("psnr_before_db", round(mean_db, 3))
+    report.metric("psnr_db", round(mean_db - lost_db, 3))
+    report.metric("psnr_change_db", round(-lost_db, 3))
+    report.metric("psnr_change_worst_view_db", round(-float(loss_db.max()), 3))
     report.metric("finetune_steps", finetuner.steps)
     _report_result(splats, found, report)
     report.metric("summary", summarise(trained, found, settings.strength, finetuner.steps))
+    overridden = settings.max_splats or settings.max_mb or settings.min_psnr
+    if targets.broken_by(loss_db) and not overridden:
+        report.warn("prune-loss-above-limit", describe_loss(loss_db, targets))
     if advice := advise_more_splats(found, settings.strength):
         report.warn("prune-more-would-pay", advice)
     assert np.isfinite(found.splats.means).all()
@@ -188,7 +200,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=11,
+    version=12,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

@@ -4,6 +4,9 @@ requested file formats.
 View-dependent colour takes up to three quarters of a file. The SH degree is lowered, for all splats
 and then for each, as far as training views do not show it. Held-out views measure the result and
 decide nothing. What the 8-bit .splat costs is measured, too.
+
+Splats that were trained with opacity compensation are fine-tuned for the formats that are drawn
+without it.
 """
 
 from __future__ import annotations
@@ -22,10 +25,11 @@ from stages.capacity import DECIDING_VIEWS, SOG_LOSS_DB
 from stages.capacity.output_formats import (
     CHOICES,
     DEFAULT_FORMATS,
+    drawing_setting,
     formats_setting,
-    rounding_formats,
+    formats_to_finetune,
 )
-from stages.formats.table import FORMATS
+from stages.formats.table import AUTO, FORMATS, PLAIN
 from stages.raster.backends import (
     backend_of_settings,
     backend_setting,
@@ -66,10 +70,17 @@ class QuantiseSettings:
         DECIDING_VIEWS, "Training views to measure on, at most.", min=1, max=100_000
     )
     formats: tuple[str, ...] = formats_setting(
-        rounding_formats(DEFAULT_FORMATS),
+        formats_to_finetune(DEFAULT_FORMATS, AUTO),
         "File format to fine-tune the splats to; repeatable. Formats that need no fine-tuning "
         "change nothing",
         may_be_empty=True,
+    )
+    drawing: str = drawing_setting()
+    plain_steps: int = setting(
+        200,
+        "Steps of fine-tuning of antialiased splats for formats that are drawn plainly.",
+        min=0,
+        max=100_000,
     )
     rounding_steps: int = setting(
         45,
@@ -83,7 +94,8 @@ class QuantiseSettings:
 
     def __post_init__(self) -> None:
         unknown = tuple(name for name in self.formats if name not in CHOICES)  # refused by checks
-        object.__setattr__(self, "formats", (*rounding_formats(self.formats), *unknown))
+        known = formats_to_finetune(self.formats, self.drawing)
+        object.__setattr__(self, "formats", (*known, *unknown))
 
 
 def run(
@@ -97,6 +109,7 @@ def run(
     `capacity.rounding`). Raises SplatError if a photograph cannot be read, and Interrupted.
     """
     from stages.capacity.bits import choose_bits
+    from stages.capacity.format_finetuning import FormatFinetuning
     from stages.capacity.rounding import write_and_read
     from stages.formats.quantisation import splats_to_write
     from stages.scene import QuantisedSplats
@@ -104,12 +117,20 @@ def run(
     splats: Splats = inputs["prune"]
     decider, evaluator = _measures(inputs["sfm"], splats.draw_settings, settings, report)
     kept, by_degree, threshold = _choose_sh_degrees(splats, settings, decider)
-    flat = _flat_colours(kept, inputs["sfm"], settings)
-    quantised = QuantisedSplats(kept, kept.sh_degree, {}, flat)
-    bits, sog_db = choose_bits(kept, decider.psnr, settings.sog_loss_db)
+    finetuning = FormatFinetuning.of(
+        kept, inputs["sfm"], inputs["train"].dropout, settings, decider.views, report
+    )
+    plain = finetuning.to_plain_drawing(kept)
+    flat = _flat_colours(kept if plain is None else plain, inputs["sfm"], settings)
+    quantised = QuantisedSplats(
+        kept, kept.sh_degree, {}, flat, plain=plain, drawing=settings.drawing
+    )
+    sog = splats_to_write(FORMATS["sog"], quantised)
+    bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
     figures = {
         "psnr_raw_db": evaluator.psnr(splats),
         "psnr_kept_db": evaluator.psnr(kept),
+        "psnr_plain_db": None if plain is None else evaluator.psnr(plain),
         "psnr_splat32_db": evaluator.psnr(
             write_and_read(FORMATS["splat"], splats_to_write(FORMATS["splat"], quantised))
         ),
@@ -124,6 +145,7 @@ def run(
         **figures,
         "psnr_sog_training_db": sog_db,
         "max_loss_db": settings.max_loss_db,
+        "drawing": settings.drawing,
         "colour_loss_of_255": threshold,
         "views": len(decider.views),
         "psnr_by_sh_degree_db": {str(d): by_degree[d] for d in sorted(by_degree)},
@@ -135,8 +157,7 @@ def run(
     report.metric("evaluated_side_px", splats.draw_settings.side)
     report_backend(report, backend_of_settings(settings))
     quantised = replace(quantised, decisions=decisions)
-    finetuned = _finetune_to_formats(quantised, inputs, settings, decider.views, report)
-    quantised = replace(quantised, finetuned=finetuned)
+    quantised = replace(quantised, finetuned=finetuning.to_rounding(quantised))
     _save(folder, quantised)
     return quantised
 
@@ -182,44 +203,6 @@ def _flat_colours(
     return view_averaged_dc(splats, cameras, backend_of_settings(settings))
 
 
-def _finetune_to_formats(
-    quantised: QuantisedSplats,
-    inputs: Mapping[str, Any],
-    settings: QuantiseSettings,
-    deciding_views: Sequence[EvaluationView],
-    report: Report,
-) -> dict[str, Splats]:
-    """By format, the splats that its file should hold. Raises Interrupted."""
-    import numpy as np
-
-    from stages.capacity.rounding import RoundingFinetuner
-    from stages.formats.values import drop_undrawable
-    from stages.measure.contribution import measure_contributions
-    from stages.measure.evaluation import load_evaluation_views
-    from stages.scene import split_held_out, training_extent
-    from stages.training.finetune import FineTuner
-
-    splats, reconstruction = drop_undrawable(quantised.splats)[0], inputs["sfm"]
-    if not (settings.rounding_steps and settings.formats and len(splats)):
-        return {}
-    backend, dropout = backend_of_settings(settings), inputs["train"].dropout
-    training = split_held_out(reconstruction.views)[0]
-    views = load_evaluation_views(reconstruction.folder, training, splats.draw_settings)
-    view_counts = np.zeros(len(splats), np.int32)
-    if dropout:  # which alone depends on them
-        view_counts = measure_contributions(splats, views, backend).view_counts
-    finetuner = FineTuner(views, training_extent(reconstruction), backend, report, dropout)
-    rounding = RoundingFinetuner(
-        finetuner, deciding_views, backend, settings.rounding_steps, view_counts
-    )
-    found, figures = {}, {}
-    for number, name in enumerate(settings.formats):
-        report.progress(number, len(settings.formats), f"fine-tuning to .{name}")
-        found[name], figures[name] = rounding.finetune(FORMATS[name], quantised)
-    report.metric("formats", figures)
-    return found
-
-
 def _bytes(splats: Splats) -> int:
     """As float32 with the same SH degree for all and 11 other values, which is what most formats
     hold; each splat's own degree helps only formats that compress zeros."""
@@ -249,10 +232,11 @@ def _measures(
     deciding = tuple(evenly_spaced(training, settings.max_views))
     evaluated, what = (held_out, "held out") if held_out else (deciding, "training")
     folder, backend = reconstruction.folder, backend_of_settings(settings)
-    return (
-        _Measure(load_evaluation_views(folder, deciding, draw_settings), backend, report),
-        _Measure(load_evaluation_views(folder, evaluated, draw_settings), backend, Report(), what),
+    decider, evaluator = (
+        load_evaluation_views(folder, views, draw_settings, report.stop_requested)
+        for views in (deciding, evaluated)
     )
+    return _Measure(decider, backend, report), _Measure(evaluator, backend, Report(), what)
 
 
 @dataclass
@@ -292,7 +276,8 @@ def _save(folder: Path, quantised: QuantisedSplats) -> None:
     if quantised.flat_dc is not None:
         with replacing(folder / _FLAT) as path, path.open("wb") as file:
             np.save(file, quantised.flat_dc)
-    for name, splats in quantised.finetuned.items():
+    held = dict(quantised.finetuned) | ({} if quantised.plain is None else {PLAIN: quantised.plain})
+    for name, splats in held.items():
         (folder / _FINETUNED / name).mkdir(parents=True, exist_ok=True)
         save_splats(folder / _FINETUNED / name, splats)
 
@@ -312,12 +297,20 @@ def load(folder: Path) -> QuantisedSplats:
     with reading(folder / _DECISIONS, stage_output("quantise-folder-damaged")):
         decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
-        return QuantisedSplats(splats, int(decisions["sh_degree"]), decisions, flat, finetuned)
+        return QuantisedSplats(
+            splats,
+            int(decisions["sh_degree"]),
+            decisions,
+            flat,
+            plain=finetuned.pop(PLAIN, None),
+            finetuned=finetuned,
+            drawing=decisions["drawing"],
+        )
 
 
 STAGE = Stage(
     name="quantise",
-    version=8,
+    version=9,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     run=run,

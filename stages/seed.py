@@ -51,6 +51,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     from stages.scene.storage import save_splats
     from stages.structure.seeding.empty_cells import fill_cells
     from stages.structure.seeding.plane_sweep import plane_sweep_points
+    from stages.structure.seeding.view_selection import selected_views
 
     reconstruction: Reconstruction = inputs["sfm"]
     finite: NDArray[np.bool_] = np.all(np.isfinite(reconstruction.points), axis=1)
@@ -67,7 +68,9 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     colours = reconstruction.colours[keep].astype(np.float64) / 255.0
     training, _ = split_held_out(reconstruction.views)  # held-out views give no points or colours
     if settings.fill:
-        more, more_colours = plane_sweep_points(reconstruction.folder, training, points)
+        chosen = selected_views(training, points)
+        report.metric("seeding_views", len(chosen))
+        more, more_colours = plane_sweep_points(reconstruction.folder, chosen, points)
         report.metric("plane_sweep_points", len(more))
         points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
     scales, clamped = _scales(points, reconstruction)
@@ -76,7 +79,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     if settings.fill:
         cameras = tuple(view.camera for view in reconstruction.views)
         more, more_colours, more_scales = fill_cells(
-            reconstruction.folder, training, points, cameras
+            reconstruction.folder, chosen, points, cameras, training
         )
         report.metric("filled_cells", len(more))
         points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
@@ -188,5 +191,5 @@ def _too_few(usable: int, points: int) -> SplatError:
 
 
 STAGE = Stage(
-    name="seed", version=4, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
+    name="seed", version=5, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
 )

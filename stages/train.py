@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
+from stages.capacity.output_formats import drawing_setting
+from stages.formats.table import PLAIN
 from stages.raster.backends import (
     backend_setting,
     device_setting,
@@ -63,8 +65,8 @@ class TrainSettings:
         default=0.0,
         metadata={
             "panel": "Quality and time",
-            "help": "Time limit of training in seconds: makes as many steps as fit, whatever "
-            "--steps says. 0: no limit.",
+            "help": "Time limit in seconds, of the whole command: training makes as many steps as "
+            "fit, whatever --steps says, and pruning as many rounds. 0: no limit.",
             "min": 0,
             "max": 1e7,
         },
@@ -108,6 +110,7 @@ class TrainSettings:
             "choices": ("auto", "on", "off"),
         },
     )
+    drawing: str = drawing_setting()
     blocks: str = field(
         default="1",
         metadata={
@@ -130,6 +133,11 @@ class TrainSettings:
     )
     backend: str = backend_setting()
     device: str = device_setting()
+
+    @property
+    def antialias(self) -> bool:
+        """Whether splats are trained to be drawn with opacity compensation."""
+        return self.drawing != PLAIN
 
 
 _TRAINED = "training.json"
@@ -179,7 +187,7 @@ def run(
     views, draw_settings = trainer.held_out, trainer.draw_settings
     write_quality(trainer.render, views, draw_settings, reconstruction, folder, report)
     write_history(trainer.history, trainer.times, folder, report)
-    trained = TrainedSplats(splats, trainer.dropout, overfitted=trainer.dropout)
+    trained = TrainedSplats(splats, trainer.dropout)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
@@ -193,7 +201,8 @@ def run(
 def _report_course(trainer: Trainer, report: Report) -> None:
     """How many steps were made by which backends, and whether densification stopped early."""
     report.metric("steps", trainer.schedule.steps)
-    report.metric("overfitted", trainer.dropout)
+    report.metric("steps_skipped", int(trainer.stepper.skipped))
+    report.metric("dropout", trainer.dropout)
     stopping = trainer.early_stopping
     report.metric("validation_views", len(stopping.rows))
     if stopping.stopped_at:
@@ -273,8 +282,7 @@ def save(folder: Path, trained: TrainedSplats) -> None:
 
     save_splats(folder, trained.splats)
     with replacing(folder / _TRAINED) as temporary:
-        facts = {"dropout": trained.dropout, "overfitted": trained.overfitted}
-        temporary.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps({"dropout": trained.dropout}) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:
@@ -285,9 +293,9 @@ def load(folder: Path) -> TrainedSplats:
     splats = load_splats(folder)
     with reading(folder / _TRAINED, stage_output("train-folder-damaged")):
         facts = json.loads((folder / _TRAINED).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, bool(facts["dropout"]), bool(facts["overfitted"]))
+        return TrainedSplats(splats, bool(facts["dropout"]))
 
 
 STAGE = Stage(
-    name="train", version=17, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=18, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

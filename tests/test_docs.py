@@ -25,6 +25,7 @@ README_LINES = 200
 _CODE = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)+$")
 # Strings of the source that look like codes and are something else.
 _NO_CODES = {
+    "no-referrer",
     *("drop-floaters", "max-mb"),  # operations of `splat edit`
     *("utf-8", "utf-8-sig", "no-store", "same-origin"),  # encodings, headers
     "allow-nonfinite",  # an argument of the USD reader's process

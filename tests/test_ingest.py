@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -221,6 +222,16 @@ def test_names_with_spaces_folders_and_accents_are_kept(photos: Path) -> None:
     capture, _, _ = ingested(photos)
     assert "day 1/été 雪.jpg" in [photo.name for photo in capture.photos]
     assert (capture.folder / "photos/day 1/été 雪.jpg").is_file()
+
+
+def test_names_that_are_not_utf8_or_hold_control_characters_are_escaped(photos: Path) -> None:
+    for number, name in enumerate((b"bad\xff.jpg", b"red\x1b[31m.jpg", b"two\nlines.jpg")):
+        save(photos / "plain.jpg", textured(20 + number))
+        os.rename(photos / "plain.jpg", os.fsencode(photos) + b"/" + name)
+    capture, _, _ = ingested(photos)
+    names = {photo.name for photo in capture.photos}
+    assert {r"bad\xff.jpg", r"red\x1b[31m.jpg", r"two\nlines.jpg"} <= names
+    assert ingest.load(capture.folder) == capture
 
 
 def test_photographs_of_the_same_name_in_two_formats_stay_apart(photos: Path) -> None:

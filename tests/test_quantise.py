@@ -14,9 +14,12 @@ from stages import quantise
 from stages.base.errors import Family, SplatError
 from stages.base.settings import check_settings
 from stages.base.stage import Report
+from stages.formats.quantisation import splats_to_write
+from stages.formats.table import FORMATS
+from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.measure.sh import sufficient_degrees, truncate_sh, truncation_rms
 from stages.quantise import QuantiseSettings
-from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb
+from stages.scene import QuantisedSplats, TrainedSplats, dc_to_rgb, split_held_out
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -105,11 +108,48 @@ def test_the_same_inputs_give_the_same_bytes_and_load_gives_the_output(
 
 
 def test_a_format_that_does_not_round_changes_no_setting() -> None:
-    assert QuantiseSettings(formats=("ply", "sog", "mesh", "splat")).formats == ("splat", "sog")
+    assert QuantiseSettings(formats=("ply", "sog", "mesh", "splat")) == QuantiseSettings(
+        formats=("splat", "usdc", "sog", "glb")
+    )
+    assert QuantiseSettings(formats=("html", "mesh")).formats == ()
     assert QuantiseSettings(formats=("sog", "splat")) == QuantiseSettings(formats=("splat", "sog"))
     check_settings(QuantiseSettings(formats=("ply",)))
     with pytest.raises(SplatError, match="--format ksplat"):
         check_settings(QuantiseSettings(formats=("ply", "ksplat")))
+
+
+def test_formats_that_are_drawn_plainly_get_splats_that_were_finetuned_to_it(
+    scene: SmallScene, tmp_path: Path
+) -> None:
+    small = replace(scene.splats, log_scales=scene.splats.log_scales - 1).with_antialias(True)
+    antialiased = SmallScene(small, scene.reconstruction)
+    result, metrics = decide(antialiased, tmp_path, formats=("glb",))
+    assert result.plain is not None
+    assert splats_to_write(FORMATS["glb"], result) is result.plain
+    assert not result.plain.draw_settings.antialias
+    assert splats_to_write(FORMATS["html"], result) is result.splats
+    assert result.splats.draw_settings.antialias
+    views = split_held_out(scene.reconstruction.views)[1]
+    held_out = load_evaluation_views(scene.reconstruction.folder, views, small.draw_settings)
+    as_they_are_db = mean_psnr_db(result.splats.with_antialias(False), held_out, "cpu")
+    assert metrics["psnr_plain_db"] > as_they_are_db + 1
+    assert quantise.load(tmp_path).plain is not None
+
+
+@pytest.mark.parametrize(
+    ("antialias", "settings"),
+    [
+        (False, {"formats": ("ply", "splat")}),
+        (True, {"formats": ("html",)}),
+        (True, {"formats": ("ply",), "drawing": "antialiased"}),
+    ],
+)
+def test_nothing_is_finetuned_to_plain_drawing_without_need(
+    antialias: bool, settings: dict[str, Any], scene: SmallScene, tmp_path: Path
+) -> None:
+    splats = scene.splats.with_antialias(antialias)
+    result, _ = decide(SmallScene(splats, scene.reconstruction), tmp_path, **settings)
+    assert result.plain is None
 
 
 def test_the_report_says_what_finetuning_to_a_format_gained(

@@ -48,6 +48,9 @@ def convert(
         begin(f"comparing {target}")
         found, loss = _proven(source, target, drop_undrawable(splats)[0])
         warnings += [loss] if loss else []
+        if "plain_drawing_db" in found:
+            db = found["plain_drawing_db"]
+            warnings.append(f"Drawn plainly, {target.name} differs by {db} dB from {source.name}.")
     size = rows[1].size_bytes(target)
     facts: dict[str, Any] = {
         "source": str(source),
@@ -89,8 +92,11 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
     cameras = cameras_for(splats, results.views_of(results.run_around(source)))
     prover = Prover.of(splats, cameras, source_format=format_of(source).ending)
     proof = prover.require(target, "convert-verify-failed")
+    figures = proof.figures
+    if splats.draw_settings.antialias and not format_of(target).antialias:
+        figures = figures | {"plain_drawing_db": round(prover.plain_drawing_db(), 2)}
     loss = losses_shown(format_of(target), proof, splats)
-    return proof.figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"
+    return figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"
 
 
 @contextlib.contextmanager

@@ -77,6 +77,8 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
         facts["median_centre"] = _rounded(statistics.median_centre)
         facts["median_scale"] = statistics.median_scale
         facts["median_opacity"] = statistics.median_opacity
+    drawing = "antialiased" if splats.draw_settings.antialias else "plain"
+    facts["drawing"] = drawing
     facts["origin"] = [float(value) for value in splats.origin]
     return facts | _memory(splats)
 

@@ -99,7 +99,7 @@ def verify(
             prover = Prover.of(original.splats, cameras, original.backend, original.source_format)
         del read
         for splats in original.candidates(file):
-            proof = replace(prover, splats=splats).prove(file, exact=original.itself)
+            proof = prover.with_original(splats).prove(file, exact=original.itself)
             if not proof.fault:
                 break
         found.append((file, proof))
@@ -117,7 +117,9 @@ def _files(target: Path | None) -> list[Path]:
 
     if target is not None and not target.is_dir():
         return [target]
-    assets = Pipeline(find_run_folder(target)).load("export")
+    pipeline = Pipeline(find_run_folder(target))
+    pipeline.check_outputs()
+    assets = pipeline.load("export")
     files = [file for file in assets.files if file.format not in MESHES]
     if not files:
         raise SplatError(

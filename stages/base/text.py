@@ -1,9 +1,13 @@
-"""Text of messages: numbers with their nouns, and what a library said."""
+"""Text for readers: numbers with their nouns, names that a terminal can show, and what a library
+said."""
 
 from __future__ import annotations
 
+import os
 import re
 
+# C0 without the line feed, DEL, C1, and the marks that change the direction of writing.
+_CONTROLS = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 _CPP_NAME = re.compile(r"\b[A-Za-z_]\w*(?:::~?[A-Za-z_]\w*)+(?:<[^>]*>)?(?:\([^)]*\))?:?")
 _ADVICE = re.compile(r"[;,] (?:use|see|set|try|consider|pass)\b.*", re.IGNORECASE)
 
@@ -11,6 +15,22 @@ _ADVICE = re.compile(r"[;,] (?:use|see|set|try|consider|pass)\b.*", re.IGNORECAS
 def counted(count: int, noun: str, plural: str = "") -> str:
     """ "1 photograph", "3 photographs", "1,200 splats". plural: where adding an s is wrong."""
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
+def printable(text: str) -> str:
+    """`text` with escapes, such as \\x1b, for control characters except the line feed, and for
+    bytes of a file name that are not UTF-8: a terminal would act on the first and Python cannot
+    print the others."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        text = os.fsencode(text).decode("utf-8", "backslashreplace")
+    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def printable_name(name: str) -> str:
+    """`printable`, in one line."""
+    return printable(name).replace("\n", "\\n")
 
 
 def reason_of(error: BaseException) -> str:

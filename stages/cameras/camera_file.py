@@ -163,14 +163,22 @@ def check_inside(root: Path, name: str, folder: Path) -> None:
 def size_of_picture(folder: Path, name: str) -> tuple[int, int]:
     """(width, height) of a picture near a camera file in `folder`, for formats that do not say it.
     Raises BadFileError if it is not found or outside the folder above."""
-    from PIL import Image
-
     check_inside(folder.parent, name, folder)
     for near in (folder, folder / "images", folder.parent, folder.parent / "images"):
         if (near / name).is_file():
-            with Image.open(near / name) as picture:
-                return picture.size
+            return stored_size(near / name)
     raise BadFileError(f"{name[:80]} is not found, and its size is needed")
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """(width, height) of a picture. Raises BadFileError if it is none."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return picture.size
+    except Exception as error:  # Pillow's parsers raise whatever the damage leads to
+        raise BadFileError(f"its picture {path.name[:80]} cannot be read ({error})") from error
 
 
 def _refuse(names: Sequence[str], bad: Any, wanted: str) -> None:

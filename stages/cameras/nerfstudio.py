@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.base.text import reason_of
 from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
@@ -33,8 +32,11 @@ from stages.cameras.camera_file import (
     content_of,
     make_views,
     poses_of,
+    stored_size,
 )
 from stages.cameras.lens import Lens
+from stages.formats.ply import Columns, tables
+from stages.formats.ply_header import read_header
 from stages.scene import View
 
 OPENGL_FROM_OURS = np.diag([1.0, -1.0, -1.0])
@@ -97,9 +99,7 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
     """The cameras of a file, named by `file_path`. size: of pictures that are not found and whose
     size the file does not say. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        data = json.loads(content_of(path).decode("utf-8"))
-        if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
-            raise BadFileError("it has no list of frames")
+        data = _document(path)
         frames = data["frames"]
         if not all(isinstance(frame, dict) for frame in frames):
             raise BadFileError("a frame is not an object")
@@ -122,7 +122,7 @@ def read_points(path: Path) -> FilePoints | None:
     """The points of `ply_file_path`, if the file names one that is there. Raises SplatError
     "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        data = json.loads(content_of(path).decode("utf-8"))
+        data = _document(path)
         named = str(data.get("ply_file_path") or "")
         check_inside(path.parent, named, path.parent)
         if not named or not (path.parent / named).is_file():
@@ -133,6 +133,13 @@ def read_points(path: Path) -> FilePoints | None:
         none = np.zeros(len(points))
         points = (points / scale - shift) @ turn
         return FilePoints(points, colours, none, none.astype(np.int32))
+
+
+def _document(path: Path) -> dict[str, Any]:
+    data = json.loads(content_of(path).decode("utf-8"))
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
+        raise BadFileError("it has no list of frames")
+    return data
 
 
 def _with_roles(views: tuple[View, ...], data: dict[str, Any]) -> tuple[View, ...]:
@@ -211,13 +218,10 @@ def _focal(merged: Mapping[str, Any], axis: str, side: float, otherwise: float |
 
 def _picture_size(folder: Path, name: str, otherwise: tuple[int, int] | None) -> tuple[int, int]:
     """Width and height of the picture itself, whose suffix may be missing from its name."""
-    from PIL import Image
-
     check_inside(folder, name, folder)
     for path in (folder / f"{name}{suffix}" for suffix in ("", *_SUFFIXES)):
         if path.is_file():
-            with Image.open(path) as picture:
-                return picture.size
+            return stored_size(path)
     if otherwise is not None:
         return otherwise
     raise BadFileError(f"a frame has no w and h, and its picture {name[:80]} is not found")
@@ -265,16 +269,16 @@ def _write_points(path: Path, points: NDArray[np.float64], colours: NDArray[np.u
 
 def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Positions [P, 3] and colours [P, 3], grey where there are none."""
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        rows = PlyData.read(str(path))["vertex"].data
-    except PlyParseError as error:
-        raise BadFileError(f"it is damaged ({reason_of(error)})") from error
-    points = np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
+    with path.open("rb") as file:
+        header = read_header(file)
+        names = [name for name, _ in header.vertex.properties]
+        parts = [Columns(names, table) for _, table in tables(file, path, header)]
+    if not parts:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    points = np.concatenate([part.take(["x", "y", "z"]) for part in parts]).astype(np.float64)
     if not np.isfinite(points).all():
         raise BadFileError("a point has a value that is not a number")
-    channels = ("red", "green", "blue")
-    if not all(name in rows.dtype.names for name in channels):
+    channels = ["red", "green", "blue"]
+    if not set(channels) <= set(names):
         return points, np.full((len(points), 3), 128, np.uint8)
-    return points, np.stack([rows[name].astype(np.uint8) for name in channels], axis=1)
+    return points, np.concatenate([part.take(channels) for part in parts]).astype(np.uint8)

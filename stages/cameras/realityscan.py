@@ -58,12 +58,12 @@ def read(path: Path) -> CameraFile:
 def _rows(path: Path) -> list[dict[str, str]]:
     text = content_of(path).decode("utf-8-sig")
     reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    columns = [column.strip().lstrip("#").lower() for column in reader.fieldnames or ()]
-    reader.fieldnames = columns
-    missing = [key for key in ("name", *_NEEDED) if key not in columns]
-    if missing:
-        raise BadFileError(f"it has no column {missing[0]!r}")
     try:
+        columns = [column.strip().lstrip("#").lower() for column in reader.fieldnames or ()]
+        reader.fieldnames = columns
+        missing = [key for key in ("name", *_NEEDED) if key not in columns]
+        if missing:
+            raise BadFileError(f"it has no column {missing[0]!r}")
         rows = [row for row in reader if row["name"]]
     except csv.Error as error:
         raise BadFileError(f"it is damaged ({reason_of(error)})") from error

@@ -79,8 +79,7 @@ def _saved(name: str, bits: int, splats: Splats) -> float:
         return _ATTRIBUTES[name][0] * len(splats) / 8
     labelled = int((splats.sh_degrees > 0).sum())
     values = 3 * (splats.sh.shape[1] - 1)
-    found: float = (1 << (bits - 1)) * values * _ENTROPY + labelled / 8
-    return found
+    return float((1 << (bits - 1)) * values * _ENTROPY + labelled / 8)
 
 
 def file_size_bytes(

@@ -6,18 +6,23 @@ from collections.abc import Iterable
 from typing import Any
 
 from stages.base.settings import setting
-from stages.formats.table import FORMATS
+from stages.formats.table import AUTO, DRAWINGS, FORMATS
 from stages.surface.table import MESHES, MeshFormat
 
 DEFAULT_FORMATS = ("ply", "splat", "glb", "usdz")
+LOSSLESS = "ply"
 ALL_MESHES = "mesh"  # a value of `--format`: every format of meshes
 CHOICES = (*FORMATS, ALL_MESHES, *MESHES)
 
 
-def rounding_formats(names: Iterable[str]) -> tuple[str, ...]:
-    """Those of the formats whose rounding needs fine-tuning, in the order of the table."""
-    chosen = set(names)
-    return tuple(n for n, row in FORMATS.items() if n in chosen and row.needs_finetuning)
+def formats_to_finetune(names: Iterable[str], drawing: str) -> tuple[str, ...]:
+    """Those of the formats that need fine-tuning, in the order of the table: to their rounding, and
+    to being drawn plainly. "ply" stands for all that are drawn plainly and round nothing, because
+    all these hold the same splats."""
+    chosen = {FORMATS[name] for name in names if name in FORMATS}
+    plain = any(not row.needs_finetuning and not row.antialiased(drawing) for row in chosen)
+    rounding = (n for n, row in FORMATS.items() if row in chosen and row.needs_finetuning)
+    return (*((LOSSLESS,) if plain else ()), *rounding)
 
 
 def mesh_formats(names: Iterable[str]) -> list[MeshFormat]:
@@ -29,3 +34,14 @@ def mesh_formats(names: Iterable[str]) -> list[MeshFormat]:
 def formats_setting(default: tuple[str, ...], help: str, **metadata: Any) -> Any:
     """The `formats` field of a stage's settings."""
     return setting(default, help, choices=CHOICES, **metadata)
+
+
+def drawing_setting() -> Any:
+    """The `drawing` field of a stage's settings."""
+    return setting(
+        AUTO,
+        "How viewers will draw the files: antialiased (opacities compensated, right at every size "
+        "and distance), plain, or auto: as the programs that a format is for draw it.",
+        choices=DRAWINGS,
+        panel="Output",
+    )

@@ -8,6 +8,7 @@ multiplier says how much squared error one parameter must save to be kept.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -30,7 +31,8 @@ OVERLAP, SIGNIFICANT = 1.25, 0.01
 MAX_VIEWS = 48  # measured in a round; what the others showed at first goes on counting
 HARM_TOLERANCE = 0.5  # of the predicted gain that removing harmful splats may miss
 TINY = float(np.finfo(np.float64).tiny)
-RATE_DISTORTION, LOSS, ROUNDS = "rate_distortion", "loss", "rounds"  # why pruning stopped
+# why pruning stopped
+RATE_DISTORTION, LOSS, ROUNDS, TIME = "rate_distortion", "loss", "rounds", "time"
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ class PruningResult:
         rate_distortion: at the start.
         start_db, end_db: mean PSNR of the measured views.
         least_tenth_db: what the tenth of the splats that contributes least contributed at first.
-        stopped_by: RATE_DISTORTION (the rest saves more bits than it costs), LOSS or ROUNDS.
+        stopped_by: RATE_DISTORTION (the rest saves more bits than it costs), LOSS, TIME
+            or ROUNDS.
         rounds: all that were tried.
     """
 
@@ -110,6 +113,7 @@ class Pruner:
         finetune_steps: after each round; where a target needs more rounds, they share
             `rounds * finetune_steps` steps.
         report: for progress.
+        deadline: after which no round begins, as `time.monotonic`, unless a target needs it.
     """
 
     views: Sequence[EvaluationView]
@@ -119,6 +123,7 @@ class Pruner:
     rounds: int
     finetune_steps: int
     report: Report
+    deadline: float = math.inf
 
     def __post_init__(self) -> None:
         every = range(len(self.views))
@@ -142,6 +147,9 @@ class Pruner:
         for number in range(planned):
             self.report.progress(number, planned, "pruning", splats=len(found.splats))
             excess = self.targets.excess(found.splats)
+            if excess <= 0 and time.monotonic() > self.deadline:
+                found.stopped_by = TIME
+                break
             removal = self._select(found, state, excess, share)
             if removal is None:
                 found.stopped_by = RATE_DISTORTION
@@ -182,8 +190,8 @@ class Pruner:
             fewer = removal.apply(found.splats)
             measured = self._sse_change(fewer, state)
             predicted = removal.predicted_sse
+            after = self._measure(fewer, state, removal)
             kept = measured <= predicted + HARM_TOLERANCE * abs(predicted)
-            after = self._measure(fewer, state, removal) if kept else state
             found.add_round(removal, predicted, measured, float(after.psnr_db.mean()), kept)
             if kept:
                 found.splats = fewer
@@ -199,10 +207,8 @@ class Pruner:
         return measured.scaled(len(self.views) / max(1, len(self._measured)))
 
     def _measure_all(self, splats: Splats) -> Contributions:
-        others = None
-        if self._others:
-            views = (self.views[i] for i in self._others)
-            others = measure_contributions(splats, views, self.backend)
+        views = (self.views[i] for i in self._others)
+        others = measure_contributions(splats, views, self.backend) if self._others else None
         return measure_contributions(splats, self._measured_views(), self.backend, others)
 
     def _measure(self, splats: Splats, before: Contributions, removal: Removal) -> Contributions:

@@ -110,7 +110,8 @@ def write_and_read(row: Format, splats: Splats) -> Splats:
         found = formats.read(path).with_sh_degree(splats.sh_degree)
     if row.order:
         found = found.take(np.argsort(load_object(row.order)(splats)))
-    return replace(found, draw_settings=splats.draw_settings, origin=splats.origin)
+    drawn = replace(splats.draw_settings, antialias=found.draw_settings.antialias)
+    return replace(found, draw_settings=drawn, origin=splats.origin)
 
 
 def _attribute(name: str, splats: Splats) -> NDArray[np.floating]:
@@ -119,8 +120,7 @@ def _attribute(name: str, splats: Splats) -> NDArray[np.floating]:
         return splats.sh[:, :1]
     if name == "sh_rest":
         return splats.sh[:, 1:]
-    found: NDArray[np.floating] = getattr(splats, name)
-    return found
+    return np.asarray(getattr(splats, name))
 
 
 def _with_attribute(name: str, splats: Splats, source: Splats) -> Splats:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stages.base.text import counted
-from stages.capacity.pruning import LOSS, RATE_DISTORTION, PruningResult
-from stages.capacity.targets import held_out_loss_ratio
+from stages.capacity.pruning import LOSS, RATE_DISTORTION, TIME, PruningResult
+from stages.capacity.targets import WORST_VIEW_DB, Targets
 from stages.scene import TrainedSplats
 
 _REASONS = {
     RATE_DISTORTION: "the remaining splats save more error than their bits cost",
     LOSS: "removing more would lose more than is allowed",
+    TIME: "its share of --seconds was over",
 }
 
 
@@ -36,11 +40,20 @@ def summarise(
         f"{f' ({floaters:,} of them floaters)' if floaters else ''}; of the {len(after):,} left, "
         f"{reduced:,} have an SH degree below {start.sh_degree}. "
         f"{counted(len(kept), 'round')} with {counted(finetune_steps, 'step')} of fine-tuning: "
-        f"{found.end_db - found.start_db:+.2f} dB on the training views; other views lose at most "
-        f"{held_out_loss_ratio(before.overfitted):.0%} of what these lose."
+        f"{found.end_db - found.start_db:+.2f} dB on the training views."
     )
     reason = _REASONS.get(found.stopped_by, "all requested rounds were done")
     return [*lines, f"Pruning stopped because {reason}."]
+
+
+def describe_loss(loss_db: NDArray[np.float64], targets: Targets) -> str:
+    """A sentence about evaluated views that lost loss_db [V], more than the targets allow."""
+    mean_db, worst_db = targets.strength * targets.max_loss_db, targets.strength * WORST_VIEW_DB
+    return (
+        f"The views that pruning is evaluated on lost {loss_db.mean():.2f} dB on average and "
+        f"{loss_db.max():.2f} dB at worst, where {mean_db:.2g} and {worst_db:.2g} dB are allowed. "
+        "A smaller --strength removes less."
+    )
 
 
 def advise_more_splats(found: PruningResult, strength: float) -> str:

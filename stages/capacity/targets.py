@@ -13,14 +13,6 @@ from stages.base.text import counted
 from stages.scene import Splats
 
 WORST_VIEW_DB = 0.3  # that any one view may lose, at strength 1
-# Loss of other views per loss of training views, at most. Measured with half of the splats removed
-# and the rest fine-tuned: 0 on an overfitted carpet, 0.15 on a toy, 0.2 on the sample.
-LOSS_RATIO, LOSS_RATIO_OVERFITTED = 0.25, 0.05
-
-
-def held_out_loss_ratio(overfitted: bool) -> float:
-    """Upper bound of the loss of other views (dB) per dB that training views lose."""
-    return LOSS_RATIO_OVERFITTED if overfitted else LOSS_RATIO
 
 
 @dataclass(frozen=True)
@@ -29,15 +21,13 @@ class Targets:
 
     Args:
         strength: factor of the Lagrange multiplier and of the loss allowed.
-        max_loss_db: mean loss of views that were not trained on, at strength 1.
-        loss_ratio: see `held_out_loss_ratio`.
+        max_loss_db: mean loss of the views, at strength 1.
         max_splats, max_bytes, min_psnr_db: these override the strength; 0 for none.
         size_bytes: gives the size of the file that `max_bytes` is about.
     """
 
     strength: float
     max_loss_db: float
-    loss_ratio: float
     max_splats: int
     max_bytes: float
     min_psnr_db: float
@@ -47,18 +37,26 @@ class Targets:
         """How many splats are too many for the size targets."""
         count = len(splats)
         allowed = self.max_splats or count
-        if self.max_bytes:
-            size = self.size_bytes(splats)
-            if size > self.max_bytes:
-                allowed = min(allowed, int(count * self.max_bytes / size))
+        size = self.size_bytes(splats) if self.max_bytes else 0
+        if size > self.max_bytes:
+            allowed = min(allowed, int(count * self.max_bytes / size))
         return count - max(1, min(allowed, count))
 
     def allows(self, psnr_db: NDArray[np.float64], best_db: NDArray[np.float64]) -> bool:
-        """Whether V training views may have `psnr_db` [V] where they had `best_db` [V]."""
+        """Whether V training views may have `psnr_db` [V] where they had `best_db` [V].
+
+        Other views lose as much where nothing is overfitted, and less elsewhere. Training views
+        that fine-tuning leaves out would be no better measure: they lose 0.6 to 1.6 dB in 90 steps
+        even if nothing is removed.
+        """
         if self.min_psnr_db:
             return float(psnr_db.mean()) >= self.min_psnr_db
-        loss = (best_db - psnr_db) * self.loss_ratio / self.strength
-        return float(loss.mean()) <= self.max_loss_db and float(loss.max()) <= WORST_VIEW_DB
+        return not self.broken_by(best_db - psnr_db)
+
+    def broken_by(self, loss_db: NDArray[np.float64]) -> bool:
+        """Whether views lose more than the strength allows. loss_db: [V]."""
+        mean, worst = (float(f(loss_db)) / self.strength for f in (np.mean, np.max))
+        return mean > self.max_loss_db or worst > WORST_VIEW_DB
 
     def check_start(self, psnr_db: float) -> None:
         """Raises SplatError (prune-psnr-not-reached) if even the unpruned model is below."""

@@ -110,7 +110,9 @@ class _BlockTraining:
         assigned = block_views.assign_views(fractions)
         folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
         parts = self._parts(folders, cells, assigned)
-        draw_settings = draw_settings_of(self.whole.views, self.settings.train_side, light)
+        draw_settings = draw_settings_of(
+            self.whole.views, self.settings.train_side, light, self.settings.antialias
+        )
         crosses = block_views.crosses_blocks(assigned)
         crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]
         seam_views = [view for view in crossing if view in training]
@@ -290,7 +292,7 @@ class _BlockTraining:
         self.report.metric("splats_by_block", by_block)
         self.report.metric("splats_at_seams", int(seam.sum()))
         self.report.metric("pruned_at_seams", int(removed.sum()))
-        return TrainedSplats(splats, dropout, overfitted=dropout)
+        return TrainedSplats(splats, dropout)
 
 
 class _BlockProgress(Listener):

@@ -163,14 +163,19 @@ class RemoteFolder:
         except FileNotFoundError as error:
             raise _missing(self.url) from error
         except PermissionError as error:
-            hint = "Check your rights there, and that credentials are set where the worker runs."
-            raise _error("url-not-permitted", self.url, "It may not be used", hint) from error
+            raise self._not_permitted() from error
         except Exception as error:
+            if "credentials" in str(error).lower():  # of the store's own library
+                raise self._not_permitted() from error
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
                 raise disk_full("copying", Path(tempfile.gettempdir())) from error
             what = f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
             hint = "Give the same command again: what is finished is kept."
             raise _error("url-failed", self.url, what, hint, Family.RESOURCES) from error
+
+    def _not_permitted(self) -> SplatError:
+        hint = "Check your rights there, and that credentials are set where the worker runs."
+        return _error("url-not-permitted", self.url, "It may not be used", hint)
 
 
 def _missing(url: str) -> SplatError:

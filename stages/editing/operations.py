@@ -134,7 +134,19 @@ def _merging(path: Path) -> Operation:
 
 def join(first: Splats, second: Splats) -> Splats:
     """Both in one, in the frame and with the draw settings of `first`, at the higher SH degree.
-    The origins of both are in the coordinates of the capture."""
+    The origins of both are in the coordinates of the capture.
+
+    Raises SplatError "edit-drawing-differs" if only one is to be drawn with opacity compensation.
+    """
+    if first.draw_settings.antialias != second.draw_settings.antialias:
+        which = "second" if second.draw_settings.antialias else "first"
+        raise SplatError(
+            "edit-drawing-differs",
+            given=f"Only the {which} of the two is for antialiased drawing.",
+            wanted="Splats that are drawn in the same way: together, one half would look wrong.",
+            hint="Export one of them again: splat export --drawing plain (or antialiased).",
+            family=Family.USAGE,
+        )
     means = (second.means + (second.origin - first.origin)).astype(first.means.dtype)
     both = concatenate([first, replace(second, means=means)])
     return replace(both, origin=first.origin, draw_settings=first.draw_settings)

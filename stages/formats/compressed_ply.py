@@ -122,7 +122,7 @@ def _header_text(splats: Splats, degree: int, units: str) -> bytes:
         lines.append(f"element sh {len(splats)}")
         rest = 3 * ((degree + 1) ** 2 - 1)
         lines += [f"property uchar f_rest_{i}" for i in range(rest)]
-    return header_text(units, splats.origin, lines)
+    return header_text(units, splats.origin, lines, antialias=splats.draw_settings.antialias)
 
 
 def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -215,6 +215,7 @@ def unpack(path: Path, header: Header) -> Splats:
     rest = _sh_rows(path, header)
     degree = 0 if rest is None else math.isqrt(len(rest.dtype.names or ()) // 3 + 1) - 1
     splats = replace(allocate(len(vertices), degree), origin=header.origin)
+    splats = splats.with_antialias(header.antialias)
     for rows in reported_blocks(len(vertices), _BLOCK):
         chunks = ranges[rows.start // CHUNK : -(-rows.stop // CHUNK)]
         _unpack_block(splats.take(rows), vertices[rows], chunks)

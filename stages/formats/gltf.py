@@ -37,7 +37,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     splats, dropped = drop_undrawable(splats)
     splats = splats.with_sh_degree(int(splats.sh_degrees.max(initial=0)))
     primitives = [_attributes(splats)] if len(splats) else []
-    write_file(Path(path), primitives, flipped(splats.take(slice(0))).origin, units)
+    write_file(Path(path), primitives, splats, units)
     return dropped
 
 

@@ -17,6 +17,8 @@ from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
 from stages.base.distribution import VERSION
 from stages.base.errors import Family, SplatError
+from stages.scene import Splats
+from stages.scene.flip import flipped
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121}
@@ -62,7 +64,7 @@ class Attribute:
 def write_file(
     path: Path,
     primitives: list[dict[str, Attribute]],
-    origin: NDArray[np.float64],
+    splats: Splats,
     units: str,
     *,
     node_scale: float = 1.0,
@@ -72,14 +74,17 @@ def write_file(
     Args:
         path: the file.
         primitives: attributes by name, all with the same number of rows, y up.
-        origin: [3] in the axes of the file; asset.extras holds it, because positions relative to 0
-            would exceed the precision of float32.
+        splats: for what asset.extras holds: the origin, in the axes of the file, because positions
+            relative to 0 would exceed the precision of float32; whether they are to be drawn with
+            opacity compensation, of which KHR_gaussian_splatting says nothing.
         units: "metres" or "arbitrary".
         node_scale: scale of the node.
 
     Raises SplatError when a file cannot be written or a .glb would exceed 4 GiB.
     """
-    document, arrays = _document(primitives, origin, units, node_scale)
+    more: dict[str, Any] = {"antialiased": True} if splats.draw_settings.antialias else {}
+    made_of = asset(units, flipped(splats.take(slice(0))).origin, **more)
+    document, arrays = _document(primitives, made_of, node_scale)
     size = sum(array.nbytes for array in arrays)
     if path.suffix.lower() == ".glb":
         write_glb(path, document, arrays, size)
@@ -88,10 +93,7 @@ def write_file(
 
 
 def _document(
-    primitives: list[dict[str, Attribute]],
-    origin: NDArray[np.float64],
-    units: str,
-    node_scale: float,
+    primitives: list[dict[str, Attribute]], made_of: dict[str, Any], node_scale: float
 ) -> tuple[dict[str, Any], list[Rows]]:
     """(the JSON, whose buffer has no size and name yet; the arrays in buffer order)."""
     accessors: list[dict[str, Any]] = []
@@ -118,7 +120,7 @@ def _document(
             offset += array.nbytes
         described.append(_primitive(names))
     document: dict[str, Any] = {
-        "asset": asset(units, origin),
+        "asset": made_of,
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0] if described else []}],

@@ -44,8 +44,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     splats, dropped = drop_undrawable(splats)
     unit = _unit(linear_scales(splats))
     primitives = [_attributes(group, unit) for group in _groups(splats)]
-    origin = flipped(splats.take(slice(0))).origin
-    write_file(Path(path), primitives, origin, units, node_scale=unit or 1.0)
+    write_file(Path(path), primitives, splats, units, node_scale=unit or 1.0)
     return dropped
 
 

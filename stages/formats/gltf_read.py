@@ -51,14 +51,17 @@ def read(path: Path) -> Splats:
                 if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
                     raise BadFileError("its nodes share meshes, which is not supported")
         extras = document["asset"].get("extras")
-        origin = extras.get("splat_origin") if isinstance(extras, dict) else None
+        extras = extras if isinstance(extras, dict) else {}
+        origin = extras.get("splat_origin")
         origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
         if not parts and "meshes" in document:
             raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
         splats = concatenate(parts)
         del parts
         means, origin = recentred(splats.means.astype(np.float64), origin)
-        return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+        splats = replace(splats, means=means, origin=origin)
+        splats = splats.with_antialias(bool(extras.get("antialiased", False)))
+        return check_finite(flipped(splats, reuse=True))
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
@@ -108,6 +111,7 @@ class _Buffers:
     def __init__(self, path: Path, described: list[Any], chunk: memoryview | None) -> None:
         self._path, self._described, self._chunk = path, described, chunk
         self._loaded: dict[int, memoryview] = {}
+        self._files: dict[Path, memoryview] = {}  # a file counts once, however many buffers it is
 
     def get(self, index: int) -> memoryview:
         if index not in self._loaded:
@@ -119,7 +123,7 @@ class _Buffers:
         return self._loaded[index]
 
     def total_bytes(self) -> int:
-        return sum(len(content) for content in self._loaded.values())
+        return sum({id(content): len(content) for content in self._loaded.values()}.values())
 
     def _load(self, described: dict[str, Any], index: int) -> memoryview:
         uri = described.get("uri")
@@ -134,7 +138,8 @@ class _Buffers:
             if not head.endswith(";base64"):
                 raise BadFileError(f"buffer {index} has an encoding that is not read")
             return memoryview(base64.b64decode(body, validate=True))
-        return _mapped(_file_beside(self._path, uri))
+        file = _file_beside(self._path, uri)
+        return self._files.setdefault(file, _mapped(file))
 
 
 def _file_beside(path: Path, uri: str) -> Path:

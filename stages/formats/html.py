@@ -18,6 +18,7 @@ from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import report_progress
 from stages.formats import ply
+from stages.formats.inflate import check_size
 from stages.formats.page import document
 from stages.formats.page.cameras import page_cameras
 from stages.formats.values import drop_undrawable
@@ -110,7 +111,7 @@ def unzipped(path: Path) -> Iterator[bytes]:
     """The .ply inside, in blocks; each script element is one line."""
     start, end = (re.escape(t.encode("ascii")) for t in (document.CHUNK_START, document.CHUNK_END))
     wanted = re.compile(start + rb"([A-Za-z0-9+/=]*)" + end)
-    unpacker = zlib.decompressobj(_GZIP)
+    unpacker, unpacked = zlib.decompressobj(_GZIP), 0
     with path.open("rb") as page:
         size = page.seek(0, 2)
         page.seek(max(0, size - _END_BYTES))
@@ -122,7 +123,10 @@ def unzipped(path: Path) -> Iterator[bytes]:
                 match = wanted.fullmatch(line)
                 data = base64.b64decode(match[1], validate=True) if match else b""
                 while data:
-                    yield unpacker.decompress(data, _INFLATED_AT_ONCE)
+                    block = unpacker.decompress(data, _INFLATED_AT_ONCE)
+                    unpacked += len(block)
+                    check_size(unpacked, size)
+                    yield block
                     data = unpacker.unconsumed_tail
                     report_progress(page.tell(), size)
         except (zlib.error, binascii.Error) as error:

@@ -12,8 +12,8 @@ from stages.base.bad_files import BadFileError
 
 # Splats compress to a half or a third. A file that declares a higher ratio than this is refused
 # before memory is allocated; small files may, because all their splats can be equal.
-_RATIO_LIMIT = 100
-_ALWAYS_ALLOWED_BYTES = 64 << 20
+_RATIO_LIMIT = 30
+_ALWAYS_ALLOWED_BYTES = 8 << 20
 _PIECE_BYTES = 1 << 18
 _WINDOW_BYTES = (
     1 << 27
@@ -71,7 +71,7 @@ class GzipReader:
 def check_size(count: int, file_bytes: int) -> None:
     """Raises BadFileError if a file of `file_bytes` cannot plausibly unpack to `count` bytes."""
     if count > max(_ALWAYS_ALLOWED_BYTES, _RATIO_LIMIT * file_bytes):
-        raise BadFileError(f"it declares {count} bytes in a file of {file_bytes}")
+        raise BadFileError(f"it declares or unpacks to {count} bytes in a file of {file_bytes}")
 
 
 def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np.uint8]:

@@ -35,6 +35,18 @@ def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
                 "write .ply, .glb or .usdz.",
             )
         )
+    if splats.draw_settings.antialias and not row.antialias:
+        found.append(
+            Loss(
+                "drawing",
+                f"{file_name} holds splats for antialiased drawing"
+                f"{'' if row.says_antialias else ', of which the file says nothing'}, and most "
+                f"programs draw .{row.ending} plainly: splats look too strong there, the more the "
+                "farther away. A viewer that compensates opacities (Spark, Brush, PlayCanvas with "
+                "antialiasing switched on) draws it right. For others, in the run's folder: "
+                f"`splat export --format {row.ending} --drawing plain`.",
+            )
+        )
     if not row.holds_origin and splats.origin.any():
         offset = ", ".join(f"{value:.10g}" for value in splats.origin)
         found.append(

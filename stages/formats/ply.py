@@ -66,7 +66,8 @@ def blocks(splats: Splats, units: str) -> Iterator[bytes]:
 
 def _header_text(splats: Splats, units: str) -> bytes:
     properties = [f"property float {name}" for name in property_names(splats.sh_degree)]
-    return header_text(units, splats.origin, [f"element vertex {len(splats)}", *properties])
+    elements = [f"element vertex {len(splats)}", *properties]
+    return header_text(units, splats.origin, elements, antialias=splats.draw_settings.antialias)
 
 
 def _table(splats: Splats, rows: slice) -> NDArray[np.float32]:
@@ -106,16 +107,13 @@ def parse(path: Path) -> Splats:
         count = sum(1 for name in names if name.startswith("f_rest_"))
         if count not in (0, 9, 24, 45):
             raise BadFileError(f"it has {count} f_rest properties, not 0, 9, 24 or 45")
-        if header.encoding == "ascii":
-            _check_ascii_size(path, header)
-            tables = _ascii_tables(file, header)
-        else:
-            tables = _binary_tables(binary_rows(path, header, "vertex"))
+        blocks_of_rows = tables(file, path, header)
         splats = allocate(header.vertex.count, math.isqrt(count // 3 + 1) - 1)
+        splats = splats.with_antialias(header.antialias)
         wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
         exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
-        for rows, table in tables:
-            columns = _Columns(names, table)
+        for rows, table in blocks_of_rows:
+            columns = Columns(names, table)
             _fill(splats.take(rows), columns, count)
             if exact is not None:
                 exact[rows] = columns.take(["x", "y", "z"])
@@ -127,7 +125,7 @@ def parse(path: Path) -> Splats:
     return check_finite(replace(splats, means=means, origin=origin))
 
 
-def _fill(splats: Splats, columns: _Columns, rest_count: int) -> None:
+def _fill(splats: Splats, columns: Columns, rest_count: int) -> None:
     """Fill all but the means of `splats`, which are views of some rows."""
     splats.quaternions[:] = columns.floats([f"rot_{i}" for i in range(4)])
     splats.log_scales[:] = columns.floats([f"scale_{i}" for i in range(3)])
@@ -144,8 +142,17 @@ def _check_is_splats(header: Header) -> None:
         raise BadFileError("it is a mesh of triangles, not splats")
     if missing:
         raise BadFileError(f"its vertices lack {', '.join(missing)}: they are no splats")
+
+
+def tables(file: BinaryIO, path: Path, header: Header) -> _Tables:
+    """The vertices of a .ply in blocks: (rows, [M, P], or [M] structured), for `Columns`. Raises
+    BadFileError if the file cannot hold what it declares, or if its vertices hold lists."""
     if header.vertex.has_lists:
         raise BadFileError("its vertices hold lists")
+    if header.encoding == "ascii":
+        _check_ascii_size(path, header)
+        return _ascii_tables(file, header)
+    return _binary_tables(binary_rows(path, header, "vertex"))
 
 
 def _binary_tables(mapped: NDArray[Any]) -> _Tables:
@@ -211,12 +218,15 @@ def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
 
 
 @dataclass(frozen=True)
-class _Columns:
+class Columns:
+    """Some rows of a .ply, by the names of their properties."""
+
     names: list[str]
     table: NDArray[Any]  # [M, P], or [M] structured
 
     def take(self, names: list[str]) -> NDArray[Any]:
-        """[M, len(names)] in the common type of the columns."""
+        """[M, len(names)] in the common type of the columns. Raises ValueError for a name that is
+        not there."""
         if self.table.ndim == 2:
             return self.table[:, [self.names.index(name) for name in names]]
         kind = np.result_type(*(self.table.dtype[name] for name in names)) if names else "f4"

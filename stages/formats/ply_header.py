@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError
 
 HEADER_LIMIT_BYTES = 1 << 20
+_MOST_PROPERTIES = 1000
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -27,14 +28,29 @@ TYPES = {
 
 
 def header_text(
-    units: str, origin: NDArray[np.float64], elements: Sequence[str], note: str = ""
+    units: str,
+    origin: NDArray[np.float64],
+    elements: Sequence[str],
+    note: str = "",
+    antialias: bool = False,
 ) -> bytes:
-    """The header of a binary file that we write. elements: the lines of elements and properties."""
+    """The header of a binary file that we write.
+
+    Args:
+        units: "metres" or "arbitrary".
+        origin: [3] of the scene, world units.
+        elements: the lines of elements and properties.
+        note: a comment.
+        antialias: whether the splats are to be drawn with opacity compensation. Said in the comment
+            of Brush (ArthurBrussee/brush, crates/brush-serde), which splat-transform also writes.
+    """
     lines = ["ply", "format binary_little_endian 1.0", *([f"comment {note}"] if note else [])]
     lines.append("comment up axis: -y (right-handed; x right, y down, z forward)")
     lines.append(f"comment units: {units}")
     if origin.any():
         lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in origin))
+    if antialias:
+        lines.append("comment SplatRenderMode: mip")
     return "\n".join([*lines, *elements, "end_header", ""]).encode("ascii")
 
 
@@ -48,9 +64,12 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
+    """antialias: whether a comment asks for opacity compensation."""
+
     encoding: str
     elements: tuple[Element, ...]
     origin: NDArray[np.float64]
+    antialias: bool
     data_starts: int
 
     @property
@@ -89,6 +108,7 @@ def read_header(file: BinaryIO) -> Header:
     if end is None:
         raise BadFileError("its header does not end")
     encoding, origin, elements = "", np.zeros(3), []
+    antialias: set[bool] = set()
     for line in re.split(r"[\r\n]+", start[: end.start()].decode("utf-8", "replace"))[1:]:
         words = line.split()
         match words:
@@ -100,13 +120,28 @@ def read_header(file: BinaryIO) -> Header:
                 elements.append(Element(name, _count(count), (), False))
             case ["property", *rest] if elements:
                 elements[-1] = _with_property(elements[-1], rest)
-            case [] | ["comment" | "obj_info", *_]:
+            case ["comment", *words]:
+                antialias |= _antialias(words)
+            case [] | ["obj_info", *_]:
                 pass
             case _:
                 raise BadFileError(f"its header holds a line that is not understood: {line[:80]!r}")
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise BadFileError(f"its encoding {encoding[:40]!r} is not known")
-    return Header(encoding, tuple(elements), origin, end.end())
+    if len(antialias) > 1:
+        raise BadFileError("its comments contradict each other about antialiasing")
+    return Header(encoding, tuple(elements), origin, True in antialias, end.end())
+
+
+def _antialias(words: list[str]) -> set[bool]:
+    """What a comment says of opacity compensation: {} for nothing. Brush writes "SplatRenderMode:
+    mip" or "default", Postshot "antialiased 1" or "0"."""
+    match [word.lower() for word in words]:
+        case ["splatrendermode:", "mip"] | ["antialiased", "1"]:
+            return {True}
+        case ["splatrendermode:", "default"] | ["antialiased", "0"]:
+            return {False}
+    return set()
 
 
 def _count(text: str) -> int:
@@ -120,6 +155,8 @@ def _with_property(element: Element, words: list[str]) -> Element:
         case ["list", _, _, name]:
             return Element(element.name, element.count, element.properties, True)
         case [kind, name] if kind in TYPES:
+            if len(element.properties) == _MOST_PROPERTIES:
+                raise BadFileError(f"it declares more than {_MOST_PROPERTIES} properties")
             if any(name == known for known, _ in element.properties):
                 raise BadFileError(f"it declares the property {name[:40]!r} twice")
             properties = (*element.properties, (name, TYPES[kind]))

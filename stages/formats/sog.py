@@ -24,7 +24,7 @@ from stages.base import scratch
 from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
 from stages.formats import codebook, smallest_three
-from stages.formats.sog_read import PALETTE_LIMIT, PER_LINE
+from stages.formats.sog_read import ANTIALIASED, PALETTE_LIMIT, PER_LINE
 from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
 
@@ -59,7 +59,10 @@ def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[st
     """
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
-    meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": False}
+    antialias = splats.draw_settings.antialias
+    meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": antialias}
+    if antialias:
+        meta["model"] = ANTIALIASED  # as splat-transform writes and reads it
     meta["asset"] = {"generator": "splat", "units": units}
     if splats.origin.any():
         meta["asset"]["splat_origin"] = [float(v) for v in splats.origin]

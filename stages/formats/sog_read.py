@@ -28,11 +28,12 @@ from stages.formats.values import allocate, check_finite, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16
+ANTIALIASED = "antialiased"  # a value of `model`
 PER_LINE = 64  # entries of the palette in a line of its image
 _META_LIMIT_BYTES = 1 << 20
-# Real files take 10 bytes a splat. A file that declares more splats than this is refused before
+# Real files take 10 bytes a splat. A file that declares more splats than bytes is refused before
 # memory is allocated; a small number may all be equal.
-_SPLATS_PER_BYTE, _ALWAYS_ALLOWED = 4, 1 << 16
+_ALWAYS_ALLOWED = 1 << 16
 Member = Callable[[Any, int], bytes]  # (name, largest size) -> content, up to a byte longer
 
 
@@ -56,7 +57,11 @@ def in_zip(package: zipfile.ZipFile) -> Member:
     def member(name: Any, limit: int) -> bytes:
         if not isinstance(name, str) or name not in package.NameToInfo:
             raise BadFileError(f"it does not hold {str(name)[:80]!r}")
-        if package.getinfo(name).file_size > limit:
+        info = package.getinfo(name)
+        # Python unpacks the other kinds without a limit, whatever size the directory gives.
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise BadFileError(f"its {name[:80]!r} is packed by another method than deflate")
+        if info.file_size > limit:
             raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
         with package.open(name) as file:
             return file.read(limit + 1)
@@ -89,7 +94,7 @@ class Source:
         meta = json.loads(self._member("meta.json", _META_LIMIT_BYTES))
         if not isinstance(meta, dict) or meta.get("version") != 2:
             raise BadFileError("its meta.json is not of SOG version 2")
-        _whole(meta, "count", max(_ALWAYS_ALLOWED, _SPLATS_PER_BYTE * self.size_bytes))
+        _whole(meta, "count", max(_ALWAYS_ALLOWED, self.size_bytes))
         return meta
 
     def splats(self) -> Splats:
@@ -103,9 +108,8 @@ class Source:
         colours, scales = (self._pixels(meta, part, 0, count) for part in ("sh0", "scales"))
         books = [_numbers(meta, part, "codebook", 256) for part in ("sh0", "scales")]
         palette, labels = self._palette(meta, count)
-        splats = replace(
-            allocate(count, math.isqrt(1 + palette.shape[1]) - 1), origin=_origin(meta)
-        )
+        splats = allocate(count, math.isqrt(1 + palette.shape[1]) - 1)
+        splats = replace(splats, origin=_origin(meta)).with_antialias(antialias_of(meta))
         for rows in reported_blocks(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
@@ -212,3 +216,13 @@ def _origin(meta: dict[str, Any]) -> NDArray[np.float64]:
     asset = meta.get("asset")
     origin = asset.get("splat_origin") if isinstance(asset, dict) else None
     return np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
+
+
+def antialias_of(meta: dict[str, Any]) -> bool:
+    """Whether meta.json asks for opacity compensation: `antialias` of the specification, `model` of
+    splat-transform."""
+    said = {bool(meta["antialias"])} if "antialias" in meta else set()
+    said |= {meta["model"] == ANTIALIASED} if "model" in meta else set()
+    if len(said) > 1:
+        raise BadFileError("its meta.json contradicts itself: antialias and model disagree")
+    return True in said

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.blocks import blocks, reported_blocks
 from stages.formats import smallest_three
-from stages.formats.spz_read import COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
+from stages.formats.spz_read import ANTIALIASED, COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
 from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import FLIP, flipped
@@ -48,8 +48,8 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
     splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
-    bits = _fractional_bits(splats.means)
-    header = HEADER.pack(MAGIC, 3, len(splats), degree, bits, 0, 0)
+    bits, flags = _fractional_bits(splats.means), ANTIALIASED * splats.draw_settings.antialias
+    header = HEADER.pack(MAGIC, 3, len(splats), degree, bits, flags, 0)
     arrays: tuple[Callable[[Splats], NDArray[Any]], ...] = (
         lambda block: _positions(block, bits),
         _opacities,

@@ -30,7 +30,7 @@ COLOUR_SCALE = 0.15
 MAGNITUDE = 511  # 9 bits beside a sign
 _TABLE_STARTS = struct.Struct("<I12x")  # follows HEADER in version 4, whose last byte is a count
 _TABLE_ROW, _RECORD = struct.Struct("<QQ"), struct.Struct("<II")
-_HAS_EXTENSIONS = 2  # in the flags
+ANTIALIASED, _HAS_EXTENSIONS = 1, 2  # in the flags
 _EXTENSIONS_LIMIT_BYTES = 1 << 20
 # SPZ_ADOBE_coordinate_system: axes other than right, up, back. Codes of the reference library:
 # 0 unspecified, 4 right up back, 6 right down front, which are ours.
@@ -45,6 +45,7 @@ class _Content:
     version: int
     degree: int
     bits: int
+    flags: int
     arrays: list[NDArray[np.uint8]]
     y_up: bool
 
@@ -52,8 +53,7 @@ class _Content:
 def read(path: Path) -> Splats:
     """The splats of an .spz, y down, float32.
 
-    The antialiasing flag is ignored. Raises SplatError "splats-unreadable" for a damaged file or
-    another version.
+    Raises SplatError "splats-unreadable" for a damaged file or another version.
     """
     path = Path(path)
     with reading(path), path.open("rb") as file:
@@ -61,7 +61,7 @@ def read(path: Path) -> Splats:
         file.seek(0)
         size = path.stat().st_size
         content = _plain(file, size) if plain else _gzipped(file, size)
-        splats = _decoded(content)
+        splats = _decoded(content).with_antialias(bool(content.flags & ANTIALIASED))
         return check_finite(flipped(splats, reuse=True) if content.y_up else splats)
 
 
@@ -77,7 +77,7 @@ def _gzipped(file: BinaryIO, size: int) -> _Content:
     arrays = [stream.rows(count, size) for size in sizes]
     extra = stream.finish()
     y_up = _is_y_up(extra) if flags & _HAS_EXTENSIONS else True
-    return _Content(version, degree, bits, arrays, y_up)
+    return _Content(version, degree, bits, flags, arrays, y_up)
 
 
 def _plain(file: BinaryIO, size: int) -> _Content:
@@ -93,7 +93,7 @@ def _plain(file: BinaryIO, size: int) -> _Content:
             raise BadFileError(f"it declares {declared} bytes for {count} times {width}")
         arrays.append(read_zstd_frame(file, packed, declared).reshape(count, width))
     y_up = _is_y_up(extra) if flags & _HAS_EXTENSIONS else True
-    return _Content(version, degree, bits, arrays, y_up)
+    return _Content(version, degree, bits, flags, arrays, y_up)
 
 
 def _table(file: BinaryIO, size: int) -> tuple[tuple[Any, ...], bytes, list[tuple[int, int]]]:
@@ -134,15 +134,15 @@ def widths(version: int, degree: int, bits: int) -> tuple[int, ...]:
 def _is_y_up(records: bytes) -> bool:
     """Whether the axes are right, up, back; False if they are ours. Other extensions (limits for
     cameras) are ignored. Raises BadFileError for other axes."""
-    while len(records) >= _RECORD.size:
-        kind, length = _RECORD.unpack_from(records)
-        value = records[_RECORD.size : _RECORD.size + length]
+    at = 0
+    while len(records) >= at + _RECORD.size:
+        kind, length = _RECORD.unpack_from(records, at)
+        at += _RECORD.size + length
         if kind == _AXES_EXTENSION:
-            axes = int.from_bytes(value, "little")
+            axes = int.from_bytes(records[at - length : at], "little")
             if axes not in (*_Y_UP, _OURS):
                 raise BadFileError(f"its axes are number {axes} of SPZ, which is not supported")
             return axes != _OURS
-        records = records[_RECORD.size + length :]
     return True
 
 

@@ -23,7 +23,7 @@ from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
-from stages.formats.sog_read import Source, in_folder, in_zip
+from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
 from stages.formats.table import CHUNK
 from stages.formats.values import allocate, check_finite, drop_undrawable
 from stages.scene import Splats, View, morton
@@ -243,7 +243,10 @@ def _read(path: Path) -> Splats:
     chunks = [(names[file], wanted) for file, wanted in sorted(rows.items())]
     if meta.get("environment"):
         chunks.append((meta["environment"], None))
-    sources = [_source(path.parent, name) for name, _ in chunks]
+    places = [_place(path.parent, name) for name, _ in chunks]
+    if len(set(places)) < len(places):
+        raise BadFileError("it names a chunk twice")
+    sources = [_source(place) for place in places]
     ranges = [_checked(source, wanted) for source, (_, wanted) in zip(sources, chunks, strict=True)]
     degree = max((found for found, _ in ranges), default=0)
     splats = allocate(sum(n for _, each in ranges for _, n in each), degree)
@@ -255,7 +258,16 @@ def _read(path: Path) -> Splats:
             end += count
     asset = meta.get("asset")
     origin = asset.get("splat_origin") if isinstance(asset, dict) else None
-    return replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    splats = replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    return splats.with_antialias(_antialias(sources))
+
+
+def _antialias(sources: Sequence[Source]) -> bool:
+    """Whether the chunks ask for opacity compensation. Raises BadFileError if they disagree."""
+    found = {antialias_of(source.meta()) for source in sources}
+    if len(found) > 1:
+        raise BadFileError("its chunks disagree about antialiasing")
+    return True in found
 
 
 def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:
@@ -324,9 +336,8 @@ def _place(folder: Path, name: Any) -> Path:
     return place
 
 
-def _source(folder: Path, name: Any) -> Source:
+def _source(place: Path) -> Source:
     """A chunk: a folder's meta.json, or a .sog."""
-    place = _place(folder, name)
     if place.name == "meta.json":
         files = [file for file in place.parent.iterdir() if file.is_file()]
         return Source(in_folder(place.parent), sum(file.stat().st_size for file in files))

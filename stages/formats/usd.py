@@ -58,6 +58,8 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
     note: dict[str, Any] = {"units": units}
     if splats.origin.any():
         note["origin"] = Gf.Vec3d(*map(float, flipped(splats.take(slice(0))).origin))
+    if splats.draw_settings.antialias:
+        note["antialiased"] = True
     layer.customLayerData = {"splat": note}
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PRIM)

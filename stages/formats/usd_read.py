@@ -20,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, reading
+from stages.base.parent import how_it_ended
 from stages.base.text import reason_of
+from stages.base.usd_path import accepted_path
 from stages.formats.values import (
     allows_nonfinite,
     check_finite,
@@ -34,10 +36,12 @@ from stages.scene.flip import flipped
 from stages.scene.recentring import recentred
 
 _TYPE = "ParticleField3DGaussianSplat"
+_ARCS = ("references", "payload", "inheritPaths", "specializes", "clips")
 _REFUSED = 3  # exit status of the child when it printed a reason
 _TIMEOUT_SECONDS = 600
-# Address space of the child: of the library, and per byte of the file (arrays may be compressed).
-_BASE_BYTES, _BYTES_PER_BYTE = 4 << 30, 64
+# Memory of the child: beyond the library's, and per byte of the file (arrays may be compressed).
+_BASE_BYTES, _BYTES_PER_BYTE = 192 << 20, 64
+_THREADS = "4"  # of the library; the stack of each counts as memory
 
 
 def read(path: Path) -> Splats:
@@ -63,7 +67,7 @@ def read(path: Path) -> Splats:
                 command,
                 capture_output=True,
                 # The library writes crash reports there; they are deleted with the folder.
-                env={**os.environ, "TMPDIR": folder},
+                env={**os.environ, "TMPDIR": folder, "PXR_WORK_THREAD_LIMIT": _THREADS},
                 cwd=Path(__file__).resolve().parents[2],
                 timeout=_TIMEOUT_SECONDS,
                 check=False,
@@ -73,40 +77,57 @@ def read(path: Path) -> Splats:
         if child.returncode == _REFUSED:
             raise BadFileError(child.stdout.decode("utf-8", "replace").strip()[:300])
         if child.returncode != 0:
-            raise BadFileError("it is damaged: the USD library crashed on it")
+            how = how_it_ended(child.returncode)
+            raise BadFileError(f"it is damaged: the USD library ended with {how} on it")
         return load_splats(output)
 
 
 def parse(path: Path) -> Splats:
     """`read`, in this process. Raises BadFileError, or what the USD library raises."""
-    stage = _open(path)
+    with accepted_path(path) as name:
+        return _parsed(_open(name))
+
+
+def _parsed(stage: Any) -> Splats:
     parts = [_splats(prim) for prim in stage.Traverse() if prim.GetTypeName() == _TYPE]
     if not parts:
         raise BadFileError(f"it holds no {_TYPE}")
     splats = concatenate(parts)
     del parts
-    means, origin = recentred(splats.means.astype(np.float64), _origin(stage))
-    return check_finite(flipped(replace(splats, means=means, origin=origin), reuse=True))
+    note = stage.GetRootLayer().customLayerData.get("splat")
+    note = note if isinstance(note, dict) else {}
+    origin = np.array(note.get("origin", np.zeros(3)), np.float64).reshape(3)
+    means, origin = recentred(splats.means.astype(np.float64), origin)
+    splats = replace(splats, means=means, origin=origin)
+    splats = splats.with_antialias(bool(note.get("antialiased", False)))
+    return check_finite(flipped(splats, reuse=True))
 
 
-def _open(path: Path) -> Any:
+def _open(name: str) -> Any:
     from pxr import Sdf, Usd, UsdGeom
 
-    layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    layer = Sdf.Layer.OpenAsAnonymous(name)
     if layer is None:
         raise BadFileError("it is not USD")
     if layer.GetCompositionAssetDependencies():
         raise BadFileError("it refers to other files, which are not supported")
+    _refuse_arcs(layer)
     stage = Usd.Stage.Open(layer)
     if UsdGeom.GetStageUpAxis(stage) != UsdGeom.Tokens.y:
         raise BadFileError("its up axis is not y, which is not supported")
     return stage
 
 
-def _origin(stage: Any) -> NDArray[np.float64]:
-    note = stage.GetRootLayer().customLayerData.get("splat", {})
-    origin = note.get("origin") if isinstance(note, dict) else None
-    return np.zeros(3) if origin is None else np.array(origin, np.float64).reshape(3)
+def _refuse_arcs(layer: Any) -> None:
+    """Raise BadFileError if a prim is composed of others: a few kilobytes of prims that refer to
+    each other twice make millions."""
+
+    def check(path: Any) -> None:
+        spec = layer.GetPrimAtPath(path) if path.IsPrimPath() else None
+        if spec and any(spec.HasInfo(name) for name in _ARCS):
+            raise BadFileError("its prims are made of each other, which is not supported")
+
+    layer.Traverse("/", check)
 
 
 def _splats(prim: Any) -> Splats:
@@ -160,11 +181,15 @@ def _placement(prim: Any) -> tuple[float, NDArray[np.float64]]:
 
 
 def _limit_memory(path: Path) -> None:
-    with suppress(ImportError, ValueError, OSError):  # not on Windows; or limited already
+    with suppress(ImportError, ValueError, OSError):  # on Linux only; or limited already
         import resource
 
-        wanted = _BASE_BYTES + _BYTES_PER_BYTE * path.stat().st_size
-        resource.setrlimit(resource.RLIMIT_AS, (wanted, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        from pxr import Sdf, Usd, UsdGeom  # noqa: F401 - loaded before it is measured
+
+        now = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+        wanted = now + _BASE_BYTES + _BYTES_PER_BYTE * path.stat().st_size
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        resource.setrlimit(resource.RLIMIT_DATA, (wanted, hard))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 

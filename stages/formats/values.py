@@ -210,4 +210,4 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
                     out = out[:, : values.shape[1]]
                 out[...] = values
         start += len(part)
-    return Splats(**arrays)
+    return Splats(**arrays, draw_settings=parts[0].draw_settings)

@@ -10,11 +10,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import Interrupted
 from stages.measure.image_metrics import capped_psnr_db, flip, ssim
 from stages.photos.load import load_image, mask_of, scaled_image, scaled_mask
 from stages.raster.draw import renderer
@@ -112,8 +114,11 @@ class Score:
 class _EvaluationViews(Sequence[EvaluationView]):
     """The first views in memory, the others on disk."""
 
-    def __init__(self, folder: Path, views: Iterable[View], draw_settings: DrawSettings) -> None:
+    def __init__(
+        self, folder: Path, views: Iterable[View], draw_settings: DrawSettings, stop: Event | None
+    ) -> None:
         self._folder, self._views, self._draw_settings = folder, tuple(views), draw_settings
+        self._stop = stop
         self._loaded: list[EvaluationView] = []
         free = IN_MEMORY_MIB * 2**20
         for number, view in enumerate(self._views):
@@ -134,9 +139,15 @@ class _EvaluationViews(Sequence[EvaluationView]):
         if isinstance(number, slice):
             return [self[i] for i in range(len(self))[number]]
         number = range(len(self))[number]
+        self._stop_if_requested()
         return self._loaded[number] if number < len(self._loaded) else self._load(number)
 
+    def _stop_if_requested(self) -> None:
+        if self._stop is not None and self._stop.is_set():
+            raise Interrupted("stopped before a view")
+
     def _load(self, number: int) -> EvaluationView:
+        self._stop_if_requested()
         view, draw_settings = self._views[number], self._draw_settings
         found = load_evaluation_view(self._folder, view, draw_settings.camera(view.camera))
         return found.in_median_light(view.light if draw_settings.light else None).over(
@@ -145,14 +156,14 @@ class _EvaluationViews(Sequence[EvaluationView]):
 
 
 def load_evaluation_views(
-    folder: Path, views: Iterable[View], draw_settings: DrawSettings
+    folder: Path, views: Iterable[View], draw_settings: DrawSettings, stop: Event | None = None
 ) -> Sequence[EvaluationView]:
     """The views with their photographs at the size of `look`, over its background and in its light.
 
     As many as fit into `IN_MEMORY_MIB` are read at once. Raises SplatError, now or when a view is
-    used.
+    used, and Interrupted when `stop` is set.
     """
-    return _EvaluationViews(folder, views, draw_settings)
+    return _EvaluationViews(folder, views, draw_settings, stop)
 
 
 def load_evaluation_view(folder: Path, view: View, camera: Camera) -> EvaluationView:
@@ -266,10 +277,17 @@ def image_renderer(splats: Splats, backend: str) -> ImageRenderer:
     return lambda camera: draw(camera).image
 
 
+def psnr_of_views_db(
+    splats: Splats, views: Iterable[EvaluationView], backend: str
+) -> NDArray[np.float64]:
+    """[V] PSNR of each view, dB."""
+    draw = image_renderer(splats, backend)
+    return np.array([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views])
+
+
 def mean_psnr_db(splats: Splats, views: Iterable[EvaluationView], backend: str) -> float:
     """Mean PSNR over the views, dB."""
-    draw = image_renderer(splats, backend)
-    return float(np.mean([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views]))
+    return float(psnr_of_views_db(splats, views, backend).mean())
 
 
 def seconds_per_frame(

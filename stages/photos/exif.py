@@ -52,7 +52,9 @@ class Exif:
         more."""
         if self.exposure_s is None or self.f_number is None or self.iso is None:
             return None
-        return math.log2(self.f_number**2 / self.exposure_s) - math.log2(self.iso / 100.0)
+        # Logarithms one by one: tags may hold values whose square or quotient float64 cannot.
+        film = math.log2(self.iso) - math.log2(100.0)
+        return 2 * math.log2(self.f_number) - math.log2(self.exposure_s) - film
 
     def focal_px(self, stored: tuple[int, int], width: int, height: int) -> float | None:
         """Focal length in pixels of the normalised picture; None for a cropped file.

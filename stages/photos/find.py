@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from stages.base.errors import Family, SplatError
-from stages.base.text import counted
+from stages.base.text import counted, printable_name
 from stages.cameras import blender
 from stages.photos import masks
 from stages.photos.sources import (
@@ -41,12 +41,12 @@ def find(folder: Path, more_masks: Path | None = None) -> Findings:
             or video.
     """
     if folder.is_file() and folder.suffix.lower() in VIDEO:
-        name = _printable(Path(folder.name))
+        name = printable_name(folder.name)
         return Findings((), (Source(folder, name, f"{PHOTOS_FOLDER}{name}"),), (), (), 0)
     _check_folder(folder)
     files: dict[str, Path] = {}
     for path in _walk(folder):
-        files[_printable(path.relative_to(folder))] = path
+        files[printable_name(path.relative_to(folder).as_posix())] = path
     mask_of, stray = _remove_masks(files, folder, more_masks)
     names = sorted(files, key=natural_key)
     photographs = _posed(folder, [name for name in names if suffix_of(name) in PICTURES])
@@ -97,7 +97,7 @@ def _remove_masks(
     found = {short: files.pop(name) for name, short in inside.items()}
     if apart is not None and apart.is_dir() and apart != folder.resolve():
         for path in _walk(apart):
-            found[_printable(path.relative_to(apart))] = path
+            found[printable_name(path.relative_to(apart).as_posix())] = path
         for name in [name for name, path in files.items() if path.resolve().is_relative_to(apart)]:
             del files[name]
     found = {name: path for name, path in found.items() if suffix_of(name) in masks.MASK_SUFFIXES}
@@ -127,11 +127,6 @@ def _walk(folder: Path) -> Iterable[Path]:
             path = Path(place, name)
             if not name.startswith(".") and path.is_file():
                 yield path
-
-
-def _printable(relative: Path) -> str:
-    """The path with "/"; bytes that are not UTF-8 are escaped, so that JSON can hold it."""
-    return os.fsencode(relative.as_posix()).decode("utf-8", "backslashreplace")
 
 
 def _check_folder(folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 # In a scan's data every FF is followed by 00 (stuffing) or D0-D7 (restart), or it is fill (FF FF).
-_MARKER_IN_SCAN = re.compile(rb"\xff+([^\x00\xd0-\xd7\xff])", re.DOTALL)
+_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
 _START, _END, _SCAN, _TEM = 0xD8, 0xD9, 0xDA, 0x01
 
 

@@ -55,7 +55,8 @@ def compressed_ply(path: Path) -> Splats:
             "sh": sh,
         }
 
-    return splats_by_rows(data["vertex"].count, values_of)
+    found = splats_by_rows(data["vertex"].count, values_of)
+    return found.with_antialias("SplatRenderMode: mip" in data.comments)
 
 
 def spz(path: Path) -> Splats:
@@ -63,7 +64,7 @@ def spz(path: Path) -> Splats:
     import struct
 
     content = gzip.decompress(path.read_bytes())
-    magic, version, n, degree, fraction = struct.unpack_from("<IIIBB", content)
+    magic, version, n, degree, fraction, flags = struct.unpack_from("<IIIBBB", content)
     assert magic == 0x5053474E, "the header does not begin with NGSP"
     assert version in (2, 3), f"the version is {version}, not 2 or 3"
     k = (degree + 1) ** 2 - 1
@@ -91,7 +92,7 @@ def spz(path: Path) -> Splats:
             "sh": sh,
         }
 
-    return splats_by_rows(n, values_of)
+    return splats_by_rows(n, values_of).with_antialias(flags & 1 == 1)
 
 
 def _xyz_in_bytes(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -176,7 +177,7 @@ def sog(path: Path | BinaryIO) -> Splats:
             "sh": sh,
         }
 
-    return splats_by_rows(meta["count"], values_of)
+    return splats_by_rows(meta["count"], values_of).with_antialias(meta["antialias"])
 
 
 def _with_largest(column: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base import scratch
 from stages.base.blocks import release_mapped_pages, reported_blocks
+from stages.base.usd_path import accepted_path
 from stages.proof.content import logits, splats_by_rows, splats_of
 from stages.scene import Splats
 
@@ -31,7 +32,8 @@ _PAGE_PIECE = 1 << 22  # characters: the parser scans an unfinished element once
 def ply(path: Path) -> Splats:
     from plyfile import PlyData
 
-    vertex = PlyData.read(str(path), mmap="c")["vertex"]
+    content = PlyData.read(str(path), mmap="c")
+    vertex = content["vertex"]
     names = [item.name for item in vertex.properties]
     per_channel = sum(name.startswith("f_rest_") for name in names) // 3
     count = len(vertex.data)
@@ -54,7 +56,7 @@ def ply(path: Path) -> Splats:
             arrays["quaternions"][part, i] = rows[f"rot_{i}"]
         arrays["opacity_logits"][part] = rows["opacity"]
         release_mapped_pages(vertex.data)
-    return splats_of(**arrays)
+    return splats_of(**arrays).with_antialias("SplatRenderMode: mip" in content.comments)
 
 
 class _Chunks(HTMLParser):
@@ -175,7 +177,8 @@ def gltf(path: Path) -> Splats:
                 sh=sh,
             )
         )
-    return _concatenated(parts)
+    antialias = (document.asset.extras or {}).get("antialiased", False)
+    return _concatenated(parts).with_antialias(antialias)
 
 
 def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
@@ -196,12 +199,17 @@ def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.float
 
 
 def usd(path: Path) -> Splats:
+    with accepted_path(path) as name:
+        return _usd(name)
+
+
+def _usd(name: str) -> Splats:
     from pxr import Gf, Sdf, Usd, Vt
 
     # The column in which each of w, x, y, z arrives, measured instead of assumed.
     columns = np.argsort(np.array(Vt.QuatfArray([Gf.Quatf(1, 2, 3, 4)]))[0])
     # Without the library's cache, which may hold an older file of the same name.
-    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(str(path)))
+    stage = Usd.Stage.Open(Sdf.Layer.OpenAsAnonymous(name))
     parts = []
     for prim in stage.Traverse():
         if prim.GetTypeName() != "ParticleField3DGaussianSplat":
@@ -219,7 +227,8 @@ def usd(path: Path) -> Splats:
                 sh=coefficients.reshape(-1, (degree + 1) ** 2, 3),
             )
         )
-    return _concatenated(parts)
+    antialias = stage.GetRootLayer().customLayerData["splat"].get("antialiased", False)
+    return _concatenated(parts).with_antialias(antialias)
 
 
 def _concatenated(parts: list[Splats]) -> Splats:

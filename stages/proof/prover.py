@@ -118,6 +118,20 @@ class Prover:
             )
         return proof
 
+    def with_original(self, splats: Splats) -> Prover:
+        """This prover for other values of the same splats. The pictures stay, so that all losses
+        show in them, unless `splats` are to be drawn in another way."""
+        if splats.draw_settings.antialias == self.splats.draw_settings.antialias:
+            return replace(self, splats=splats)
+        return Prover.of(splats, self.cameras, self.backend, self.source_format)
+
+    def plain_drawing_db(self) -> float:
+        """Mean PSNR between the pictures and those of a viewer that does not compensate opacities,
+        of splats that are to be drawn with compensation."""
+        plain = self.with_original(self.splats.with_antialias(False))
+        pairs = zip(plain.pictures, self.pictures, strict=True)
+        return float(np.mean([capped_psnr_db(a, np.clip(b, 0.0, 1.0)) for a, b in pairs]))
+
     def prove(self, path: Path, exact: bool = False) -> Proof:
         """Read `path` with an independent reader, draw it and compare. Nothing is raised for a
         wrong file.
@@ -164,7 +178,10 @@ class Prover:
         instead of the splats into ours, so that the rotation of positions, quaternions and SH is
         checked by other code than itself."""
         drawn = self.drawn if isinstance(self.drawn, slice) else self.drawn[rows]
-        draw = renderer(content.splats.take(drawn), raster_settings_of(self.splats), self.backend)
+        settings = replace(
+            raster_settings_of(self.splats), antialias=content.splats.draw_settings.antialias
+        )
+        draw = renderer(content.splats.take(drawn), settings, self.backend)
         moved = (camera.moved(content.world_from_file) for camera in self.cameras)
         return [
             capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stages.base.usd_path import accepted_path
+
 
 def errors_in(path: Path) -> list[str]:
     """One line for each error that a registered validator finds.
@@ -14,9 +16,10 @@ def errors_in(path: Path) -> list[str]:
     from pxr import Usd, UsdValidation
 
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    stage = Usd.Stage.Open(str(path))
-    stage.Reload()  # the library's cache may hold an older file of the same name
-    found = UsdValidation.ValidationContext(validators).Validate(stage)
+    with accepted_path(path) as name:
+        stage = Usd.Stage.Open(name)
+        stage.Reload()  # the library's cache may hold an older file of the same name
+        found = UsdValidation.ValidationContext(validators).Validate(stage)
     return [
         " ".join(error.GetErrorAsString().split())
         for error in found

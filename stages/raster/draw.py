@@ -61,5 +61,6 @@ def renderer(
 
 def raster_settings_of(splats: Splats) -> RasterSettings:
     """By the draw settings of `splats`; without a near plane there, by the extent of the splats."""
-    near = splats.draw_settings.near or near_plane_of(splats.means)
-    return RasterSettings(near=near, background=(splats.draw_settings.background,) * 3)
+    drawn = splats.draw_settings
+    near = drawn.near or near_plane_of(splats.means)
+    return RasterSettings(near, antialias=drawn.antialias, background=(drawn.background,) * 3)

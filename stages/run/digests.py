@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from stages.base.text import printable_name
+
 UNREADABLE = "unreadable"
 
 
@@ -45,21 +47,22 @@ def record_files(
             without being read.
         leave_out: names to skip.
         users: whether the files are the user's own. Then names with a leading dot are left out,
-            because desktop programs write such files among photographs, and a file without read
-            permission is recorded as `UNREADABLE`.
+            because desktop programs write such files among photographs, a file without read
+            permission is recorded as `UNREADABLE`, and names are made printable, as ingest does.
 
     Raises OSError.
     """
     known = known or {}
     record = _record_if_readable if users else _record
     if folder.is_file():
-        return {folder.name: record(folder, known.get(folder.name))}
+        name = printable_name(folder.name)
+        return {name: record(folder, known.get(name))}
     found: FileRecords = {}
     for path in sorted(folder.rglob("*")):
         relative = path.relative_to(folder)
         if users and any(part.startswith(".") for part in relative.parts):
             continue
-        name = relative.as_posix()
+        name = printable_name(relative.as_posix()) if users else relative.as_posix()
         if name not in leave_out and path.is_file():
             found[name] = record(path, known.get(name))
     return found
@@ -103,10 +106,13 @@ def differences(old: Mapping[str, FileRecord], new: Mapping[str, FileRecord]) ->
     return changes
 
 
-def damage(folder: Path, recorded: Mapping[str, FileRecord]) -> list[str]:
+def damage(
+    folder: Path, recorded: Mapping[str, FileRecord], *, read_all: bool = False
+) -> list[str]:
     """Which recorded files under `folder` have changed, as text; [] if none has.
 
     Files that are not in `recorded` are ignored: a viewer may have written some beside ours.
+    read_all: whether to read files of the recorded size and time, too.
     """
     changes = []
     for name, record in sorted(recorded.items()):
@@ -114,7 +120,7 @@ def damage(folder: Path, recorded: Mapping[str, FileRecord]) -> list[str]:
         try:
             if not path.is_file():
                 changes.append(f"{name} is missing")
-            elif _record(path, record).sha256 != record.sha256:
+            elif _record(path, None if read_all else record).sha256 != record.sha256:
                 changes.append(f"{name} changed")
         except OSError as error:
             changes.append(f"{name} cannot be read ({error.strerror})")

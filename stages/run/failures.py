@@ -7,11 +7,18 @@ from pathlib import Path
 
 from stages.base.disk import DISK_FULL, is_full, not_permitted
 from stages.base.errors import Family, SplatError
-from stages.base.text import reason_of
+from stages.base.text import printable, printable_name, reason_of
 
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _USER = (Family.USAGE, Family.INPUT, Family.RUN_FOLDER)
-_MEMORY_WORDS = ("can't allocate memory", "out of memory", "not enough memory")
+_MEMORY_WORDS = (
+    "can't allocate memory",
+    "out of memory",
+    "not enough memory",
+    "cannot allocate memory",
+    "can't start new thread",
+    "failed to map segment",
+)
 
 
 def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError | None:
@@ -35,9 +42,24 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
             return disk_full(doing, folder) if full and link.family not in _USER else link
         if isinstance(link, OSError) and link.errno in _DENIED:
             return not_permitted(Path(link.filename or folder), link)
+        if isinstance(link, UnicodeEncodeError) and printable(link.object) != link.object:
+            what = f"{printable_name(link.object)} has a name that is not UTF-8."
+            return _unusable_name("name-not-utf-8", what)
+        if isinstance(link, OSError) and link.errno == errno.ENAMETOOLONG:
+            what = f"{link.filename or folder}: the name or the whole path is too long."
+            return _unusable_name("name-too-long", what)
         if isinstance(link, MemoryError) or any(w in str(link).lower() for w in _MEMORY_WORDS):
             return out_of_memory(doing, link)
     return disk_full(doing, folder) if full else None
+
+
+def _unusable_name(code: str, given: str) -> SplatError:
+    return SplatError(
+        code,
+        given=given,
+        wanted="Names of files and folders that the system and its libraries can use.",
+        hint="Rename it, or use another folder.",
+    )
 
 
 def _chain(error: BaseException) -> list[BaseException]:

@@ -15,6 +15,7 @@ from stages.base.errors import Family, SplatError
 
 LOCK = ".lock"
 HOLDER = ".lock-holder"  # process id of whoever holds it
+_PATIENCE_S = 0.5  # a process that was killed may hold it a moment longer
 
 
 @contextmanager
@@ -24,7 +25,7 @@ def locked(folder: Path) -> Iterator[None]:
 
     lock = FileLock(folder / LOCK)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=_PATIENCE_S)
     except Timeout:
         raise _busy(folder) from None
     note = folder / HOLDER

@@ -6,6 +6,7 @@ its own contents, so that a manifest edited by hand is detected.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -116,7 +117,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
-        json.dump(plain(data), file, indent=1, ensure_ascii=False)
+        json.dump(plain(data), file, indent=1)
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
@@ -143,6 +144,8 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
     except PermissionError as error:
         raise not_permitted(path, error) from error
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:  # reported where the name is used
+            raise
         raise SplatError(
             "run-folder-unreadable",
             given=f"{path} cannot be read: {error.strerror}.",
@@ -150,7 +153,7 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
             hint="Check the permissions of the folder.",
             family=Family.RUN_FOLDER,
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise _edited(path) from error
     if not isinstance(data, dict) or not isinstance(data.get("schema"), int):
         raise _edited(path)

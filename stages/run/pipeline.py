@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +16,13 @@ from stages.base.settings import check_settings
 from stages.base.stage import Stage
 from stages.run import runfolder
 from stages.run.attempt import Listener, attempt
+from stages.run.digests import damage
 from stages.run.failures import as_splat_error
 from stages.run.lock import holder
 from stages.run.manifest import Manifest
 from stages.run.planning import PHOTOS, Planner, Step
 from stages.run.runfile import RunFile
+from stages.run.time_limit import within_limit
 from stages.run.workspace import Layout
 
 __all__ = ["Listener", "Pipeline", "Step"]
@@ -79,6 +82,26 @@ class Pipeline:
             raise runfolder.missing(self.run_folder)
         return self.plan()
 
+    def check_outputs(self) -> None:
+        """Read all files of all finished stages. Raises SplatError (run-folder-damaged) if one is
+        not as it was written: a fault of the disk may change neither size nor time."""
+        damaged = {}
+        for stage in self.layout.stages:
+            manifest = self.manifest(stage.name)
+            folder = self.stage_folder(stage.name)
+            if manifest and (found := damage(folder, manifest.outputs, read_all=True)):
+                damaged[folder] = found
+        if damaged:
+            what = (f"{folder.name}/{change}" for folder in damaged for change in damaged[folder])
+            raise SplatError(
+                "run-folder-damaged",
+                given=f"In {self.run_folder}, {', '.join(what)}.",
+                wanted="The files as the stages wrote them.",
+                hint=f"Check the disk. Delete {', '.join(map(str, damaged))}; then `splat process "
+                f"{self.run_folder}` makes this again, and what depends on it if it differs.",
+                family=Family.RUN_FOLDER,
+            )
+
     def plan(self, settings: Mapping[str, Any] | None = None) -> list[Step]:
         """What `run` would do, one step for each stage. Changes nothing.
 
@@ -103,7 +126,7 @@ class Pipeline:
         Args:
             settings: dataclasses by stage name; recorded for later runs. The recorded ones are
                 used where left out.
-            until: name of the last stage; None for all.
+            until: name of the last stage; None for all, which share a limit of time.
             may_run: names of the stages that may run; it is an error if another one has to.
             listener: receives the events of the run.
 
@@ -144,13 +167,13 @@ class Pipeline:
         stop: Event,
         listener: Listener,
     ) -> list[Manifest]:
-        manifests = []
+        manifests, began = [], time.monotonic() if until is None else None
         for stage in self.layout.up_to(until):
             step = planner.assess(stage, wanted[stage.name])
             if step.will_run or step.manifest is None:
                 if stop.is_set():
                     raise Interrupted(stage.name)
-                manifest = self._run_one(planner, step, wanted[stage.name], stop, listener)
+                manifest = self._run_one(planner, step, wanted[stage.name], stop, listener, began)
                 listener.finished(stage, step.number, manifest)
             else:
                 manifest = step.manifest
@@ -160,7 +183,13 @@ class Pipeline:
         return manifests
 
     def _run_one(
-        self, planner: Planner, step: Step, settings: Any, stop: Event, listener: Listener
+        self,
+        planner: Planner,
+        step: Step,
+        settings: Any,
+        stop: Event,
+        listener: Listener,
+        began: float | None,
     ) -> Manifest:
         stage = step.stage
         space = self.layout.workspace(stage)
@@ -170,6 +199,8 @@ class Pipeline:
         inputs = {name: self.load(name) for name in stage.reads} or {
             PHOTOS: planner.existing_photos()
         }
+        if began is not None:
+            settings = within_limit(stage.name, settings, time.monotonic() - began)
         return attempt(stage, settings, request, inputs, space, stop, listener)
 
     def _check_allowed(

@@ -45,7 +45,7 @@ class Request:
         """Whether the work in a folder was begun for an equal request."""
         try:
             left = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return False
         return bool(left == json.loads(json.dumps(self.key(settings_type))))
 

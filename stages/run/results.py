@@ -98,7 +98,10 @@ def read_file(file: Path, strict: bool = True) -> Splats:
 
     splats = read(file, strict=strict)
     views = views_of(run_around(file))
-    return replace(splats, draw_settings=draw_settings_of(views)) if views else splats
+    if not views:
+        return splats
+    antialias = splats.draw_settings.antialias  # as the file says
+    return replace(splats, draw_settings=draw_settings_of(views, antialias=antialias))
 
 
 def backend_of_run(pipeline: Pipeline | None) -> str:

@@ -113,7 +113,7 @@ def _stage_files(folder: Path) -> Iterator[tuple[str, Path]]:
 
 def _settings_in(name: str, path: Path) -> dict[str, Any] | None:
     """The settings in a manifest or request of the stage `name`; None if it is not one."""
-    with suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
+    with suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         data = json.loads(path.read_text(encoding="utf-8"))
         fits = data.get("stage", name) == name and {"version", "inputs"} <= data.keys()
         return dict(data["settings"]) if fits else None

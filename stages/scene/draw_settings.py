@@ -29,22 +29,28 @@ class DrawSettings:
             none.
         background: grey level behind everything, 0 to 1: black, or white for cut-out photographs.
         light: whether photographs are corrected to their median light (`scene.light`) first.
+        antialias: whether opacities are reduced by as much as the rasteriser's dilation enlarges
+            the area of a splat: the 2D Mip filter of Mip-Splatting (Yu et al. 2024, section 4.2).
+            Splats are trained for one of the two and look wrong when they are drawn as the other.
     """
 
     near: float = 0.0
     side: int = 0
     background: float = 0.0
     light: bool = False
+    antialias: bool = False
 
     def camera(self, camera: Camera) -> Camera:
         """`camera` at the size of training and evaluation; never enlarged."""
         return camera.fitted(self.side) if self.side else camera
 
 
-def draw_settings_of(views: tuple[View, ...], side: int = 0, light: bool = False) -> DrawSettings:
-    """How splats trained on these views are drawn. side, light: as in `DrawSettings`."""
+def draw_settings_of(
+    views: tuple[View, ...], side: int = 0, light: bool = False, antialias: bool = False
+) -> DrawSettings:
+    """How splats trained on these views are drawn. The others: as in `DrawSettings`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
-    return DrawSettings(near_plane(views), side, float(cut_out), light)
+    return DrawSettings(near_plane(views), side, float(cut_out), light, antialias)
 
 
 def near_plane(views: tuple[View, ...]) -> float:

@@ -95,6 +95,10 @@ class Splats:
         shift[:3, 3] = self.origin
         return camera.moved(shift)
 
+    def with_antialias(self, antialias: bool) -> Splats:
+        """The same values, to be drawn with or without opacity compensation."""
+        return replace(self, draw_settings=replace(self.draw_settings, antialias=antialias))
+
     def with_sh_degree(self, degree: int) -> Splats:
         """With coefficients of higher degrees dropped, or zero coefficients added."""
         wanted = (degree + 1) ** 2
@@ -113,13 +117,10 @@ class TrainedSplats:
     """The result of training.
 
     dropout: whether some splats were dropped from each of the last steps (`training.dropout`).
-    overfitted: whether training views are reproduced much better than other views. Other views
-        then hardly change when splats are removed that the training views need.
     """
 
     splats: Splats
     dropout: bool = False
-    overfitted: bool = False
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,9 @@ class QuantisedSplats:
     flat_dc [N, 3]: DC coefficients for formats without view-dependent colour; None where those of
     the splats do. finetuned: by format that
     rounds its values, the splats that its file should hold, fine-tuned to that rounding.
+    plain: the splats for formats that are drawn without opacity compensation; None where `splats`
+    are drawn without it, or no such format was requested. drawing: which formats these are, see
+    `formats.table.Format.antialiased`.
     """
 
     splats: Splats
@@ -138,6 +142,8 @@ class QuantisedSplats:
     decisions: dict[str, object]
     flat_dc: NDArray[np.floating] | None = None
     finetuned: Mapping[str, Splats] = field(default_factory=dict)
+    plain: Splats | None = None
+    drawing: str = "auto"
 
 
 def parameters_per_splat(sh_degrees: NDArray[np.integer]) -> NDArray[np.int64]:

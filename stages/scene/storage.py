@@ -23,7 +23,7 @@ from stages.base.errors import Family, SplatError
 from stages.scene.draw_settings import DrawSettings
 from stages.scene.splats import Splats
 
-MAGIC = b"SPLATS3\n"
+MAGIC = b"SPLATS4\n"
 FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees", "origin")
 FILE_NAME = "splats.bin"
 _DTYPES = {"<f4", "<f8", "|u1"}
@@ -59,14 +59,17 @@ def load_splats(path: Path) -> Splats:
             if file.read(len(MAGIC)) != MAGIC:
                 raise ValueError("it does not start as a splats file")
             arrays = {name: _read_array(file, size, name) for name in FIELDS}
-            near, side, grey, light = _read_array(file, size, "draw settings").astype(np.float64)
+            drawn = _read_array(file, size, "draw settings").astype(np.float64)
+            near, side, grey, light, antialias = drawn
             if file.read(1):
                 raise ValueError("bytes follow its end")
-        draw_settings = DrawSettings(float(near), int(side), float(grey), bool(light))
+        draw_settings = DrawSettings(
+            float(near), int(side), float(grey), bool(light), bool(antialias)
+        )
         return Splats(**arrays, draw_settings=draw_settings)  # type: ignore[arg-type]
     except PermissionError as error:
         raise not_permitted(source, error) from error
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, OverflowError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise SplatError(
             "splats-file-damaged",

@@ -82,7 +82,7 @@ class Job:
     pairs: tuple[tuple[int, int], ...] = ()
 
     def write(self, path: Path) -> Path:
-        path.write_text(json.dumps(asdict(self), ensure_ascii=False), encoding="utf-8")
+        path.write_text(json.dumps(asdict(self)), encoding="utf-8")
         return path
 
     @classmethod
@@ -137,7 +137,7 @@ def prepare_work_folder(work: Path, job: Job, known_cameras: str = "") -> None:
     # Locations and the number of threads change no result.
     same = {"images_root": "", "database": "", "out": "", "progress": "", "threads": 0}
     data = asdict(job) | same | {"known_cameras": known_cameras}
-    wanted = json.dumps(data, ensure_ascii=False, sort_keys=True)
+    wanted = json.dumps(data, sort_keys=True)
     try:
         unchanged = description.read_text(encoding="utf-8") == wanted
     except (OSError, ValueError):

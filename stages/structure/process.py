@@ -12,6 +12,7 @@ from pathlib import Path
 from threading import Event
 
 from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.parent import how_it_ended
 from stages.base.stage import Report
 from stages.structure.job import Job
 from stages.structure.worker_progress import read_progress
@@ -142,10 +143,10 @@ def crash_error(crash: WorkerCrashed, folder: Path) -> SplatError:
     """A worker's crash as an error for the user, which names the log in `folder`."""
     lines = [line for line in crash.tail.splitlines() if line.strip()]
     last = lines[-1] if lines else "(none)"
-    how = f"signal {-crash.status}" if crash.status < 0 else f"status {crash.status}"
     return SplatError(
         "sfm-crashed",
-        given=f"COLMAP ended with {how} during {crash.step}. The last line of its log: {last}",
+        given=f"COLMAP ended with {how_it_ended(crash.status)} during {crash.step}. "
+        f"The last line of its log: {last}",
         wanted="COLMAP must finish without an error.",
         hint=f"Give the same command again; if it ends the same way, use smaller photographs "
         f"(--max-side). The whole log is {folder / 'log.txt'}.",

@@ -35,7 +35,9 @@ def make_trainer(
     kept, held = split_held_out(reconstruction.views)
     light = corrects_light(reconstruction, settings.light, report)
     train = load_views(reconstruction.folder, kept, settings.train_side, folder, light)
-    draw_settings = draw_settings_of(reconstruction.views, settings.train_side, light)
+    draw_settings = draw_settings_of(
+        reconstruction.views, settings.train_side, light, settings.antialias
+    )
     held_out = load_evaluation_views(reconstruction.folder, held, draw_settings)
     sides = [max(v.camera.width, v.camera.height) for v in reconstruction.views]
     if smaller := sum(side < settings.train_side for side in sides):

@@ -63,7 +63,7 @@ class ColourRefit:
         change = 0.0
         both = zip(self._errors(model), self._errors(moved), strict=True)
         for (_, before), (_, after) in both:
-            difference = np.square(after) - np.square(before)
+            difference = np.square(after, dtype=np.float64) - np.square(before, dtype=np.float64)
             change += float((_huber_weights(before) * difference).sum(dtype=np.float64))
         return change
 

@@ -89,6 +89,7 @@ class FineTuner:
             rates = LearningRates().scaled(
                 MEANS_LR * self.extent * (MEANS_LR_END / MEANS_LR) ** done,
                 RATE * (RATE_END / RATE) ** done,
+                self.extent,
             )
             rates = replace(rates, **dict.fromkeys(frozen, 0.0))
             self._stepper.step(self._next_level(), settings, rates, False, self._dropout())

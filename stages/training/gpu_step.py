@@ -15,7 +15,7 @@ import triton
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.raster.definition import OPACITY, SH, RasterSettings, gradient_columns
+from stages.raster.definition import OPACITY, ROTATION, SH, RasterSettings, gradient_columns
 from stages.raster.gpu.device import gpu_errors_explained, interpreted
 from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
 from stages.scene import Camera
@@ -65,11 +65,12 @@ class Arrivals:
 
 
 class GpuStep:
-    """See `step.TrainingStep`. skipped: number of steps whose lists had too little room."""
+    """See `step.TrainingStep`."""
 
     def __init__(self, rasteriser: GpuRasteriser, lag: int | None = None) -> None:
         self.rasteriser, self.device = rasteriser, rasteriser.device
-        self.skipped, self._room, self._splats = 0, 0, 0
+        self._room, self._splats = 0, 0
+        self.skipped = torch.zeros(1, dtype=torch.int64, device=self.device)
         self._arrivals = Arrivals(
             self.device, (0 if interpreted() else LAG) if lag is None else lag
         )
@@ -134,10 +135,10 @@ class GpuStep:
                 parameters *= self._own[:, : parameters.shape[1]]
             self._adam(drawn, view, parameters, means2d, rates, room)
             self._on_host = None
+            self.skipped += drawn.lists.total > room
             self._arrivals.send(torch.stack([loss.double(), drawn.lists.total[0].double()]))
             value, wanted = self._arrivals.read()
         if wanted > self._room:
-            self.skipped += 1
             self._room = int(SPARE * wanted)
         return value
 
@@ -172,6 +173,7 @@ class GpuStep:
         n, columns, out_columns = len(self), self._scene.rows.shape[1], parameters.shape[1]
         if n == 0:
             return
+        parameters[:, :ROTATION] *= rates.extent
         block = 4096 if interpreted() else 16
         pixels = view.width * view.height
         gpu_kernels.adam_kernel[(triton.cdiv(n, block),)](

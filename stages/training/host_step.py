@@ -14,6 +14,8 @@ from stages.training.optimiser import Model, empty_model
 class HostStep:
     """See `step.TrainingStep`; subclasses add `step`."""
 
+    skipped = 0
+
     def __init__(self, rasteriser: Rasteriser) -> None:
         self.rasteriser = rasteriser
         self._model = empty_model()

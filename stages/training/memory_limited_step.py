@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import SupportsInt, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,11 @@ class MemoryLimitedStep:
 
     def __len__(self) -> int:
         return len(self.inner)
+
+    @property
+    def skipped(self) -> SupportsInt:
+        """See `step.TrainingStep`."""
+        return self.inner.skipped
 
     def load(self, model: Model) -> None:
         """See `step.TrainingStep`; loads the most opaque splats that fit."""

@@ -42,7 +42,8 @@ from stages.raster.kernels.simd import (
 
 BETA1, BETA2 = 0.9, 0.999
 # Gradients are those of H x W x loss (see `loss`), so this is about 1e-9 in the units of the mean
-# loss: 1e-15, as often used, turns rounding noise into whole steps.
+# loss: 1e-15, as often used, turns rounding noise into whole steps. Means count in extents of the
+# scene, so that neither this nor LARGEST_GRADIENT depends on the unit of length.
 EPSILON = 1e-4
 # A step with a larger gradient is skipped: it is a numerical accident. Valid gradients are much
 # smaller. The square of this one is far from overflow in float32. A gradient of 1e15 in the moments
@@ -78,7 +79,8 @@ GROUP_SIZE = len(COLUMN_COUNTS)
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates, in the units of the parameters (means: world units)."""
+    """Learning rates, in the units of the parameters (means: world units). extent: of the scene,
+    world units; gradients by means are multiplied by it."""
 
     means: float = 0.0
     quaternions: float = 1e-3
@@ -86,17 +88,12 @@ class LearningRates:
     opacity_logits: float = 5e-2
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
+    extent: float = 1.0
 
-    def scaled(self, means: float, factor: float) -> LearningRates:
+    def scaled(self, means: float, factor: float, extent: float = 1.0) -> LearningRates:
         """All rates times `factor`, but that of the means, which is `means`."""
-        return LearningRates(
-            means,
-            self.quaternions * factor,
-            self.log_scales * factor,
-            self.opacity_logits * factor,
-            self.sh_dc * factor,
-            self.sh_rest * factor,
-        )
+        others = {name: rate * factor for name, rate in vars(self).items()}
+        return LearningRates(**others | {"means": means, "extent": extent})
 
     def row(self, coefficients: int) -> NDArray[np.float32]:
         """The rate of each column of a gradient row with so many SH coefficients."""
@@ -331,29 +328,19 @@ def apply_gradients(
     rates: LearningRates,
     width: int,
     height: int,
-    dense: bool = False,
 ) -> None:
-    """One step of Adam on `model`, in place. coefficients: number of SH coefficients that the
-    gradients hold.
-
-    dense: splats that are not visible are updated with a gradient of 0, as in Adam on whole
-    tensors: they keep moving, and their moments decay. It costs a pass over the whole model.
-    """
+    """One step of Adam on `model`, in place; gradients by means become those per extent.
+    coefficients: number of SH coefficients that the gradients hold."""
     pixels = width * height
-    rows, parameters, means2d = backward.rows, backward.parameters, backward.means2d
-    if dense:
-        unseen = np.ones(len(model), bool)
-        unseen[rows] = False
-        n = len(model)
-        parameters, means2d = _spread(parameters, rows, n), _spread(means2d, rows, n)
-        rows = np.arange(len(model), dtype=np.int32)
-        model.gradient_count[unseen] -= 1  # which the step below adds
+    parameters = backward.parameters
+    with np.errstate(over="ignore", invalid="ignore"):  # then the splat's step is skipped
+        parameters[:, MEAN:ROTATION] *= np.float32(rates.extent)
     pool.share(
         adam_step,
         CHUNK,
-        rows,
+        backward.rows,
         parameters,
-        means2d,
+        backward.means2d,
         model.means,
         model.quaternions,
         model.log_scales,
@@ -371,10 +358,3 @@ def apply_gradients(
         model.gradient_sum,
         model.gradient_count,
     )
-
-
-def _spread(values: NDArray[np.float32], rows: NDArray[np.int32], n: int) -> NDArray[np.float32]:
-    """[n, columns] `values` at `rows`, 0 elsewhere."""
-    full = np.zeros((n, values.shape[1]), np.float32)
-    full[rows] = values
-    return full

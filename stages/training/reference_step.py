@@ -119,8 +119,10 @@ def adam(
     height: int,
 ) -> None:
     """One sparse step of Adam, as `optimiser.apply_gradients` does it."""
-    whole = (np.abs(backward.parameters) <= LARGEST_GRADIENT).all(1)
-    rows, g = backward.rows[whole], backward.parameters[whole].astype(np.float64)
+    parameters = backward.parameters.astype(np.float64)
+    parameters[:, MEAN:ROTATION] *= rates.extent
+    whole = (np.abs(parameters) <= LARGEST_GRADIENT).all(1)
+    rows, g = backward.rows[whole], parameters[whole]
     columns = g.shape[1]
     model.steps[rows, : active_counts(coefficients)] += 1
     t = np.maximum(model.steps[rows], 1).astype(np.float64)[:, COLUMN_COUNTS[:columns]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, SupportsInt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,10 @@ class TrainingStep(Protocol):
 
     def __len__(self) -> int:
         """Number of splats; needs no transfer from a device."""
+
+    @property
+    def skipped(self) -> SupportsInt:
+        """Number of steps so far that changed nothing, because a device's lists were full."""
 
     def load(self, model: Model) -> None:
         """Replace the model, including the optimiser's moments."""

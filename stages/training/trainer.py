@@ -119,7 +119,8 @@ class Trainer:
         settings = self.raster_settings(schedule.active_sh_degree(step))
         if self.random_background:
             settings = replace(settings, background=schedule.background(step))
-        rates = LearningRates().scaled(schedule.means_lr(step), schedule.rate_factor(step))
+        means_lr, factor = schedule.means_lr(step), schedule.rate_factor(step)
+        rates = LearningRates().scaled(means_lr, factor, schedule.extent)
         dropout = None
         if self.dropout and not schedule.densifying(step):  # it would distort the mean gradients
             dropout = Dropout(len(self.train), schedule.dropout_key(step))
@@ -158,8 +159,11 @@ class Trainer:
 
     def raster_settings(self, sh_degree: int) -> RasterSettings:
         """To render the model with SH coefficients up to `sh_degree`."""
-        grey, near = self.draw_settings.background, self.draw_settings.near
-        return RasterSettings(near=near, sh_degree=sh_degree, background=(grey,) * 3)
+        drawn = self.draw_settings
+        background = (drawn.background,) * 3
+        return RasterSettings(
+            drawn.near, antialias=drawn.antialias, background=background, sh_degree=sh_degree
+        )
 
     def render(self, camera: Camera, sh_degree: int | None = None) -> NDArray[np.float32]:
         """[H, W, 3] of the current model, with all its SH coefficients or up to `sh_degree`."""

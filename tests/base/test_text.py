@@ -1,10 +1,10 @@
-"""Words that depend on a number, and what is left of a library's."""
+"""Words that depend on a number, names that a terminal can show, what is left of a library's."""
 
 from __future__ import annotations
 
 import pytest
 
-from stages.base.text import counted, reason_of
+from stages.base.text import counted, printable, printable_name, reason_of
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,23 @@ def test_plural_that_takes_more_than_an_s() -> None:
 )
 def test_what_a_library_said_keeps_neither_its_names_nor_its_advice(said: str, left: str) -> None:
     assert reason_of(RuntimeError(said)) == left
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("été 雪.jpg", "été 雪.jpg"),
+        ("a\x1b[31mb", "a\\x1b[31mb"),
+        ("bell\x07, C1 \x9b2J", "bell\\x07, C1 \\x9b2J"),
+        ("gnp.\u202ejpg", "gnp.\\u202ejpg"),
+        ("bad\udcff.jpg", "bad\\xff.jpg"),
+        ("two\nlines", "two\nlines"),
+    ],
+)
+def test_what_a_terminal_would_act_on_is_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown
+    shown.encode()
+
+
+def test_printable_name_is_one_line() -> None:
+    assert printable_name("two\nlines") == r"two\nlines"

@@ -10,7 +10,6 @@ import pytest
 
 from stages import export, formats
 from stages.base.stage import Report
-from stages.capacity.output_formats import rounding_formats
 from stages.capacity.rounding import RoundingFinetuner, finetune_to_rounding, write_and_read
 from stages.export import ExportSettings
 from stages.formats import FORMATS
@@ -22,7 +21,7 @@ from stages.training.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene
 
 FEW = BitDepths(position=9, rotation=4, scale=4, colour=5, opacity=4, palette=5)
-ROUNDING = rounding_formats(FORMATS)
+ROUNDING = tuple(name for name, row in FORMATS.items() if row.needs_finetuning)
 
 
 @pytest.fixture(scope="module")

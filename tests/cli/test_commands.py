@@ -413,3 +413,29 @@ def test_run_folder_without_a_whole_run_file_is_continued_with_a_warning(
     assert '"steps": 70' in run_file.read_text()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hill", "photos"]
     assert "rebuilt" not in splat("process", "hill").stderr
+
+
+def test_names_reach_the_terminal_without_control_characters(splat, pretend) -> None:
+    def refuse(inputs, settings, folder, report) -> None:
+        report.progress(1, 2, "reading \x1b[2J.jpg")
+        report.warn("pretend-name", "bad\udcff\x1b[31m.jpg is left out.")
+
+    pretend["ingest"] = refuse
+    os.rename("photos", os.fsencode("new\nline\x1b[31m\udcff"))
+    shown = splat("process", "new\nline\x1b[31m\udcff", "--out", "run\x1b[31m")
+    assert shown.exit_code == 0
+    assert "\x1b" not in shown.output
+    assert r"bad\xff\x1b[31m.jpg is left out." in shown.output
+    words = ("process", "no\nfolder\x1b[31m\udcff")
+    assert r"no\nfolder\x1b[31m\xff does not exist." in splat(*words).stderr
+    assert "\x1b" not in splat(*words, "--json").output
+
+
+def test_name_that_a_library_cannot_use_is_an_error_in_words(splat, pretend) -> None:
+    def refuse(inputs, settings, folder, report) -> None:
+        "bad\udcff.usdc".encode()
+
+    pretend["export"] = refuse
+    result = splat("process", "photos")
+    assert result.exit_code == 3
+    assert r"bad\xff.usdc has a name that is not UTF-8" in result.stderr

@@ -71,6 +71,7 @@ def run(scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
             stage_folder=lambda name: exported,
             manifest=outputs.get,
             load=lambda name: outputs[name],
+            check_outputs=lambda: None,
             recorded_settings=lambda: {"train": TrainSettings()},
         )
 
@@ -107,7 +108,8 @@ def test_the_meshes_of_a_run_are_not_taken_for_splats(
     names = (*beside, "mesh.glb")
     files = tuple(ExportedFile(name, f"scene.{name}", 1) for name in names)
     assets = ExportedAssets(run / "7-export", files)
-    monkeypatch.setattr(command, "Pipeline", lambda path: SimpleNamespace(load=lambda name: assets))
+    fake = SimpleNamespace(load=lambda name: assets, check_outputs=lambda: None)
+    monkeypatch.setattr(command, "Pipeline", lambda path: fake)
     if beside:
         assert command._files(run) == [run / "7-export" / "scene.ply"]
     else:

@@ -190,9 +190,14 @@ def test_a_capture_that_is_not_there_does_not_keep_the_others(splat, store) -> N
     }
 
 
-def test_rights_that_are_missing_are_told(splat, store, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "reason", [PermissionError("no"), RuntimeError("Unable to locate credentials")]
+)
+def test_rights_that_are_missing_are_told(splat, store, monkeypatch, reason: Exception) -> None:
+    """The second is what s3fs raises where none are set."""
+
     def refused(*_: object, **__: object) -> None:
-        raise PermissionError("no")
+        raise reason
 
     monkeypatch.setattr(store, "put_file", refused)
     result = batch(splat)

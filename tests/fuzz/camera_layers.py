@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -57,7 +58,59 @@ def _checked(cameras: list[Camera]) -> int:
 
 
 def _read_transforms(path: Path) -> int:
+    nerfstudio.read_points(path)
     return _checked([view.camera for view in nerfstudio.read(path).views])
+
+
+def _read_points(path: Path) -> int:
+    found = nerfstudio.read_points(path.with_name("transforms.json"))
+    assert found is not None
+    assert len(found.points) <= _MOST
+    assert np.isfinite(found.points).all()
+    return len(found.points)
+
+
+@functools.cache
+def _points(text: bool) -> bytes:
+    from plyfile import PlyData
+
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "transforms.json"
+        model = example()
+        views = [View(n, n, c) for n, c in zip(model.names, model.cameras, strict=True)]
+        nerfstudio.write(path, views, path.parent, model.points, model.colours)
+        data = PlyData.read(str(path.with_suffix(".ply")))
+        data.text = text
+        out = io.BytesIO()
+        data.write(out)
+        return out.getvalue()
+
+
+def _points_layer(text: bool) -> Layer:
+    whole = _files("json")["transforms.json"]
+    naming = whole.replace(b"{", b'{"ply_file_path": "transforms.ply",', 1)
+    return Layer(
+        "transforms.ply",
+        lambda: _points(text),
+        beside=lambda: {"transforms.json": naming},
+        text=True,
+        read=_read_points,
+        holds=len(example().points),
+    )
+
+
+def _picture() -> Layer:
+    """A picture whose size a camera file needs."""
+    name = f"images/{drawn.NAMES[0]}"
+
+    def read(path: Path) -> int:
+        file = path.parents[1] / "cameras.csv"
+        return _checked([view.camera for view in realityscan.read(file).views])
+
+    def beside() -> dict[str, bytes]:
+        return {other: data for other, data in _drawn("realityscan").items() if other != name}
+
+    return Layer(name, lambda: _drawn("realityscan")[name], beside=beside, read=read, holds=4)
 
 
 def _read_model(path: Path) -> int:
@@ -129,6 +182,9 @@ LAYERS = {
         read=_read_transforms,
         holds=5,
     ),
+    "points of transforms.json": _points_layer(text=False),
+    "points of transforms.json, ascii": _points_layer(text=True),
+    "a picture of cameras": _picture(),
     **{
         f"COLMAP {part}.{kind}": _part(kind, f"{part}.{kind}")
         for kind in ("bin", "txt")

@@ -1,14 +1,13 @@
-"""Damage to a file's bytes, drawn by Hypothesis: blind for bytes, by word for text."""
+"""Damage to a file's bytes, by random numbers: blind for bytes, by word for text."""
 
 from __future__ import annotations
 
 import re
 import struct
 from collections.abc import Callable
+from random import Random
 
-from hypothesis import strategies as st
-
-Change = Callable[[bytes], bytes]
+Change = Callable[[Random, bytes], bytes]
 
 HEAD_BYTES = 1500  # counts, versions, types and names lie there in every format
 _TOKENS = re.compile(rb'-?\d[\d.]*(?:[eE][+-]?\d+)?|"[^"]*"|[A-Za-z_][\w:]*')
@@ -37,54 +36,62 @@ HOSTILE_WORDS = (
 )
 
 
-def _where(draw: st.DrawFn, size: int) -> int:
-    if draw(st.booleans()):
-        return draw(st.integers(0, min(size, HEAD_BYTES)))
-    return draw(st.integers(0, size))
+def _where(random: Random, size: int) -> int:
+    return random.randint(0, min(size, HEAD_BYTES) if random.random() < 0.5 else size)
 
 
-@st.composite
-def _overwritten(draw: st.DrawFn, content: bytes) -> bytes:
-    at = _where(draw, len(content))
-    new = draw(st.one_of(st.binary(min_size=1, max_size=8), st.sampled_from(HOSTILE_BYTES)))
-    removed = draw(st.sampled_from((len(new), len(new), 0, 3)))  # mostly in place
+def _overwritten(random: Random, content: bytes) -> bytes:
+    at = _where(random, len(content))
+    new = random.choice((random.randbytes(random.randint(1, 8)), random.choice(HOSTILE_BYTES)))
+    removed = random.choice((len(new), len(new), 0, 3))  # mostly in place
     return content[:at] + new + content[at + removed :]
 
 
-@st.composite
-def _moved(draw: st.DrawFn, content: bytes) -> bytes:
+def _flipped(random: Random, content: bytes) -> bytes:
+    """One bit."""
+    at = min(_where(random, len(content)), len(content) - 1)
+    if at < 0:
+        return content
+    return content[:at] + bytes([content[at] ^ 1 << random.randrange(8)]) + content[at + 1 :]
+
+
+def _moved(random: Random, content: bytes) -> bytes:
     """A piece left out, or put in again elsewhere."""
-    start, to = _where(draw, len(content)), _where(draw, len(content))
-    piece = content[start : start + draw(st.integers(1, 200))]
-    if draw(st.booleans()):
+    start, to = _where(random, len(content)), _where(random, len(content))
+    piece = content[start : start + random.randint(1, 200)]
+    if random.random() < 0.5:
         return content[:to] + piece + content[to:]
     return content[:start] + content[start + len(piece) :]
 
 
-@st.composite
-def _cut(draw: st.DrawFn, content: bytes) -> bytes:
-    return content[: _where(draw, len(content))]
+def _repeated(random: Random, content: bytes) -> bytes:
+    """A short piece some hundred times, for counts and depths that grow."""
+    start = _where(random, len(content))
+    piece = content[start : start + random.randint(1, 40)]
+    return content[:start] + piece * random.randint(2, 500) + content[start:]
 
 
-@st.composite
-def _reworded(draw: st.DrawFn, content: bytes) -> bytes:
+def _cut(random: Random, content: bytes) -> bytes:
+    return content[: _where(random, len(content))]
+
+
+def _reworded(random: Random, content: bytes) -> bytes:
     """One number, string or name replaced: by something hostile, or by another of the same file."""
     words = list(_TOKENS.finditer(content, 0, 20_000))
     if not words:
         return content
-    word = words[draw(st.integers(0, len(words) - 1))]
-    other = words[draw(st.integers(0, len(words) - 1))][0]
-    new = draw(st.one_of(st.sampled_from(HOSTILE_WORDS), st.just(other)))
+    word = random.choice(words)
+    new = random.choice((random.choice(HOSTILE_WORDS), random.choice(words)[0]))
     return content[: word.start()] + new + content[word.end() :]
 
 
-@st.composite
-def damaged(draw: st.DrawFn, content: bytes, *, text: bool) -> bytes:
+_BLIND: tuple[Change, ...] = (*(_overwritten,) * 4, _flipped, _flipped, _moved, _repeated, _cut)
+_BY_WORD: tuple[Change, ...] = (*_BLIND, *(_reworded,) * 16)
+
+
+def damaged(random: Random, content: bytes, *, text: bool) -> bytes:
     """`content` with one to three changes. text: mostly by word, so that more of the file still
     means something."""
-    kinds = [_overwritten] * 4 + [_moved, _cut]
-    if text:
-        kinds += [_reworded] * 12
-    for _ in range(draw(st.integers(1, 3))):
-        content = draw(draw(st.sampled_from(kinds))(content))
+    for _ in range(random.choice((1, 1, 2, 3))):
+        content = random.choice(_BY_WORD if text else _BLIND)(random, content)
     return content

@@ -22,9 +22,11 @@ import numpy as np
 import zstandard
 
 from stages import formats
+from stages.formats import usd_read
+from stages.scene import load_splats
 from tests.formats.truth import many_splats
-from tests.fuzz import camera_layers, mask_layer
-from tests.fuzz.layer import SPLATS, Layer
+from tests.fuzz import camera_layers, photo_layers, run_layers
+from tests.fuzz.layer import SPLATS, Layer, checked
 
 _SPZ_4 = Path(__file__).parents[1] / "formats" / "spz4" / "adobe_degree_3.spz"
 
@@ -165,12 +167,22 @@ def _on_disk(ending: str) -> Layer:
     def beside() -> dict[str, bytes]:
         return {other: content for other, content in files(ending).items() if other != name}
 
-    share = 0.05 if ending in _PROCESS_EACH else 1.0
-    return Layer(name, _whole(ending), beside=beside, text=ending in _WORDS, share=share)
+    if ending in _USD:
+        return Layer(name, _whole(ending), text=ending in _WORDS, read=_read_usd, in_fork=True)
+    return Layer(name, _whole(ending), beside=beside, text=ending in _WORDS)
+
+
+def _read_usd(path: Path) -> int:
+    """The exit status of what `usd_read.read` starts, which begins with `main`."""
+    output = path.with_name("splats.bin")
+    status = usd_read.main([str(path), str(output)])
+    if status == 0:
+        checked(load_splats(output))
+    return status
 
 
 _WORDS = ("gltf", "usda")
-_PROCESS_EACH = ("usda", "usdc", "usdz")
+_USD = ("usda", "usdc", "usdz")
 
 LAYERS: dict[str, Layer] = {
     **{ending: _on_disk(ending) for ending in formats.FORMATS},
@@ -193,5 +205,6 @@ LAYERS: dict[str, Layer] = {
     "quantised.glb, document": _glb_document("quantised.glb"),
     "html, unpacked": Layer("a.html", _html_inside, _html_with, text=True),
     **camera_layers.LAYERS,
-    **mask_layer.LAYERS,
+    **photo_layers.LAYERS,
+    **run_layers.LAYERS,
 }

@@ -263,6 +263,17 @@ def test_the_usd_librarys_validators_find_no_errors(
     assert usd_validators.errors_in(tmp_path / f"a.{name}") == []
 
 
+@pytest.mark.parametrize("name", ["usda", "usdc", "usdz"])
+def test_usd_is_proven_below_a_folder_whose_name_has_two_lines(
+    prover: Prover, scene: SmallScene, tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / "two\nlines" / f"a.{name}"
+    path.parent.mkdir()
+    formats.write(path, scene.splats)
+    assert len(formats.read(path)) == len(scene.splats)
+    assert prover.prove(path).fault == ""
+
+
 @pytest.mark.parametrize(
     ("old", "new", "word"),
     [

@@ -192,6 +192,26 @@ def test_damaged_output_runs_its_stage_again(
     assert victim.read_text() == "42000"
 
 
+def test_flipped_bit_of_the_same_size_and_time_is_found_by_reading_all(
+    finished: Pipeline, run_folder: Path
+) -> None:
+    finished.check_outputs()
+    path = run_folder / "2-count" / "count.txt"
+    stat = path.stat()
+    path.write_bytes(bytes([path.read_bytes()[0] ^ 1]) + path.read_bytes()[1:])
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert not any(step.will_run for step in finished.plan())
+    with pytest.raises(SplatError) as error:
+        finished.check_outputs()
+    assert error.value.code == "run-folder-damaged"
+    assert "2-count/count.txt changed" in error.value.given
+    assert str(run_folder / "2-count") in error.value.hint
+    shutil.rmtree(run_folder / "2-count")  # as the hint says
+    assert next(step.stage.name for step in finished.plan() if step.will_run) == "count"
+    finished.run()
+    finished.check_outputs()
+
+
 def test_extra_file_beside_the_outputs_does_no_harm(finished: Pipeline, run_folder: Path) -> None:
     (run_folder / "3-sign" / "thumbnail.png").write_text("a viewer left this")
     assert ran(finished) == []
@@ -464,6 +484,38 @@ def test_second_process_is_refused_and_named(finished: Pipeline, run_folder: Pat
         finished.run()
     assert caught.value.code == "run-folder-busy"
     finished.run()
+
+
+def test_clock_that_steps_backwards_changes_nothing(
+    photos: Path, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files are then newer than the present, and each reading of the clock is earlier."""
+    future = time.time() + 1e8
+    for path in photos.iterdir():
+        os.utime(path, (future, future))
+    readings = iter(range(2_000_000_000, 0, -100_000))
+    monkeypatch.setattr(time, "time", lambda: float(next(readings)))
+    pipeline = Pipeline(run_folder, photos, fake_stages())
+    manifests = pipeline.run()
+    assert all(0 <= one.seconds < 60 and one.cpu_seconds >= 0 for one in manifests)
+    for path in run_folder.rglob("*"):
+        os.utime(path, (future, future))
+    assert ran(pipeline) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a path has 4,095 bytes at most on Linux")
+@pytest.mark.parametrize("length", [4000, 4090, 5000])
+def test_long_path_works_or_is_refused_in_words(photos: Path, tmp_path: Path, length: int) -> None:
+    deep = tmp_path
+    while len(str(deep)) < length - 1:
+        deep /= "x" * min(200, length - 1 - len(str(deep)))
+    pipeline = Pipeline(deep, photos, fake_stages())
+    if length == 4000:
+        assert len(pipeline.run()) == 3
+        return
+    with pytest.raises(SplatError) as error:
+        pipeline.run()
+    assert (error.value.code, error.value.family) == ("name-too-long", Family.INPUT)
 
 
 def test_lock_of_a_killed_process_does_not_count(finished: Pipeline, run_folder: Path) -> None:

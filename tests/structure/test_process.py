@@ -51,7 +51,7 @@ def test_an_abort_is_reported_with_its_last_line(
     assert crash.value.status == -signal.SIGABRT
     error = process.crash_error(crash.value, tmp_path)
     assert error.code == "sfm-crashed"
-    assert "signal 6 during features" in error.given
+    assert "signal 6 (SIGABRT) during features" in error.given
     assert "Check failed: x > 0" in error.given
     assert str(tmp_path / "log.txt") in error.hint
     assert "Check failed" in (tmp_path / "log.txt").read_text()

@@ -65,6 +65,17 @@ def test_repeated_refits_never_get_worse(truth):
     assert errors == sorted(errors, reverse=True)
 
 
+@pytest.mark.parametrize("value", [1e10, 3e38])
+def test_one_colour_beyond_all_bounds_leaves_the_others_their_refit(truth, value):
+    levels, broken = pictures_of(truth), paler(truth)
+    wanted = refitted(broken, levels).sh - broken.sh
+    broken.sh[7, 0] = value
+    found = refitted(broken, levels).sh - broken.sh
+    others = np.arange(len(truth)) != 7
+    assert np.isfinite(found).all()
+    assert np.abs(found[others]).max() > 0.3 * np.abs(wanted).max()
+
+
 def test_nothing_but_colours_moves(truth):
     after = refitted(paler(truth), pictures_of(truth))
     for name, array in vars(truth).items():

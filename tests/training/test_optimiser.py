@@ -1,10 +1,12 @@
 """Adam on the splats that a step has seen."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
-from stages.raster.definition import Backward, gradient_columns, used_columns
+from stages.raster.definition import MEAN, ROTATION, Backward, gradient_columns, used_columns
 from stages.raster.kernels.pool import Pool
 from stages.training.optimiser import (
     EPSILON,
@@ -13,6 +15,7 @@ from stages.training.optimiser import (
     bias_corrections,
     new_model,
 )
+from stages.training.reference_step import adam
 
 RATES = LearningRates(means=0.01)
 
@@ -33,13 +36,12 @@ def backward(rows, coefficients, seed=1, scale=1.0):
     return Backward(np.asarray(rows, np.int32), values, means2d)
 
 
-def apply(m, b, coefficients=4, dense=False):
-    apply_gradients(Pool(1), m, b, coefficients, RATES, 100, 50, dense)
+def apply(m, b, coefficients=4):
+    apply_gradients(Pool(1), m, b, coefficients, RATES, 100, 50)
 
 
-@pytest.mark.parametrize("dense", [False, True])
-def test_many_steps_are_those_of_torch(dense):
-    """Sparse with every splat in view; dense with every other splat in view only."""
+def test_many_steps_are_those_of_torch():
+    """With every splat in view."""
     m = model()
     columns = used_columns(4)
     start = np.concatenate([a.reshape(5, -1) for a in m.arrays], 1)
@@ -51,17 +53,15 @@ def test_many_steps_are_those_of_torch(dense):
         eps=EPSILON,
     )
     for step in range(50):
-        b = backward(range(step % 2, 5, 2) if dense else range(5), 4, seed=step)
-        full = np.zeros((5, columns))
-        full[b.rows] = b.parameters[:, :columns]
+        b = backward(range(5), 4, seed=step)
         for k, g in enumerate(groups):
-            g.grad = torch.tensor(full[:, k], dtype=torch.float64)
+            g.grad = torch.tensor(b.parameters[:, k], dtype=torch.float64)
         adam.step()
-        apply(m, b, dense=dense)
+        apply(m, b)
     found = np.concatenate([a.reshape(5, -1) for a in m.arrays], 1)
     wanted = torch.stack(groups, 1).detach().numpy()
     np.testing.assert_allclose(found, wanted, atol=2e-5)  # 50 roundings of values up to 4
-    assert m.gradient_count.sum() == (125 if dense else 250)  # of splats in view
+    assert m.gradient_count.sum() == 250
 
 
 def test_the_first_step_of_a_splat_first_seen_late_is_its_rate():
@@ -82,6 +82,22 @@ def test_splats_out_of_view_and_broken_gradients_change_nothing():
         np.testing.assert_array_equal(found[[0, 2, 3, 4]], wanted[[0, 2, 3, 4]])
         assert (found[1] != wanted[1]).all()
     assert m.steps.max(1).tolist() == [0, 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e11])  # far below EPSILON, and near the largest
+def test_a_step_does_not_depend_on_the_unit_of_length(unit, scale):
+    def moved(unit, step):
+        m, b, means = model(), backward(range(5), 4, scale=scale), slice(MEAN, ROTATION)
+        m.means[:] = 0
+        b.parameters[:, means] /= unit
+        step(m, b, 4, RATES.scaled(0.01 * unit, 1.0, unit), 100, 50)
+        return m.means / unit
+
+    for step in (partial(apply_gradients, Pool(1)), adam):
+        wanted = moved(1.0, step)
+        assert wanted.any()
+        np.testing.assert_allclose(moved(unit, step), wanted, rtol=1e-4)
 
 
 def test_sh_coefficients_that_are_not_trained_yet_stay_zero():

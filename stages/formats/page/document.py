@@ -56,6 +56,7 @@ def scene_data(
         "source": source,
         "count": len(splats),
         "units": units,
+        "antialias": splats.draw_settings.antialias,
         "content": content,
         "levels": list(levels),
         "bounds": _bounds(splats),

@@ -164,7 +164,9 @@ def _formats(
             held = splats_to_write(row, inputs.quantised) if inputs.quantised else splats
             formats.write(path, held, units=inputs.units, views=inputs.views)
             size = row.size_bytes(path)
-            read = replace(formats.read(path), draw_settings=splats.draw_settings)
+            read = formats.read(path)
+            antialias = read.draw_settings.antialias
+            read = replace(read, draw_settings=splats.draw_settings).with_antialias(antialias)
             for file in row.files(path):
                 file.unlink()
             scores = own if _identical(read, splats) else _scores(inputs, read)

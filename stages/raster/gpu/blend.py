@@ -192,7 +192,7 @@ def blend_gradient_kernel(
         raw = alpha_of(record, frame, i, j)
         drawn = (raw >= ALPHA_MIN) & (finished_at >= number)
         alpha = tl.where(drawn, tl.minimum(raw, ALPHA_MAX), 0.0)
-        inverse = 1.0 / (1.0 - alpha)
+        inverse = tl.div_rn(1.0, 1.0 - alpha)  # rounded: errors add up over layers
         passing = passing * inverse
         weight = alpha * passing
         out = gradients + tl.load(slots + entry) * SUMS
@@ -253,7 +253,7 @@ def contribution_kernel(
         raw = alpha_of(record, tile_frame(record, x, y), i, j)
         drawn = (raw >= ALPHA_MIN) & (finished_at >= number)
         alpha = tl.where(drawn, tl.minimum(raw, ALPHA_MAX), 0.0)
-        inverse = 1.0 / (1.0 - alpha)
+        inverse = tl.div_rn(1.0, 1.0 - alpha)  # rounded: errors add up over layers
         passing = passing * inverse
         weight, ratio = alpha * passing, alpha * inverse
         painted = weight * tl.load(record + COLOUR)

@@ -25,6 +25,8 @@ from stages.raster.gpu.project import (
     SHAPE,
 )
 
+LONGEST_RUN = tl.constexpr(1024)  # of equal depths that are put in order
+
 
 @inner
 def shape_of(shapes, row, mask):
@@ -164,22 +166,26 @@ def ties_kernel(
     """ordered [n]: `order`, with runs of equal finite keys in the order of the splats' own values.
 
     keys [n]: sorted. A splat moves up by those before it that belong behind it, and down by those
-    behind it that belong before it.
+    behind it that belong before it. Runs of more than LONGEST_RUN splats stay in the order of rows:
+    work grows with the square of a run's length, and a million splats at one depth would never end.
     """
     i = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     mask = i < n
     key = tl.load(keys + i, mask=mask, other=float("inf"))
     row = tl.load(order + i, mask=mask, other=0)
-    place = i
+    place, length = i, i * 0 + 1
     for side in tl.static_range(2):
         way = 2 * side - 1
         rival = i + way
         tied = mask & (key < float("inf"))
-        while top_of(tied.to(tl.int32), 0) > 0:
+        seen = 0
+        while (top_of(tied.to(tl.int32), 0) > 0) & (seen < LONGEST_RUN):
             tied = tied & (rival >= 0) & (rival < n)
             tied = tied & (tl.load(keys + rival, mask=tied, other=float("inf")) == key)
             rival_row = tl.load(order + rival, mask=tied, other=0)
             wrong = order_of(rows, rival_row, row, tied, COLUMNS, STORED) * way < 0
             place += tl.where(tied & wrong, way, 0)
+            length += tied.to(tl.int64)
             rival += way
-    tl.store(ordered + place, row, mask=mask)
+            seen += 1
+    tl.store(ordered + tl.where(length > LONGEST_RUN, i, place), row, mask=mask)

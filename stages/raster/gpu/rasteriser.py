@@ -157,11 +157,10 @@ class GpuRasteriser:
         self._over_tiles(blend.contribution_kernel, forward.view, drawn, planes, raw)
         sums = self._summed(raw, made, tl.float64)
         found = sums.cpu().numpy()[forward.visible]
-        entries = raw[:, LARGEST_WEIGHT].cpu().numpy()
-        firsts, counts = (t.cpu().numpy()[forward.visible] for t in (made.firsts, made.counts))
-        for place in range(len(found)):
-            own = entries[firsts[place] : firsts[place] + counts[place]]
-            found[place, LARGEST_WEIGHT] = own.max(initial=0.0)
+        largest = torch.zeros(len(made.counts), device=self.device)
+        by_entry = raw[made.slots, LARGEST_WEIGHT]
+        largest.scatter_reduce_(0, made.members.long(), by_entry, "amax")
+        found[:, LARGEST_WEIGHT] = largest.cpu().numpy()[forward.visible]
         return found
 
     def scene(self, arrays: Arrays, smoothing: NDArray[np.float32] = NO_SMOOTHING) -> Scene:

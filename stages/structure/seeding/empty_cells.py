@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
@@ -57,22 +58,25 @@ def fill_cells(
     views: tuple[View, ...],
     points: NDArray[np.float64],
     cameras: tuple[Camera, ...] = (),
+    training: tuple[View, ...] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float64]]:
     """(points [M, 3], colours [M, 3] in 0..1, scales [M] in world units) to add to `points`.
 
     Args:
         folder: folder that the views' image paths are relative to.
-        views: training views.
+        views: training views of which the cells are filled.
         points: [P, 3].
         cameras: of all views; no point is added close to them.
+        training: all training views, `views` if left out: beyond its borders a photograph is
+            extrapolated only to where none of them looks.
     """
     filling = _Filling(points, [(c.centre, _clearance(c, points)) for c in cameras])
     visibility = VisibilityConstraints(views, points)
     ordered = sorted(views, key=lambda v: v.name)
     for view in ordered:
-        _fill(filling, folder, view, 0, visibility, ordered)
+        _fill(filling, folder, view, 0, visibility, training or views)
     for view in ordered:
-        _fill(filling, folder, view, round(MARGIN * CELLS), visibility, ordered)
+        _fill(filling, folder, view, round(MARGIN * CELLS), visibility, training or views)
     return (
         np.concatenate(filling.positions),
         np.concatenate(filling.colours),
@@ -86,7 +90,7 @@ def _fill(
     view: View,
     margin: int,
     visibility: VisibilityConstraints,
-    views: list[View],
+    training: tuple[View, ...],
 ) -> None:
     """Fill the empty cells of one photograph, also those in a margin (cells) beyond its borders."""
     small = view.camera.fitted(CELLS)
@@ -98,12 +102,14 @@ def _fill(
         return
     depth = _interpolated(empty, *sampled)
     if margin:
-        free = ~_in_any_picture(unproject(camera, empty, depth), views)
+        free = ~_in_any_picture(unproject(camera, empty, depth), training)
     else:
         depth, free = _supported_depth(view, camera, empty, depth, sampled[1], visibility)
     positions = unproject(camera, empty, depth)
     for centre, distance in filling.clearances:
         free &= np.linalg.norm(positions - centre, axis=1) > distance
+    if not free.any():
+        return
     picture = load_image(folder / view.image, small.width, small.height)
     rows, columns = cells(empty - margin)
     at = rows.clip(0, small.height - 1), columns.clip(0, small.width - 1)
@@ -134,7 +140,7 @@ def _supported_depth(
     return moved, supported | ((occluding == 0) & (moved > depth))
 
 
-def _in_any_picture(positions: NDArray[np.float64], views: list[View]) -> NDArray[np.bool_]:
+def _in_any_picture(positions: NDArray[np.float64], views: tuple[View, ...]) -> NDArray[np.bool_]:
     """[K] whether a position projects into any photograph."""
     shown = np.zeros(len(positions), bool)
     for view in views:
@@ -186,29 +192,27 @@ def _interpolated(
     four quadrants is used: surfaces without texture are more often behind than in front, and a
     splat that is too far occludes nothing.
     """
-    offset = pixels[None] - at[:, None]
-    distance2 = (offset**2).sum(2)
-    nearest = np.argpartition(distance2, PLANE_POINTS - 1, axis=1)[:, :PLANE_POINTS]
-    by_distance = np.argsort(np.take_along_axis(distance2, nearest, 1), axis=1, kind="stable")
-    nearest = np.take_along_axis(nearest, by_distance, 1)
+    distance, nearest = cKDTree(pixels).query(at, PLANE_POINTS)
     inverse = 1.0 / depths[nearest]
-    near = np.take_along_axis(offset, nearest[..., None], 1)
-    design = np.concatenate([np.ones_like(near[..., :1]), near], 2)
-    weights = 1.0 / (1.0 + np.take_along_axis(distance2, nearest, 1))[..., None]
+    design = np.concatenate([np.ones((*nearest.shape, 1)), pixels[nearest] - at[:, None]], 2)
+    weights = 1.0 / (1.0 + distance**2)[..., None]
     normal = np.einsum("kpi,kpj->kij", design * weights, design) + 1e-9 * np.eye(3)
     right = np.einsum("kpi,kp->ki", design * weights, inverse)
     plane = np.linalg.solve(normal, right[..., None])[..., 0]
     residual = np.einsum("kpi,ki->kp", design, plane) - inverse
     flat = np.sqrt((residual**2).mean(1)) < PLANE_RESIDUAL * inverse.mean(1)
     low, high = inverse.min(1) / PLANE_EXTENT, inverse.max(1) * PLANE_EXTENT
-    on_plane = 1.0 / np.clip(plane[:, 0], low, high)
-    return np.where(flat, on_plane, _farthest_around(offset, distance2, depths))
+    depth: NDArray[np.float64] = 1.0 / np.clip(plane[:, 0], low, high)
+    depth[~flat] = _farthest_around(at[~flat], pixels, depths)
+    return depth
 
 
 def _farthest_around(
-    offset: NDArray[np.float64], distance2: NDArray[np.float64], depths: NDArray[np.float64]
+    at: NDArray[np.float64], pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """[K] the largest depth among the nearest point in each quadrant. offset [K, P, 2]."""
+    """[K] the largest depth among the nearest point in each quadrant around each pixel `at`."""
+    offset = pixels[None] - at[:, None]
+    distance2 = (offset**2).sum(2)
     quadrant = 2 * (offset[..., 0] > 0) + (offset[..., 1] > 0)
     farthest = np.zeros(len(offset))
     for number in range(4):

@@ -23,16 +23,12 @@ from stages.base import threads
 from stages.photos.load import load_image, mask_of
 from stages.scene import Camera, View
 from stages.structure.seeding.projection import cells, pixel_centres, unproject, visible_points
+from stages.structure.seeding.view_selection import Observations
 from stages.structure.seeding.visibility import VisibilityConstraints
 
 SIDE = 200  # pixels, longer side of the depth maps
 PLANES = 64  # depth hypotheses
 RADIUS = 3  # of the neighbourhood, pixels
-SOURCES = 4  # source views of each reference view
-# Triangulation angle in degrees: the best one, and the spread below and above it.
-BEST_ANGLE, ANGLE_SPREAD = 10.0, (4.0, 8.0)
-FEWEST_SHARED = 20  # sparse points seen by both views
-SAMPLE = 1000  # sparse points by which source views are selected
 DEPTH_MARGIN = (0.7, 1.6)  # factors on the nearest and farthest depth of sparse points
 FLAT = 2e-5  # variance of a neighbourhood without texture: hundredths of 8-bit noise
 DEPTH_TOLERANCE = 0.015  # relative
@@ -66,7 +62,8 @@ def plane_sweep_points(
         for view, camera in zip(ordered, cameras, strict=True)
     ]
     grey = [np.ascontiguousarray(picture.mean(2), np.float32) for picture in pictures]
-    sources = _source_views(cameras, points)
+    observations = Observations(cameras, points)
+    sources = [observations.sources(i) for i in range(len(cameras))]
     with ThreadPoolExecutor(threads.count()) as pool:
         sweep = functools.partial(_sweep, cameras=cameras, grey=grey, points=points)
         depth_maps = list(pool.map(sweep, range(len(cameras)), sources))
@@ -86,31 +83,6 @@ def plane_sweep_points(
     more = np.concatenate(positions[1:] or [np.zeros((0, 3))])
     supported = VisibilityConstraints(views, points).supported(more)
     return more[supported], np.concatenate(colours)[supported]
-
-
-def _source_views(cameras: list[Camera], points: NDArray[np.float64]) -> list[list[int]]:
-    """Source views of each view: those with many shared points at a good triangulation angle."""
-    chosen = np.unique(
-        np.linspace(0, len(points) - 1, min(SAMPLE, len(points))).round().astype(int)
-    )
-    points = points[chosen]
-    visible = np.zeros((len(cameras), len(points)), bool)
-    rays = np.zeros((len(cameras), len(points), 3))
-    for i, camera in enumerate(cameras):
-        visible[i, visible_points(camera, points)[0]] = True
-        towards = points - camera.centre
-        rays[i] = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    found = []
-    for i in range(len(cameras)):
-        angle = np.degrees(np.arccos(np.clip((rays[i] * rays).sum(2), -1, 1)))
-        spread = np.where(angle < BEST_ANGLE, *ANGLE_SPREAD)
-        fitness = np.exp(-(((angle - BEST_ANGLE) / spread) ** 2) / 2)
-        both = visible[i] & visible
-        score = np.where(both.sum(1) >= FEWEST_SHARED, (fitness * both).sum(1), 0.0)
-        score[i] = 0.0
-        order = np.argsort(-score, kind="stable")[:SOURCES]
-        found.append([int(j) for j in order if score[j] > 0.02 * visible[i].sum()])
-    return found
 
 
 def _sweep(

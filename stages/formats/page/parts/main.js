@@ -76,6 +76,7 @@ async function start() {
         contents: streamed ? undefined : contentOf(scene),
         renderer: query.has("webgl") ? "webgl" : "webgpu",
         ui: !bare,
+        aa: scene.antialias,
         noanim: true
     });
     const { app } = viewer;

@@ -1,0 +1,103 @@
+"""Fine-tunes splats to the requested file formats: to being drawn plainly, and to rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stages.base.stage import Report
+from stages.capacity.rounding import RoundingFinetuner
+from stages.formats.table import FORMATS
+from stages.formats.values import drop_undrawable
+from stages.measure.contribution import measure_contributions
+from stages.measure.evaluation import EvaluationView, load_evaluation_views
+from stages.raster.backends import backend_of_settings
+from stages.raster.compensation import without_compensation
+from stages.scene import (
+    QuantisedSplats,
+    Reconstruction,
+    Splats,
+    split_held_out,
+    training_extent,
+)
+from stages.training.finetune import FineTuner
+
+if TYPE_CHECKING:
+    from stages.quantise import QuantiseSettings
+
+
+@dataclass(frozen=True)
+class FormatFinetuning:
+    """Fine-tunes on the training views.
+
+    Attributes:
+        rounding: fine-tunes to the rounding of formats.
+        settings, report: of the stage.
+    """
+
+    rounding: RoundingFinetuner
+    settings: QuantiseSettings
+    report: Report
+
+    @classmethod
+    def of(
+        cls,
+        splats: Splats,
+        reconstruction: Reconstruction,
+        dropout: bool,
+        settings: QuantiseSettings,
+        deciding_views: Sequence[EvaluationView],
+        report: Report,
+    ) -> FormatFinetuning:
+        """For `splats`.
+
+        Args:
+            splats: as trained and pruned.
+            reconstruction: whose training views are used.
+            dropout: whether training used dropout.
+            settings: of the stage.
+            deciding_views: training views that decide whether fine-tuning to rounding has helped.
+            report: says before each step whether to stop.
+        """
+        splats, backend = drop_undrawable(splats)[0], backend_of_settings(settings)
+        training = split_held_out(reconstruction.views)[0]
+        views = load_evaluation_views(
+            reconstruction.folder, training, splats.draw_settings, report.stop_requested
+        )
+        view_counts = np.zeros(len(splats), np.int32)
+        if dropout and settings.formats:  # dropout alone depends on them
+            view_counts = measure_contributions(splats, views, backend).view_counts
+        finetuner = FineTuner(views, training_extent(reconstruction), backend, report, dropout)
+        rounding = RoundingFinetuner(
+            finetuner, deciding_views, backend, settings.rounding_steps, view_counts
+        )
+        return cls(rounding, settings, report)
+
+    def to_plain_drawing(self, splats: Splats) -> Splats | None:
+        """The splats for formats that are drawn without opacity compensation; None if no such
+        format is requested, or `splats` are drawn so. Raises Interrupted."""
+        rows = [FORMATS[name] for name in self.settings.formats]
+        if not splats.draw_settings.antialias or all(
+            row.antialiased(self.settings.drawing) for row in rows
+        ):
+            return None
+        self.report.progress(0, 1, "fine-tuning to plain drawing")
+        finetuner = self.rounding.finetuner
+        found = without_compensation(drop_undrawable(splats)[0], finetuner.cameras)
+        return finetuner.finetune(found, self.settings.plain_steps, self.rounding.view_counts)
+
+    def to_rounding(self, quantised: QuantisedSplats) -> dict[str, Splats]:
+        """By format that rounds, the splats that its file should hold. Metric: formats, by format
+        the figures of `RoundingFinetuner.finetune`. Raises Interrupted."""
+        if not (self.settings.rounding_steps and len(drop_undrawable(quantised.splats)[0])):
+            return {}
+        names = [name for name in self.settings.formats if FORMATS[name].needs_finetuning]
+        found, figures = {}, {}
+        for number, name in enumerate(names):
+            self.report.progress(number, len(names), f"fine-tuning to .{name}")
+            found[name], figures[name] = self.rounding.finetune(FORMATS[name], quantised)
+        self.report.metric("formats", figures)
+        return found
