@@ -11,12 +11,17 @@ from stages.base.text import counted
 from stages.run.manifest import Manifest
 from stages.run.pipeline import Pipeline
 
+_HEADINGS = {
+    "psnr_db": "held_out_psnr_db",
+    "psnr_half_db": "half_size_db",
+    "psnr_quarter_db": "quarter_size_db",
+}
 # The metrics in the tables of `process` and `status`, by stage.
 _HEADLINES = {
     "ingest": ("photographs", "left_out"),
     "sfm": ("registered_images", "points", "mean_reprojection_error_px"),
     "seed": ("splats",),
-    "train": ("splats", "psnr_db", "ssim", "trained_by"),
+    "train": ("splats", "psnr_db", "psnr_half_db", "psnr_quarter_db", "ssim", "trained_by"),
     # Later stages measure at sizes of their own: it cannot be compared with that of training.
     "prune": ("splats", "floaters_removed", "psnr_change_db"),
     "quantise": ("sh_degree", "kept_mib"),
@@ -67,8 +72,8 @@ def headline(manifest: Manifest) -> str:
     """The most important metrics of one stage."""
     names = _HEADLINES.get(manifest.stage, ())
     chosen = {n: manifest.metrics[n] for n in names if n in manifest.metrics}
-    if "psnr_db" in chosen:  # always of photographs that training did not see
-        chosen = {("held_out_psnr_db" if n == "psnr_db" else n): v for n, v in chosen.items()}
+    if manifest.stage == "train":
+        chosen = {_HEADINGS.get(n, n): v for n, v in chosen.items()}
     counts = {n: len(v) if isinstance(v, (list, dict)) else v for n, v in chosen.items()}
     return console.figures(counts)
 

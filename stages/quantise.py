@@ -129,7 +129,7 @@ def run(
     bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
     figures = {
         "psnr_raw_db": evaluator.psnr(splats),
-        "psnr_kept_db": evaluator.psnr(kept),
+        **evaluator.psnr_at_sizes(kept, "psnr_kept"),
         "psnr_plain_db": None if plain is None else evaluator.psnr(plain),
         "psnr_splat32_db": evaluator.psnr(
             write_and_read(FORMATS["splat"], splats_to_write(FORMATS["splat"], quantised))
@@ -249,16 +249,22 @@ class _Measure:
     what: str = "training"
     done: int = 0
 
-    def psnr(self, splats: Splats) -> float:
-        """Mean PSNR over the views (dB)."""
+    def psnr(self, splats: Splats, scale: float = 1.0) -> float:
+        """Mean PSNR over the views at `scale` times their size (dB)."""
         from stages.measure.evaluation import mean_psnr_db
 
-        mean = round(mean_psnr_db(splats, self.views, self.backend), 4)
+        mean = round(mean_psnr_db(splats, self.views, self.backend, scale), 4)
         self.done += 1
         # As it is, three lower degrees, each threshold, and about as many bit depths.
         total = 5 + len(_THRESHOLDS_OF_255) + _BIT_DEPTH_MEASUREMENTS
         self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
         return mean
+
+    def psnr_at_sizes(self, splats: Splats, stem: str) -> dict[str, float]:
+        """Mean PSNR at each of `SIZES`, by the name of the metric."""
+        from stages.measure.evaluation import SIZES, psnr_name
+
+        return {psnr_name(size, stem): self.psnr(splats, scale) for size, scale in SIZES.items()}
 
 
 def _save(folder: Path, quantised: QuantisedSplats) -> None:
@@ -310,7 +316,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=9,
+    version=10,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     run=run,

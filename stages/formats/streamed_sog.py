@@ -30,7 +30,7 @@ from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
 
 LEAF, CHUNK_SPLATS = 1 << 15, 1 << 17  # splats of the finest level; of a chunk, about
-_META_LIMIT_BYTES, _DEEPEST = 1 << 26, 64
+_META_LIMIT_BYTES, _DEEPEST, _MOST_LEVELS = 1 << 26, 64, 100
 _Rows = NDArray[np.intp]
 
 
@@ -317,6 +317,8 @@ def splat_widths(path: Path, finest: Splats) -> list[float]:
     finest level, scaled by the square root of the ratio of counts. Raises SplatError."""
     with reading(path):
         meta = json.loads(path.read_text(encoding="utf-8"))
+        if not 0 <= meta["lodLevels"] <= _MOST_LEVELS:
+            raise BadFileError(f"it has more than {_MOST_LEVELS} levels")
         counts = np.zeros(meta["lodLevels"])
         for lods in _leaf_lods(meta["tree"]):
             for level, at in lods.items():

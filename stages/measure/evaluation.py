@@ -285,9 +285,17 @@ def psnr_of_views_db(
     return np.array([capped_psnr_db(draw(v.camera), v.image, v.valid) for v in views])
 
 
-def mean_psnr_db(splats: Splats, views: Iterable[EvaluationView], backend: str) -> float:
-    """Mean PSNR over the views, dB."""
-    return float(psnr_of_views_db(splats, views, backend).mean())
+def mean_psnr_db(
+    splats: Splats, views: Iterable[EvaluationView], backend: str, scale: float = 1.0
+) -> float:
+    """Mean PSNR over the views, each `EvaluationView.scaled`, dB."""
+    scaled = (view.scaled(scale) for view in views)
+    return float(psnr_of_views_db(splats, scaled, backend).mean())
+
+
+def psnr_name(size: str, stem: str = "psnr") -> str:
+    """The name of a metric at one of `SIZES`: psnr_db, psnr_half_db, psnr_quarter_db."""
+    return f"{stem}_db" if size == "full" else f"{stem}_{size}_db"
 
 
 def seconds_per_frame(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stages.measure.evaluation import EvaluationView, ImageRenderer
 from stages.measure.image_metrics import capped_psnr_db
+from stages.photos.load import scaled_image
 from stages.scene import Camera
 
 STEP_PX = 0.5
@@ -111,20 +112,10 @@ def small_psnr_db(draw: ImageRenderer, views: Iterable[EvaluationView]) -> tuple
     and scaled down."""
     found = []
     for view in views:
-        camera, valid = view.camera, view.valid
-        truth = block_means(view.image)
-        all_valid = None if valid is None else (block_means(valid[..., None]) == 1)[..., 0]
-        fx, fy, cx, cy = (x / FACTOR for x in (camera.fx, camera.fy, camera.cx, camera.cy))
-        small = Camera(truth.shape[1], truth.shape[0], fx, fy, cx, cy, camera.world_to_camera)
-        for drawn in (draw(small), block_means(np.clip(draw(camera), 0.0, 1.0))):
-            found.append(capped_psnr_db(drawn, truth, all_valid))
+        small = view.scaled(1 / FACTOR)
+        large = np.clip(draw(view.camera), 0.0, 1.0)
+        scaled = scaled_image(large, small.camera.width, small.camera.height)
+        for drawn in (draw(small.camera), scaled):
+            found.append(capped_psnr_db(drawn, small.image, small.valid))
     drawn_small, scaled_down = np.reshape(found, (-1, 2)).mean(axis=0)
     return float(drawn_small), float(scaled_down)
-
-
-def block_means(image: NDArray[np.generic]) -> Image:
-    """Means over blocks of 4 x 4 pixels of [H, W, C], without incomplete blocks at the edge."""
-    height, width = (side // FACTOR for side in image.shape[:2])
-    whole = image[: height * FACTOR, : width * FACTOR].astype(np.float32)
-    means: Image = whole.reshape(height, FACTOR, width, FACTOR, -1).mean(axis=(1, 3))
-    return means

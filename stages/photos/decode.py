@@ -21,7 +21,7 @@ from PIL import Image, ImageCms, ImageFile, UnidentifiedImageError
 from stages.base.text import reason_of
 from stages.photos import colour
 from stages.photos.exif import Exif, read_exif
-from stages.photos.jpeg import ends_properly
+from stages.photos.jpeg import fault_of
 from stages.scene import fitted_size
 
 MAX_MEGAPIXELS = 200
@@ -149,8 +149,8 @@ def _read(path: Path) -> bytes:
         raise Unusable(f"it cannot be opened ({error.strerror or error})") from error
     if not data:
         raise Unusable("the file is empty")
-    if data[:3] == b"\xff\xd8\xff" and not ends_properly(data):
-        raise Unusable("the file is truncated")
+    if data[:3] == b"\xff\xd8\xff" and (fault := fault_of(data)):
+        raise Unusable(fault)
     return data
 
 

@@ -91,7 +91,7 @@ class Manifest:
             data["input_files"] = {k: records_from_data(v) for k, v in files.items()}
             return cls(**{f.name: data[f.name] for f in fields(cls)})
         except (KeyError, TypeError, AttributeError) as error:
-            raise _edited(folder / MANIFEST) from error
+            raise edited(folder / MANIFEST) from error
 
 
 def plain(value: Any) -> Any:
@@ -154,9 +154,9 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
             family=Family.RUN_FOLDER,
         ) from error
     except (ValueError, RecursionError) as error:
-        raise _edited(path) from error
+        raise edited(path) from error
     if not isinstance(data, dict) or not isinstance(data.get("schema"), int):
-        raise _edited(path)
+        raise edited(path)
     if data["schema"] < SCHEMA:
         raise SplatError(
             "run-folder-older",
@@ -175,7 +175,7 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
         )
     digest = data.pop("digest", None)
     if digest != _seal(data):
-        raise _edited(path)
+        raise edited(path)
     return data
 
 
@@ -184,7 +184,8 @@ def _seal(body: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
-def _edited(path: Path) -> SplatError:
+def edited(path: Path) -> SplatError:
+    """The error for a file of a run folder that is not as splat wrote it."""
     what = f"the folder {path.parent}" if path.name == MANIFEST else path
     again = "its stage runs again" if path.name == MANIFEST else "it is written again"
     return SplatError(

@@ -16,7 +16,7 @@ from typing import Any
 
 from stages.base.errors import SplatError
 from stages.base.stage import Stage
-from stages.run.manifest import EDITED, MANIFEST, read_sealed, write_sealed
+from stages.run.manifest import EDITED, MANIFEST, edited, read_sealed, write_sealed
 from stages.run.request import REQUEST, settings_from_data, settings_to_data
 
 RUN_FILE = "run.json"
@@ -40,15 +40,17 @@ class RunFile:
         """
         try:
             data = read_sealed(folder / RUN_FILE)
+            if data is not None:
+                photographs, settings = data.get("photographs"), data.get("settings", {})
+                if not isinstance(photographs, str | None) or not isinstance(settings, dict):
+                    raise edited(folder / RUN_FILE)
+                return cls(Path(photographs) if photographs else None, settings)
         except SplatError as error:
             if error.code != EDITED or not (settings := settings_of_stages(folder)):
                 raise
             return cls(settings=settings, rebuilt=True)
-        if data is None:
-            settings = settings_of_stages(folder)
-            return cls(settings=settings, rebuilt=True) if settings else None
-        photographs = data.get("photographs")
-        return cls(Path(photographs) if photographs else None, data.get("settings", {}))
+        settings = settings_of_stages(folder)
+        return cls(settings=settings, rebuilt=True) if settings else None
 
     def write(self, folder: Path) -> None:
         """Write it atomically. Raises OSError."""

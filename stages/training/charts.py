@@ -10,28 +10,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.measure.evaluation import SIZES
 
 SHEET_COLUMN = 480  # pixels, at most
 ERROR_GAIN = 4.0
 
 
 def contact_sheet(
-    path: Path, rows: list[tuple[str, float, NDArray[np.float32], NDArray[np.float32]]]
+    path: Path,
+    rows: Sequence[tuple[str, Sequence[float], NDArray[np.float32], NDArray[np.float32]]],
 ) -> None:
-    """A PNG with a numbered row for each (name, PSNR in dB, render, photograph): photograph,
-    render, absolute error x 4; and a .txt beside it that says which number is which photograph,
-    since the picture's font knows only ASCII."""
+    """A PNG with a numbered row for each (name, PSNR in dB at each of `SIZES`, render,
+    photograph): photograph, render, absolute error x 4; and a .txt beside it that says which number
+    is which photograph, since the picture's font knows only ASCII."""
     import cv2
 
     strips, legend = [], []
-    for number, (name, decibel, image, truth) in enumerate(rows, 1):
-        legend.append(f"{number}  {name}  {decibel:.2f} dB\n")
+    for number, (name, decibels, image, truth) in enumerate(rows, 1):
+        figures = ", ".join(
+            f"{size} size {psnr:.2f} dB" for size, psnr in zip(SIZES, decibels, strict=True)
+        )
+        legend.append(f"{number}  {name}  {figures}\n")
         error = np.clip(np.abs(image - truth) * ERROR_GAIN, 0, 1)
         tiles = [_fitted(tile) for tile in (truth, image, error)]
         strip = np.hstack(tiles)
         title = np.full((26, strip.shape[1], 3), 24, np.uint8)
         shown = f"{number}  {name if name.isascii() else f'(see {path.stem}.txt)'}"
-        text = f"{shown}   photograph | render {decibel:.2f} dB | error x{ERROR_GAIN:.0f}"
+        text = f"{shown}   photograph | render {decibels[0]:.2f} dB | error x{ERROR_GAIN:.0f}"
         cv2.putText(title, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (220,) * 3, 1, cv2.LINE_AA)
         strips.append(np.vstack([title, strip]))
     if not strips:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,11 @@ from stages.measure.evaluation import (
     EvaluationView,
     ImageRenderer,
     Score,
-    evaluate,
+    evaluate_at_sizes,
     evaluation_subset,
     psnr_as_taken_db,
     psnr_inside_masks_db,
+    psnr_name,
 )
 from stages.scene import DrawSettings, Reconstruction, split_held_out
 from stages.training.charts import contact_sheet, training_plot
@@ -41,9 +42,10 @@ def write_quality(
         draw_settings: they are drawn with.
         reconstruction: the held-out views come from.
     """
-    scores = evaluate(render, views, with_flip=True)
+    by_size = evaluate_at_sizes(render, views, with_flip=True)
+    scores = by_size["full"]
     if scores:
-        _report_scores(scores, report)
+        _report_scores(by_size, report)
     else:
         report.warn(
             "train-nothing-held-out",
@@ -57,14 +59,19 @@ def write_quality(
     inside = psnr_inside_masks_db(render, views)
     if inside is not None:
         report.metric("psnr_inside_db", round(inside, 3))
-    report.metric("held_out", [asdict(score) for score in scores])
+    figures = [
+        {psnr_name(name): score.psnr_db for name, score in zip(by_size, same, strict=True)}
+        for same in zip(*by_size.values(), strict=True)
+    ]
+    held_out = [asdict(score) | more for score, more in zip(scores, figures, strict=True)]
+    report.metric("held_out", held_out)
     sides = (max(view.pixels.shape[:2]) for view in views)
     report.metric("evaluated_side_px", max(sides, default=0))
     rows = []
     worst = min(range(len(scores)), key=lambda i: scores[i].psnr_db, default=0)
     for i in sorted({*evaluation_subset(len(scores)), worst}) if scores else ():
         image = np.clip(render(views[i].camera), 0.0, 1.0)
-        rows.append((views[i].name, scores[i].psnr_db, image, views[i].image))
+        rows.append((views[i].name, list(figures[i].values()), image, views[i].image))
     contact_sheet(folder / "held_out.png", rows)
 
 
@@ -86,11 +93,14 @@ def write_history(
     report.metric("history", [entry | asdict(elapsed) for entry, elapsed in both])
 
 
-def _report_scores(scores: Sequence[Score], report: Report) -> None:
+def _report_scores(by_size: Mapping[str, Sequence[Score]], report: Report) -> None:
+    scores = by_size["full"]
     values = [score.psnr_db for score in scores]
     worst = min(scores, key=lambda score: score.psnr_db)
     flips = [score.flip for score in scores if score.flip is not None]
-    report.metric("psnr_db", round(float(np.mean(values)), 3))
+    for name, same in by_size.items():
+        mean = float(np.mean([score.psnr_db for score in same]))
+        report.metric(psnr_name(name), round(mean, 3))
     report.metric("psnr_worst_db", round(worst.psnr_db, 3))
     report.metric("psnr_worst_view", worst.name)
     report.metric("psnr_spread_db", round(float(np.std(values)), 3))

@@ -8,6 +8,7 @@ reconstruction by the similarity that fits the cameras of the photographs best.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from PIL import Image
 
 from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
-from stages.scene import Camera, Reconstruction, View
+from stages.measure.evaluation import EvaluationView, load_evaluation_views
+from stages.scene import Camera, DrawSettings, Reconstruction, View
 from stages.scene.similarity import similarity
 
 TRUTH = Path(make.__file__).parent / "still_life" / "truth.json"
@@ -51,6 +53,15 @@ def render_test_views(folder: Path) -> None:
         path = folder / f"test_{number:02d}.png"
         if not path.exists():
             Image.fromarray(photograph(list(make.scene()), Light(), PINHOLE, pose)).save(path)
+
+
+def evaluation_views(
+    folder: Path, reconstruction: Reconstruction, settings: DrawSettings
+) -> Sequence[EvaluationView]:
+    """The test views, drawn into `folder` if they are not there, in the world of the sample's
+    `reconstruction`."""
+    render_test_views(folder)
+    return load_evaluation_views(folder, held_out_views_in(reconstruction), settings)
 
 
 def held_out_views_in(reconstruction: Reconstruction) -> tuple[View, ...]:

@@ -18,7 +18,7 @@ from tests.fuzz.child import NUMBER, Tally
 from tests.fuzz.cost import ENVIRONMENT
 from tests.fuzz.layers import LAYERS
 
-BATCH = 2000  # inputs of a process; what a killed run repeats
+BATCH = 10_000  # inputs of a process; what a killed run repeats
 _SECONDS = 120.0  # on the clock, for what waits instead of computing: to start, and ...
 _SECONDS_EACH = 0.5  # ... for each input
 _WRITING = threading.Lock()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageCms
 
 from stages.photos.decode import Decoded, PixelBudget, decode, readers_set_up
 from stages.photos.exif import Exif
@@ -59,6 +60,27 @@ def _with_tags(tags: bytes) -> bytes:
     return whole[:2] + b"\xff\xe1" + struct.pack(">H", len(tags) + 2) + tags + whole[2:]
 
 
+def _profile() -> bytes:
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+def _with_profile(profile: bytes) -> bytes:
+    return _saved("JPEG", icc_profile=profile)()
+
+
+def _with_sums(content: bytes) -> bytes:
+    """A PNG whose chunks end in their checksums."""
+    fitting, at = bytearray(content), 8
+    while at + 12 <= len(fitting):
+        (size,) = struct.unpack_from(">I", fitting, at)
+        end = at + 8 + size
+        if end + 4 > len(fitting):
+            break
+        struct.pack_into(">I", fitting, end, zlib.crc32(fitting[at + 4 : end]))
+        at = end + 4
+    return bytes(fitting)
+
+
 def _mask() -> bytes:
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[8:, 5:40] = 255
@@ -82,6 +104,10 @@ LAYERS = {
     "photograph, JPEG": _photograph("a.jpg", _saved("JPEG", quality=90, exif=exif())),
     "photograph, progressive": _photograph("a.jpg", _saved("JPEG", progressive=True)),
     "photograph, Exif": Layer("a.jpg", _tags, _with_tags, read=_decoded, holds=1),
+    "photograph, colour profile": Layer("a.jpg", _profile, _with_profile, read=_decoded, holds=1),
+    "photograph, PNG with fitting sums": Layer(
+        "a.png", _saved("PNG", exif=exif()), _with_sums, read=_decoded, holds=1
+    ),
     "photograph, PNG": _photograph("a.png", _saved("PNG", compress_level=0, exif=exif())),
     "photograph, PNG of a palette": _photograph("a.png", _saved("PNG", "P", compress_level=0)),
     "photograph, TIFF": _photograph("a.tif", _saved("TIFF", exif=exif())),

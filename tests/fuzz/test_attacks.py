@@ -21,10 +21,13 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.cameras import nerfstudio, realityscan
 from stages.cameras.camera_file import size_of_picture
+from stages.formats import streamed_sog
 from stages.formats.spz_read import MAGIC
+from stages.photos.decode import PixelBudget, Unusable, decode, readers_set_up
 from stages.photos.exif import Exif
-from stages.photos.jpeg import ends_properly
-from stages.run.manifest import MANIFEST, Manifest
+from stages.photos.jpeg import fault_of
+from stages.run.manifest import MANIFEST, Manifest, write_sealed
+from stages.run.runfile import RUN_FILE, RunFile
 from stages.scene import load_splats, save_splats
 from tests.formats.truth import many_splats, red_splat
 from tests.fuzz.cost import Meter
@@ -114,6 +117,13 @@ def test_a_list_that_names_a_chunk_twice_is_refused(tmp_path: Path) -> None:
     meta["tree"] = {"children": leaves}
     path.write_text(json.dumps(meta))
     refused(formats.read, path, "twice")
+
+
+def test_a_list_of_very_many_levels_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "lod-meta.json", 40)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "lodLevels": 200_000_000}))
+    splats = formats.read(path)
+    refused(lambda place: streamed_sog.splat_widths(place, splats), path, "levels")
 
 
 def test_a_gltf_whose_buffers_are_one_file_is_refused(tmp_path: Path) -> None:
@@ -231,9 +241,25 @@ def test_the_exposure_of_any_numbers_is_a_number(
 def test_the_end_of_a_jpeg_with_a_long_fill_is_found_soon() -> None:
     scan = b"\xff\xd8\xff\xda\x00\x02"
     meter = Meter()
-    assert not ends_properly(scan + (b"\xff" * 60_000 + b"\x00") * 3)
-    assert ends_properly(scan + b"\xff" * 60_000 + b"\x00\x01" + b"\xff\xff\xd9")
+    assert fault_of(scan + (b"\xff" * 60_000 + b"\x00") * 3)
+    assert not fault_of(scan + b"\xff" * 60_000 + b"\x00\x01" + b"\xff\xff\xd9")
     assert meter.stop().cpu_s < _CPU_S
+
+
+def test_a_jpeg_of_very_many_scans_is_refused(tmp_path: Path) -> None:
+    """Each scan of a few bytes costs a walk over all pixels."""
+    out = io.BytesIO()
+    Image.new("L", (2048, 2048)).save(out, "JPEG", progressive=True)
+    whole = out.getvalue()
+    path = tmp_path / "a.jpg"
+    path.write_bytes(whole[:-2] + whole[whole.rindex(b"\xff\xda") : -2] * 3000 + whole[-2:])
+    meter = Meter()
+    with readers_set_up(), pytest.raises(Unusable, match="scans"):
+        decode(path, 1600, PixelBudget(1 << 28))
+    assert meter.stop().cpu_s < _CPU_S
+    path.write_bytes(whole)
+    with readers_set_up():
+        assert decode(path, 1600, PixelBudget(1 << 28)).stored == (2048, 2048)
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
@@ -242,6 +268,12 @@ def test_stored_splats_of_no_size_are_refused(tmp_path: Path, value: float) -> N
     whole = path.read_bytes()
     path.write_bytes(whole[:-24] + np.float64(value).tobytes() + whole[-16:])
     refused(load_splats, path)
+
+
+@pytest.mark.parametrize("data", [{"photographs": 7}, {"settings": [1]}])
+def test_a_run_file_of_other_types_is_refused(tmp_path: Path, data: dict[str, Any]) -> None:
+    write_sealed(tmp_path / RUN_FILE, data)
+    refused(lambda path: RunFile.read(path.parent), tmp_path / RUN_FILE)
 
 
 def test_a_manifest_of_deep_lists_is_refused(tmp_path: Path) -> None:

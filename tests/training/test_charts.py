@@ -21,13 +21,16 @@ def test_contact_sheet_never_shows_a_name_that_its_font_cannot_draw(
     monkeypatch.setattr(cv2, "putText", lambda image, text, *more: drawn.append(text))
     grey = np.full((30, 40, 3), 0.5, np.float32)
     charts.contact_sheet(
-        tmp_path / "held_out.png", [("a.jpg", 21.5, grey, grey), (name, 20.25, grey, grey)]
+        tmp_path / "held_out.png",
+        [("a.jpg", (21.5, 24, 27), grey, grey), (name, (20.25, 22, 25), grey, grey)],
     )
     assert drawn[0].startswith("1  a.jpg  ")
     assert drawn[1].startswith("2  (see held_out.txt)  ")
     assert "?" not in drawn[1]
     legend = (tmp_path / "held_out.txt").read_text(encoding="utf-8")
-    assert legend == f"1  a.jpg  21.50 dB\n2  {name}  20.25 dB\n"
+    first, second = legend.splitlines()
+    assert first == "1  a.jpg  full size 21.50 dB, half size 24.00 dB, quarter size 27.00 dB"
+    assert second.startswith(f"2  {name}  full size 20.25 dB")
 
 
 def test_contact_sheet_of_nothing_is_none(tmp_path: Path) -> None:

@@ -359,6 +359,20 @@ def test_under_the_smoothing_filter_no_trained_splat_is_finer_than_its_photograp
     widths = smoothing_widths(found.means, [v.camera.fitted(72) for v in kept], near=0.01)
     assert (np.exp(found.log_scales).min(1) >= 0.999 * widths).all()
     assert report.metrics["psnr_db"] > 20
+    _shown_at_every_size(report, folder)
+
+
+def _shown_at_every_size(report, folder):
+    """The manifest, the summary and the contact sheet's legend give the half and quarter size."""
+    figures = [report.metrics[n] for n in ("psnr_db", "psnr_half_db", "psnr_quarter_db")]
+    line = headline(cast(Any, SimpleNamespace(stage="train", metrics=report.metrics)))
+    for name, figure in zip(("held out PSNR", "half size", "quarter size"), figures, strict=True):
+        assert f"{name} {figure:.4g} dB" in line
+    for number, view in enumerate(report.metrics["held_out"]):
+        shown = (folder / "held_out.txt").read_text().splitlines()[number]
+        assert f"quarter size {view['psnr_quarter_db']:.2f} dB" in shown
+    halves = [view["psnr_half_db"] for view in report.metrics["held_out"]]
+    assert figures[1] == pytest.approx(np.mean(halves), abs=1e-3)
 
 
 class KilledError(Exception):

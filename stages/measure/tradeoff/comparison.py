@@ -14,9 +14,10 @@ from stages.base.errors import Family, SplatError
 from stages.base.text import counted
 from stages.measure.bootstrap import Difference, paired_difference
 from stages.measure.evaluation import (
+    SIZES,
     EvaluationView,
     Score,
-    evaluate,
+    evaluate_at_sizes,
     image_renderer,
     load_evaluation_views,
 )
@@ -59,17 +60,28 @@ class Comparison:
     Args:
         candidates: the first and the second.
         views: of each, in the same order.
-        scores: of each, in that order.
-        psnr, ssim: of the second less the first.
-        side_px: longer side of every picture.
+        by_size: the scores of each, in that order, at each of `SIZES`.
+        psnr, ssim: of the second less the first, at the full size.
+        psnr_by_size: the same at each of `SIZES`.
+        side_px: longer side of every picture at the full size.
     """
 
     candidates: tuple[Candidate, Candidate]
     views: tuple[tuple[EvaluationView, ...], tuple[EvaluationView, ...]]
-    scores: tuple[tuple[Score, ...], tuple[Score, ...]]
-    psnr: Difference
+    by_size: tuple[dict[str, list[Score]], dict[str, list[Score]]]
     ssim: Difference
+    psnr_by_size: dict[str, Difference]
     side_px: int
+
+    @property
+    def psnr(self) -> Difference:
+        return self.psnr_by_size["full"]
+
+    @property
+    def scores(self) -> tuple[list[Score], list[Score]]:
+        """Of each, at the full size."""
+        first, second = self.by_size
+        return first["full"], second["full"]
 
 
 def compare_runs(first: Candidate, second: Candidate) -> Comparison:
@@ -88,35 +100,46 @@ def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     side_px = min(one.side_px(name) for one in both for name in names)
     views = (first.views(names, side_px), second.views(names, side_px))
     a, b = (
-        tuple(evaluate(image_renderer(one.splats, one.backend), seen))
+        evaluate_at_sizes(image_renderer(one.splats, one.backend), seen)
         for one, seen in zip(both, views, strict=True)
     )
-    ssim = np.array([two.ssim - one.ssim for one, two in zip(a, b, strict=True)])
-    return Comparison(both, views, (a, b), psnr_change(b, a), paired_difference(ssim), side_px)
+    ssim = np.array([two.ssim - one.ssim for one, two in zip(a["full"], b["full"], strict=True)])
+    psnr = {size: psnr_change(b[size], a[size]) for size in SIZES}
+    return Comparison(both, views, (a, b), paired_difference(ssim), psnr, side_px)
 
 
 def verdict_lines(comparison: Comparison) -> list[str]:
     """Whether the second candidate is better, and how sure that is."""
     change, (a, b) = comparison.psnr, comparison.candidates
-    interval, ssim = (
-        f"95 %: {d.low:+.{digits}f} to {d.high:+.{digits}f}" if d.views > 1 else "one view"
-        for d, digits in ((change, 2), (comparison.ssim, 4))
-    )
     return [
-        f"{b.name} against {a.name}: {change.mean:+.2f} dB ({interval}): {change.verdict}.",
-        f"SSIM: {comparison.ssim.mean:+.4f} ({ssim}): {comparison.ssim.verdict}.",
+        f"{b.name} against {a.name}: {_in_words(change, 2, ' dB')}",
+        *(
+            f"At {size} size: {_in_words(comparison.psnr_by_size[size], 2, ' dB')}"
+            for size in ("half", "quarter")
+        ),
+        f"SSIM: {_in_words(comparison.ssim, 4)}",
         f"Measured on {counted(change.views, 'held-out view')}, {comparison.side_px} pixels large. "
         "Each is one run: the interval does not say whether the same settings would be better with "
         "another seed.",
     ]
 
 
+def _in_words(change: Difference, digits: int, unit: str = "") -> str:
+    interval = f"95 %: {change.low:+.{digits}f} to {change.high:+.{digits}f}"
+    interval = interval if change.views > 1 else "one view"
+    return f"{change.mean:+.{digits}f}{unit} ({interval}): {change.verdict}."
+
+
 def fact_rows(comparison: Comparison) -> list[tuple[str, str, str]]:
     """(name, of the first, of the second)."""
     first, second = (candidate.facts for candidate in comparison.candidates)
-    means = [mean_db(scores) for scores in comparison.scores]
+    a, b = comparison.by_size
+    means = [
+        (f"held-out PSNR, {size} size", f"{mean_db(a[size]):.2f} dB", f"{mean_db(b[size]):.2f} dB")
+        for size in SIZES
+    ]
     rows = [(name, first.get(name, "-"), second.get(name, "-")) for name in first | second]
-    return [("held-out PSNR", f"{means[0]:.2f} dB", f"{means[1]:.2f} dB"), *rows]
+    return [*means, *rows]
 
 
 def distinct_name(folder: Path, other: Path) -> str:

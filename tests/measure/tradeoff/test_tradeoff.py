@@ -17,6 +17,7 @@ from stages.measure.tradeoff import summary
 from stages.measure.tradeoff.comparison import (
     Candidate,
     compare_runs,
+    fact_rows,
     verdict_lines,
     write_comparison,
 )
@@ -222,6 +223,18 @@ def test_a_worse_run_is_worse_and_the_other_way_round_better(scene) -> None:
     fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
     assert compare_runs(side(scene, "all"), fewer).psnr.verdict == WORSE
     assert compare_runs(fewer, side(scene, "all")).psnr.verdict == BETTER
+
+
+def test_a_comparison_says_which_run_is_better_at_each_size(scene) -> None:
+    fewer = side(scene, "fewer", scene.splats.take(slice(0, 120)))
+    found = compare_runs(side(scene, "all"), fewer)
+    assert [d.verdict for d in found.psnr_by_size.values()] == [WORSE] * 3
+    (_, half, quarter, *_) = verdict_lines(found)
+    assert half.startswith("At half size: -")
+    assert quarter.startswith("At quarter size: -")
+    assert [row[0] for row in fact_rows(found)][:3] == [
+        f"held-out PSNR, {size} size" for size in ("full", "half", "quarter")
+    ]
 
 
 def test_both_are_compared_at_the_smaller_size(scene) -> None:

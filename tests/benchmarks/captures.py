@@ -1,0 +1,140 @@
+"""The captures that quality is measured on: `python -m tests.benchmarks.captures FOLDER [CLONES]`.
+
+Says which of them FOLDER lacks and where they are published. With a folder of clones, named as the
+repositories are, it copies what is missing from them. Nothing of them belongs into this repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import subprocess
+import tarfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stages.cameras.nerfstudio import OPENGL_FROM_OURS
+
+PICTURES = ("images", "masks")  # folders of which a part may be taken
+_STRECHA = "Benchmarking_Camera_Calibration_2008"
+_TRUE_CAMERAS = "gt_dense_cameras"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a capture is published.
+
+    Args:
+        repository: on GitHub.
+        folder: of the capture there.
+        parts: files and folders of it that are copied.
+        every: of the pictures, in the order of their names, the first and each so many-th after it.
+    """
+
+    repository: str
+    folder: str
+    parts: tuple[str, ...] = ("images",)
+    every: int = 1
+
+    @property
+    def text(self) -> str:
+        """Where it is, in words."""
+        some = f", one picture in {self.every}" if self.every > 1 else ""
+        where = f"{self.folder}: " if self.folder else ""
+        return f"https://github.com/{self.repository}, {where}{', '.join(self.parts)}{some}"
+
+
+_LLFF = ("images", "poses_bounds.npy")
+SOURCES = {
+    "banana": Source("pierotofy/dataset_banana", ""),
+    "plush": Source("noname0310/snowmiku2023plush-splat", "", ("input",)),
+    "lego": Source(
+        "luo-ziyuan/CopyRNeRF-code",
+        "data/nerf_synthetic/lego",
+        ("train", "test", "transforms_train.json", "transforms_test.json"),
+    ),
+    "fern": Source("luo-ziyuan/CopyRNeRF-code", "data/nerf_llff_data/fern", _LLFF),
+    "horns": Source("Bussler/CustomNeRF", "data/horns", _LLFF),
+    "kitchen": Source("facebookresearch/vggsfm", "examples/kitchen"),
+    **{
+        name: Source(
+            "openMVG/SfM_quality_evaluation", f"{_STRECHA}/{name}", ("images", _TRUE_CAMERAS)
+        )
+        for name in ("fountain-P11", "Herz-Jesus-P25")
+    },
+    "table": Source("Scodive/Data", ""),
+    "statue-of-liberty": Source("vork/StatueOfLiberty-Photogrammetry", "", PICTURES, every=3),
+}
+
+
+def photographs_of(capture: Path) -> Path:
+    """The folder of photographs in the folder of a capture."""
+    found = (capture / name for name in ("images", "input"))
+    return next((folder for folder in found if folder.is_dir()), capture)
+
+
+def copy_from(clone: Path, source: Source, into: Path) -> None:
+    """Copy a capture from a clone, bare or not. Raises CalledProcessError where it is not there."""
+    tree = f"HEAD:{source.folder}" if source.folder else "HEAD"
+    words = ["git", "-C", str(clone), "archive", tree, *source.parts]
+    packed = subprocess.run(words, capture_output=True, check=True).stdout
+    with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
+        files = [member for member in archive.getmembers() if member.isfile()]
+        archive.extractall(into, chosen(files, source.every), filter="data")
+    if _TRUE_CAMERAS in source.parts:
+        write_true_cameras(into)
+
+
+def chosen(files: Iterable[tarfile.TarInfo], every: int) -> list[tarfile.TarInfo]:
+    """All files but pictures that are left out."""
+    by_folder: dict[str, list[tarfile.TarInfo]] = {}
+    for file in sorted(files, key=lambda file: file.name):
+        by_folder.setdefault(file.name.rpartition("/")[0], []).append(file)
+    return [
+        file
+        for folder, inside in by_folder.items()
+        for file in inside[:: every if folder in PICTURES else 1]
+    ]
+
+
+def write_true_cameras(capture: Path) -> None:
+    """Strecha's `NAME.camera` as a transforms.json: the lens matrix, a line of zeros, camera to
+    world rotation, position, and the size of the picture."""
+    frames = []
+    for path in sorted((capture / _TRUE_CAMERAS).glob("*.camera")):
+        numbers = np.array(path.read_text(encoding="utf-8").split(), np.float64)
+        lens, rotation = numbers[:9].reshape(3, 3), numbers[12:21].reshape(3, 3)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation @ OPENGL_FROM_OURS, numbers[21:24]
+        width, height = (int(side) for side in numbers[24:26])
+        sides = {"w": width, "h": height, "cx": lens[0, 2], "cy": lens[1, 2]}
+        focal = {"fl_x": lens[0, 0], "fl_y": lens[1, 1]}
+        name = f"images/{path.stem}"
+        frames.append({"file_path": name, "transform_matrix": pose.tolist(), **sides, **focal})
+    written = json.dumps({"camera_model": "PINHOLE", "frames": frames})
+    (capture / "transforms.json").write_text(written, encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("clones", type=Path, nargs="?")
+    given = parser.parse_args()
+    for name, source in SOURCES.items():
+        clone = given.clones and given.clones / source.repository.rpartition("/")[2]
+        if (given.folder / name).is_dir():
+            state = "there"
+        elif clone and clone.is_dir():
+            copy_from(clone, source, given.folder / name)
+            state = "copied"
+        else:
+            state = f"missing: {source.text}"
+        print(f"{name}: {state}")
+
+
+if __name__ == "__main__":
+    main()

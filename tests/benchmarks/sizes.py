@@ -1,0 +1,70 @@
+"""An asset of the sample drawn at several sizes: `python -m tests.benchmarks.sizes TARGET ...`.
+
+A target is a run folder of the sample, or a file in its export folder. Its splats are drawn from
+twelve viewpoints that no photograph was taken from, at each longer side of `--sides`, and compared
+with photographs of that size. The table gives the mean and the worst PSNR, dB.
+
+Splats are drawn as they were trained, and with `--drawing plain` or `--drawing antialiased` as a
+viewer does that does not compensate opacities, or does.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from splatcli.folders import load_target
+from stages.measure.evaluation import EvaluationView, evaluate_at_sizes
+from stages.raster.draw import raster_settings_of, renderer
+from stages.run import results
+from stages.scene import Splats
+from tests.benchmarks.sample_test_views import PINHOLE, evaluation_views
+
+SIDES = (120, 240, 320, 480, 640)
+DRAWINGS = {"trained": None, "plain": False, "antialiased": True}
+
+
+def psnr_at(
+    splats: Splats, views: Sequence[EvaluationView], sides: Sequence[int], drawing: str = "trained"
+) -> dict[int, tuple[float, float]]:
+    """Mean and worst PSNR by longer side. views: at PINHOLE's size, in the world of `splats`."""
+    settings, compensates = raster_settings_of(splats), DRAWINGS[drawing]
+    if compensates is not None:
+        settings = replace(settings, antialias=compensates)
+    draw = renderer(splats, settings)
+    sizes = {str(side): side / PINHOLE.width for side in sides}
+    found = evaluate_at_sizes(lambda camera: draw(camera).image, views, sizes)
+    psnr_db = {int(side): [score.psnr_db for score in same] for side, same in found.items()}
+    return {side: (float(np.mean(same)), min(same)) for side, same in psnr_db.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("targets", nargs="+", type=Path)
+    parser.add_argument("--sides", nargs="+", type=int, default=SIDES)
+    parser.add_argument("--drawing", nargs="+", choices=list(DRAWINGS), default=["trained"])
+    parser.add_argument("--views", type=Path, default=Path("test_views"), help="kept there")
+    given = parser.parse_args()
+    table = Table("asset", "splats", "drawn", *(f"{side} px" for side in given.sides))
+    for target in given.targets:
+        splats, run = load_target(target)
+        run = run or results.run_around(target)
+        if run is None:
+            raise SystemExit(f"{target} lies in no run: the cameras of the test views are unknown.")
+        settings = replace(splats.draw_settings, side=PINHOLE.width)
+        views = evaluation_views(given.views, run.load("sfm"), settings)
+        for drawing in given.drawing:
+            found = psnr_at(splats, views, given.sides, drawing)
+            cells = (f"{mean:.1f} / {worst:.1f}" for mean, worst in found.values())
+            table.add_row(str(target), f"{len(splats):,}", drawing, *cells)
+    Console(width=150).print(table)
+
+
+if __name__ == "__main__":
+    main()
