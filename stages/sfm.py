@@ -281,5 +281,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=13, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=14, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -42,19 +42,24 @@ def inlier_ratios(
         world_to_camera: [V, 4, 4].
         side: the longer side of the pictures, in pixels.
     """
-    ratios = np.full(len(pairs), np.nan)
-    no_baseline = _ROUNDING * np.abs(world_to_camera[:, :3, 3]).max(initial=0.0)
-    for number, (first, second, a, b) in enumerate(pairs):
-        relative = world_to_camera[second] @ np.linalg.inv(world_to_camera[first])
-        baseline = relative[:3, 3]
-        if np.linalg.norm(baseline) <= no_baseline:
-            continue
-        essential = _cross(baseline) @ relative[:3, :3]
-        left, right = _pixel_matrix(intrinsics[second]), _pixel_matrix(intrinsics[first])
-        ratios[number] = (
-            _sampson(left.T @ essential @ right, a, b) < INLIER_DISTANCE * side
-        ).mean()
-    return ratios
+    distances = (epipolar_distances(pair, intrinsics, world_to_camera) for pair in pairs)
+    return np.array(
+        [np.nan if d is None else (d < INLIER_DISTANCE * side).mean() for d in distances]
+    )
+
+
+def epipolar_distances(
+    pair: MatchedPair, intrinsics: NDArray[np.float64], world_to_camera: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """[N] Sampson distance of each match, pixels; None without a baseline. See `inlier_ratios`."""
+    first, second, a, b = pair
+    relative = world_to_camera[second] @ np.linalg.inv(world_to_camera[first])
+    baseline = relative[:3, 3]
+    if np.linalg.norm(baseline) <= _ROUNDING * np.abs(world_to_camera[:, :3, 3]).max(initial=0.0):
+        return None
+    essential = _cross(baseline) @ relative[:3, :3]
+    left, right = _pixel_matrix(intrinsics[second]), _pixel_matrix(intrinsics[first])
+    return _sampson(left.T @ essential @ right, a, b)
 
 
 def likely_mistakes(poses: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

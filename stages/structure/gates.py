@@ -219,16 +219,13 @@ def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[
 
 
 def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
-    hint = (
-        "Look for something that stays in the same place of every picture (a date stamp, a frame, "
-        "a dirty lens) and crop it away; and do not mix zoom settings."
-    )
     if abs(model.distortion) > thresholds.distortion:
         yield Failure(
             "sfm-implausible-distortion",
             f"The radial distortion of the lens was estimated as k = {model.distortion:.2f}.",
             f"Lenses have |k| below {thresholds.distortion:g}.",
-            hint,
+            "Look for something that stays in the same place of every picture (a date stamp, a "
+            "frame, a dirty lens) and crop it away; and do not mix zoom settings.",
         )
     ratio = model.focal_over_prior
     if ratio is not None and not 1 / thresholds.focal_ratio <= ratio <= thresholds.focal_ratio:
@@ -236,7 +233,9 @@ def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Fa
             "sfm-implausible-focal",
             f"The focal length was estimated as {ratio:.2f} times what the photographs' EXIF says.",
             f"It should lie within a factor of {thresholds.focal_ratio:g}.",
-            hint,
+            "A walk straight on, or few matches, leave the focal length open: use larger "
+            "photographs (--max-side) and more overlap, from places to the side, too. If they were "
+            "cropped or zoomed after EXIF was written, remove it.",
         )
 
 

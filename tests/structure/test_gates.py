@@ -123,6 +123,13 @@ def test_measured_bad_captures_are_caught(changes: dict[str, object], code: str)
     assert code in codes(replace(BANANA, **changes))  # type: ignore[arg-type]
 
 
+def test_a_focal_length_off_its_prior_is_not_put_down_to_a_date_stamp() -> None:
+    (failure,) = check_model(replace(BANANA, focal_over_prior=0.48))
+    assert failure.code == "sfm-implausible-focal"
+    assert "date stamp" not in failure.hint
+    assert "--max-side" in failure.hint
+
+
 def test_one_photograph_of_sixteen_may_be_left_out_but_not_four() -> None:
     assert codes(BANANA) == []
     assert codes(replace(BANANA, registered=12)) == ["sfm-too-few-registered"]
