@@ -122,9 +122,7 @@ def run(
     )
     plain = finetuning.to_plain_drawing(kept)
     flat = _flat_colours(kept if plain is None else plain, inputs["sfm"], settings)
-    quantised = QuantisedSplats(
-        kept, kept.sh_degree, {}, flat, plain=plain, drawing=settings.drawing
-    )
+    quantised = QuantisedSplats(kept, {}, flat, plain=plain, drawing=settings.drawing)
     sog = splats_to_write(FORMATS["sog"], quantised)
     bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
     figures = {
@@ -305,7 +303,6 @@ def load(folder: Path) -> QuantisedSplats:
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
         return QuantisedSplats(
             splats,
-            int(decisions["sh_degree"]),
             decisions,
             flat,
             plain=finetuned.pop(PLAIN, None),

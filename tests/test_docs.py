@@ -31,7 +31,6 @@ _NO_CODES = {
     "allow-nonfinite",  # an argument of the USD reader's process
     *("in-use", "peak-memory"),  # parts of file names
     *("no-rotation", "too-large"),  # flags of `splat info`
-    "out-of-range",  # the end of `export-FORMAT-out-of-range`
 }
 
 

@@ -35,7 +35,7 @@ def exported(
     splats = replace(splats, origin=scene.reconstruction.origin)
     inputs = {
         "sfm": scene.reconstruction,
-        "quantise": QuantisedSplats(splats, splats.sh_degree, {}),
+        "quantise": QuantisedSplats(splats, {}),
     }
     return export.run(inputs, ExportSettings(**settings), folder, report), report
 

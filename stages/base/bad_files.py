@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -85,6 +87,10 @@ def reading(path: Path, kind: FileKind = SPLATS) -> Iterator[None]:
         TypeError,
         OverflowError,
         RecursionError,
+        EOFError,
+        NotImplementedError,  # of zip files of a later version
+        zipfile.BadZipFile,
+        zlib.error,
         struct.error,
     ) as error:
         if isinstance(error, BadFileError):

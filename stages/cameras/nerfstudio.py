@@ -35,7 +35,7 @@ from stages.cameras.camera_file import (
     stored_size,
 )
 from stages.cameras.lens import Lens
-from stages.formats.ply import Columns, tables
+from stages.formats.ply import columns, tables
 from stages.formats.ply_header import read_header
 from stages.scene import View
 
@@ -272,13 +272,13 @@ def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     with path.open("rb") as file:
         header = read_header(file)
         names = [name for name, _ in header.vertex.properties]
-        parts = [Columns(names, table) for _, table in tables(file, path, header)]
+        parts = [table for _, table in tables(file, path, header)]
     if not parts:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    points = np.concatenate([part.take(["x", "y", "z"]) for part in parts]).astype(np.float64)
+    points = np.concatenate([columns(part, ["x", "y", "z"]) for part in parts]).astype(np.float64)
     if not np.isfinite(points).all():
         raise BadFileError("a point has a value that is not a number")
     channels = ["red", "green", "blue"]
     if not set(channels) <= set(names):
         return points, np.full((len(points), 3), 128, np.uint8)
-    return points, np.concatenate([part.take(channels) for part in parts]).astype(np.uint8)
+    return points, np.concatenate([columns(part, channels) for part in parts]).astype(np.uint8)

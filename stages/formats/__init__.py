@@ -4,11 +4,11 @@
 them so. The axes and encodings of a format stay inside its module.
 
 To add a format, in six steps:
-1. Write `write(path, splats, *, units)` in a module here. It writes what `values.drop_undrawable`
-   leaves through `base.atomic.replacing`, one block of `base.blocks.reported_blocks` at a time, and
-   returns how many splats it left out.
-2. Write `read(path)` in the same module, or in one beside it. It works inside
-   `base.bad_files.reading` and returns its result through `values.check_finite`.
+1. Write `write(path, splats, *, units)` in a module here. Its splats are all drawable. It writes
+   through `base.atomic.replacing`, one block of `base.blocks.reported_blocks` at a time.
+2. Write `read(path)` in the same module, or in one beside it. It raises
+   `base.bad_files.BadFileError`, or what damaged bytes cause in Python and NumPy; `formats.read`
+   turns both into SplatError, and checks the values.
 3. Add a row to `table.TABLE`. `splat export`, `convert`, `verify`, `info` and their help, the
    fuzzer and the tests of all formats are driven by this table.
 4. Write an independent reader (of a library, or of raw bytes) and a byte breakdown in
@@ -66,13 +66,15 @@ def write(
     Raises SplatError as `format_of`, or what keeps the file from being written.
     """
     from stages.formats.offset import write_offset
+    from stages.formats.values import drop_undrawable
 
     row = format_of(path)
     remove_abandoned_files(Path(path).parent)
     more: dict[str, Any] = {"views": views} if row.takes_views else {}
     if row.streamed:
         more["coarser"] = coarser
-    dropped: int = load_object(row.writer)(Path(path), splats, units=units, **more)
+    splats, dropped = drop_undrawable(splats)
+    load_object(row.writer)(Path(path), splats, units=units, **more)
     if not row.holds_origin:
         write_offset(Path(path), row, splats, units)
     return dropped
@@ -84,9 +86,9 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError as
     `format_of`, or "splats-unreadable".
     """
-    from stages.formats.values import nonfinite_allowed
+    from stages.base.bad_files import reading
+    from stages.formats.values import check_finite, nonfinite_allowed
 
-    reader = load_object(format_of(path).reader)
-    with nullcontext() if strict else nonfinite_allowed():
-        splats: Splats = reader(Path(path))
-    return splats
+    path, reader = Path(path), load_object(format_of(path).reader)
+    with nullcontext() if strict else nonfinite_allowed(), reading(path):
+        return check_finite(reader(path))

@@ -20,14 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import blocks, reported_blocks
 from stages.formats import smallest_three
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
 from stages.formats.values import (
     allocate,
-    check_finite,
-    drop_undrawable,
     linear_opacities,
     logits_of,
     unit_quaternions,
@@ -54,14 +52,13 @@ _RANGES = (
 )
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     Positions stay relative to `splats.origin`, which a comment holds. All splats get one SH
     degree, and coefficients are clipped to -4..4. Raises SplatError when the file cannot be
     written.
     """
-    splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
     splats, rows = splats.with_sh_degree(degree), order(splats)
     packed = [_pack(splats.take(rows[part])) for part in reported_blocks(len(splats), _BLOCK)]
@@ -70,7 +67,6 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         for part in range(3):  # all chunks, then all vertices, then all SH
             for block in packed:
                 file.write(block[part].data)
-    return dropped
 
 
 def order(splats: Splats) -> NDArray[np.intp]:
@@ -134,7 +130,7 @@ def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     colour, colour_ranges = _within_chunks(colours)
     rgba = np.concatenate([colour, linear_opacities(splats)[:, None]], axis=1)
     largest, others = smallest_three.split(unit_quaternions(splats.quaternions))
-    rotations = _pack_bits(0.5 + others / (2 * smallest_three.LIMIT), (10, 10, 10))
+    rotations = _pack_bits(smallest_three.fractions_of(others), (10, 10, 10))
     words = (
         _pack_bits(positions, _AXES_BITS),
         rotations | largest.astype(np.uint32) << np.uint32(30),
@@ -187,15 +183,13 @@ def _unpack_bits(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.
 def read(path: Path) -> Splats:
     """The splats of a compressed .ply, float32; SH and colour ranges are optional.
 
-    Raises SplatError "splats-unreadable" for a damaged file or another kind of .ply.
+    Raises BadFileError for a damaged file or another kind of .ply.
     """
-    path = Path(path)
-    with reading(path):
-        with path.open("rb") as file:
-            header = read_header(file)
-        if not header.is_compressed:
-            raise BadFileError("it is no compressed .ply: its name should end in .ply alone")
-        return unpack(path, header)
+    with path.open("rb") as file:
+        header = read_header(file)
+    if not header.is_compressed:
+        raise BadFileError("it is no compressed .ply: its name should end in .ply alone")
+    return unpack(path, header)
 
 
 def unpack(path: Path, header: Header) -> Splats:
@@ -221,7 +215,7 @@ def unpack(path: Path, header: Header) -> Splats:
         _unpack_block(splats.take(rows), vertices[rows], chunks)
         if degree and rest is not None:
             splats.sh[rows, 1:] = _sh_values(rest[rows])
-    return check_finite(splats)
+    return splats
 
 
 def _unpack_block(out: Splats, vertices: NDArray[Any], ranges: NDArray[Any]) -> None:
@@ -230,7 +224,7 @@ def _unpack_block(out: Splats, vertices: NDArray[Any], ranges: NDArray[Any]) -> 
     rgba = _unpack_bits(words[3], _COLOUR_BITS)
     colours = _in_range(rgba[:, :3], ranges, _RANGES[2])
     largest_float = float(np.finfo(np.float32).max)
-    rotations = (_unpack_bits(words[1], (2, 10, 10, 10))[:, 1:] - 0.5) * 2 * smallest_three.LIMIT
+    rotations = smallest_three.from_fractions(_unpack_bits(words[1], (2, 10, 10, 10))[:, 1:])
     out.means[:] = _in_range(_unpack_bits(words[0], _AXES_BITS), ranges, _RANGES[0])
     out.quaternions[:] = smallest_three.join(words[1] >> np.uint32(30), rotations)
     out.log_scales[:] = _in_range(_unpack_bits(words[2], _AXES_BITS), ranges, _RANGES[1])

@@ -17,34 +17,15 @@ from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
 from stages.base.distribution import VERSION
 from stages.base.errors import Family, SplatError
+from stages.formats.json_fields import origin_field
 from stages.scene import Splats
 from stages.scene.flip import flipped
 
 EXTENSION = "KHR_gaussian_splatting"
-_COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121}
+_COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121, "<u4": 5125}
 _GLB_LIMIT_BYTES = (1 << 32) - 1
-_ARRAY_BUFFER = 34962
+ARRAY_BUFFER = 34962
 _POINTS = 0
-
-
-@dataclass(frozen=True)
-class Negated:
-    """An array that is negated when it is read, which saves a copy."""
-
-    array: NDArray[Any]
-
-    def __len__(self) -> int:
-        return len(self.array)
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        return -self.array[rows]
-
-    dtype = property(lambda self: self.array.dtype)
-    nbytes = property(lambda self: self.array.nbytes)
-    shape = property(lambda self: self.array.shape)
-
-
-Rows = NDArray[Any] | Negated
 
 
 @dataclass(frozen=True)
@@ -55,10 +36,12 @@ class Attribute:
         rows: [N, W] the values, little-endian; integers are normalised to 0..1 or -1..1.
         width: the number of columns that belong to the attribute; the others pad each row to a
             multiple of 4 bytes (glTF 2.0, section 3.6.2.4).
+        negated: whether the rows are negated when they are written, which saves a copy.
     """
 
-    rows: Rows
+    rows: NDArray[Any]
     width: int
+    negated: bool = False
 
 
 def write_file(
@@ -84,41 +67,26 @@ def write_file(
     """
     more: dict[str, Any] = {"antialiased": True} if splats.draw_settings.antialias else {}
     made_of = asset(units, flipped(splats.take(slice(0))).origin, **more)
-    document, arrays = _document(primitives, made_of, node_scale)
-    size = sum(array.nbytes for array in arrays)
-    if path.suffix.lower() == ".glb":
-        write_glb(path, document, arrays, size)
-    else:
-        _write_pair(path, document, arrays, size)
+    document = _document(primitives, made_of, node_scale)
+    written = [attribute for attributes in primitives for attribute in attributes.values()]
+    write = write_glb if path.suffix.lower() == ".glb" else _write_pair
+    write(path, document, written)
 
 
 def _document(
     primitives: list[dict[str, Attribute]], made_of: dict[str, Any], node_scale: float
-) -> tuple[dict[str, Any], list[Rows]]:
-    """(the JSON, whose buffer has no size and name yet; the arrays in buffer order)."""
+) -> dict[str, Any]:
+    """The JSON, whose buffer has no size and name yet."""
     accessors: list[dict[str, Any]] = []
     views: list[dict[str, Any]] = []
-    arrays: list[Rows] = []
     offset = 0
     described = []
     for attributes in primitives:
-        names = {}
+        described.append(_primitive({n: len(views) + i for i, n in enumerate(attributes)}))
         for name, attribute in attributes.items():
-            names[name] = len(accessors)
             accessors.append(accessor(name, attribute, len(views)))
-            array = attribute.rows
-            view = {
-                "buffer": 0,
-                "byteOffset": offset,
-                "byteLength": array.nbytes,
-                "target": _ARRAY_BUFFER,
-            }
-            if array.shape[1] > attribute.width:
-                view["byteStride"] = array.nbytes // len(array)
-            views.append(view)
-            arrays.append(array)
-            offset += array.nbytes
-        described.append(_primitive(names))
+            views.append(buffer_view(attribute, offset))
+            offset += attribute.rows.nbytes
     document: dict[str, Any] = {
         "asset": made_of,
         "extensionsUsed": [EXTENSION],
@@ -126,19 +94,17 @@ def _document(
         "scenes": [{"nodes": [0] if described else []}],
     }
     if not described:  # glTF forbids empty lists; a scene without nodes is valid
-        document["scenes"] = [{"name": "empty"}]
-        return document, []
+        return document | {"scenes": [{"name": "empty"}]}
     node: dict[str, Any] = {"mesh": 0, "name": "splats"}
     if node_scale != 1:
         node["scale"] = [node_scale] * 3
-    document |= {
+    return document | {
         "nodes": [node],
         "meshes": [{"primitives": described, "name": "splats"}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{}],
     }
-    return document, arrays
 
 
 def asset(units: str, origin: NDArray[np.float64], made: str = "", **more: Any) -> dict[str, Any]:
@@ -152,13 +118,21 @@ def asset(units: str, origin: NDArray[np.float64], made: str = "", **more: Any) 
     """
     generator = f"splat {VERSION}{made and f' ({made})'}"
     extras: dict[str, Any] = {"units": units, **more}
-    if origin.any():
-        extras["splat_origin"] = [float(v) for v in origin]
-    return {"version": "2.0", "generator": generator, "extras": extras}
+    return {"version": "2.0", "generator": generator, "extras": extras | origin_field(origin)}
+
+
+def buffer_view(attribute: Attribute, offset: int, target: int = ARRAY_BUFFER) -> dict[str, Any]:
+    """The buffer view of an attribute whose bytes start at `offset`."""
+    rows = attribute.rows
+    view = {"buffer": 0, "byteOffset": offset, "byteLength": rows.nbytes, "target": target}
+    if rows.shape[1] > attribute.width:
+        view["byteStride"] = rows.nbytes // len(rows)
+    return view
 
 
 def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
-    """The accessor of a vertex attribute in the buffer view of this number."""
+    """The accessor of a vertex attribute, or of indices (name ""), in the buffer view of this
+    number."""
     rows, width = attribute.rows, attribute.width
     described: dict[str, Any] = {
         "bufferView": view,
@@ -166,11 +140,11 @@ def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
         "count": len(rows),
         "type": "SCALAR" if width == 1 else f"VEC{width}",
     }
-    if rows.dtype.kind in "iu":
+    if name and rows.dtype.kind in "iu":
         described["normalized"] = True
     if name == "POSITION":
-        described["min"] = [float(v) for v in rows[:].min(axis=0)]
-        described["max"] = [float(v) for v in rows[:].max(axis=0)]
+        described["min"] = [float(v) for v in rows.min(axis=0)]
+        described["max"] = [float(v) for v in rows.max(axis=0)]
     return described
 
 
@@ -189,14 +163,15 @@ def _primitive(names: dict[str, int]) -> dict[str, Any]:
     }
 
 
-def write_glb(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size: int) -> None:
-    """Write a .glb of `document` with one buffer of the `arrays`: `size` bytes in all, each a
-    multiple of 4. Raises SplatError when it cannot be written or would exceed 4 GiB."""
-    if arrays:
+def write_glb(path: Path, document: dict[str, Any], attributes: Sequence[Attribute]) -> None:
+    """Write a .glb of `document` with one buffer of the rows of `attributes`, each a multiple of 4
+    bytes. Raises SplatError when it cannot be written or would exceed 4 GiB."""
+    size = _size(attributes)
+    if attributes:
         document["buffers"] = [{"byteLength": size}]
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + (8 + size if arrays else 0)
+    total = 12 + 8 + len(text) + (8 + size if attributes else 0)
     if total > _GLB_LIMIT_BYTES:
         raise SplatError(
             "export-glb-too-large",
@@ -208,24 +183,29 @@ def write_glb(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, total))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        if arrays:  # every array is a multiple of 4 bytes, so the chunk needs no padding
+        if attributes:  # all are multiples of 4 bytes, so the chunk needs no padding
             file.write(struct.pack("<I4s", size, b"BIN\0"))
-            _write_arrays(file, arrays)
+            _write_rows(file, attributes)
 
 
-def _write_pair(path: Path, document: dict[str, Any], arrays: Sequence[Rows], size: int) -> None:
+def _write_pair(path: Path, document: dict[str, Any], attributes: Sequence[Attribute]) -> None:
     """Write .bin and .gltf, the .bin first: a .gltf that exists then has its buffer."""
     binary = path.with_suffix(".bin")
-    if arrays:
-        document["buffers"] = [{"uri": quote(binary.name), "byteLength": size}]
+    if attributes:
+        document["buffers"] = [{"uri": quote(binary.name), "byteLength": _size(attributes)}]
         with replacing(binary) as temporary, temporary.open("wb") as file:
-            _write_arrays(file, arrays)
+            _write_rows(file, attributes)
     text = json.dumps(document, indent=1, allow_nan=False) + "\n"
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
-def _write_arrays(file: BinaryIO, arrays: Sequence[Rows]) -> None:
-    for array in arrays:
-        for rows in reported_blocks(len(array)):
-            file.write(np.ascontiguousarray(array[rows]).data)
+def _size(attributes: Sequence[Attribute]) -> int:
+    return sum(attribute.rows.nbytes for attribute in attributes)
+
+
+def _write_rows(file: BinaryIO, attributes: Sequence[Attribute]) -> None:
+    for attribute in attributes:
+        for part in reported_blocks(len(attribute.rows)):
+            rows = attribute.rows[part]
+            file.write(np.ascontiguousarray(-rows if attribute.negated else rows).data)

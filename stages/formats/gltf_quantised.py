@@ -17,17 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import blocks
-from stages.formats.gltf import fallback_colours, sh_attributes
-from stages.formats.gltf_file import EXTENSION, Attribute, write_file
-from stages.formats.values import (
-    drop_undrawable,
-    linear_opacities,
-    linear_scales,
-    unit_quaternions,
-)
+from stages.formats.gltf import attributes, plain
+from stages.formats.gltf_file import Attribute, write_file
+from stages.formats.values import linear_scales
 from stages.scene import Splats
-from stages.scene.flip import flipped
 
 _U16 = 65535
 # Largest step of the scales relative to the median size. Where a few huge splats would make the
@@ -35,17 +28,15 @@ _U16 = 65535
 _MAX_STEP = 0.01
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats` as `path`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats` as `path`.
 
     Normalised scales end at 1, so the node scales them up by a power of two; positions are divided
     by it, which is exact. Raises SplatError as `gltf.write`.
     """
-    splats, dropped = drop_undrawable(splats)
     unit = _unit(linear_scales(splats))
     primitives = [_attributes(group, unit) for group in _groups(splats)]
     write_file(Path(path), primitives, splats, units, node_scale=unit or 1.0)
-    return dropped
 
 
 def order(splats: Splats) -> NDArray[np.intp]:
@@ -71,28 +62,19 @@ def _unit(scales: NDArray[np.float32]) -> float | None:
 
 def _attributes(splats: Splats, unit: float | None) -> dict[str, Attribute]:
     """The attributes of a primitive. splats: y down, all of one SH degree. unit: see `_unit`."""
-    y_up = flipped(splats.with_sh_degree(0))
-    opacities = linear_opacities(splats)
-    colours = np.empty((len(splats), 4), "u1")
-    for rows in blocks(len(splats)):
-        colours[rows] = np.rint(255 * fallback_colours(splats.take(rows), opacities[rows]))
-    rotations = np.rint(32767.0 * unit_quaternions(y_up.quaternions)).astype("<i2")
-    scales = linear_scales(splats)
-    if unit is None:
-        scale = Attribute(scales.astype("<f4"), 3)
-    else:
+
+    def encoded(name: str, values: NDArray[np.float32]) -> Attribute:
+        if name == "ROTATION":
+            return Attribute(np.rint(32767.0 * values).astype("<i2"), 4)
+        if name == "OPACITY":
+            return Attribute(_padded(np.rint(float(_U16) * values).astype("<u2"), 2), 1)
+        if unit is None:
+            return plain(name, values)
         # never 0, which some viewers take for a flat splat
-        steps = np.maximum(np.rint(scales / np.float64(unit) * _U16), 1)
-        scale = Attribute(_padded(steps.astype("<u2"), 4), 3)
-    opacity = np.rint(float(_U16) * opacities[:, None]).astype("<u2")
-    return {
-        "POSITION": Attribute((y_up.means / np.float32(unit or 1.0)).astype("<f4"), 3),
-        "COLOR_0": Attribute(colours, 4),
-        f"{EXTENSION}:ROTATION": Attribute(rotations[:, [1, 2, 3, 0]], 4),
-        f"{EXTENSION}:SCALE": scale,
-        f"{EXTENSION}:OPACITY": Attribute(_padded(opacity, 2), 1),
-        **sh_attributes(splats),
-    }
+        steps = np.maximum(np.rint(values / np.float64(unit) * _U16), 1)
+        return Attribute(_padded(steps.astype("<u2"), 4), 3)
+
+    return attributes(splats, encoded, "u1", unit or 1.0)
 
 
 def _padded(rows: NDArray[np.uint16], width: int) -> NDArray[np.uint16]:

@@ -18,8 +18,9 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
-from stages.formats.values import check_finite, concatenate, log_scales_of, logits_of
+from stages.base.bad_files import BadFileError
+from stages.formats.json_fields import numbers, origin_of, whole
+from stages.formats.values import concatenate, log_scales_of, logits_of
 from stages.scene import Splats
 from stages.scene.flip import flipped
 from stages.scene.recentring import recentred
@@ -34,34 +35,30 @@ def read(path: Path) -> Splats:
     """All splats of the scene, y down, float32.
 
     Nodes may be translated and uniformly scaled; positions far from zero keep their precision in
-    `origin`. Raises SplatError "splats-unreadable" for a damaged file, one without splats, one that
-    refers to files outside its folder, or an unsupported feature (sparse accessors, compression,
+    `origin`. Raises BadFileError for a damaged file, one without splats, one that refers to files
+    outside its folder, or an unsupported feature (sparse accessors, compression,
     rotated nodes).
     """
-    path = Path(path)
-    with reading(path):
-        document, chunk = _parse(path)
-        buffers = _Buffers(path, _list(document, "buffers"), chunk)
-        source = _Source(document, buffers)
-        parts: list[Splats] = []
-        for node, transform in _nodes(document):
-            for part in source.splats(node, transform):
-                parts.append(part)
-                # Splats that are not shared cannot be more than this, which bounds the memory.
-                if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
-                    raise BadFileError("its nodes share meshes, which is not supported")
-        extras = document["asset"].get("extras")
-        extras = extras if isinstance(extras, dict) else {}
-        origin = extras.get("splat_origin")
-        origin = np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
-        if not parts and "meshes" in document:
-            raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
-        splats = concatenate(parts)
-        del parts
-        means, origin = recentred(splats.means.astype(np.float64), origin)
-        splats = replace(splats, means=means, origin=origin)
-        splats = splats.with_antialias(bool(extras.get("antialiased", False)))
-        return check_finite(flipped(splats, reuse=True))
+    document, chunk = _parse(path)
+    buffers = _Buffers(path, _list(document, "buffers"), chunk)
+    source = _Source(document, buffers)
+    parts: list[Splats] = []
+    for node, transform in _nodes(document):
+        for part in source.splats(node, transform):
+            parts.append(part)
+            # Splats that are not shared cannot be more than this, which bounds the memory.
+            if sum(map(len, parts)) * _MIN_SPLAT_BYTES > buffers.total_bytes():
+                raise BadFileError("its nodes share meshes, which is not supported")
+    extras = document["asset"].get("extras")
+    extras = extras if isinstance(extras, dict) else {}
+    if not parts and "meshes" in document:
+        raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
+    splats = concatenate(parts)
+    del parts
+    means, origin = recentred(splats.means.astype(np.float64), origin_of(extras))
+    splats = replace(splats, means=means, origin=origin)
+    splats = splats.with_antialias(bool(extras.get("antialiased", False)))
+    return flipped(splats, reuse=True)
 
 
 def _parse(path: Path) -> tuple[dict[str, Any], memoryview | None]:
@@ -116,7 +113,7 @@ class _Buffers:
     def get(self, index: int) -> memoryview:
         if index not in self._loaded:
             content = self._load(_item(self._described, index, "buffer"), index)
-            length = _whole(self._described[index], "byteLength")
+            length = whole(self._described[index], "byteLength")
             if length > len(content):
                 raise BadFileError(f"buffer {index} is cut short: {len(content)} of {length} bytes")
             self._loaded[index] = content
@@ -156,19 +153,10 @@ def _file_beside(path: Path, uri: str) -> Path:
     return target
 
 
-@dataclass(frozen=True)
-class _NodeTransform:
-    """x -> scale x + offset."""
-
-    scale: float = 1.0
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def then(self, inner: _NodeTransform) -> _NodeTransform:
-        offset = np.array(self.offset) + self.scale * np.array(inner.offset)
-        return _NodeTransform(self.scale * inner.scale, (offset[0], offset[1], offset[2]))
+_Transform = tuple[float, NDArray[np.float64]]  # x -> scale x + offset
 
 
-def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _NodeTransform]]:
+def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _Transform]]:
     """The nodes of the scene with their transform to the world; each node at most once."""
     nodes, scenes = _list(document, "nodes"), _list(document, "scenes")
     if scenes:
@@ -179,38 +167,41 @@ def _nodes(document: dict[str, Any]) -> list[tuple[dict[str, Any], _NodeTransfor
             child for node in nodes if isinstance(node, dict) for child in _list(node, "children")
         }
         roots = [index for index in range(len(nodes)) if index not in children]
-    waiting = [(index, _NodeTransform()) for index in reversed(roots)]
-    found: list[tuple[dict[str, Any], _NodeTransform]] = []
+    waiting: list[tuple[Any, _Transform]] = [
+        (index, (1.0, np.zeros(3))) for index in reversed(roots)
+    ]
+    found: list[tuple[dict[str, Any], _Transform]] = []
     seen: set[int] = set()
     while waiting:
-        index, outer = waiting.pop()
+        index, (scale, offset) = waiting.pop()
         node = _item(nodes, index, "node")
         if index in seen:
             raise BadFileError("a node has two parents")
         seen.add(index)
-        transform = outer.then(_transform_of(node))
+        inner_scale, inner_offset = _transform_of(node)
+        transform = scale * inner_scale, offset + scale * inner_offset
         found.append((node, transform))
         waiting += [(child, transform) for child in reversed(_list(node, "children"))]
     return found
 
 
-def _transform_of(node: dict[str, Any]) -> _NodeTransform:
+def _transform_of(node: dict[str, Any]) -> _Transform:
     if "matrix" in node:
-        matrix = _numbers(node["matrix"], 16).reshape(4, 4).T
+        matrix = numbers(node, "matrix", 16).reshape(4, 4).T
         scale, offset = float(matrix[0, 0]), matrix[:3, 3]
         even = np.array_equal(matrix[:3, :3], scale * np.eye(3))
         if not even or not np.array_equal(matrix[3], [0, 0, 0, 1]):
             raise BadFileError("one of its nodes is rotated or stretched, which is not supported")
     else:
-        rotation = _numbers(node.get("rotation", [0, 0, 0, 1]), 4)
-        scales = _numbers(node.get("scale", [1, 1, 1]), 3)
-        offset = _numbers(node.get("translation", [0, 0, 0]), 3)
+        rotation = numbers(node, "rotation", 4, [0, 0, 0, 1])
+        scales = numbers(node, "scale", 3, [1, 1, 1])
+        offset = numbers(node, "translation", 3, [0, 0, 0])
         scale = float(scales[0])
         if np.abs(rotation[:3]).max() > 1e-7 or not (scales == scale).all():
             raise BadFileError("one of its nodes is rotated or stretched, which is not supported")
     if not scale > 0:
         raise BadFileError("one of its nodes has a scale that is not positive")
-    return _NodeTransform(scale, (float(offset[0]), float(offset[1]), float(offset[2])))
+    return scale, offset
 
 
 @dataclass(frozen=True)
@@ -218,7 +209,7 @@ class _Source:
     document: dict[str, Any]
     buffers: _Buffers
 
-    def splats(self, node: dict[str, Any], transform: _NodeTransform) -> Iterator[Splats]:
+    def splats(self, node: dict[str, Any], transform: _Transform) -> Iterator[Splats]:
         """The splats of a node's mesh, primitive after primitive, in the file's axes."""
         if "mesh" not in node:
             return
@@ -229,7 +220,7 @@ class _Source:
                 yield self._primitive(primitive, extensions[_EXTENSION], transform)
 
     def _primitive(
-        self, primitive: dict[str, Any], extension: dict[str, Any], transform: _NodeTransform
+        self, primitive: dict[str, Any], extension: dict[str, Any], transform: _Transform
     ) -> Splats:
         if extension.get("kernel") != "ellipse":
             raise BadFileError("its splats have another kernel than ellipse")
@@ -264,9 +255,9 @@ class _Source:
                 sh[:, d * d + i] = coefficient
         return Splats(
             # float64: `read` recentres them
-            means=means.astype(np.float64) * transform.scale + np.array(transform.offset),
+            means=means.astype(np.float64) * transform[0] + transform[1],
             quaternions=rotations[:, [3, 0, 1, 2]],
-            log_scales=log_scales_of(scales, transform.scale),
+            log_scales=log_scales_of(scales, transform[0]),
             opacity_logits=logits_of(opacities[:, 0]),
             sh=sh,
             sh_degrees=np.full(len(means), degree, np.uint8),
@@ -283,13 +274,13 @@ class _Source:
         ):
             raise BadFileError(f"accessor {index} has a type that its attribute must not have")
         dtype = np.dtype(_TYPES[accessor["componentType"]])
-        count = _whole(accessor, "count")
+        count = whole(accessor, "count")
         view = _item(_list(self.document, "bufferViews"), accessor["bufferView"], "buffer view")
-        content = self.buffers.get(_whole(view, "buffer"))
-        start, length = _whole(view, "byteOffset", 0), _whole(view, "byteLength")
-        offset = _whole(accessor, "byteOffset", 0)
+        content = self.buffers.get(whole(view, "buffer"))
+        start, length = whole(view, "byteOffset", 0), whole(view, "byteLength")
+        offset = whole(accessor, "byteOffset", 0)
         element = dtype.itemsize * width
-        stride = _whole(view, "byteStride", element)
+        stride = whole(view, "byteStride", element)
         if stride < element or (stride > 252 and stride != element):
             raise BadFileError(f"accessor {index} has stride {stride} for elements of {element}")
         if start + length > len(content) or offset + (count - 1) * stride + element > length:
@@ -317,17 +308,3 @@ def _item(items: list[Any], index: Any, what: str) -> dict[str, Any]:
         raise BadFileError(f"it refers to {what} {str(index)[:40]}, which it does not hold")
     found: dict[str, Any] = items[index]
     return found
-
-
-def _whole(holder: dict[str, Any], key: str, default: int | None = None) -> int:
-    value = holder.get(key, default)
-    if type(value) is not int or value < 0:
-        raise BadFileError(f"{key} is {str(value)[:40]}, not a whole number from 0")
-    return value
-
-
-def _numbers(values: Any, count: int) -> NDArray[np.float64]:
-    array = np.array(values, np.float64)
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise BadFileError(f"a node's transform is not {count} numbers")
-    return array

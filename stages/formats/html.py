@@ -15,13 +15,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from stages.base.atomic import replacing
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import report_progress
 from stages.formats import ply
 from stages.formats.inflate import check_size
 from stages.formats.page import document
 from stages.formats.page.cameras import page_cameras
-from stages.formats.values import drop_undrawable
 from stages.scene import Splats, View
 
 _GZIP = 31  # wbits of zlib for the gzip container, whose header then holds no time
@@ -34,12 +33,11 @@ _INFLATED_AT_ONCE = 1 << 22
 
 def write(
     path: Path, splats: Splats, *, units: str = "arbitrary", views: tuple[View, ...] = ()
-) -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+) -> None:
+    """Write `splats`.
 
     views: cameras to look from. Raises SplatError when the file cannot be written.
     """
-    splats, dropped = drop_undrawable(splats)
     shots = page_cameras(views, splats)
     scene = document.scene_data(path.stem, splats, shots, units=units, source=path.name)
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -49,7 +47,6 @@ def write(
             file.write(base64.b64encode(chunk))
             file.write(document.CHUNK_END.encode("ascii"))
         file.write(document.tail().encode("utf-8"))
-    return dropped
 
 
 def write_beside(
@@ -97,14 +94,13 @@ def _chunks(blocks: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def read(path: Path) -> Splats:
-    """The splats of a page that `write` made. Raises SplatError "splats-unreadable"."""
-    path = Path(path)
-    with reading(path), tempfile.TemporaryDirectory(prefix="splat-") as folder:
+    """The splats of a page that `write` made. Raises BadFileError."""
+    with tempfile.TemporaryDirectory(prefix="splat-") as folder:
         inside = Path(folder) / "inside.ply"
         with inside.open("wb") as file:
             for block in unzipped(path):
                 file.write(block)
-        return ply.parse(inside)
+        return ply.read(inside)
 
 
 def unzipped(path: Path) -> Iterator[bytes]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,58 +13,29 @@ from stages.base.bad_files import BadFileError
 # before memory is allocated; small files may, because all their splats can be equal.
 _RATIO_LIMIT = 30
 _ALWAYS_ALLOWED_BYTES = 8 << 20
-_PIECE_BYTES = 1 << 18
-_WINDOW_BYTES = (
-    1 << 27
-)  # of zstd: the limit of its own decoders, which all levels of the encoder respect
+_WINDOW_BYTES = 1 << 27  # of zstd: the limit of its decoders, which all levels of encoders respect
+_PIECE_BYTES = 1 << 18  # at a time, because gzip copies what it reads
 _EXTRA_BYTES = 1 << 20  # after the splats: extensions, which are ignored
 
 
-class GzipReader:
-    """The content of a gzip file. Every method raises BadFileError for a damaged file."""
+def read_rows(stream: Any, count: int, width: int) -> NDArray[np.uint8]:
+    """[count, width] the next bytes of a stream. Raises BadFileError if there are fewer."""
+    out = np.empty(count * width, np.uint8)
+    filled = 0
+    while filled < len(out) and (more := stream.readinto(out[filled : filled + _PIECE_BYTES].data)):
+        filled += more
+    if filled < len(out):
+        raise BadFileError(f"it is cut short: {len(out) - filled} bytes are missing")
+    return out.reshape(count, width)
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self._gzip = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
 
-    def read(self, count: int) -> bytes:
-        """Exactly `count` bytes."""
-        return self.rows(1, count).tobytes()
-
-    def rows(self, count: int, width: int) -> NDArray[np.uint8]:
-        """[count, width] bytes."""
-        out = np.empty(count * width, np.uint8)
-        filled = 0
-        while filled < len(out):
-            part = self._some(len(out) - filled)
-            if not part:
-                raise BadFileError(f"it is cut short: {len(out) - filled} bytes are missing")
-            out[filled : filled + len(part)] = np.frombuffer(part, np.uint8)
-            filled += len(part)
-        return out.reshape(count, width)
-
-    def finish(self) -> bytes:
-        """The rest of the content, to the end of the stream, where gzip verifies its checksum."""
-        extra = b""
-        while part := self._some(_PIECE_BYTES):
-            extra += part
-            if len(extra) > _EXTRA_BYTES:
-                raise BadFileError("it holds more than its header declares")
-        return extra
-
-    def _some(self, limit: int) -> bytes:
-        """1 to `limit` bytes; none at the end of the stream."""
-        while not self._gzip.eof:
-            piece = self._gzip.unconsumed_tail or self._file.read(_PIECE_BYTES)
-            try:
-                out = self._gzip.decompress(piece, min(limit, _PIECE_BYTES))
-            except zlib.error as error:
-                raise BadFileError(f"it is damaged ({error})") from error
-            if out:
-                return out
-            if not piece:
-                raise BadFileError("it is cut short")
-        return b""
+def read_rest(stream: Any) -> bytes:
+    """The rest of a stream, to its end, where gzip verifies its checksum. Raises BadFileError if
+    that is more than extensions take."""
+    extra: bytes = stream.read(_EXTRA_BYTES + 1)
+    if len(extra) > _EXTRA_BYTES:
+        raise BadFileError("it holds more than its header declares")
+    return extra
 
 
 def check_size(count: int, file_bytes: int) -> None:
@@ -84,15 +54,10 @@ def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np
     packed = file.read(packed_bytes) if packed_bytes <= _left(file) else b""
     if len(packed) < packed_bytes:
         raise BadFileError("it is cut short")
-    out = np.empty(count, np.uint8)
     unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
     try:
         with unpacker.stream_reader(packed) as stream:
-            filled = 0
-            while filled < count and (more := stream.readinto(out[filled:].data)):
-                filled += more
-            if filled < count:
-                raise BadFileError(f"it is cut short: {count - filled} bytes are missing")
+            out = read_rows(stream, count, 1).ravel()
             if count and stream.read(1):
                 raise BadFileError("it holds more than its header declares")
     except zstandard.ZstdError as error:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.lazy import load_object
-from stages.base.text import counted
 from stages.formats.offset import offset_path
 from stages.formats.table import Format
+from stages.formats.values import drop_undrawable
 from stages.scene import Splats
 
 
@@ -23,18 +23,12 @@ class Loss:
 def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
     """What a file of the format `row` cannot hold of `splats`; most files hold everything."""
     found: list[Loss] = []
+    splats = drop_undrawable(splats)[0]
     if not len(splats):
         return found
-    if row.out_of_range and (count := load_object(row.out_of_range)(splats)):
-        found.append(
-            Loss(
-                "range",
-                f"{file_name} holds positions of 24 bits, and {counted(count, 'splat')} of "
-                f"{len(splats):,} lie farther out. These were moved towards the origin and scaled "
-                "down. If they are outliers, `splat edit --drop-floaters` removes them; else "
-                "write .ply, .glb or .usdz.",
-            )
-        )
+    if row.position_loss and (loss := load_object(row.position_loss)(splats)):
+        advice = "`splat edit --drop-floaters` removes outliers; .ply, .glb and .usdz hold them."
+        found.append(Loss("range", f"{file_name} {loss}. {advice}"))
     if splats.draw_settings.antialias and not row.antialias:
         found.append(
             Loss(

@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import release_mapped_pages, reported_blocks
 from stages.formats import compressed_ply
 from stages.formats.ply_header import Header, binary_rows, header_text, read_header
-from stages.formats.values import allocate, check_finite, drop_undrawable
+from stages.formats.values import allocate
 from stages.scene import Splats
 from stages.scene.recentring import recentred
 
@@ -44,17 +45,15 @@ def property_names(degree: int) -> list[str]:
     ]
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     Positions stay relative to `splats.origin`, which a comment holds.
     Raises SplatError when the file cannot be written.
     """
-    splats, dropped = drop_undrawable(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
         for block in blocks(splats, units):
             file.write(block)
-    return dropped
 
 
 def blocks(splats: Splats, units: str) -> Iterator[bytes]:
@@ -89,15 +88,8 @@ def read(path: Path) -> Splats:
 
     Properties may be in any order and of any numeric type, with others between them; ascii or
     either byte order; SH degree 0 to 3; compressed files, too (see `compressed_ply`). Raises
-    SplatError "splats-unreadable" for a damaged file or one without splats.
+    BadFileError for a damaged file or one without splats.
     """
-    path = Path(path)
-    with reading(path):
-        return parse(path)
-
-
-def parse(path: Path) -> Splats:
-    """As `read`, but raises BadFileError."""
     with path.open("rb") as file:
         header = read_header(file)
         if header.is_compressed:
@@ -113,25 +105,24 @@ def parse(path: Path) -> Splats:
         wide = any(name in "xyz" and kind[1] == "8" for name, kind in header.vertex.properties)
         exact = np.empty((len(splats), 3)) if wide or header.encoding == "ascii" else None
         for rows, table in blocks_of_rows:
-            columns = Columns(names, table)
-            _fill(splats.take(rows), columns, count)
+            _fill(splats.take(rows), table, count)
             if exact is not None:
-                exact[rows] = columns.take(["x", "y", "z"])
+                exact[rows] = columns(table, ["x", "y", "z"])
             else:
-                splats.means[rows] = columns.floats(["x", "y", "z"])
+                splats.means[rows] = _floats(table, ["x", "y", "z"])
     if exact is None:
-        return check_finite(replace(splats, origin=header.origin))
+        return replace(splats, origin=header.origin)
     means, origin = recentred(exact, header.origin)
-    return check_finite(replace(splats, means=means, origin=origin))
+    return replace(splats, means=means, origin=origin)
 
 
-def _fill(splats: Splats, columns: Columns, rest_count: int) -> None:
+def _fill(splats: Splats, table: NDArray[Any], rest_count: int) -> None:
     """Fill all but the means of `splats`, which are views of some rows."""
-    splats.quaternions[:] = columns.floats([f"rot_{i}" for i in range(4)])
-    splats.log_scales[:] = columns.floats([f"scale_{i}" for i in range(3)])
-    splats.opacity_logits[:] = columns.floats(["opacity"])[:, 0]
-    splats.sh[:, 0] = columns.floats(["f_dc_0", "f_dc_1", "f_dc_2"])
-    rest = columns.floats([f"f_rest_{i}" for i in range(rest_count)])
+    splats.quaternions[:] = _floats(table, [f"rot_{i}" for i in range(4)])
+    splats.log_scales[:] = _floats(table, [f"scale_{i}" for i in range(3)])
+    splats.opacity_logits[:] = _floats(table, ["opacity"])[:, 0]
+    splats.sh[:, 0] = _floats(table, ["f_dc_0", "f_dc_1", "f_dc_2"])
+    rest = _floats(table, [f"f_rest_{i}" for i in range(rest_count)])
     splats.sh[:, 1:] = rest.reshape(len(rest), 3, rest_count // 3).transpose(0, 2, 1)
 
 
@@ -145,7 +136,7 @@ def _check_is_splats(header: Header) -> None:
 
 
 def tables(file: BinaryIO, path: Path, header: Header) -> _Tables:
-    """The vertices of a .ply in blocks: (rows, [M, P], or [M] structured), for `Columns`. Raises
+    """The vertices of a .ply in blocks: (rows, structured table [M]), for `columns`. Raises
     BadFileError if the file cannot hold what it declares, or if its vertices hold lists."""
     if header.vertex.has_lists:
         raise BadFileError("its vertices hold lists")
@@ -156,14 +147,11 @@ def tables(file: BinaryIO, path: Path, header: Header) -> _Tables:
 
 
 def _binary_tables(mapped: NDArray[Any]) -> _Tables:
-    """The rows of a binary file in blocks: [M, P] where all columns have one type, else [M]
-    structured."""
-    kinds = {mapped.dtype[name] for name in mapped.dtype.names or ()}
+    """The rows of a binary file in blocks."""
     for rows in reported_blocks(len(mapped), _ROWS_AT_ONCE):
         block = np.array(mapped[rows])
         release_mapped_pages(mapped)
-        plain = block.view(block.dtype[0]).reshape(len(block), -1) if len(kinds) == 1 else block
-        yield rows, plain
+        yield rows, block
 
 
 def _ascii_numbers(header: Header) -> tuple[int, int]:
@@ -179,7 +167,7 @@ def _check_ascii_size(path: Path, header: Header) -> None:
 
 
 def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
-    """The rows of a text file in blocks: [M, P] float64."""
+    """The rows of a text file in blocks, all columns float64."""
     skipped, declared = _ascii_numbers(header)
     width = len(header.vertex.properties)
     file.seek(header.data_starts)
@@ -201,7 +189,7 @@ def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
             there += len(more)
         whole = np.concatenate(parts)
         held = whole[wanted:]
-        yield rows, whole[:wanted].reshape(-1, width)
+        yield rows, whole[:wanted].view([(name, "f8") for name, _ in header.vertex.properties])
 
 
 def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
@@ -217,30 +205,19 @@ def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
     yield np.array(rest.split(), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class Columns:
-    """Some rows of a .ply, by the names of their properties."""
+def columns(table: NDArray[Any], names: list[str]) -> NDArray[Any]:
+    """[M, len(names)] of a structured table [M], in the common type of the columns."""
+    if not names:
+        return np.empty((len(table), 0), np.float32)
+    return structured_to_unstructured(table[names])
 
-    names: list[str]
-    table: NDArray[Any]  # [M, P], or [M] structured
 
-    def take(self, names: list[str]) -> NDArray[Any]:
-        """[M, len(names)] in the common type of the columns. Raises ValueError for a name that is
-        not there."""
-        if self.table.ndim == 2:
-            return self.table[:, [self.names.index(name) for name in names]]
-        kind = np.result_type(*(self.table.dtype[name] for name in names)) if names else "f4"
-        out = np.empty((len(self.table), len(names)), kind)
-        for i, name in enumerate(names):
-            out[:, i] = self.table[name]
-        return out
-
-    def floats(self, names: list[str]) -> NDArray[np.float32]:
-        """[M, len(names)] float32. Raises BadFileError for values that float32 cannot hold."""
-        exact = self.take(names)
-        with np.errstate(over="ignore"):
-            out = exact.astype(np.float32)
-        if exact.dtype.itemsize == 8 and (lost := np.isinf(out) & np.isfinite(exact)).any():
-            name = names[int(lost.any(axis=0).argmax())]
-            raise BadFileError(f"values of {name} are too large")
-        return out
+def _floats(table: NDArray[Any], names: list[str]) -> NDArray[np.float32]:
+    """`columns` as float32. Raises BadFileError for values that float32 cannot hold."""
+    exact = columns(table, names)
+    with np.errstate(over="ignore"):
+        out = exact.astype(np.float32)
+    if exact.dtype.itemsize == 8 and (lost := np.isinf(out) & np.isfinite(exact)).any():
+        name = names[int(lost.any(axis=0).argmax())]
+        raise BadFileError(f"values of {name} are too large")
+    return out

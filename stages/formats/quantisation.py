@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from stages.base.lazy import load_object
 from stages.formats import codebook, smallest_three
 from stages.formats.axes import smallest_rotations
-from stages.formats.sog import LOG_SCALE_LIMIT, STEPS, palette_size, symmetric_exp, symmetric_log
+from stages.formats.sog import (
+    LOG_SCALE_LIMIT,
+    STEPS,
+    palette_of,
+    palette_size,
+    position_range,
+    symmetric_exp,
+    symmetric_log,
+)
 from stages.formats.table import Format
 from stages.formats.values import (
     drop_undrawable,
@@ -99,20 +107,16 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
 def _positions(means: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
     if bits >= 16:
         return means.astype(np.float32)
-    encoded = symmetric_log(means)
-    low, high = encoded.min(axis=0), encoded.max(axis=0)
+    low, high = position_range(means)
     span = np.where(high > low, high - low, 1.0)
-    coarse = 1 << (16 - bits)
-    steps = np.minimum(np.rint((encoded - low) / span * (STEPS / coarse)) * coarse, STEPS)
-    found: NDArray[np.float32] = symmetric_exp(low + span * steps / STEPS).astype(np.float32)
-    return found
+    steps = _coarse((symmetric_log(means) - low) / span, STEPS, 16 - bits)
+    return symmetric_exp(low + span * steps / STEPS).astype(np.float32)
 
 
 def _rotations(quaternions: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
-    coarse, limit = 1 << (8 - bits), smallest_three.LIMIT
     largest, others = smallest_three.split(unit_quaternions(quaternions))
-    steps = np.minimum(np.rint(255 * (0.5 + others / (2 * limit)) / coarse) * coarse, 255)
-    return smallest_three.join(largest, (steps / 255 - 0.5) * 2 * limit)
+    steps = _coarse(smallest_three.fractions_of(others), 255, 8 - bits)
+    return smallest_three.join(largest, smallest_three.from_fractions(steps / 255))
 
 
 def _by_codebook(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
@@ -122,12 +126,16 @@ def _by_codebook(values: NDArray[np.floating], bits: int) -> NDArray[np.float32]
 
 
 def _by_palette(rest: NDArray[np.floating], bits: int) -> NDArray[np.float32]:
-    vectors = rest.reshape(len(rest), -1).astype(np.float32)
-    palette, labels = codebook.vector_palette(vectors, min(palette_size(len(rest)), 1 << bits))
+    palette, labels = palette_of(rest.astype(np.float32), bits)
     return palette[labels].reshape(rest.shape)
 
 
 def _opacities(splats: Splats, bits: int) -> NDArray[np.float32]:
-    coarse = 1 << (8 - bits)
-    steps = np.rint(255 * linear_opacities(splats).astype(np.float64) / coarse) * coarse
-    return logits_of(np.clip(steps, 1, 255) / 255)
+    steps = _coarse(linear_opacities(splats).astype(np.float64), 255, 8 - bits)
+    return logits_of(np.maximum(steps, 1) / 255)
+
+
+def _coarse(fractions: NDArray[np.floating], top: int, dropped: int) -> NDArray[np.floating]:
+    """The nearest of 0..top, without the lowest `dropped` bits; `top` itself stays."""
+    coarse = 1 << dropped
+    return np.asarray(np.minimum(np.rint(top * fractions / coarse) * coarse, top))

@@ -33,6 +33,16 @@ def join(largest: NDArray[np.integer], others: NDArray[np.floating]) -> NDArray[
     return found
 
 
+def fractions_of(others: NDArray[np.floating]) -> NDArray[np.floating]:
+    """-LIMIT..LIMIT as 0..1, which most formats store in integers."""
+    return np.asarray(0.5 + others / (2 * LIMIT))
+
+
+def from_fractions(fractions: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The inverse of `fractions_of`."""
+    return np.asarray((fractions - 0.5) * 2 * LIMIT)
+
+
 def _columns(largest: NDArray[np.integer]) -> NDArray[np.intp]:
     """[N, 3] the indices of the other components, ascending."""
     table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], np.intp)

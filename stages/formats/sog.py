@@ -23,9 +23,12 @@ from numpy.typing import NDArray
 from stages.base import scratch
 from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
+from stages.base.text import counted
 from stages.formats import codebook, smallest_three
+from stages.formats.compressed_ply import outlier_shells
+from stages.formats.json_fields import origin_field
 from stages.formats.sog_read import ANTIALIASED, PALETTE_LIMIT, PER_LINE
-from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
+from stages.formats.values import linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
 
 # Log scales beyond this look the same; clipping leaves more codebook entries for the others.
@@ -33,20 +36,19 @@ LOG_SCALE_LIMIT = 20.0
 _PALETTE_LEAST, _SPLATS_PER_ENTRY = 1024, 4
 _DC_LIMIT = 1e4
 STEPS = 65535  # of a position, along each axis
+_COARSER_WARNED = 2.0
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     Positions stay relative to `splats.origin`, which meta.json holds. Raises SplatError when the
     file cannot be written.
     """
-    splats, dropped = drop_undrawable(splats)
     found = sog_members(splats, morton.morton_order(splats), units)
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as package:
         for name, content in found.items():
             _add(package, name, content)
-    return dropped
 
 
 def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[str, bytes]:
@@ -63,9 +65,7 @@ def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[st
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": antialias}
     if antialias:
         meta["model"] = ANTIALIASED  # as splat-transform writes and reads it
-    meta["asset"] = {"generator": "splat", "units": units}
-    if splats.origin.any():
-        meta["asset"]["splat_origin"] = [float(v) for v in splats.origin]
+    meta["asset"] = {"generator": "splat", "units": units} | origin_field(splats.origin)
     pictures: dict[str, NDArray[np.uint8]] = {}
     for part in (_positions, _shapes, _colours):
         pictures |= part(splats, places, meta)
@@ -110,9 +110,7 @@ def _picture(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _positions(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
-    low, high = (np.zeros(3), np.zeros(3))
-    if len(splats):  # the logarithm is monotonic, so it maps the bounds to the bounds
-        low, high = (symmetric_log(getattr(splats.means, end)(axis=0)) for end in ("min", "max"))
+    low, high = position_range(splats.means)
     span = np.where(high > low, high - low, 1.0)
     halves = np.empty((2, len(splats), 3), np.uint8)
     for rows in reported_blocks(len(splats)):
@@ -123,6 +121,30 @@ def _positions(
     files = ["means_l.webp", "means_u.webp"]
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
     return {name: _picture(half) for name, half in zip(files, halves, strict=True)}
+
+
+def position_range(means: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """([3], [3]) least and greatest symmetric logarithm on each axis; 0 without splats."""
+    if not len(means):
+        return np.zeros(3), np.zeros(3)
+    # the logarithm is monotonic, so it maps the bounds to the bounds
+    return symmetric_log(means.min(axis=0)), symmetric_log(means.max(axis=0))
+
+
+def position_loss(splats: Splats) -> str:
+    """By how much outliers coarsen the positions of the others; "" if by less than a factor of
+    `_COARSER_WARNED`."""
+    means = splats.means
+    outliers = outlier_shells(means) > 0
+    if not outliers.any():
+        return ""
+    all_low, all_high = position_range(means)
+    low, high = position_range(means[~outliers])
+    factor = float(((all_high - all_low) / np.maximum(high - low, 1e-30)).max())
+    if factor < _COARSER_WARNED:
+        return ""
+    count = counted(int(np.count_nonzero(outliers)), "outlier")
+    return f"holds positions {min(factor, STEPS):,.0f} times as coarse as without {count}"
 
 
 def symmetric_log(means: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -146,7 +168,7 @@ def _shapes(
         part = splats.take(places[rows])
         scales[rows] = codebook.nearest(book, part.log_scales)
         largest, others = smallest_three.split(unit_quaternions(part.quaternions))
-        rotations[rows, :3] = np.rint(255 * (0.5 + others / (2 * smallest_three.LIMIT)))
+        rotations[rows, :3] = np.rint(255 * smallest_three.fractions_of(others))
         rotations[rows, 3] = 252 + largest
     meta["quats"] = {"files": ["quats.webp"]}
     return {"scales.webp": _picture(scales), "quats.webp": _picture(rotations)}
@@ -170,6 +192,14 @@ def palette_size(count: int) -> int:
     return min(PALETTE_LIMIT, max(_PALETTE_LEAST, count // _SPLATS_PER_ENTRY))
 
 
+def palette_of(
+    rest: NDArray[np.float32], bits: int = 16
+) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """(palette [entries, 3K], labels [N]) of coefficients [N, K, 3]; bits: of a label."""
+    size = min(palette_size(len(rest)), 1 << bits)
+    return codebook.vector_palette(rest.reshape(len(rest), -1), size)
+
+
 def _sh_palette(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:
@@ -177,8 +207,7 @@ def _sh_palette(
     vectors = scratch.empty((len(splats), count, 3))
     for rows in reported_blocks(len(splats)):
         vectors[rows] = np.clip(splats.sh[places[rows], 1:], -_DC_LIMIT, _DC_LIMIT)
-    size = palette_size(len(splats))
-    palette, labels = codebook.vector_palette(vectors.reshape(len(splats), -1), size)
+    palette, labels = palette_of(vectors)
     book = codebook.scalar_codebook(palette)
     book[np.abs(book).argmin()] = 0.0  # keep zero exact
     book.sort()

@@ -12,7 +12,6 @@ import math
 import struct
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,10 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.values import allocate, check_finite, logits_of
+from stages.formats.json_fields import numbers, origin_of, whole
+from stages.formats.values import allocate, logits_of
 from stages.scene import Splats
 
 PALETTE_LIMIT = 1 << 16
@@ -38,17 +38,10 @@ Member = Callable[[Any, int], bytes]  # (name, largest size) -> content, up to a
 
 
 def read(path: Path) -> Splats:
-    """The splats of a .sog, float32. Raises SplatError "splats-unreadable" for a damaged file,
-    another version, or a missing member."""
-    path = Path(path)
-    with reading(path):
-        try:
-            with zipfile.ZipFile(path) as package:
-                return check_finite(Source(in_zip(package), path.stat().st_size).splats())
-        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-            raise BadFileError(f"it is not a complete zip ({error})") from error
-        except (NotImplementedError, RuntimeError) as error:  # encrypted, or packed in another way
-            raise BadFileError(f"its zip cannot be unpacked ({error})") from error
+    """The splats of a .sog, float32. Raises BadFileError for a damaged file, another version, or a
+    missing member."""
+    with zipfile.ZipFile(path) as package:
+        return Source(in_zip(package), path.stat().st_size).splats()
 
 
 def in_zip(package: zipfile.ZipFile) -> Member:
@@ -63,8 +56,11 @@ def in_zip(package: zipfile.ZipFile) -> Member:
             raise BadFileError(f"its {name[:80]!r} is packed by another method than deflate")
         if info.file_size > limit:
             raise BadFileError(f"its {name[:80]!r} is too large for what it should hold")
-        with package.open(name) as file:
-            return file.read(limit + 1)
+        try:
+            with package.open(name) as file:
+                return file.read(limit + 1)
+        except RuntimeError as error:  # encrypted, or packed in another way
+            raise BadFileError(f"its zip cannot be unpacked ({error})") from error
 
     return member
 
@@ -94,27 +90,28 @@ class Source:
         meta = json.loads(self._member("meta.json", _META_LIMIT_BYTES))
         if not isinstance(meta, dict) or meta.get("version") != 2:
             raise BadFileError("its meta.json is not of SOG version 2")
-        _whole(meta, "count", max(_ALWAYS_ALLOWED, self.size_bytes))
+        whole(meta, "count", most=max(_ALWAYS_ALLOWED, self.size_bytes))
         return meta
 
     def splats(self) -> Splats:
         meta = self.meta()
         count = meta["count"]
         low, high = (self._pixels(meta, "means", i, count)[:, :3] for i in (0, 1))
-        ends = [_numbers(meta, "means", name, 3) for name in ("mins", "maxs")]
+        ends = [numbers(_part(meta, "means"), name, 3) for name in ("mins", "maxs")]
         rotations = self._pixels(meta, "quats", 0, count)
         if (rotations[:, 3] < 252).any():
             raise BadFileError("its rotations do not name their largest component")
         colours, scales = (self._pixels(meta, part, 0, count) for part in ("sh0", "scales"))
-        books = [_numbers(meta, part, "codebook", 256) for part in ("sh0", "scales")]
+        books = [numbers(_part(meta, part), "codebook", 256) for part in ("sh0", "scales")]
         palette, labels = self._palette(meta, count)
         splats = allocate(count, math.isqrt(1 + palette.shape[1]) - 1)
-        splats = replace(splats, origin=_origin(meta)).with_antialias(antialias_of(meta))
+        splats = replace(splats, origin=origin_of(meta.get("asset")))
+        splats = splats.with_antialias(antialias_of(meta))
         for rows in reported_blocks(count):
             out = splats.take(rows)
             steps = (low[rows] + 256.0 * high[rows]) / 65535
             encoded = ends[0] + (ends[1] - ends[0]) * steps
-            others = (rotations[rows, :3] / 255.0 - 0.5) * 2 * smallest_three.LIMIT
+            others = smallest_three.from_fractions(rotations[rows, :3] / 255.0)
             with np.errstate(over="ignore", invalid="ignore"):
                 out.means[:] = np.sign(encoded) * np.expm1(np.abs(encoded))
                 out.sh[:, 0] = books[0][colours[rows, :3]]
@@ -133,12 +130,12 @@ class Source:
         none = np.zeros((1, 0, 3), np.float32), np.zeros(count, np.intp)
         if "shN" not in meta:
             return none
-        entries = _whole(_part(meta, "shN"), "count", PALETTE_LIMIT)
-        degree = _whole(_part(meta, "shN"), "bands", 3)
+        entries = whole(_part(meta, "shN"), "count", most=PALETTE_LIMIT)
+        degree = whole(_part(meta, "shN"), "bands", most=3)
         k = (degree + 1) ** 2 - 1
         if not degree:
             return none
-        book = _numbers(meta, "shN", "codebook", 256).astype(np.float32)
+        book = numbers(_part(meta, "shN"), "codebook", 256).astype(np.float32)
         lines = -(-entries // PER_LINE)
         indices = self._pixels(meta, "shN", 0, lines * PER_LINE * k, width=PER_LINE * k)
         halves = self._pixels(meta, "shN", 1, count)
@@ -196,26 +193,6 @@ def _part(meta: dict[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(part, dict):
         raise BadFileError(f"its meta.json lacks {name}")
     return part
-
-
-def _whole(part: dict[str, Any], name: str, most: int) -> int:
-    value = part.get(name)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= most:
-        raise BadFileError(f"its meta.json says {name} is {str(value)[:40]}, wanted 0 to {most}")
-    return value
-
-
-def _numbers(meta: dict[str, Any], part: str, name: str, count: int) -> NDArray[np.float64]:
-    values = np.array(_part(meta, part).get(name), np.float64)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise BadFileError(f"its meta.json lacks the {count} numbers of {part}.{name}")
-    return values
-
-
-def _origin(meta: dict[str, Any]) -> NDArray[np.float64]:
-    asset = meta.get("asset")
-    origin = asset.get("splat_origin") if isinstance(asset, dict) else None
-    return np.array(origin if origin is not None else [0, 0, 0], np.float64).reshape(3)
 
 
 def antialias_of(meta: dict[str, Any]) -> bool:

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
 from stages.formats.values import (
     LOG_SCALE_MIN,
     allocate,
-    check_finite,
-    drop_undrawable,
+    fill,
     linear_opacities,
     linear_scales,
     log_scales_of,
@@ -82,32 +81,26 @@ def decode(records: NDArray[np.void]) -> Splats:
     )
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     The format has no field for SH above degree 0, which is lost, and none for units and the
     origin; `formats.write` writes these beside it.
     Raises SplatError when the file cannot be written.
     """
-    splats, dropped = drop_undrawable(splats)
     splats, places = splats.with_sh_degree(0), order(splats)
     with replacing(path) as temporary, temporary.open("wb") as file:
         for rows in reported_blocks(len(splats)):
             file.write(encode(splats.take(places[rows])).tobytes())
-    return dropped
 
 
 def read(path: Path) -> Splats:
-    """The splats of a .splat. Raises SplatError "splats-unreadable" for other files."""
-    path = Path(path)
-    with reading(path):
-        size = path.stat().st_size
-        if size % RECORD.itemsize:
-            raise BadFileError(f"its {size} bytes are no multiple of {RECORD.itemsize}")
-        splats = allocate(size // RECORD.itemsize, 0)
-        with path.open("rb") as file:
-            for rows in reported_blocks(len(splats)):
-                block = decode(np.fromfile(file, RECORD, rows.stop - rows.start))
-                for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-                    getattr(splats, name)[rows] = getattr(block, name)
-        return check_finite(splats)
+    """The splats of a .splat. Raises BadFileError for other files."""
+    size = path.stat().st_size
+    if size % RECORD.itemsize:
+        raise BadFileError(f"its {size} bytes are no multiple of {RECORD.itemsize}")
+    splats = allocate(size // RECORD.itemsize, 0)
+    with path.open("rb") as file:
+        for rows in reported_blocks(len(splats)):
+            fill(splats.take(rows), decode(np.fromfile(file, RECORD, rows.stop - rows.start)))
+    return splats

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.blocks import blocks, reported_blocks
+from stages.base.text import counted
 from stages.formats import smallest_three
 from stages.formats.spz_read import ANTIALIASED, COLOUR_SCALE, HEADER, MAGIC, MAGNITUDE
-from stages.formats.values import drop_undrawable, linear_opacities, unit_quaternions
+from stages.formats.values import linear_opacities, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import FLIP, flipped
 from stages.scene.spacing import median_spacing
@@ -38,14 +39,13 @@ _FIXED_LIMIT = (1 << 23) - 1
 _SH_STEPS = (8, 16, 16)  # of 256, for degree 1, 2, 3: 5 and 4 bits, which gzip compresses
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats`; return how many could not be drawn and were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats`.
 
     The format has no field for units and the origin; `formats.write` writes them beside it. A splat
     beyond the range of 24 bits (see `count_out_of_range`) is moved closer along its ray and scaled
     down, which looks the same from the centre. Raises SplatError when the file cannot be written.
     """
-    splats, dropped = drop_undrawable(splats)
     degree = int(splats.sh_degrees.max(initial=0))
     splats = splats.with_sh_degree(degree)
     bits, flags = _fractional_bits(splats.means), ANTIALIASED * splats.draw_settings.antialias
@@ -68,16 +68,25 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
         for array in arrays:
             for rows in reported_blocks(len(splats)):
                 packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
-    return dropped
 
 
 def count_out_of_range(splats: Splats) -> int:
-    """The number of drawable splats that lie farther out than the file can hold."""
-    means = drop_undrawable(splats)[0].means
+    """The number of splats that lie farther out than the file can hold."""
+    means = splats.means
     reach = _reach(_fractional_bits(means))
     return sum(
         int(np.count_nonzero(np.abs(means[rows]).max(axis=1, initial=0.0) > reach))
         for rows in blocks(len(means))
+    )
+
+
+def position_loss(splats: Splats) -> str:
+    """What happens to the splats that lie farther out than the file can hold; "" if none does."""
+    if not (count := count_out_of_range(splats)):
+        return ""
+    return (
+        f"holds positions of 24 bits, and {counted(count, 'splat')} of {len(splats):,} lie farther "
+        "out: they were moved towards the origin and scaled down"
     )
 
 

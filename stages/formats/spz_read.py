@@ -8,6 +8,7 @@ SH above degree 0 there is no array for it. Specification: nianticlabs/spz, READ
 
 from __future__ import annotations
 
+import gzip
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +17,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.inflate import GzipReader, check_size, read_zstd_frame
-from stages.formats.values import allocate, check_finite, logits_of, unit_quaternions
+from stages.formats.inflate import check_size, read_rest, read_rows, read_zstd_frame
+from stages.formats.values import allocate, logits_of, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import flipped
 
@@ -53,29 +54,30 @@ class _Content:
 def read(path: Path) -> Splats:
     """The splats of an .spz, y down, float32.
 
-    Raises SplatError "splats-unreadable" for a damaged file or another version.
+    Raises BadFileError for a damaged file or another version.
     """
-    path = Path(path)
-    with reading(path), path.open("rb") as file:
+    with path.open("rb") as file:
         plain = file.read(len(MAGIC)) == MAGIC
         file.seek(0)
         size = path.stat().st_size
         content = _plain(file, size) if plain else _gzipped(file, size)
         splats = _decoded(content).with_antialias(bool(content.flags & ANTIALIASED))
-        return check_finite(flipped(splats, reuse=True) if content.y_up else splats)
+        return flipped(splats, reuse=True) if content.y_up else splats
 
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:
-    stream = GzipReader(file)
-    magic, version, count, degree, bits, flags, _ = HEADER.unpack(stream.read(HEADER.size))
+    stream = gzip.GzipFile(fileobj=file)
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack(
+        read_rows(stream, 1, HEADER.size).tobytes()
+    )
     if magic != MAGIC:
         raise BadFileError("it does not hold 'NGSP'")
     if version not in (2, 3):
         raise BadFileError(f"it is SPZ version {version} in gzip; there 2 and 3 are read")
     sizes = widths(version, degree, bits)
     check_size(count * sum(sizes), size)
-    arrays = [stream.rows(count, size) for size in sizes]
-    extra = stream.finish()
+    arrays = [read_rows(stream, count, size) for size in sizes]
+    extra = read_rest(stream)
     y_up = _is_y_up(extra) if flags & _HAS_EXTENSIONS else True
     return _Content(version, degree, bits, flags, arrays, y_up)
 

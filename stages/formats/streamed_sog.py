@@ -12,7 +12,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,9 +23,10 @@ from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
+from stages.formats.json_fields import origin_field, origin_of, whole
 from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
 from stages.formats.table import CHUNK
-from stages.formats.values import allocate, check_finite, drop_undrawable
+from stages.formats.values import allocate, fill
 from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
 
@@ -36,9 +37,10 @@ _Rows = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class _Leaf:
-    """rows: of each level, in the order of the file."""
+    """rows: of each level, in the order of the file. lods: by level, where the rows are."""
 
     rows: tuple[_Rows, ...]
+    lods: dict[str, dict[str, int]] = field(default_factory=dict)
 
 
 _Tree = _Leaf | tuple["_Tree", "_Tree"]
@@ -57,7 +59,7 @@ def write(
     units: str = "arbitrary",
     views: tuple[View, ...] = (),
     coarser: Sequence[Splats] = (),
-) -> int:
+) -> None:
     """Write a streamed SOG and, beside it, a page that shows it on any web server.
 
     Args:
@@ -67,13 +69,10 @@ def write(
         views: cameras of the page.
         coarser: coarser levels of detail of the same scene, finest first, all drawable.
 
-    Returns how many of `splats` could not be drawn and were left out. Raises SplatError when the
-    asset cannot be written.
+    Raises SplatError when the asset cannot be written.
     """
-    kept, dropped = drop_undrawable(splats)
-    write_levels(path, [kept, *coarser], units)
-    html.write_beside(path, kept, units, views, splat_widths(path, kept))
-    return dropped
+    write_levels(path, [splats, *coarser], units)
+    html.write_beside(path, splats, units, views, splat_widths(path, splats))
 
 
 def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
@@ -84,19 +83,16 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
     partial = path.with_name(partial_prefix() + "chunks")
     try:
         make_folder(partial)
-        places = _write_chunks(partial, tree, levels, units)
-        asset: dict[str, Any] = {"generator": "splat", "units": units}
-        if levels[0].origin.any():
-            asset["splat_origin"] = [float(v) for v in levels[0].origin]
+        names = _write_chunks(partial, list(_leaves(tree)), levels, units)
         counts = [len(level) for level in levels]
         meta = {
             "version": 1,
-            "asset": asset,
+            "asset": {"generator": "splat", "units": units} | origin_field(levels[0].origin),
             "count": sum(counts),
             "counts": counts,
             "lodLevels": len(levels),
-            "filenames": places.names,
-            "tree": _described(tree, levels, places),
+            "filenames": names,
+            "tree": _described(tree, levels),
         }
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
@@ -108,14 +104,6 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
                 new.rename(path.with_name(new.name))
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-@dataclass(frozen=True)
-class _Places:
-    """names: of the chunks. lods: by leaf and level, the location of its rows."""
-
-    names: list[str]
-    lods: dict[tuple[int, int], dict[str, int]]
 
 
 def _cut(levels: Sequence[Splats]) -> _Tree:
@@ -145,33 +133,27 @@ def _leaves(tree: _Tree) -> Iterator[_Leaf]:
         yield from _leaves(side)
 
 
-def _write_chunks(folder: Path, tree: _Tree, levels: Sequence[Splats], units: str) -> _Places:
-    places, leaves = _Places([], {}), list(_leaves(tree))
+def _write_chunks(
+    folder: Path, leaves: list[_Leaf], levels: Sequence[Splats], units: str
+) -> list[str]:
+    """Write the chunks and fill `lods` of the leaves; returns the names of the chunks."""
+    names: list[str] = []
     for level, splats in enumerate(levels):
+        used = [leaf for leaf in leaves if len(leaf.rows[level])]
         held: list[_Rows] = []
-        number = 0
-
-        def flush(level: int = level, splats: Splats = splats) -> None:
-            nonlocal held, number
-            rows = np.concatenate(held)
-            _write_chunk(folder / f"{level}_{number}", splats.take(rows), units)
-            number, held = number + 1, []
-
-        for index in reported_blocks(len(leaves), 1):
-            rows = leaves[index.start].rows[level]
-            if not len(rows):
-                continue
+        first = len(names)
+        for index in reported_blocks(len(used), 1):
             if not held:
-                places.names.append(f"{level}_{number}/meta.json")
-            before = sum(map(len, held))
-            at = {"file": len(places.names) - 1, "offset": before, "count": len(rows)}
-            places.lods[index.start, level] = at
-            held.append(rows)
-            if before + len(rows) >= CHUNK_SPLATS:
-                flush()
-        if held:
-            flush()
-    return places
+                names.append(f"{level}_{len(names) - first}/meta.json")
+            leaf, before = used[index.start], sum(map(len, held))
+            held.append(leaf.rows[level])
+            count = len(leaf.rows[level])
+            leaf.lods[str(level)] = {"file": len(names) - 1, "offset": before, "count": count}
+            if before + count >= CHUNK_SPLATS or index.stop == len(used):
+                rows = np.concatenate(held)
+                _write_chunk((folder / names[-1]).parent, splats.take(rows), units)
+                held = []
+    return names
 
 
 def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
@@ -181,23 +163,14 @@ def _write_chunk(folder: Path, splats: Splats, units: str) -> None:
             temporary.write_bytes(content)
 
 
-def _described(tree: _Tree, levels: Sequence[Splats], places: _Places) -> dict[str, Any]:
+def _described(part: _Tree, levels: Sequence[Splats]) -> dict[str, Any]:
     """The tree for lod-meta.json, with the bounding box of the ellipsoids of each node."""
-    number = 0
-
-    def node(part: _Tree) -> dict[str, Any]:
-        nonlocal number
-        if isinstance(part, _Leaf):
-            every = range(len(levels))
-            lods = {str(i): places.lods[number, i] for i in every if (number, i) in places.lods}
-            number += 1
-            boxes = [_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
-            return {"bound": _around(boxes), "lods": lods}
-        children = [node(side) for side in part]
-        ends = [(c["bound"]["min"], c["bound"]["max"]) for c in children]
-        return {"bound": _around(ends), "children": children}
-
-    return node(tree)
+    if isinstance(part, _Leaf):
+        boxes = [_box(levels[i], rows) for i, rows in enumerate(part.rows) if len(rows)]
+        return {"bound": _around(boxes), "lods": part.lods}
+    children = [_described(side, levels) for side in part]
+    ends = [(c["bound"]["min"], c["bound"]["max"]) for c in children]
+    return {"bound": _around(ends), "children": children}
 
 
 def _box(splats: Splats, rows: _Rows) -> tuple[list[float], list[float]]:
@@ -219,17 +192,8 @@ def _around(boxes: Sequence[tuple[list[float], list[float]]]) -> dict[str, list[
 
 
 def read(path: Path) -> Splats:
-    """The finest level of each leaf, and the environment if there is one. Raises SplatError
-    "splats-unreadable" for a damaged asset or a missing chunk."""
-    path = Path(path)
-    with reading(path):
-        try:
-            return check_finite(_read(path))
-        except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-            raise BadFileError(f"one of its chunks is not a complete zip ({error})") from error
-
-
-def _read(path: Path) -> Splats:
+    """The finest level of each leaf, and the environment if there is one. Raises BadFileError for a
+    damaged asset or a missing chunk."""
     if path.stat().st_size > _META_LIMIT_BYTES:
         raise BadFileError("it is too large for a list of chunks")
     meta = json.loads(path.read_text(encoding="utf-8"))
@@ -254,11 +218,9 @@ def _read(path: Path) -> Splats:
     for source, (_, each) in zip(sources, ranges, strict=True):
         chunk = source.splats().with_sh_degree(degree)
         for offset, count in each:
-            _fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
+            fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
             end += count
-    asset = meta.get("asset")
-    origin = asset.get("splat_origin") if isinstance(asset, dict) else None
-    splats = replace(splats, origin=np.array(origin or [0, 0, 0], np.float64).reshape(3))
+    splats = replace(splats, origin=origin_of(meta.get("asset")))
     return splats.with_antialias(_antialias(sources))
 
 
@@ -289,12 +251,8 @@ def _finest(tree: dict[str, Any], files: int) -> dict[int, list[tuple[int, int]]
     found: dict[int, list[tuple[int, int]]] = {}
     for lods in _leaf_lods(tree):
         at = lods[min(lods, key=int)]
-        values = [at[name] for name in ("file", "offset", "count")]
-        if not all(isinstance(v, int) and 0 <= v < 1 << 40 for v in values):
-            raise BadFileError("its tree refers to rows by something that is not a number")
-        if values[0] >= files:
-            raise BadFileError("its tree refers to a chunk that is not listed")
-        found.setdefault(values[0], []).append((values[1], values[2]))
+        file = whole(at, "file", most=files - 1)
+        found.setdefault(file, []).append((whole(at, "offset"), whole(at, "count")))
     return {file: sorted(ranges) for file, ranges in found.items()}
 
 
@@ -352,7 +310,7 @@ def _checked(
     """(SH degree, rows) of a chunk, checked for overlaps; None stands for all rows."""
     meta = source.meta()
     rest = meta.get("shN")
-    degree = rest.get("bands", 0) if isinstance(rest, dict) else 0
+    degree = whole(rest, "bands", 0, most=3) if isinstance(rest, dict) else 0
     if rows is None:
         return degree, [(0, meta["count"])]
     end = 0
@@ -362,9 +320,4 @@ def _checked(
         end = offset + count
     if end > meta["count"]:
         raise BadFileError("its tree refers to rows that a chunk does not have")
-    return min(degree, 3) if isinstance(degree, int) else 0, rows
-
-
-def _fill(out: Splats, values: Splats) -> None:
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-        getattr(out, name)[:] = getattr(values, name)
+    return degree, rows

@@ -24,15 +24,15 @@ class Format:
     Attributes:
         ending: what a file's name ends in, without the dot; also the value of `--format`.
         opens_in, keeps: two cells of README's table.
-        writer: (path, splats, *, units) -> number of splats that could not be drawn and were left
-            out. It also takes `views` if `takes_views`, and `coarser` if `streamed`.
-        reader: (path) -> Splats, y down; raises SplatError "splats-unreadable".
+        writer: (path, splats, *, units), with drawable splats. It also takes `views` if
+            `takes_views`, and `coarser` if `streamed`.
+        reader: (path) -> Splats, y down; raises BadFileError, or what damaged bytes cause.
         order: (splats) -> [N] the row of `splats` that each row of the file comes from; "" if the
             format keeps the order.
         quantiser: (splats, bit depths) -> Splats on coarser grids, for a format that compresses
             repeated values; "" for the others.
-        out_of_range: (splats) -> the number of splats that lie farther out than a file can hold;
-            "" for formats that hold any position.
+        position_loss: (splats) -> what far splats do to the positions, as the end of "the file
+            ...", or ""; "" for formats in which they do nothing.
         loses: what of the splats changes, as the end of "the format ..."; "" if every value comes
             back as float32.
         sh_degree: the highest SH degree that is kept.
@@ -55,7 +55,7 @@ class Format:
     reader: str
     order: str = ""
     quantiser: str = ""
-    out_of_range: str = ""
+    position_loss: str = ""
     loses: str = ""
     sh_degree: int = 3
     y_up: bool = False
@@ -164,7 +164,7 @@ TABLE = (
         keeps="sizes to 3 %, 8-bit colour, 4 to 5 bits of view-dependent colour",
         writer="stages.formats.spz:write",
         reader="stages.formats.spz_read:read",
-        out_of_range="stages.formats.spz:count_out_of_range",
+        position_loss="stages.formats.spz:position_loss",
         holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
@@ -179,6 +179,7 @@ TABLE = (
         reader="stages.formats.sog_read:read",
         order="stages.scene.morton:morton_order",
         quantiser="stages.formats.quantisation:quantise_for_sog",
+        position_loss="stages.formats.sog:position_loss",
         loses="has 256 sizes and colours, and a palette of view-dependent colours",
         needs_finetuning=True,
     ),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import partial_prefix, replacing
 from stages.base.blocks import reported_blocks
-from stages.formats.values import drop_undrawable, linear_opacities, linear_scales, unit_quaternions
+from stages.formats.values import linear_opacities, linear_scales, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import flipped
 from stages.scene.rotations import matrices_of
@@ -26,22 +26,19 @@ from stages.scene.rotations import matrices_of
 _ROOT, _PRIM = "/Scene", "/Scene/Splats"
 
 
-def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> int:
-    """Write `splats` as `path` (.usda, .usdc or .usdz); return how many could not be drawn and
-    were left out.
+def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
+    """Write `splats` as `path` (.usda, .usdc or .usdz).
 
     Positions stay relative to `splats.origin`; customLayerData holds it, in the axes of the file,
     together with the units. Raises SplatError when the file cannot be
     written.
     """
     path = Path(path)
-    splats, dropped = drop_undrawable(splats)
     with replacing(path) as temporary:
         if path.suffix.lower() == ".usdz":
             _write_package(temporary, splats, units, f"{path.stem}.usdc")
         else:
             _export(_layer(splats, units, path.suffix.lower()), temporary)
-    return dropped
 
 
 def _layer(splats: Splats, units: str, suffix: str) -> Any:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.bad_files import BadFileError, reading
+from stages.base.bad_files import BadFileError
 from stages.base.parent import how_it_ended
 from stages.base.text import reason_of
 from stages.base.usd_path import accepted_path
@@ -48,11 +48,10 @@ def read(path: Path) -> Splats:
     """All Gaussian splats of a USD file, y down, float32.
 
     Prims may be translated and uniformly scaled; the up axis must be y. Positions far from zero
-    keep their precision in `origin`. Raises SplatError "splats-unreadable" for a damaged file, one
-    without splats, one that refers to other files, or one with rotated prims.
+    keep their precision in `origin`. Raises BadFileError for a damaged file, one without splats,
+    one that refers to other files, or one with rotated prims.
     """
-    path = Path(path)
-    with reading(path), tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "splats.bin"
         command = [
             sys.executable,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
@@ -87,24 +87,26 @@ def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
     return replace(splats, **arrays)
 
 
+def _by_blocks(
+    values: NDArray[np.floating], change: Callable[[NDArray[np.float64]], NDArray[np.floating]]
+) -> NDArray[np.float32]:
+    """`change` of the `values` in float64, as float32 of the same shape."""
+    out = np.empty(values.shape, np.float32)
+    for rows in blocks(len(values)):
+        out[rows] = change(values[rows].astype(np.float64))
+    return out
+
+
 def unit_quaternions(quaternions: NDArray[np.floating]) -> NDArray[np.float32]:
     """[N, 4] normalised w, x, y, z. The norm is computed in float64, where 1e-20 squared is not
     0."""
-    unit = np.empty((len(quaternions), 4), np.float32)
-    for rows in blocks(len(quaternions)):
-        exact = quaternions[rows].astype(np.float64)
-        unit[rows] = exact / np.linalg.norm(exact, axis=1, keepdims=True)
-    return unit
+    return _by_blocks(quaternions, lambda q: q / np.linalg.norm(q, axis=1, keepdims=True))
 
 
 def linear_scales(splats: Splats) -> NDArray[np.float32]:
     """[N, 3] standard deviations, at least the smallest normal float32, so that the logarithm is
     reversible."""
-    scales = np.empty((len(splats), 3), np.float32)
-    for rows in blocks(len(splats)):
-        exact = np.maximum(splats.log_scales[rows].astype(np.float64), LOG_SCALE_MIN)
-        scales[rows] = np.exp(exact)
-    return scales
+    return _by_blocks(splats.log_scales, lambda logs: np.exp(np.maximum(logs, LOG_SCALE_MIN)))
 
 
 def linear_opacities(splats: Splats) -> NDArray[np.float32]:
@@ -115,27 +117,27 @@ def linear_opacities(splats: Splats) -> NDArray[np.float32]:
 
 def logits_of(opacities: NDArray[np.floating]) -> NDArray[np.float32]:
     """[N] the inverse of `linear_opacities`. Raises BadFileError for values outside [0, 1]."""
-    logits = np.empty(len(opacities), np.float32)
-    for rows in blocks(len(opacities)):
-        p = opacities[rows].astype(np.float64)
+
+    def logits(p: NDArray[np.float64]) -> NDArray[np.float64]:
         if not ((p >= 0) & (p <= 1)).all() and not allows_nonfinite():
             raise BadFileError("opacities lie outside 0..1")
         with np.errstate(divide="ignore", invalid="ignore"):
-            logits[rows] = np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX)
-    return logits
+            return np.asarray(np.clip(np.log(p) - np.log1p(-p), LOGIT_MIN, LOGIT_MAX))
+
+    return _by_blocks(opacities, logits)
 
 
 def log_scales_of(scales: NDArray[np.floating], factor: float = 1.0) -> NDArray[np.float32]:
     """[N, 3] the inverse of `linear_scales`, for `scales` times `factor`. Scales of 0, of flat
     splats, become the smallest normal float32. Raises BadFileError for negative scales."""
-    logs = np.empty(scales.shape, np.float32)
-    for rows in blocks(len(scales)):
-        exact = scales[rows].astype(np.float64) * factor
+
+    def logs(exact: NDArray[np.float64]) -> NDArray[np.float64]:
         if not (exact >= 0).all() and not allows_nonfinite():
             raise BadFileError("scales are negative or not numbers")
         with np.errstate(divide="ignore", invalid="ignore"):
-            logs[rows] = np.maximum(np.log(exact), LOG_SCALE_MIN)
-    return logs
+            return np.maximum(np.log(exact * factor), LOG_SCALE_MIN)
+
+    return _by_blocks(scales, logs)
 
 
 def allocate(count: int, degree: int) -> Splats:
@@ -148,6 +150,12 @@ def allocate(count: int, degree: int) -> Splats:
         sh=scratch.empty((count, (degree + 1) ** 2, 3)),
         sh_degrees=np.zeros(count, np.uint8),
     )
+
+
+def fill(out: Splats, values: Splats) -> None:
+    """Copy all values but the degrees into `out`, which are views of some rows."""
+    for name in _FIELDS[:-1]:
+        getattr(out, name)[:] = getattr(values, name)
 
 
 def sh_degrees_used(sh: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -173,7 +181,7 @@ def check_finite(splats: Splats) -> Splats:
         logits[opaque] = np.clip(logits[opaque], LOGIT_MIN, LOGIT_MAX)
         np.clip(logits, -1e30, 1e30, out=logits)
     clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "origin"):
+    for name in (*_FIELDS[:-1], "origin"):
         bad = count_nonfinite(getattr(clean, name))
         if bad and not allows_nonfinite():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")

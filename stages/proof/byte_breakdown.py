@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import struct
@@ -14,7 +15,6 @@ from typing import Any
 
 from stages.formats import format_of, spz_read
 from stages.formats.html import unzipped
-from stages.formats.inflate import GzipReader
 from stages.formats.ply_header import Header, read_header
 from stages.formats.splat32 import RECORD
 
@@ -115,8 +115,8 @@ def spz(path: Path) -> ByteBreakdown:
     sizes = spz_read.packed_sizes(path)
     if sizes:
         return ByteBreakdown(dict(zip(_SPZ, sizes, strict=False)))
-    with path.open("rb") as file:
-        head = GzipReader(file).read(spz_read.HEADER.size)
+    with gzip.open(path) as file:
+        head = file.read(spz_read.HEADER.size)
     _, version, count, degree, bits, _, _ = spz_read.HEADER.unpack(head)
     widths = spz_read.widths(version, degree, bits)
     parts = {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base import scratch
-from stages.base.blocks import blocks
 from stages.base.lazy import load_object
 from stages.formats import BY_ENDING, Format
-from stages.proof.content import FileContent
+from stages.proof.content import FileContent, arrays_by_rows
 from stages.proof.matching import Rows, extent_of, matched_rows
 from stages.scene import SH_C0, Splats
 from stages.scene.flip import FLIP, flipped
@@ -74,19 +72,17 @@ def differences(splats: Splats, content: FileContent, *names: str) -> Difference
     rows = matched_rows(placed, file, _orders(placed, file, formats))
     kept = [row.sh_degree for row in formats]
     degree = min([max(splats.sh_degree, file.sh_degree), *kept])
-    errors: dict[str, NDArray[np.floating]] = {}
     sums = np.zeros(3)
-    for block in blocks(len(file), _BLOCK):
+
+    def errors_of(block: slice) -> dict[str, NDArray[np.floating]]:
         a = splats.take(rows[block]).with_sh_degree(degree)
         b = file.take(block).with_sh_degree(degree)
         a = flipped(a) if upright else a
-        for name, values in _errors(a, b).items():
-            if name not in errors:
-                errors[name] = scratch.empty((len(file),))
-            errors[name][block] = values
         pair = a.sh[:, 1:].astype(np.float64), b.sh[:, 1:].astype(np.float64)
-        sums += [np.square(x).sum() for x in (pair[0] - pair[1], *pair)]
-    return _summary(errors, sums, extent_of(splats), rows)
+        sums[:] += [np.square(x).sum() for x in (pair[0] - pair[1], *pair)]
+        return _errors(a, b)
+
+    return _summary(arrays_by_rows(len(file), errors_of, _BLOCK), sums, extent_of(splats), rows)
 
 
 def _orders(truth: Splats, file: Splats, formats: list[Format]) -> Iterator[Rows]:
@@ -115,10 +111,8 @@ def _errors(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
 
 def _largest_difference(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """[N] largest difference in each row of [N, K]."""
-    found: NDArray[np.float64] = np.abs(a.astype(np.float64) - b.astype(np.float64)).max(
-        axis=1, initial=0.0
-    )
-    return found
+    difference = np.abs(a.astype(np.float64) - b.astype(np.float64))
+    return np.asarray(difference.max(axis=1, initial=0.0))
 
 
 def rotation_angles(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -137,7 +131,7 @@ def rotation_angles(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray
 def _summary(
     errors: dict[str, NDArray[np.floating]], sums: NDArray[np.float64], extent: float, rows: Rows
 ) -> Differences:
-    if not errors:
+    if not len(rows):
         return Differences(_named(dict.fromkeys(_VISIBLE, 0.0)), "", 0, (), rows)
     largest = {name: float(errors[name].max()) for name in _VISIBLE}
     units = {**_VISIBLE, "position": _VISIBLE["position"] * extent}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import scratch
-from stages.base.blocks import blocks
+from stages.base.blocks import ROWS, reported_blocks
 from stages.scene import Splats
 
 # From the axes of a file to ours. Not taken from the writers: their error must not check itself.
@@ -47,13 +47,20 @@ def splats_of(**arrays: NDArray[np.floating]) -> Splats:
 
 
 def splats_by_rows(
-    count: int, values_of: Callable[[slice], dict[str, NDArray[np.floating]]]
+    count: int, values_of: Callable[[slice], dict[str, NDArray[np.floating]]], rows: int = ROWS
 ) -> Splats:
-    """`splats_of` the arrays that `values_of` returns for slices of rows, block after block."""
+    """`splats_of` the arrays that `values_of` returns for slices of so many rows."""
+    return splats_of(**arrays_by_rows(count, values_of, rows))
+
+
+def arrays_by_rows(
+    count: int, values_of: Callable[[slice], dict[str, NDArray[np.floating]]], rows: int = ROWS
+) -> dict[str, NDArray[np.floating]]:
+    """float32 arrays of `count` rows, of what `values_of` returns for slices of so many rows."""
     arrays: dict[str, NDArray[np.floating]] = {}
-    for rows in blocks(count) if count else [slice(0, 0)]:
-        for name, values in values_of(rows).items():
+    for part in reported_blocks(count, rows) if count else [slice(0, 0)]:
+        for name, values in values_of(part).items():
             if name not in arrays:
                 arrays[name] = scratch.empty((count, *values.shape[1:]))
-            arrays[name][rows] = values
-    return splats_of(**arrays)
+            arrays[name][part] = values
+    return arrays

@@ -61,25 +61,16 @@ def _axes(splats: Splats, content: FileContent) -> str:
     wanted = np.percentile(means, _QUANTILES, axis=0)
     given = np.percentile(content.splats.means, _QUANTILES, axis=0)
     extent = extent_of(splats)
-    best, least = "", _FITS_EXTENT * extent
+    tried = []
     for axes in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
+            pairs = list(zip(axes, signs, strict=True))
             # the quantiles of -x are those of x, negated and from the other end
-            tried = [
-                wanted[:, axis] if sign > 0 else -wanted[::-1, axis]
-                for axis, sign in zip(axes, signs, strict=True)
-            ]
-            apart = float(np.abs(np.stack(tried, axis=1) - given).max())
-            if apart < least:
-                least = apart
-                best = ", ".join(
-                    ("" if sign > 0 else "-") + "xyz"[axis]
-                    for axis, sign in zip(axes, signs, strict=True)
-                )
-    if best and best != "x, y, z":
-        return f"its x, y, z look like {best}"
-    if best:
-        return ""
+            guess = [wanted[:, axis] if sign > 0 else -wanted[::-1, axis] for axis, sign in pairs]
+            words = ", ".join("-" * (sign < 0) + "xyz"[axis] for axis, sign in pairs)
+            tried.append((words, float(np.abs(np.stack(guess, axis=1) - given).max())))
+    if best := _first_below(_FITS_EXTENT * extent, tried):
+        return "" if best == "x, y, z" else f"its x, y, z look like {best}"
     # neither permuted nor mirrored: moved, or scaled
     times = float(np.ptp(given, axis=0).sum() / max(float(np.ptp(wanted, axis=0).sum()), 1e-30))
     moved = np.median(given - times * wanted, axis=0)

@@ -19,9 +19,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base import scratch
-from stages.base.blocks import release_mapped_pages, reported_blocks
+from stages.base.blocks import release_mapped_pages
 from stages.base.usd_path import accepted_path
+from stages.formats.values import concatenate
 from stages.proof.content import logits, splats_by_rows, splats_of
 from stages.scene import Splats
 
@@ -34,29 +34,27 @@ def ply(path: Path) -> Splats:
 
     content = PlyData.read(str(path), mmap="c")
     vertex = content["vertex"]
-    names = [item.name for item in vertex.properties]
-    per_channel = sum(name.startswith("f_rest_") for name in names) // 3
-    count = len(vertex.data)
-    arrays: dict[str, NDArray[np.float32]] = {
-        "means": scratch.empty((count, 3)),
-        "quaternions": scratch.empty((count, 4)),
-        "log_scales": scratch.empty((count, 3)),
-        "opacity_logits": scratch.empty((count,)),
-        "sh": scratch.empty((count, per_channel + 1, 3)),
-    }
-    for part in reported_blocks(count, _PLY_ROWS):
+    per_channel = sum(item.name.startswith("f_rest_") for item in vertex.properties) // 3
+
+    def values_of(part: slice) -> dict[str, NDArray[np.floating]]:
         rows = vertex.data[part]
+        sh = np.empty((len(rows), per_channel + 1, 3), np.float32)
         for i in range(3):
-            arrays["means"][part, i] = rows["xyz"[i]]
-            arrays["log_scales"][part, i] = rows[f"scale_{i}"]
-            arrays["sh"][part, 0, i] = rows[f"f_dc_{i}"]
+            sh[:, 0, i] = rows[f"f_dc_{i}"]
             for k in range(per_channel):
-                arrays["sh"][part, k + 1, i] = rows[f"f_rest_{i * per_channel + k}"]
-        for i in range(4):
-            arrays["quaternions"][part, i] = rows[f"rot_{i}"]
-        arrays["opacity_logits"][part] = rows["opacity"]
+                sh[:, k + 1, i] = rows[f"f_rest_{i * per_channel + k}"]
+        found = {
+            "means": np.stack([rows[axis] for axis in "xyz"], axis=1),
+            "quaternions": np.stack([rows[f"rot_{i}"] for i in range(4)], axis=1),
+            "log_scales": np.stack([rows[f"scale_{i}"] for i in range(3)], axis=1),
+            "opacity_logits": rows["opacity"],
+            "sh": sh,
+        }
         release_mapped_pages(vertex.data)
-    return splats_of(**arrays).with_antialias("SplatRenderMode: mip" in content.comments)
+        return found
+
+    splats = splats_by_rows(len(vertex.data), values_of, _PLY_ROWS)
+    return splats.with_antialias("SplatRenderMode: mip" in content.comments)
 
 
 class _Chunks(HTMLParser):
@@ -178,7 +176,7 @@ def gltf(path: Path) -> Splats:
             )
         )
     antialias = (document.asset.extras or {}).get("antialiased", False)
-    return _concatenated(parts).with_antialias(antialias)
+    return concatenate(parts).with_antialias(antialias)
 
 
 def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
@@ -228,15 +226,4 @@ def _usd(name: str) -> Splats:
             )
         )
     antialias = stage.GetRootLayer().customLayerData["splat"].get("antialiased", False)
-    return _concatenated(parts).with_antialias(antialias)
-
-
-def _concatenated(parts: list[Splats]) -> Splats:
-    if len(parts) == 1:
-        return parts[0]
-    if not parts:
-        shapes = {"means": 3, "quaternions": 4, "log_scales": 3}
-        empty = {name: np.zeros((0, width)) for name, width in shapes.items()}
-        return splats_of(**empty, opacity_logits=np.zeros(0), sh=np.zeros((0, 1, 3)))
-    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    return splats_of(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+    return concatenate(parts).with_antialias(antialias)

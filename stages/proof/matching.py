@@ -14,13 +14,13 @@ from stages.scene.quantiles import quantiles
 
 Rows = NDArray[np.intp]
 
-# Two rows may be the same splat if their distance is less than this share of the scene's extent
-# and at most one of the values below differs more. These are several times the errors of the packed
-# formats.
+# Two rows match if their distance is less than this share of the scene's extent, and have like
+# values if at most one of those below differs more. These are several times the errors of the
+# packed formats.
 _APART = 0.005
 _OPACITY, _COLOUR, _LOG_SCALE = 1 / 64, 0.05, 0.25
 _EXACT = 1e-6  # of the extent: positions that only rounding moved
-_MAX_MISMATCHED = 0.05  # share of the rows; an order with more mismatches is rejected
+_MAX_MISMATCHED = 0.05  # share of the rows; an order with more rows of unlike values is rejected
 # Weight of distances against the other values when neighbours are compared.
 _DISTANCE_WEIGHT = 20.0
 _NEIGHBOURS = 8
@@ -41,33 +41,37 @@ def extent_of(splats: Splats) -> float:
 def matched_rows(truth: Splats, file: Splats, orders: Iterable[Rows]) -> Rows:
     """[N] for each row of `file`, its row in `truth`; a permutation.
 
-    The first order that matches nearly all rows is taken. Mismatched rows are then matched among
-    themselves, each to the most similar of its nearest neighbours.
+    The first order that matches nearly all rows is taken; else the order in which the most rows
+    match, if nearly all have like values: a format that moved many positions has kept the order.
+    Its mismatched rows are then matched among themselves, each to the most similar of its nearest
+    neighbours, or of like values although it moved.
 
     Args:
         truth, file: N splats each, in the same axes.
         orders: orders in which the file may have been written; the unchanged order is tried first.
     """
     n, extent = len(truth), extent_of(truth)
-    if n == 0:
-        return np.zeros(0, np.intp)
     values = _values(truth), _values(file)
-    unit = _APART * extent / _DISTANCE_WEIGHT
-    for index in (np.arange(n), *orders):
-        distance, mismatched = np.empty(n, np.float32), np.empty(n, bool)
+    every = np.arange(n)
+    found, fewest = (every, every, np.zeros(n, bool)), n + 1
+    for index in (np.arange(n), *orders) if n else ():
+        distance, unlike = np.empty(n, np.float32), np.empty(n, bool)
         for rows in reported_blocks(n):
             moved = np.abs(truth.means[index[rows]] - file.means[rows])
             distance[rows] = moved.max(axis=1, initial=0.0)
-            unlike = _unlike(values[0][index[rows]], values[1][rows])
-            mismatched[rows] = (distance[rows] > _APART * extent) | unlike
-        if np.count_nonzero(mismatched) <= _MAX_MISMATCHED * n:
+            unlike[rows] = _unlike(values[0][index[rows]], values[1][rows])
+        far = distance > _APART * extent
+        mismatched, most = far | unlike, _MAX_MISMATCHED * n
+        count = int(np.count_nonzero(mismatched))
+        like = np.count_nonzero(unlike) <= most and np.count_nonzero(far) <= n - most
+        if like and count < fewest:
             if np.median(distance) <= _EXACT * extent:  # then neighbours can be distinguished
                 mismatched |= distance > _EXACT * extent
-            _match_neighbours(truth, file, index, np.flatnonzero(mismatched), unit, *values)
-            return index
-    index = np.arange(n)
-    _match_neighbours(truth, file, index, index.copy(), unit, *values)
-    return index
+            found, fewest = (index, np.flatnonzero(mismatched), far[mismatched]), count
+        if fewest <= most:
+            break
+    _match_neighbours(truth, file, *found, _APART * extent / _DISTANCE_WEIGHT, *values)
+    return found[0]
 
 
 def _values(splats: Splats) -> NDArray[np.float32]:
@@ -95,6 +99,7 @@ def _match_neighbours(
     file: Splats,
     index: Rows,
     mismatched: Rows,
+    moved: NDArray[np.bool_],
     unit: float,
     truths: NDArray[np.float32],
     files: NDArray[np.float32],
@@ -102,7 +107,8 @@ def _match_neighbours(
     """Match the rows `mismatched` among themselves, changing `index` in place.
 
     In each round every remaining row proposes to the most similar of its nearest neighbours; of
-    several proposals for one row the most similar wins.
+    several proposals for one row the most similar wins. In the first round a row that has `moved`
+    may also propose to its own, at the cost of one allowed difference instead of its distance.
     """
     import cv2
 
@@ -118,8 +124,9 @@ def _match_neighbours(
         )
         queries = np.ascontiguousarray(file.means[mine], np.float32)
         places, squares = tree.knnSearch(queries, count, params={"checks": -1})
-        cost = np.full(len(mine), np.inf)
-        choice = np.zeros(len(mine), np.intp)
+        choice = np.arange(len(mine))
+        unlike = np.square(truths[theirs] - files[mine]).sum(axis=1)
+        cost = np.where(moved, unlike + 1, np.inf)
         for place, square in zip(places.T, squares.T, strict=True):
             unlike = np.square(truths[theirs[place]] - files[mine]).sum(axis=1)
             total = square.astype(np.float64) / unit**2 + unlike
@@ -130,6 +137,7 @@ def _match_neighbours(
         matched = by_cost[first]
         index[mine[matched]] = theirs[taken]
         mine, theirs = np.delete(mine, matched), np.delete(theirs, taken)
+        moved = np.zeros(len(mine), bool)
         if len(matched) * 10 < len(mine):
             break
     index[mine] = theirs

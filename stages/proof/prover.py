@@ -19,7 +19,7 @@ from stages.base.blocks import blocks
 from stages.base.errors import Family, SplatError
 from stages.base.text import reason_of
 from stages.formats import BY_ENDING, format_of
-from stages.formats.values import LOG_SCALE_MIN, LOGIT_MAX, LOGIT_MIN, drop_undrawable
+from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
 from stages.proof import checks, diagnosis
 from stages.proof.compare import differences
@@ -205,17 +205,5 @@ def _central_rows(splats: Splats) -> NDArray[np.bool_] | slice:
 def _drawable(content: FileContent) -> FileContent:
     """The drawable splats. Infinite logarithms of flat and opaque splats become finite, as in our
     readers."""
-    splats = content.splats
-    if not (np.isfinite(splats.log_scales).all() and np.isfinite(splats.opacity_logits).all()):
-        splats = replace(
-            splats,
-            log_scales=np.where(
-                np.isneginf(splats.log_scales), np.float32(LOG_SCALE_MIN), splats.log_scales
-            ),
-            opacity_logits=np.where(
-                np.isinf(splats.opacity_logits),
-                np.clip(splats.opacity_logits, LOGIT_MIN, LOGIT_MAX),
-                splats.opacity_logits,
-            ),
-        )
-    return replace(content, splats=drop_undrawable(splats)[0])
+    with nonfinite_allowed():
+        return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])

@@ -34,8 +34,8 @@ def losses_shown(row: Format, proof: Proof, splats: Splats) -> str:
 
 def _cause(row: Format, splats: Splats, moved: bool) -> str:
     """moved: whether positions differ by more than the distance between neighbours."""
-    if moved and row.out_of_range and (count := load_object(row.out_of_range)(splats)):
-        return f"{counted(count, 'splat')} lie beyond the range of its positions. {_DROP}."
+    if moved and row.position_loss and (loss := load_object(row.position_loss)(splats)):
+        return f"it {loss}. {_DROP}."
     if moved and (count := int(np.count_nonzero(outlier_shells(splats.means)))):
         return f"{counted(count, 'outlier')} widened the range of its positions. {_DROP}."
     if moved:

@@ -30,7 +30,7 @@ from stages.scene.quantiles import quantiles
 NEEDLE_ASPECT = 100.0
 GIANT_PART = 0.1  # of the extent
 OUTLIER_BOXES = 5.0
-_MIDDLE = (0.01, 0.5, 0.99)
+_BOX = {"low": 0.0, "middle_low": 0.01, "median_centre": 0.5, "middle_high": 0.99, "high": 1.0}
 _VALUES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
@@ -78,7 +78,7 @@ def statistics_of(splats: Splats) -> Statistics:
     degrees, counts = np.unique(splats.sh_degrees, return_counts=True)
     by_degree = {int(d): int(n) for d, n in zip(degrees, counts, strict=True)}
     whole, not_finite = _finite(splats)
-    box: dict[str, Any] = _box(splats.means[whole])
+    box = dict(zip(_BOX, quantiles(splats.means[whole], tuple(_BOX.values())), strict=True))
     extent = float(np.linalg.norm(box["middle_high"] - box["middle_low"]))
     found: dict[str, Any] = dict.fromkeys(
         ("needles", "giants", "outliers", "transparent", "no_rotation", "too_large"), 0
@@ -115,20 +115,6 @@ def _finite(splats: Splats) -> tuple[NDArray[np.bool_], dict[str, int]]:
             failed[name] += int(np.count_nonzero(~good))
             whole[rows] &= good
     return whole, {name: n for name, n in failed.items() if n}
-
-
-def _box(means: NDArray[np.floating]) -> dict[str, NDArray[np.float64]]:
-    if not len(means):
-        nothing = np.zeros(3)
-        return dict.fromkeys(("low", "high", "middle_low", "middle_high", "median_centre"), nothing)
-    low, middle_low, centre, middle_high, high = quantiles(means, (0, *_MIDDLE, 1))
-    return {
-        "low": low,
-        "high": high,
-        "middle_low": middle_low,
-        "middle_high": middle_high,
-        "median_centre": centre,
-    }
 
 
 def _troubles(

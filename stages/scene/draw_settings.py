@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
 from stages.scene.capture import TRANSPARENT, View, scene_extent
-from stages.scene.quantiles import quantiles
 
 NEAR_SHARE = 0.01  # of the cameras' extent: photographs are not in focus nearer than that
-# Of the diagonal of the box around the middle 98 % of the splats, if there are no cameras: a scene
-# is mostly seen from within or just outside its box, which is then two to three extents across.
-NEAR_SHARE_OF_BOX = 0.004
-_MIDDLE = (0.01, 0.99)
+# Of the diagonal of `_densest_half`, if there are no cameras. With this share, runs on six captures
+# get 0.4 to 2.8 times the near plane of their cameras.
+NEAR_SHARE_OF_HALF = 0.008
 
 
 @dataclass(frozen=True)
@@ -59,8 +57,19 @@ def near_plane(views: tuple[View, ...]) -> float:
 
 
 def near_plane_of(means: NDArray[np.floating]) -> float:
-    """A near plane for splats with means [N, 3] and no cameras, world units."""
-    if not np.isfinite(means).all(axis=1).any():
+    """A near plane for splats with means [N, 3] and no cameras, world units. It depends on the
+    densest half of the splats alone, so that neither outliers nor a sky dome move it."""
+    whole = means[np.isfinite(means).all(axis=1)]
+    if not len(whole):
         return NEAR_SHARE
-    low, high = quantiles(means, _MIDDLE)
-    return max(NEAR_SHARE_OF_BOX * float(np.linalg.norm(high - low)), 1e-8)
+    return max(NEAR_SHARE_OF_HALF * float(np.linalg.norm(_densest_half(whole))), 1e-8)
+
+
+def _densest_half(means: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[3] on each axis the length of the shortest interval that holds half of the means [N, 3]."""
+    further = (len(means) - 1) // 2
+    lengths = np.empty(3)
+    for axis in range(3):  # one at a time saves memory
+        ordered = np.sort(means[:, axis].astype(np.float64))
+        lengths[axis] = (ordered[further:] - ordered[: len(ordered) - further]).min()
+    return lengths

@@ -128,7 +128,7 @@ class QuantisedSplats:
     """Splats as decided for export: what was kept, and at which precision.
 
     splats: the values to export, SH already cut to the degree decided for each splat.
-    degree: the SH degree kept. decisions: plain data for the manifest (what was kept, its cost).
+    decisions: plain data for the manifest (what was kept, its cost).
     flat_dc [N, 3]: DC coefficients for formats without view-dependent colour; None where those of
     the splats do. finetuned: by format that
     rounds its values, the splats that its file should hold, fine-tuned to that rounding.
@@ -138,7 +138,6 @@ class QuantisedSplats:
     """
 
     splats: Splats
-    degree: int
     decisions: dict[str, object]
     flat_dc: NDArray[np.floating] | None = None
     finetuned: Mapping[str, Splats] = field(default_factory=dict)

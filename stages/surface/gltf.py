@@ -6,15 +6,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.formats.gltf import linear_light
-from stages.formats.gltf_file import Attribute, accessor, asset, write_glb
+from stages.formats.gltf_file import (
+    ARRAY_BUFFER,
+    Attribute,
+    accessor,
+    asset,
+    buffer_view,
+    write_glb,
+)
 from stages.scene.flip import FLIP
 from stages.surface.mesh import NOTE, Mesh
 
-_UNSIGNED_INT = 5125
-_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_ELEMENT_ARRAY_BUFFER = 34963
 _TRIANGLES = 4
 
 
@@ -29,53 +34,38 @@ def write(path: Path, mesh: Mesh, units: str) -> None:
         "scenes": [{"nodes": [0]}],
     }
     if not len(mesh.faces):  # as in formats.gltf: glTF forbids empty lists
-        write_glb(path, document | {"scenes": [{"name": "empty"}]}, [], 0)
+        write_glb(path, document | {"scenes": [{"name": "empty"}]}, [])
         return
-    arrays = [*_attributes(mesh).values(), np.ascontiguousarray(mesh.faces.ravel(), "<u4")]
-    document |= _described(mesh, arrays)
-    write_glb(path, document, arrays, sum(array.nbytes for array in arrays))
+    attributes = _attributes(mesh)
+    indices = Attribute(np.ascontiguousarray(mesh.faces.reshape(-1, 1), "<u4"), 1)
+    write_glb(path, document | _described(attributes, indices), [*attributes.values(), indices])
 
 
-def _attributes(mesh: Mesh) -> dict[str, NDArray[Any]]:
-    """[V, ...] by name, each vertex a multiple of 4 bytes."""
+def _attributes(mesh: Mesh) -> dict[str, Attribute]:
+    """By name, each vertex a multiple of 4 bytes."""
     flip = FLIP.astype(np.float32)
     # + 0 turns -0 into 0, so that equal positions are equal bytes
     linear = linear_light(mesh.colours / 255.0)
     colours = np.concatenate([linear, np.ones((len(linear), 1))], axis=1)
     return {
-        "POSITION": np.ascontiguousarray(mesh.vertices * flip + np.float32(0), "<f4"),
-        "NORMAL": np.ascontiguousarray(mesh.normals() * flip + np.float32(0), "<f4"),
-        "COLOR_0": np.rint(65535 * colours).astype("<u2"),
+        "POSITION": Attribute(np.ascontiguousarray(mesh.vertices * flip + np.float32(0), "<f4"), 3),
+        "NORMAL": Attribute(np.ascontiguousarray(mesh.normals() * flip + np.float32(0), "<f4"), 3),
+        "COLOR_0": Attribute(np.rint(65535 * colours).astype("<u2"), 4),
     }
 
 
-def _described(mesh: Mesh, arrays: list[NDArray[Any]]) -> dict[str, Any]:
-    names = ("POSITION", "NORMAL", "COLOR_0")
-    ends = np.cumsum([array.nbytes for array in arrays])
-    views = [
-        {
-            "buffer": 0,
-            "byteOffset": int(end) - array.nbytes,
-            "byteLength": array.nbytes,
-            "target": _ARRAY_BUFFER if array.ndim == 2 else _ELEMENT_ARRAY_BUFFER,
-        }
-        for array, end in zip(arrays, ends, strict=True)
-    ]
-    accessors = [
-        accessor(name, Attribute(a, a.shape[1]), i)
-        for i, (name, a) in enumerate(zip(names, arrays, strict=False))
-    ]
-    accessors.append(
-        {
-            "bufferView": len(names),
-            "componentType": _UNSIGNED_INT,
-            "count": mesh.faces.size,
-            "type": "SCALAR",
-        }
-    )
+def _described(attributes: dict[str, Attribute], indices: Attribute) -> dict[str, Any]:
+    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, Any]] = []
+    offset = 0
+    for name, attribute in [*attributes.items(), ("", indices)]:
+        target = ARRAY_BUFFER if name else _ELEMENT_ARRAY_BUFFER
+        accessors.append(accessor(name, attribute, len(views)))
+        views.append(buffer_view(attribute, offset, target))
+        offset += attribute.rows.nbytes
     primitive = {
-        "attributes": {name: i for i, name in enumerate(names)},
-        "indices": len(names),
+        "attributes": {name: i for i, name in enumerate(attributes)},
+        "indices": len(attributes),
         "material": 0,
         "mode": _TRIANGLES,
     }

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import SplatError
 from stages.base.stage import DrawView
 from stages.scene import Camera
 
@@ -102,7 +103,7 @@ class LiveFrames:
         start = self._clock()
         try:
             pixels = draw(camera)
-        except MemoryError:  # a frame that does not fit must not end the training
+        except (MemoryError, SplatError):  # a frame that does not fit must not end the training
             return None
         finally:
             end = self._clock()

@@ -67,7 +67,7 @@ def test_what_is_read_comes_in_the_order_that_was_written(scene: SmallScene, nam
 
 
 def quantised(scene: SmallScene, *names: str) -> tuple[QuantisedSplats, dict[str, dict]]:
-    plain = QuantisedSplats(scene.splats, 2, {"bits": vars(FEW)})
+    plain = QuantisedSplats(scene.splats, {"bits": vars(FEW)})
     rounding = RoundingFinetuner(finetuner(scene), views(scene), "cpu", 10, no_counts(scene))
     found = {name: rounding.finetune(FORMATS[name], plain) for name in names}
     finetuned = {name: splats for name, (splats, _) in found.items()}

@@ -106,6 +106,18 @@ def test_splats_out_of_range_are_counted_and_reported(tmp_path: Path) -> None:
     assert "24 bits" in json.loads(out.splitlines()[-1])["warnings"][0]
 
 
+def test_outliers_that_coarsen_the_positions_of_a_sog_are_told(tmp_path: Path) -> None:
+    splats = replace(many_splats(2000), origin=np.zeros(3))
+    splats.sh[:, 1:] = 0
+    splats.means[4] = 1000 * np.ptp(splats.means, axis=0).max()
+    formats.write(tmp_path / "a.ply", splats)
+    _, err = converted(tmp_path / "a.ply", tmp_path / "b.sog")
+    text = " ".join(err.split())
+    assert err.count("Warning") == 1
+    assert "times as coarse as without 1 outlier" in text
+    assert "--drop-floaters" in text
+
+
 @pytest.mark.parametrize("ending", ["spz", "splat"])
 def test_an_origin_that_a_file_cannot_hold_is_reported(tmp_path: Path, ending: str) -> None:
     formats.write(tmp_path / "a.ply", replace(many_splats(30), origin=np.array([5e5, 0, -4])))

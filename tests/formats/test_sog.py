@@ -166,7 +166,7 @@ Edit = Callable[[dict[str, Any], dict[str, bytes]], Any]
         (lambda meta, files: meta["shN"].update(bands=4), "bands"),
         (lambda meta, files: meta["shN"].update(bands=2), "pixels"),
         (lambda meta, files: meta["shN"].update(count=1), "palette"),
-        (lambda meta, files: meta["asset"].update(splat_origin=[1]), "damaged"),
+        (lambda meta, files: meta["asset"].update(splat_origin=[1]), "3 numbers"),
         (lambda meta, files: files.update({"sh0.webp": b"RIFF"}), "lossless WebP"),
         (lambda meta, files: files.update({"sh0.webp": files["sh0.webp"][:40]}), "damaged"),
     ],

@@ -70,6 +70,21 @@ def test_a_splat_that_was_moved_is_still_itself(far: float) -> None:
     )
 
 
+@pytest.mark.parametrize("moved", [0.03, 0.5, 0.9])
+@pytest.mark.parametrize("order", [None, morton.morton_order])
+def test_rows_whose_position_moved_keep_the_order_of_the_format(
+    moved: float, order: object
+) -> None:
+    """As where a format has no room for them, and moves them onto the border of its range."""
+    splats = many_splats(4 * N)
+    rows = np.arange(4 * N) if order is None else order(splats)  # type: ignore[operator]
+    border = np.quantile(np.abs(splats.means).max(axis=1), 1 - moved)
+    file = splats.take(rows)
+    factors = np.minimum(1, border / np.abs(file.means).max(axis=1, keepdims=True))
+    file = replace(file, means=(file.means * factors).astype(np.float32))
+    np.testing.assert_array_equal(matched_rows(splats, file, [rows]), rows)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_rows_are_matched(count: int) -> None:
     splats = many_splats(N).take(np.arange(count))

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import Family, SplatError
+from stages.base.memory import MIB, available_mib
 from stages.raster.camera_row import camera_row
 from stages.raster.cpu import binning, blend, contributions
 from stages.raster.cpu.projection import GEOMETRY_ROW
@@ -39,20 +41,27 @@ class Buffers:
         self._arrays: dict[str, NDArray[Any]] = {}
 
     def get(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        """An uninitialised C-contiguous array of this shape; valid until the next call."""
+        """An uninitialised C-contiguous array of this shape; valid until the next call. Raises
+        MemoryError before it allocates more than is free: a system that promises more memory than
+        it has would end the process later."""
         size = int(np.prod(shape))
         have = self._arrays.get(name)
         if have is None or have.size < size or have.dtype != np.dtype(dtype):
+            wanted_mib, free_mib = size * np.dtype(dtype).itemsize / MIB, available_mib()
+            if wanted_mib > free_mib:
+                raise MemoryError(f"{wanted_mib:,.0f} MiB wanted, {free_mib:,.0f} MiB free")
             have = np.empty(size + size // 8 + 16, dtype)
             self._arrays[name] = have
         return have[:size].reshape(shape)
 
-    def carve(self, *wanted: tuple[tuple[int, ...], Any]) -> list[NDArray[Any]]:
-        """Uninitialised arrays of (shape, dtype) from one buffer that all calls share: each call
-        invalidates the arrays of the one before."""
+    def carve(
+        self, *wanted: tuple[tuple[int, ...], Any], name: str = "scratch"
+    ) -> list[NDArray[Any]]:
+        """Uninitialised arrays of (shape, dtype) from one buffer that all calls with its name
+        share: each call invalidates the arrays of the one before."""
         sizes = [int(np.prod(shape)) * np.dtype(dtype).itemsize for shape, dtype in wanted]
         ends = np.cumsum([-(-size // 64) * 64 for size in sizes])
-        arena = self.get("scratch", (int(ends[-1]),), np.uint8)
+        arena = self.get(name, (int(ends[-1]),), np.uint8)
         parts = []
         for (shape, dtype), size, end in zip(wanted, sizes, ends, strict=True):
             start = int(end) + -(-size // 64) * -64
@@ -135,7 +144,10 @@ class CpuRasteriser:
             project_splats, CHUNK, cam, degree, *arrays, smoothing, geometry, paint, status
         )
         visible = np.flatnonzero(status == VISIBLE).astype(np.int32)
-        lists = self._lists(visible, arrays, geometry, paint, width, height)
+        try:
+            lists = self._lists(visible, arrays, geometry, paint, width, height)
+        except MemoryError as error:
+            raise _lists_too_large(error, camera, arrays[2][visible]) from error
         background = np.asarray(settings.background, np.float32)
         tiles = len(lists.starts) - 1
         image = get("image", (6 if depths else 4, height, width), np.float32)
@@ -269,13 +281,9 @@ class CpuRasteriser:
         share(binning.count_tiles, order, places, tiles, positions)
         starts = get("tile_starts", (n_tiles + 1,), np.int64)
         binning.scan_counts(positions, starts)
-        lists = TileLists(
-            starts,
-            get("members", (total,), np.int32),
-            get("slots", (total,), np.int32),
-            get("masks", (total,), np.uint16),
-            places,
-        )
+        columns = (((total,), np.int32), ((total,), np.int32), ((total,), np.uint16))
+        members, slots, masks_of = self.buffers.carve(*columns, name="lists")
+        lists = TileLists(starts, members, slots, masks_of, places)
         share(
             binning.fill_tiles,
             order,
@@ -291,10 +299,8 @@ class CpuRasteriser:
 
 
 def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:
-    """Fill `starts` with the sums of all counts before; returns the total.
-
-    Raises MemoryError if it needs more than 31 bits: 2 billion entries take 90 GB.
-    """
+    """Fill `starts` with the sums of all counts before; returns the total. Raises MemoryError if it
+    needs more than 31 bits: 2 billion entries take 90 GB."""
     total = int(counts.sum(dtype=np.int64))
     if total >= 2**31:
         raise MemoryError(f"{total:,} splat-tile intersections; at most 2**31 - 1 can be drawn")
@@ -302,3 +308,21 @@ def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:
         starts[0] = 0
         np.cumsum(counts[:-1], out=starts[1:])
     return total
+
+
+def _lists_too_large(
+    error: MemoryError, camera: Camera, log_scales: NDArray[np.floating]
+) -> SplatError:
+    """log_scales: of the visible splats."""
+    given = f"The lists of {len(log_scales):,} splats for {camera.width} x {camera.height} pixels"
+    linear = bool((log_scales >= 0).all())  # lengths are, and logarithms of small lengths are not
+    return SplatError(
+        "raster-memory",
+        given=f"{given} do not fit into memory ({error})."
+        + (" No scale is negative: they look linear and were read as logarithms." * linear),
+        wanted="Splats that fill less of the picture, or a smaller picture.",
+        hint="Write the natural logarithm of each scale into the file."
+        if linear
+        else "Ask for less: --width, --train-side or --max-splats; or close other programs.",
+        family=Family.RESOURCES,
+    )
