@@ -28,6 +28,7 @@ def watched(command: Callable[[], None]) -> None:
     if child == 0:
         # In a group of its own, so that a terminal's Ctrl-C reaches it once, from the parent.
         os.setpgid(0, 0)
+        signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # it may write to the terminal all the same
         die_with_parent(watch_input=False)
         return command()
     _forward_signals(child)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from stages.base.disk import DISK_FULL, is_full
+from stages.base.disk import DISK_FULL, disk_full, is_full
 from stages.base.errors import Family, SplatError
 
 _PARTIAL = ".partial-"
@@ -97,13 +97,7 @@ def _refused(path: Path, error: OSError) -> SplatError:
     reason = error.strerror or str(error)
     # NumPy and the USD library do not say why a write failed.
     if error.errno in DISK_FULL or (error.errno is None and is_full(path.parent)):
-        return SplatError(
-            "disk-full",
-            given=f"{path} could not be written: {reason}.",
-            wanted="The disk must have room for it.",
-            hint="Free some space, or choose a folder on another disk, and run the command again.",
-            family=Family.RESOURCES,
-        )
+        return disk_full(f"writing {path.name}", path.parent)
     return SplatError(
         "file-not-written",
         given=f"{path} could not be written: {reason}.",

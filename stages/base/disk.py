@@ -14,6 +14,18 @@ DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 _FULL_BELOW_BYTES = 4 * 1024 * 1024
 
 
+def disk_full(doing: str, folder: Path) -> SplatError:
+    """The error for a disk that became full. doing: what was going on, such as "train"."""
+    return SplatError(
+        "disk-full",
+        given=f"The disk of {folder} became full during {doing}.",
+        wanted="Free space for the output.",
+        hint="Free some space, or use a folder on another disk, and run the same command again: "
+        "what was finished is kept.",
+        family=Family.RESOURCES,
+    )
+
+
 def is_full(place: Path) -> bool:
     """Whether the disk of `place`, or of its nearest parent that exists, has less than 4 MiB left.
 

@@ -17,11 +17,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from stages.base.atomic import make_folder
+from stages.base.disk import disk_full
 from stages.base.distribution import install_command
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Stage
 from stages.distributed.tasks import Location, RunTask
-from stages.run.failures import disk_full
 from stages.run.listeners import Listeners
 from stages.run.lock import locked
 from stages.run.manifest import MANIFEST, Manifest

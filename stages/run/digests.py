@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -127,11 +127,6 @@ def damage(
     return changes
 
 
-def records_to_data(records: Mapping[str, FileRecord]) -> dict[str, Any]:
-    """Plain data for JSON."""
-    return {name: asdict(record) for name, record in sorted(records.items())}
-
-
 def records_from_data(data: Mapping[str, Any]) -> FileRecords:
-    """The inverse of `records_to_data`. Raises TypeError or AttributeError for another shape."""
+    """From JSON data. Raises TypeError or AttributeError for another shape."""
     return {name: FileRecord(**value) for name, value in data.items()}

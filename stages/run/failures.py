@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-from stages.base.disk import DISK_FULL, is_full, not_permitted
+from stages.base.disk import DISK_FULL, disk_full, is_full, not_permitted
 from stages.base.errors import Family, SplatError
 from stages.base.text import printable, printable_name, reason_of
 
@@ -69,16 +69,6 @@ def _chain(error: BaseException) -> list[BaseException]:
         links.append(link)
         link = link.__cause__ or link.__context__
     return links
-
-
-def disk_full(doing: str, folder: Path) -> SplatError:
-    return SplatError(
-        "disk-full",
-        given=f"The disk of {folder} became full during {doing}.",
-        wanted="Free space for the output of the stage.",
-        hint="Free some space and run the same command again: finished stages are kept.",
-        family=Family.RESOURCES,
-    )
 
 
 def out_of_memory(doing: str, error: BaseException) -> SplatError:

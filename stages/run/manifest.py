@@ -19,7 +19,7 @@ from typing import Any
 from stages.base.atomic import sync_folder
 from stages.base.disk import not_permitted
 from stages.base.errors import Family, SplatError
-from stages.run.digests import FileRecords, records_from_data, records_to_data
+from stages.run.digests import FileRecords, records_from_data
 
 SCHEMA = 2  # of manifests and `run.json`; raised when their keys or settings are renamed
 MANIFEST = "manifest.json"
@@ -71,10 +71,7 @@ class Manifest:
 
     def write(self, folder: Path) -> None:
         """Write `manifest.json` into `folder` atomically. Raises OSError."""
-        data = asdict(self)
-        data["outputs"] = records_to_data(self.outputs)
-        data["input_files"] = {k: records_to_data(v) for k, v in self.input_files.items()}
-        write_sealed(folder / MANIFEST, data)
+        write_sealed(folder / MANIFEST, asdict(self))
 
     @classmethod
     def read(cls, folder: Path) -> Manifest | None:

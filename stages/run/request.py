@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -86,7 +86,7 @@ def _settings_changes(
     now: Mapping[str, Any], then: Mapping[str, Any], settings_type: type
 ) -> list[str]:
     """["steps 7000 -> 30000"]. A setting that the finished run lacks counts as its default."""
-    defaults = _defaults(settings_type)
+    defaults = settings_to_data(settings_type())
     quiet = _quiet_fields(settings_type)
     changes = []
     for name, value in now.items():
@@ -123,16 +123,6 @@ def _quiet_fields(settings_type: type) -> set[str]:
 
 def _midway_fields(settings_type: type) -> set[str]:
     return {f.name for f in fields(settings_type) if f.metadata.get("midway", False)}
-
-
-def _defaults(settings_type: type) -> dict[str, Any]:
-    values = {}
-    for field in fields(settings_type):
-        if field.default is not MISSING:
-            values[field.name] = plain(field.default)
-        elif field.default_factory is not MISSING:
-            values[field.name] = plain(field.default_factory())
-    return values
 
 
 def request_for(

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
+from stages.base.disk import disk_full
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.parent import how_it_ended
 from stages.base.stage import Report
@@ -79,7 +80,7 @@ def run_worker(
     if worker.returncode != 0:
         tail = _tail(log)
         if any(words in tail.lower() for words in _DISK_FULL):
-            raise _disk_full(folder)
+            raise disk_full("structure from motion", folder)
         raise WorkerCrashed(job.step, worker.returncode, tail)
     tick()
 
@@ -127,16 +128,6 @@ def _tail(log: Path) -> str:
     # Other threads and processes go on printing their progress.
     errors = [line for line in lines if not _PROGRESS.match(line)]
     return "\n".join((errors or lines)[-_TAIL_LINES:])
-
-
-def _disk_full(folder: Path) -> SplatError:
-    return SplatError(
-        "disk-full",
-        given=f"The disk of {folder} became full during structure from motion.",
-        wanted="About 10 MB of free disk space are needed for each photograph.",
-        hint="Free some space and give the same command again: finished work is kept.",
-        family=Family.RESOURCES,
-    )
 
 
 def crash_error(crash: WorkerCrashed, folder: Path) -> SplatError:

@@ -91,3 +91,30 @@ def test_command_dies_with_the_process_that_watches_it() -> None:
     while command.is_running() and command.status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+def test_ctrl_c_of_a_terminal_reaches_the_command_once() -> None:
+    """Also on a terminal that stops what writes to it from the background."""
+    import pty
+    import termios
+
+    counting = (
+        "count = []; signal.signal(2, lambda *_: (count.append(1), print('heard', flush=True)));"
+        "print('ready', flush=True); time.sleep(1.5); sys.exit(len(count))"
+    )
+    pid, terminal = pty.fork()
+    if pid == 0:
+        words = processes.python(CODE.format(do=counting))
+        os.execv(words[0], words)
+    attributes = termios.tcgetattr(terminal)
+    attributes[3] |= termios.TOSTOP
+    termios.tcsetattr(terminal, termios.TCSANOW, attributes)
+    shown = b""
+    while b"ready" not in shown:
+        shown += os.read(terminal, 4096)
+    os.write(terminal, b"\x03")
+    while b"heard" not in shown:
+        shown += os.read(terminal, 4096)
+    _, status = os.waitpid(pid, 0)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(status) == 1

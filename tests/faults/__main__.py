@@ -1,6 +1,6 @@
 """`python -m tests.faults --kills 200`: kills and full disks in every stage, and a table of ends.
 
-With --write the table replaces the one in docs/experiments/faults.md.
+With --write its rows replace those in docs/experiments/faults.md.
 """
 
 from __future__ import annotations
@@ -17,6 +17,10 @@ from tests.faults.small_run import SmallRun, names, prepare
 
 PAGE = Path(__file__).parents[2] / "docs" / "experiments" / "faults.md"
 _TABLE = re.compile(r"(<!-- python -m tests.faults -->\n).*?(<!-- end of faults -->)", re.S)
+_HEAD = (
+    "| stage | points | runs killed | kills | the same bytes after | full disks "
+    "| the same bytes after | room that is enough |\n|---|--:|--:|--:|--:|--:|--:|--:|\n"
+)
 _MOST_ROOM = 1 << 20  # bytes: no stage of the small run writes more
 
 
@@ -32,26 +36,28 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="faults-") as place:
         folder = Path(place)
         run = SmallRun.made(folder / "whole")
-        rows, wrong = [], []
+        rows, wrong = dict[str, str](), list[str]()
         for stage in given.stages or names():
             share = given.kills // len(given.stages or names())
             points, hits, bad = _killed(run, stage, share, given.seed, folder / "work")
             full, smallest, faults = _filled(run, stage, given.disks, folder)
             wrong += [f"{stage}: {one}" for one in bad + faults]
             cells = (f"`{stage}`", points, share, hits, share - len(bad), full, full - len(faults))
-            rows.append(f"| {' | '.join(map(str, cells))} | {smallest} |\n")
-            print(rows[-1], end="", flush=True)
+            rows[stage] = f"| {' | '.join(map(str, cells))} | {smallest} |\n"
+            print(rows[stage], end="", flush=True)
     for one in wrong:
         print(one)
     if given.write:
-        head = (
-            "| stage | points | runs killed | kills | the same bytes after | full disks "
-            "| the same bytes after | room that is enough |\n|---|--:|--:|--:|--:|--:|--:|--:|\n"
-        )
-        text = PAGE.read_text(encoding="utf-8")
-        table = head + "".join(rows)
-        PAGE.write_text(_TABLE.sub(lambda f: f[1] + table + f[2], text), encoding="utf-8")
+        _write(rows)
     raise SystemExit(bool(wrong))
+
+
+def _write(rows: dict[str, str]) -> None:
+    """Replace the rows of these stages in the table."""
+    text = PAGE.read_text(encoding="utf-8")
+    rows = {found[1]: found[0] for found in re.finditer(r"\| `(\w+)` .*\n", text)} | rows
+    table = _HEAD + "".join(rows[stage] for stage in names() if stage in rows)
+    PAGE.write_text(_TABLE.sub(lambda f: f[1] + table + f[2], text), encoding="utf-8")
 
 
 def _killed(

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
+import io
 import os
 import shutil
 import sys
@@ -21,6 +23,7 @@ from tests import sample
 
 PHOTOS = 10  # of the sample capture, enough to be placed
 FORMATS = ("ply", "gltf", "usdz", "sog", "html")
+_MODULES = "modules"  # that the run has imported
 CHECKPOINT_SECONDS = 0.2  # of training that lasts a second or two
 _SETTINGS: dict[str, dict[str, Any]] = {
     "ingest": {"max_side": 500},
@@ -48,6 +51,9 @@ class SmallRun:
         status, shown = forked(lambda: _whole(folder), folder / "log")
         if status:
             raise RuntimeError(shown)
+        for name in (folder / _MODULES).read_text(encoding="utf-8").splitlines():
+            with contextlib.suppress(Exception):  # parts that only their package can import
+                importlib.import_module(name)
         return cls(folder)
 
     def before(self, stage: str, target: Path) -> None:
@@ -89,15 +95,16 @@ def outputs(folder: Path) -> dict[str, str]:
 
 
 def prepare() -> None:
-    """Import what the stages import, without starting a thread."""
+    """Load what all processes need; the process has no threads afterwards."""
     import torch
 
-    import stages.capacity.pruning
-    import stages.proof.prover
     import stages.training.hooks
+    from splatcli.app import app
 
     stages.training.hooks.CHECKPOINT_SECONDS = CHECKPOINT_SECONDS
     torch.set_num_threads(1)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        app(["train", "--help"])
 
 
 def stage_command(stage: str, folder: Path) -> None:
@@ -146,3 +153,4 @@ def _whole(folder: Path) -> None:
     every: tuple[Stage, ...] = pipeline.layout.stages
     settings = {one.name: one.settings_type(**_SETTINGS.get(one.name, {})) for one in every}
     pipeline.run(settings)
+    Path(_MODULES).write_text("\n".join(sorted(sys.modules)), encoding="utf-8")

@@ -1,7 +1,7 @@
 """Damaged files for every reader, and a table of what became of them.
 
 `python -m tests.fuzz --inputs 1000000 --kept FOLDER --jobs 8` is a night's work. The same command
-goes on where a stopped one was. --docs writes the table of FOLDER into the documentation.
+goes on where a stopped one was. --write puts the table of FOLDER into docs/experiments/formats.md.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import platform
 import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from datetime import date
 from pathlib import Path
 
 from tests.fuzz.batch import UntriedError, fuzz, journal, total
@@ -36,7 +37,8 @@ def table(kept: Path) -> str:
         "",
         f"{sum(t.tried for t in totals)} inputs, of which {beaten} crashed a reader, took more than"
         f" {CPU_LIMIT_S:.0f} CPU seconds or {PEAK_LIMIT_MIB:.0f} MiB, or raised anything but its"
-        f" error. Python {platform.python_version()}, {platform.system()} {platform.machine()}.",
+        f" error. Python {platform.python_version()}, {platform.system()} {platform.machine()},"
+        f" {date.today()}.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -46,7 +48,7 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=2000, help="damaged files for each layer")
     parser.add_argument("--kept", type=Path, default=Path("fuzz"), help="journal, seeds, failures")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--docs", action="store_true", help=f"write the table into {PAGE.name}")
+    parser.add_argument("--write", action="store_true", help=f"the table into {PAGE.name}")
     parser.add_argument("layers", nargs="*", help=f"some of: {', '.join(LAYERS)}")
     given = parser.parse_args()
     given.kept.mkdir(parents=True, exist_ok=True)
@@ -67,7 +69,7 @@ def main() -> int:
         beaten = sum(pool.map(run, given.layers or LAYERS))
     text = table(given.kept)
     print(text)
-    if given.docs:
+    if given.write:
         page = PAGE.read_text(encoding="utf-8")
         PAGE.write_text(_TABLE.sub(lambda m: m[1] + text + m[2], page), encoding="utf-8")
     return int(beaten > 0)

@@ -98,13 +98,15 @@ def _zip_with(ending: str, name: str, new: bytes) -> bytes:
 _CHUNK = re.compile(rb'(<script[^>]*class="splats"[^>]*>)([A-Za-z0-9+/=]*)(</script>)')
 
 
+@functools.cache
 def _html_parts() -> tuple[bytes, bytes, bytes]:
-    """(the viewer before the splats, the splats, the viewer after them): megabytes of it, in which
-    damage meets no reader of ours."""
+    """(the first line of the page, the splats, the end of the page). The viewer between them, in
+    which damage meets no reader of ours, is left out: it has megabytes."""
     page = files("html")["a.html"]
     match = _CHUNK.search(page)
     assert match is not None
-    return page[: match.start()], page[match.start() : match.end()], page[match.end() :]
+    head, end = page[: page.index(b"\n") + 1], page[match.end() :]
+    return head, page[match.start() : match.end()], end[:1] + end[-1000:]
 
 
 def _html_around(splats: bytes) -> bytes:
