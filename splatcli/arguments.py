@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -69,31 +69,19 @@ Cluster = Annotated[
         rich_help_panel="Advanced",
     ),
 ]
+
+
+def _chosen(name: str, choices: tuple[str, ...], help: str) -> Any:
+    """An option that is one of `choices`."""
+    text = help.format(", ".join(choices))
+    setting = Setting(name, f"--{name}", str, choices=choices, help=text, panel="Advanced")
+    return option(setting, shown=False)
+
+
 Backend = Annotated[
     str | None,
-    option(
-        Setting(
-            "backend",
-            "--backend",
-            str,
-            choices=CHOICES,
-            help=f"Rendering backend: {', '.join(CHOICES)}; by default the one of the training.",
-            panel="Advanced",
-        ),
-        shown=False,
-    ),
+    _chosen("backend", CHOICES, "Rendering backend: {}; by default the one of the training."),
 ]
 Device = Annotated[
-    str | None,
-    option(
-        Setting(
-            "device",
-            "--device",
-            str,
-            choices=DEVICES,
-            help=f"Torch device for --backend reference: {', '.join(DEVICES)}.",
-            panel="Advanced",
-        ),
-        shown=False,
-    ),
+    str | None, _chosen("device", DEVICES, "Torch device for --backend reference: {}.")
 ]

@@ -71,14 +71,13 @@ def write_settings(settings: Any) -> None:
 
 
 def _environment() -> dict[str, str]:
-    free_mib = available_mib()
     variables = {n: v for n, v in os.environ.items() if n.startswith(("SPLAT_", "OMP_", "NUMBA_"))}
     return {
         "command": shlex.join(sys.argv),
         "version": f"{NAME} {VERSION}, Python {platform.python_version()}",
         "platform": platform.platform(),
         "processor": f"{platform.machine()}, {os.cpu_count()} cores, {threads.count()} threads",
-        "free memory": "unknown" if free_mib is None else f"{free_mib:,.0f} MiB",
+        "free memory": f"{available_mib():,.0f} MiB",
         "libraries": ", ".join(f"{name} {version}" for name, version in versions().items()),
         "variables": str(variables),
     }

@@ -73,7 +73,7 @@ class Events(Listener):
             console.emit("progress", stage=stage.name, **values, numbers=plain(numbers))
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        console.emit("finished", stage=stage.name, **_result_of(manifest))
+        console.emit("finished", stage=stage.name, **result_of(manifest))
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
         console.emit("skipped", stage=stage.name)
@@ -82,7 +82,8 @@ class Events(Listener):
         console.emit("stopping")
 
 
-def _result_of(manifest: Manifest) -> dict[str, Any]:
+def result_of(manifest: Manifest) -> dict[str, Any]:
+    """Costs, metrics and warnings of a finished stage as plain data."""
     return {
         "seconds": manifest.seconds,
         "cpu_seconds": manifest.cpu_seconds,

@@ -116,16 +116,6 @@ def _as_data(
 ) -> dict[str, Any]:
     return {
         "run_folder": str(pipeline.run_folder),
-        "stages": {
-            m.stage: {
-                "seconds": m.seconds,
-                "cpu_seconds": m.cpu_seconds,
-                "peak_memory_mib": m.peak_memory_mib,
-                "device": m.device,
-                "metrics": m.metrics,
-                "warnings": m.warnings,
-            }
-            for m in manifests
-        },
+        "stages": {m.stage: {**progress.result_of(m), "device": m.device} for m in manifests},
         "assets": [{"path": path, "size_bytes": count} for path, count, _ in assets],
     }

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
@@ -223,19 +224,11 @@ def load(folder: Path) -> ExportedAssets:
     """The files of a finished folder. Raises SplatError if its index is damaged."""
     from stages.scene import ExportedAssets, ExportedFile
 
-    try:
+    with reading(folder / _INDEX, stage_output("export-folder-damaged")):
         entries = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
         files = tuple(
             ExportedFile(str(e["format"]), str(e["path"]), int(e["size_bytes"])) for e in entries
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SplatError(
-            "export-folder-damaged",
-            given=f"{folder / _INDEX} cannot be read: {error}.",
-            wanted="The list of files that the stage wrote.",
-            hint="Run `splat export` again.",
-            family=Family.RUN_FOLDER,
-        ) from error
     return ExportedAssets(folder, files)
 
 

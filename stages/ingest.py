@@ -325,4 +325,4 @@ def _too_few(root: Path, usable: int, unusable: list[tuple[str, str, str]]) -> S
     )
 
 
-STAGE = Stage(name="ingest", version=5, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=6, reads=(), settings_type=IngestSettings, run=run, load=load)

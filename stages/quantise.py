@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Family, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
@@ -297,7 +298,7 @@ def load(folder: Path) -> QuantisedSplats:
         for path in sorted((folder / _FINETUNED).glob("*"))
         if path.is_dir()
     }
-    try:
+    with reading(folder / _DECISIONS, stage_output("quantise-folder-damaged")):
         decisions = json.loads((folder / _DECISIONS).read_text(encoding="utf-8"))
         flat = np.load(folder / _FLAT) if (folder / _FLAT).exists() else None
         return QuantisedSplats(
@@ -308,14 +309,6 @@ def load(folder: Path) -> QuantisedSplats:
             finetuned=finetuned,
             drawing=decisions["drawing"],
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SplatError(
-            "quantise-folder-damaged",
-            given=f"{folder / _DECISIONS} cannot be read: {error}.",
-            wanted="The file that the stage wrote.",
-            hint="Delete the stage's folder and run the command again.",
-            family=Family.RUN_FOLDER,
-        ) from error
 
 
 STAGE = Stage(

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report, Stage
 from stages.capacity.output_formats import drawing_setting
@@ -290,17 +291,9 @@ def load(folder: Path) -> TrainedSplats:
     from stages.scene.storage import load_splats
 
     splats = load_splats(folder)
-    try:
+    with reading(folder / _TRAINED, stage_output("train-folder-damaged")):
         facts = json.loads((folder / _TRAINED).read_text(encoding="utf-8"))
         return TrainedSplats(splats, bool(facts["dropout"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SplatError(
-            "train-folder-damaged",
-            given=f"{folder / _TRAINED} cannot be read: {error}.",
-            wanted="The file that the stage wrote.",
-            hint="Delete the stage's folder and run the command again.",
-            family=Family.RUN_FOLDER,
-        ) from error
 
 
 STAGE = Stage(

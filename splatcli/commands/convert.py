@@ -12,7 +12,6 @@ import typer
 
 from splatcli import console
 from splatcli.arguments import ENDINGS, AsJson, Quiet
-from stages.base.errors import Family, SplatError
 from stages.run import results
 
 if TYPE_CHECKING:
@@ -92,24 +91,12 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
 
     cameras = cameras_for(splats, results.views_of(results.run_around(source)))
     prover = Prover.of(splats, cameras, source_format=format_of(source).ending)
-    proof = prover.prove(target)
-    if proof.fault:
-        raise _failed(target, proof.fault)
+    proof = prover.require(target, "convert-verify-failed")
     figures = proof.figures
     if splats.draw_settings.antialias and not format_of(target).antialias:
         figures = figures | {"plain_drawing_db": round(prover.plain_drawing_db(), 2)}
     loss = losses_shown(format_of(target), proof, splats)
     return figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"
-
-
-def _failed(path: Path, reason: str) -> SplatError:
-    return SplatError(
-        "convert-verify-failed",
-        given=f"{path} came out wrong: {reason}.",
-        wanted="A file that another program reads as the same splats.",
-        hint="Convert to another format, and report this with the file that was read.",
-        family=Family.QUALITY,
-    )
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from stages.base.errors import Family
 from stages.base.lazy import load_object
 from stages.base.libraries import modules_of, needed, versions
 from stages.base.memory import available_mib
-from stages.base.text import counted
+from stages.base.text import counted, reason_of
 from stages.raster.backends import AUTO, BACKENDS, Backend, backend_of
 
 _LITTLE_MEMORY_MIB = 2048.0
@@ -80,18 +80,12 @@ def _library(distribution: str) -> Check:
         for module in modules:
             importlib.import_module(module)
     except Exception as error:  # a broken library may raise anything while it loads
-        return Check(distribution, _first_line(error), ok=False, advice=advice)
+        return Check(distribution, reason_of(error), ok=False, advice=advice)
     return Check(distribution, versions().get(distribution, "present"))
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _memory() -> Check:
     free = available_mib()
-    if free is None:
-        return Check("free memory", "unknown")
     enough = free >= _LITTLE_MEMORY_MIB
     advice = "" if enough else "Little: use --preset preview and a smaller --train-side."
     return Check("free memory", f"{free:,.0f} MiB", advice=advice)
@@ -114,7 +108,7 @@ def _kernel_cache() -> Check:
             value += console.size(sum(map(cache.size_bytes, others)))
         return Check("kernel cache", value)
     except Exception as error:  # no place to write to, or no Numba
-        return Check("kernel cache", _first_line(error), ok=False)
+        return Check("kernel cache", reason_of(error), ok=False)
 
 
 def _readable(what: str, names: Callable[[], list[str]]) -> Check:
@@ -123,7 +117,7 @@ def _readable(what: str, names: Callable[[], list[str]]) -> Check:
     try:
         return Check(label, ", ".join(names()))
     except Exception as error:  # of a library that is missing or broken
-        return Check(label, _first_line(error), ok=False)
+        return Check(label, reason_of(error), ok=False)
 
 
 def _photograph_formats() -> list[str]:
@@ -154,7 +148,7 @@ def _backend(backend: Backend) -> Check:
             return Check(label, f"not chosen: {why}", advice=_BACKEND_ADVICE)
         load_object(backend.rasteriser)
     except Exception as error:
-        return Check(label, f"not present ({_first_line(error)})", ok=False)
+        return Check(label, f"not present ({reason_of(error)})", ok=False)
     return Check(label, "present")
 
 
@@ -166,4 +160,4 @@ def _gpu() -> Check:
         missing = device.missing()
         return Check("GPU", f"{missing}; {device.built()}" if missing else device.describe())
     except Exception as error:  # a broken driver may raise anything
-        return Check("GPU", _first_line(error))
+        return Check("GPU", reason_of(error))

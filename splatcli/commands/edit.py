@@ -132,16 +132,8 @@ def _proven(source: Path, target: Path, scene: EditedScene) -> dict[str, Any]:
     splats = drop_undrawable(scene.splats)[0]
     source_format = format_of(source).ending if source.is_file() else ""
     cameras = cameras_for(splats, scene.placed_views())
-    proof = Prover.of(splats, cameras, scene.backend, source_format).prove(target)
-    if proof.fault:
-        raise SplatError(
-            "edit-verify-failed",
-            given=f"{target} came out wrong: {proof.fault}.",
-            wanted="A file that another program reads as the same splats.",
-            hint="Write another format, and report this with the file that was read.",
-            family=Family.QUALITY,
-        )
-    return proof.figures
+    prover = Prover.of(splats, cameras, scene.backend, source_format)
+    return prover.require(target, "edit-verify-failed").figures
 
 
 def _db(scene: EditedScene) -> float | None:

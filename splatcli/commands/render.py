@@ -194,7 +194,7 @@ def _resized(camera: Camera, width: int | None) -> Camera:
 def _check_memory(camera: Camera) -> None:
     free = memory.available_mib()
     needed = camera.width * camera.height * _BYTES_PER_PIXEL / memory.MIB
-    if free is not None and needed > free:
+    if needed > free:
         raise SplatError(
             "render-too-large",
             given=f"A picture of {camera.width} x {camera.height} takes about {needed:,.0f} MiB.",

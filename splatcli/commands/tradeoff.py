@@ -29,9 +29,9 @@ def tradeoff(
 ) -> None:
     """Measure quality against time, bytes and number of splats: a report with plots.
 
-    The quality is measured on held-out views. Nothing is trained: the course of training comes from
-    its log, files are really written and read, splats are removed in the order of what they
-    contribute.
+    The quality is measured on held-out views. The course of training comes from its log, files are
+    really written and read, splats are removed in the order of what they contribute and the rest
+    fine-tuned, as `splat prune` does.
     """
     from stages.base.atomic import make_folder
     from stages.measure.tradeoff.measurement import measure_tradeoff
@@ -67,9 +67,11 @@ def tradeoff(
 def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     """The splats, views and files to measure, of a finished run. Raises SplatError
     (stage-not-finished, run-half-anew, nothing-held-out)."""
+    from stages.base.stage import Report
     from stages.measure.evaluation import load_evaluation_views
-    from stages.measure.tradeoff.measurement import TradeoffInputs, deciding_views
-    from stages.scene import split_held_out
+    from stages.measure.tradeoff.measurement import SHARES, TradeoffInputs, deciding_views
+    from stages.scene import split_held_out, training_extent
+    from stages.training.finetune import FineTuner
 
     splats = results.final_splats(pipeline)
     settings = splats.draw_settings
@@ -84,20 +86,24 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
             family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
-    exported = tuple(results.exported_formats(pipeline))
+    views = load_evaluation_views(reconstruction.folder, training, settings)
+    deciding = {view.name for view in deciding_views(training, settings)}
+    backend = results.backend_of_run(pipeline)
+    dropout = pipeline.load("train").dropout
+    finetuner = FineTuner(views, training_extent(reconstruction), backend, Report(), dropout)
+    pruning = pipeline.recorded_settings()["prune"]
+    # as many steps as pruning takes, by the time that half of the splats are left
+    steps = pruning.rounds * pruning.finetune_steps // sum(share >= 0.5 for share in SHARES)
     return TradeoffInputs(
         splats=splats,
-        training=load_evaluation_views(
-            reconstruction.folder,
-            deciding_views(training, splats.draw_settings),
-            splats.draw_settings,
-        ),
+        training=[view for view in views if view.name in deciding],
         held_out=load_evaluation_views(reconstruction.folder, held, settings),
         views=reconstruction.views,
         units=reconstruction.units,
-        backend=results.backend_of_run(pipeline),
+        backend=backend,
         levelled=reconstruction.levelled,
         history=trained.metrics.get("history", ()) if trained else (),
-        exported=exported,
+        exported=tuple(results.exported_formats(pipeline)),
         quantised=pipeline.load("quantise"),
+        finetune=lambda fewer, view_counts: finetuner.finetune(fewer, steps, view_counts),
     )

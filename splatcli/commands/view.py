@@ -61,7 +61,13 @@ def view(
         try:
             server = LocalServer(items, port)
         except OSError as error:
-            raise _port_refused(port, error) from error
+            raise SplatError(
+                "view-port",
+                given=f"Port {port} of this machine cannot be listened on: {error.strerror}.",
+                wanted="A port that is free and allowed.",
+                hint="Leave --port away to get a free one.",
+                family=Family.USAGE,
+            ) from error
         with server:
             _serve(server, count, open_browser)
 
@@ -127,13 +133,3 @@ def one_signal_stops() -> Iterator[None]:
     finally:
         for one in handled:
             signal.signal(one, before[one])
-
-
-def _port_refused(port: int, error: OSError) -> SplatError:
-    return SplatError(
-        "view-port",
-        given=f"Port {port} of this machine cannot be listened on: {error.strerror or error}.",
-        wanted="A port that is free and allowed.",
-        hint="Leave --port away to get a free one.",
-        family=Family.USAGE,
-    )

@@ -10,7 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.base.errors import SplatError
+from stages.base.disk import not_permitted
+from stages.base.errors import Family, SplatError
+from stages.base.text import reason_of
 
 
 class BadFileError(ValueError):
@@ -30,6 +32,7 @@ class FileKind:
     what: str
     wanted: str
     hint: str
+    family: Family = Family.INPUT
 
 
 SPLATS = FileKind(
@@ -44,6 +47,17 @@ CAMERAS = FileKind(
     "A whole file of cameras in one of the formats that README.md lists.",
     "Export the cameras again; a run's own are written by `splat cameras RUN OUT`.",
 )
+
+
+def stage_output(code: str) -> FileKind:
+    """A file that a stage wrote into a run folder. code: of the error."""
+    return FileKind(
+        code,
+        "the output of its stage",
+        "The file as the stage wrote it.",
+        "Delete the stage's folder and run the command again; it is then made again.",
+        Family.RUN_FOLDER,
+    )
 
 
 @contextmanager
@@ -61,6 +75,8 @@ def reading(path: Path, kind: FileKind = SPLATS) -> Iterator[None]:
         if path.stat().st_size == 0:
             raise BadFileError("it is empty")
         yield
+    except PermissionError as error:
+        raise not_permitted(path, error) from error
     except OSError as error:
         raise _unreadable(path, kind, error.strerror or str(error)) from error
     except MemoryError as error:
@@ -79,7 +95,7 @@ def reading(path: Path, kind: FileKind = SPLATS) -> Iterator[None]:
     ) as error:
         if isinstance(error, BadFileError):
             raise _unreadable(path, kind, str(error), error.hint) from error
-        raise _unreadable(path, kind, f"it is damaged ({error})") from error
+        raise _unreadable(path, kind, f"it is damaged ({reason_of(error)})") from error
 
 
 def _unreadable(path: Path, kind: FileKind, reason: str, hint: str = "") -> SplatError:
@@ -88,4 +104,5 @@ def _unreadable(path: Path, kind: FileKind, reason: str, hint: str = "") -> Spla
         given=f"{path} cannot be read as {kind.what}: {reason}.",
         wanted=kind.wanted,
         hint=hint or kind.hint,
+        family=kind.family,
     )

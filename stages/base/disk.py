@@ -1,8 +1,9 @@
-"""Whether a disk is full."""
+"""What a disk refuses: room, and permission."""
 
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -37,3 +38,18 @@ def is_full(place: Path) -> bool:
             continue
         return usage.total > 0 and usage.free < _FULL_BELOW_BYTES
     return False
+
+
+def not_permitted(path: Path, error: OSError) -> SplatError:
+    """The error "not-permitted": `path` may not be read if the system says so, else not written."""
+    place = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
+    needed = os.R_OK | os.X_OK if os.path.isdir(place) else os.R_OK
+    reads = error.errno != errno.EROFS and not os.access(place, needed)
+    return SplatError(
+        "not-permitted",
+        given=f"{path}: {error.strerror or error}.",
+        wanted=f"A file or folder that you may {'read' if reads else 'write to'}.",
+        hint="Change its permissions, or name another "
+        + ("one." if reads else "folder with --out."),
+        family=Family.RESOURCES,
+    )

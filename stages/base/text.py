@@ -1,4 +1,5 @@
-"""Text for readers: numbers with their nouns, and names that a terminal can show."""
+"""Text for readers: numbers with their nouns, names that a terminal can show, and what a library
+said."""
 
 from __future__ import annotations
 
@@ -7,6 +8,8 @@ import re
 
 # C0 without the line feed, DEL, C1, and the marks that change the direction of writing.
 _CONTROLS = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+_CPP_NAME = re.compile(r"\b[A-Za-z_]\w*(?:::~?[A-Za-z_]\w*)+(?:<[^>]*>)?(?:\([^)]*\))?:?")
+_ADVICE = re.compile(r"[;,] (?:use|see|set|try|consider|pass)\b.*", re.IGNORECASE)
 
 
 def counted(count: int, noun: str, plural: str = "") -> str:
@@ -28,3 +31,10 @@ def printable(text: str) -> str:
 def printable_name(name: str) -> str:
     """`printable`, in one line."""
     return printable(name).replace("\n", "\\n")
+
+
+def reason_of(error: BaseException) -> str:
+    """What a library said, in a line of at most 160 characters, without C++ names and without
+    advice to programmers; the type of the error where nothing is left."""
+    line = " ".join(_CPP_NAME.sub("", str(error)).strip().partition("\n")[0].split())
+    return _ADVICE.sub("", line).strip(" :;,.")[:160] or type(error).__name__

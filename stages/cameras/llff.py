@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.base.text import reason_of
 from stages.cameras.camera_file import CameraFile, content_of, make_views, poses_of
 from stages.cameras.lens import PINHOLE
 
@@ -56,7 +57,7 @@ def _rows(data: bytes) -> NDArray[np.float64]:
             read_header = np.lib.format.read_array_header_2_0
         shape, by_columns, dtype = read_header(file)
     except (tokenize.TokenError, SyntaxError) as error:
-        raise BadFileError(f"its header is damaged ({error})") from error
+        raise BadFileError(f"its header is damaged ({reason_of(error)})") from error
     if len(shape) != 2 or shape[1] != _COLUMNS or dtype.kind != "f":
         raise BadFileError(f"it is not a table of {_COLUMNS} columns")
     count = shape[0] * _COLUMNS

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.base.text import reason_of
 from stages.cameras.camera_file import (
     NO_GEOREFERENCE,
     ROTATION_TOLERANCE,
@@ -110,7 +111,7 @@ def _parsed(path: Path) -> Element:
     try:
         return ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
-        raise BadFileError(f"it is damaged ({error})") from error
+        raise BadFileError(f"it is damaged ({reason_of(error)})") from error
 
 
 def _optics(sensor: Element) -> tuple[list[float], Lens]:

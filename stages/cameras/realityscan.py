@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.base.text import reason_of
 from stages.cameras.camera_file import CameraFile, content_of, make_views, poses_of, size_of_picture
 from stages.cameras.lens import Lens
 from stages.cameras.nerfstudio import OPENGL_FROM_OURS
@@ -65,7 +66,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
             raise BadFileError(f"it has no column {missing[0]!r}")
         rows = [row for row in reader if row["name"]]
     except csv.Error as error:
-        raise BadFileError(f"it is damaged ({error})") from error
+        raise BadFileError(f"it is damaged ({reason_of(error)})") from error
     if any(None in row or None in row.values() for row in rows):
         raise BadFileError("a row is incomplete")
     if not rows:

@@ -14,6 +14,7 @@ from threading import Event
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from stages.base.errors import CRASHED, Family, Interrupted, SplatError
+from stages.base.text import reason_of
 from stages.run.failures import as_splat_error
 from stages.run.pipeline import Listener, Pipeline
 
@@ -164,8 +165,7 @@ def error_result(error: BaseException) -> TaskResult:
     """The result of a task that raised `error`."""
     if isinstance(error, SplatError):
         return TaskResult(int(error.family), error.code, error.given)
-    message = str(error).splitlines()[0] if str(error) else "no message"
-    return TaskResult(CRASHED, "bug", f"{type(error).__name__}: {message}.")
+    return TaskResult(CRASHED, "bug", f"{type(error).__name__}: {reason_of(error)}.")
 
 
 class SerialExecutor:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError, FileKind, reading
 from stages.base.blocks import reported_blocks
 from stages.base.errors import Family, SplatError
+from stages.base.text import reason_of
 from stages.scene import Splats
 
 Inside = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points [M, 3] -> [M]
@@ -134,5 +135,5 @@ def _points(path: Path) -> NDArray[np.float64]:
     try:
         vertices = PlyData.read(str(path))["vertex"]
     except PlyParseError as error:
-        raise BadFileError(f"it is no .ply ({error})") from error
+        raise BadFileError(f"it is no .ply ({reason_of(error)})") from error
     return np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +58,7 @@ class EditedScene:
         """Mean PSNR of the held-out views; None where there are none."""
         if not len(self.held_out_views):
             return None
-        views = _PlacedViews(self.held_out_views, self.placement)
+        views = _placed(self.held_out_views, self.placement)
         return mean_psnr_db(self.splats, views, self.backend)
 
     def placed_views(self) -> tuple[View, ...]:
@@ -73,7 +72,7 @@ class EditedScene:
 
     def contributions(self) -> Contributions:
         """The contribution of each splat to the training views, of which there must be some."""
-        views = _PlacedViews(self.training_views, self.placement)
+        views = _placed(self.training_views, self.placement)
         return measure_contributions(self.splats, views, self.backend)
 
     def removal_costs(self, splats: Splats) -> RemovalCosts:
@@ -90,21 +89,6 @@ class EditedScene:
         return RemovalCosts(found.weight + _UNSEEN_WEIGHT, costs)
 
 
-class _PlacedViews(Sequence[EvaluationView]):
-    """Views with transformed cameras; each is read when it is used."""
-
-    def __init__(self, views: Sequence[EvaluationView], placement: Similarity) -> None:
-        self._views, self._placement = views, placement
-
-    def __len__(self) -> int:
-        return len(self._views)
-
-    @overload
-    def __getitem__(self, number: int) -> EvaluationView: ...
-    @overload
-    def __getitem__(self, number: slice) -> Sequence[EvaluationView]: ...
-    def __getitem__(self, number: int | slice) -> EvaluationView | Sequence[EvaluationView]:
-        if isinstance(number, slice):
-            return [self[i] for i in range(len(self))[number]]
-        view = self._views[number]
-        return replace(view, camera=self._placement.apply_to_camera(view.camera))
+def _placed(views: Iterable[EvaluationView], placement: Similarity) -> Iterator[EvaluationView]:
+    """The views with transformed cameras; each is read when it is used."""
+    return (replace(view, camera=placement.apply_to_camera(view.camera)) for view in views)

@@ -68,7 +68,7 @@ def parse_file(path: Path) -> list[ParsedOperation]:
     optional; # begins a comment. Raises SplatError "edit-ops"."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+    except (FileNotFoundError, IsADirectoryError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise _invalid(f"{path} cannot be read: {reason}.") from error
     operations = []

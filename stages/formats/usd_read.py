@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
 from stages.base.parent import how_it_ended
+from stages.base.text import reason_of
 from stages.base.usd_path import accepted_path
 from stages.formats.values import (
     allows_nonfinite,
@@ -202,7 +203,7 @@ def main(arguments: list[str]) -> int:
         print(error)
         return _REFUSED
     except Exception as error:  # errors of the library, and consequences of damaged values
-        print(f"it is damaged ({' '.join(str(error).split())[:160]})")
+        print(f"it is damaged ({reason_of(error)})")
         return _REFUSED
     save_splats(output, splats)
     return 0

@@ -7,7 +7,7 @@ is not seen, and a patch seen edge-on hardly is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,8 @@ MIN_GAP_DEG = 40.0  # to the nearest view
 _DIRECTIONS = 400
 _CONE_DEG = 15.0
 _BLOCKED_SHARE = 0.1  # of a cone's cross-section
+_WALL_SHARE, _BEHIND_SHARE = 0.3, 0.05  # of the area: on a wall, at least; behind it, at most
+_WALLS, _TRIED_PLANES = 3, 300
 
 
 @dataclass(frozen=True)
@@ -222,16 +224,21 @@ class Gap:
     nearest: int
 
 
-def find_gaps(layout: CameraLayout, patches: Patches, most: int = 3) -> tuple[Gap, ...]:
+def find_gaps(
+    layout: CameraLayout, patches: Patches, cameras: Sequence[Camera], most: int = 3
+) -> tuple[Gap, ...]:
     """The emptiest directions, largest gap first; each is found as if the gaps before it were
-    filled. Directions where a surface is in the way, or where nobody could hold a camera, are left
-    out."""
+    filled. Left out are directions where a surface is in the way, which are behind a wall, or where
+    nobody could hold a camera."""
     tried = _sphere(_DIRECTIONS)
     elevations = layout.elevations_deg(tried)
     lowest, highest = INWARD_ELEVATIONS_DEG if layout.inward else OUTWARD_ELEVATIONS_DEG
     tried = tried[(elevations >= lowest) & (elevations <= highest)]
     if layout.inward:
         tried = tried[[not _blocked(layout, patches, direction) for direction in tried]]
+        for normal, offset in _walls(patches, np.array([camera.centre for camera in cameras])):
+            places = layout.middle + layout.distance * tried
+            tried = tried[places @ normal > offset]
     known, found = layout.directions, []
     for _ in range(most):
         if not len(tried):
@@ -265,6 +272,36 @@ def _blocked(layout: CameraLayout, patches: Patches, direction: NDArray[np.float
     inside = (along > 0.5 * layout.distance) & (along < layout.distance) & (beside < cone * along)
     cross_section = np.pi * (cone * layout.distance) ** 2
     return bool(patches.area[inside].sum() > _BLOCKED_SHARE * cross_section)
+
+
+def _walls(
+    patches: Patches, eyes: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """(normal [3] towards the cameras, offset) of planes that hold much of the area, that hide
+    nearly none of it, and that all cameras, with centres `eyes` [V, 3], are before. Planes through
+    three random patches are tried (RANSAC)."""
+    total = patches.area / max(patches.area.sum(), 1e-12)
+    share = total
+    for number in range(_WALLS):
+        if share.sum() < _WALL_SHARE:
+            return
+        chances = share / share.sum()
+        draw = np.random.default_rng(number).choice(len(share), (_TRIED_PLANES, 3), p=chances)
+        a, b, c = patches.centres[draw].transpose(1, 0, 2)
+        normals = _normalised(np.cross(b - a, c - a))
+        offsets = (normals * a).sum(axis=1)
+        towards = np.sign(eyes.mean(axis=0) @ normals.T - offsets)
+        normals, offsets = normals * towards[:, None], offsets * towards
+        heights = patches.centres @ normals.T - offsets
+        on = np.abs(heights) < patches.side
+        fits = (eyes @ normals.T > offsets).all(axis=0)
+        fits &= total @ (heights < -patches.side) <= _BEHIND_SHARE
+        held = np.where(fits, share @ on, 0.0)
+        best = int(held.argmax())
+        if held[best] < _WALL_SHARE:
+            return
+        yield normals[best], float(offsets[best])
+        share = np.where(on[:, best], 0.0, share)
 
 
 @dataclass(frozen=True)

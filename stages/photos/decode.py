@@ -18,6 +18,7 @@ import pillow_heif
 from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageFile, UnidentifiedImageError
 
+from stages.base.text import reason_of
 from stages.photos import colour
 from stages.photos.exif import Exif, read_exif
 from stages.photos.jpeg import fault_of
@@ -134,7 +135,7 @@ def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
     except UnidentifiedImageError as error:
         raise _unidentified(data) from error
     except Exception as error:  # decoders raise whatever the damage leads to
-        raise Unusable(f"it does not decode ({_first_line(error)})") from error
+        raise Unusable(f"it does not decode ({reason_of(error)})") from error
 
 
 def _read(path: Path) -> bytes:
@@ -285,7 +286,3 @@ def _unidentified(data: bytes) -> Unusable:
     if data[:64].isascii() and b"\0" not in data[:64]:
         return Unusable("it holds text, not a picture", "Remove it, or replace it by the picture")
     return Unusable("it is not a picture, or is damaged")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

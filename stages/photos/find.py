@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from stages.base.errors import Family, SplatError
 from stages.base.text import counted, printable_name
+from stages.cameras import blender
 from stages.photos import masks
 from stages.photos.sources import (
     OTHER_PICTURES,
@@ -47,7 +49,7 @@ def find(folder: Path, more_masks: Path | None = None) -> Findings:
         files[printable_name(path.relative_to(folder).as_posix())] = path
     mask_of, stray = _remove_masks(files, folder, more_masks)
     names = sorted(files, key=natural_key)
-    photographs = [name for name in names if suffix_of(name) in PICTURES]
+    photographs = _posed(folder, [name for name in names if suffix_of(name) in PICTURES])
     stems = {stem_of(name) for name in photographs}
     unpaired = [name for name in names if stem_of(name) not in stems]
     kinds = {
@@ -67,6 +69,16 @@ def find(folder: Path, more_masks: Path | None = None) -> Findings:
     if not found.sources and not found.videos:
         raise _no_photographs(folder, found)
     return found
+
+
+def _posed(folder: Path, pictures: list[str]) -> list[str]:
+    """The pictures that the camera files of a synthetic NeRF scene name, where the folder holds
+    such files and pictures: what lies beside these are maps of depth and of normals."""
+    named: set[str] = set()
+    if blender.locate(folder) is not None:
+        with suppress(SplatError):
+            named = {stem_of(view.name) for view in blender.read(folder).views}
+    return [name for name in pictures if stem_of(name) in named] or pictures
 
 
 def _remove_masks(

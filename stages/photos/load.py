@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.errors import Family, SplatError
+from stages.base.text import reason_of
 from stages.scene.capture import TRANSPARENT, View
 
 
@@ -27,7 +28,7 @@ def load_image(path: Path, width: int, height: int) -> NDArray[np.float32]:
         flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
         image = cv2.imdecode(encoded, flags) if encoded.size else None
     except (OSError, cv2.error) as error:
-        raise _unreadable(path, str(error)) from error
+        raise _unreadable(path, reason_of(error)) from error
     if image is None:
         raise _unreadable(path, "it does not decode as an image")
     full = {"uint8": 255.0, "uint16": 65535.0}.get(image.dtype.name)

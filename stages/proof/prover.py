@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
+from stages.base.errors import Family, SplatError
+from stages.base.text import reason_of
 from stages.formats import BY_ENDING, format_of
 from stages.formats.values import check_finite, drop_undrawable, nonfinite_allowed
 from stages.measure.image_metrics import IDENTICAL_DB, capped_psnr_db
@@ -103,6 +105,19 @@ class Prover:
         pictures = tuple(draw(camera).image for camera in cameras)
         return cls(splats, drawn, cameras, pictures, backend, source_format)
 
+    def require(self, path: Path, code: str) -> Proof:
+        """The proof of a file that was just written. Raises SplatError `code` if it is wrong."""
+        proof = self.prove(path)
+        if proof.fault:
+            raise SplatError(
+                code,
+                given=f"{path} came out wrong: {proof.fault}.",
+                wanted="A file that another program reads as the same splats.",
+                hint="Write another format, and report this with the file that was read.",
+                family=Family.QUALITY,
+            )
+        return proof
+
     def with_original(self, splats: Splats) -> Prover:
         """This prover for other values of the same splats. The pictures stay, so that all losses
         show in them, unless `splats` are to be drawn in another way."""
@@ -129,7 +144,7 @@ class Prover:
             content = _drawable(checks.read_back(path))
             errors = checks.CHECKS[row.ending].validate(path)
         except Exception as error:  # whatever the reader raises: the file is wrong
-            return Proof(0, {}, f"another reader refused it ({_message(error)})")
+            return Proof(0, {}, f"another reader refused it ({reason_of(error)})")
         count = len(content.splats)
         if errors:
             return Proof(count, {}, f"its validator says: {errors[0]}")
@@ -192,7 +207,3 @@ def _drawable(content: FileContent) -> FileContent:
     readers."""
     with nonfinite_allowed():
         return replace(content, splats=drop_undrawable(check_finite(content.splats))[0])
-
-
-def _message(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -20,6 +20,7 @@ from stages.base.stage import (
     Report,
     Stage,
 )
+from stages.base.text import reason_of
 from stages.run.digests import combined_digest, record_files
 from stages.run.failures import as_splat_error
 from stages.run.manifest import Manifest, plain, write_json
@@ -82,8 +83,7 @@ def attempt(
     except Exception as error:
         explained = as_splat_error(error, stage.name, space.run_folder)
         if explained is None:
-            message = str(error).splitlines()[0] if str(error) else "no message"
-            space.note_failure("bug", f"{type(error).__name__}: {message}.")
+            space.note_failure("bug", f"{type(error).__name__}: {reason_of(error)}.")
             raise
         space.note_failure(explained.code, explained.given)
         if explained is error:

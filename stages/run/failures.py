@@ -5,9 +5,9 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
-from stages.base.disk import DISK_FULL, disk_full, is_full
+from stages.base.disk import DISK_FULL, disk_full, is_full, not_permitted
 from stages.base.errors import Family, SplatError
-from stages.base.text import printable, printable_name
+from stages.base.text import printable, printable_name, reason_of
 
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
 _USER = (Family.USAGE, Family.INPUT, Family.RUN_FOLDER)
@@ -41,7 +41,7 @@ def as_splat_error(error: BaseException, doing: str, folder: Path) -> SplatError
             # A child process that ended cannot say why; a full disk explains it.
             return disk_full(doing, folder) if full and link.family not in _USER else link
         if isinstance(link, OSError) and link.errno in _DENIED:
-            return not_writable(Path(link.filename or folder), link)
+            return not_permitted(Path(link.filename or folder), link)
         if isinstance(link, UnicodeEncodeError) and printable(link.object) != link.object:
             what = f"{printable_name(link.object)} has a name that is not UTF-8."
             return _unusable_name("name-not-utf-8", what)
@@ -71,21 +71,10 @@ def _chain(error: BaseException) -> list[BaseException]:
     return links
 
 
-def not_writable(path: Path, error: OSError) -> SplatError:
-    return SplatError(
-        "not-permitted",
-        given=f"{path}: {error.strerror or error}.",
-        wanted="A folder that can be written to.",
-        hint="Change its permissions, or name another folder with --out.",
-        family=Family.RESOURCES,
-    )
-
-
 def out_of_memory(doing: str, error: BaseException) -> SplatError:
-    said = str(error).splitlines()[0] if str(error) else type(error).__name__
     return SplatError(
         "out-of-memory",
-        given=f"Memory ran out during {doing} ({said}).",
+        given=f"Memory ran out during {doing} ({reason_of(error)}).",
         wanted="Enough free memory for the settings.",
         hint="Close other programs, or ask for less: --max-splats, --train-side, --max-side.",
         family=Family.RESOURCES,

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from stages.base.atomic import sync_folder
+from stages.base.disk import not_permitted
 from stages.base.errors import Family, SplatError
 from stages.run.digests import FileRecords, records_from_data
 
@@ -137,6 +138,8 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None
+    except PermissionError as error:
+        raise not_permitted(path, error) from error
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:  # reported where the name is used
             raise

@@ -75,6 +75,16 @@ def holds_stages(folder: Path) -> bool:
     return any(_settings_in(name, path) is not None for name, path in _stage_files(folder))
 
 
+def stage_folder_around(place: Path) -> Path | None:
+    """The folder of a stage that `place` is or lies in."""
+    place = place.resolve()
+    for folder in (place, *place.parents):
+        beside = _stage_files(folder.parent)
+        if any(p.parent == folder and _settings_in(n, p) is not None for n, p in beside):
+            return folder
+    return None
+
+
 def settings_of_stages(folder: Path) -> dict[str, dict[str, Any]]:
     """Settings as plain data by stage name: those of the finished stages, and over them those of
     unfinished attempts, which were requested later. Damaged files are left out.

@@ -11,7 +11,7 @@ from stages.run.digests import combined_digest, record_files
 from stages.run.lock import HOLDER, LOCK, locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.planning import PHOTOS
-from stages.run.runfile import RUN_FILE, RunFile, holds_stages
+from stages.run.runfile import RUN_FILE, RunFile, holds_stages, stage_folder_around
 
 # What a run that stopped before its run file was complete may leave.
 _WITHOUT_RUN_FILE = (LOCK, HOLDER, RUN_FILE + ".tmp")
@@ -41,7 +41,13 @@ def opened(folder: Path, photos: Path | None) -> Iterator[None]:
         if photos is None:
             raise missing(folder)
         if folder.exists() and any(path.name not in _WITHOUT_RUN_FILE for path in folder.iterdir()):
-            raise _foreign(folder)
+            raise SplatError(
+                "run-folder-foreign",
+                given=f"{folder} exists and holds other things.",
+                wanted="A new folder, an empty one, or a run folder that splat made.",
+                hint="Name another folder with --out.",
+                family=Family.RUN_FOLDER,
+            )
     RunFile.read(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
@@ -62,7 +68,14 @@ def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) ->
         return recorded
     moved = recorded.photographs is not None and not recorded.photographs.exists()
     if has_finished_work(folder) and not moved and not _same(photos, first_stage_folder):
-        raise _other_photographs(folder, recorded.photographs, photos)
+        before = recorded.photographs or "other photographs"
+        raise SplatError(
+            "run-folder-other-photographs",
+            given=f"{folder} was made from {before}, not from {photos}.",
+            wanted="One run folder for one set of photographs.",
+            hint="Name another run folder with --out.",
+            family=Family.RUN_FOLDER,
+        )
     return RunFile(photos, recorded.settings)
 
 
@@ -81,12 +94,15 @@ def _check_photos(folder: Path, photos: Path) -> None:
             wanted="A folder of photographs.",
             hint="Check the path; put quotes around one with spaces.",
         )
-    if is_run_folder(photos):
+    stage_folder = stage_folder_around(photos)
+    if stage_folder is not None or is_run_folder(photos):
+        what = f"belongs to {stage_folder}, which splat made" if stage_folder else "is a run folder"
+        run = stage_folder.parent if stage_folder else photos
         raise SplatError(
             "photographs-run-folder",
-            given=f"{photos} is a run folder that splat made, not a folder of photographs.",
-            wanted="A folder of photographs.",
-            hint=f"To continue the run: splat process {photos}",
+            given=f"{photos} {what}.",
+            wanted="A folder of photographs as they were taken.",
+            hint=f"To continue the run: splat process {run}",
             family=Family.USAGE,
         )
     if folder.resolve().is_relative_to(photos.resolve()):
@@ -97,26 +113,6 @@ def _check_photos(folder: Path, photos: Path) -> None:
             hint="Name one with --out, for example --out ../run",
             family=Family.USAGE,
         )
-
-
-def _foreign(folder: Path) -> SplatError:
-    return SplatError(
-        "run-folder-foreign",
-        given=f"{folder} exists and holds other things.",
-        wanted="A new folder, an empty one, or a run folder that splat made.",
-        hint="Name another folder with --out.",
-        family=Family.RUN_FOLDER,
-    )
-
-
-def _other_photographs(folder: Path, recorded: Path | None, photos: Path) -> SplatError:
-    return SplatError(
-        "run-folder-other-photographs",
-        given=f"{folder} was made from {recorded or 'other photographs'}, not from {photos}.",
-        wanted="One run folder for one set of photographs.",
-        hint="Name another run folder with --out.",
-        family=Family.RUN_FOLDER,
-    )
 
 
 def missing(folder: Path) -> SplatError:

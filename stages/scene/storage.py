@@ -18,6 +18,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
+from stages.base.disk import not_permitted
 from stages.base.errors import Family, SplatError
 from stages.scene.draw_settings import DrawSettings
 from stages.scene.splats import Splats
@@ -66,6 +67,8 @@ def load_splats(path: Path) -> Splats:
             float(near), int(side), float(grey), bool(light), bool(antialias)
         )
         return Splats(**arrays, draw_settings=draw_settings)  # type: ignore[arg-type]
+    except PermissionError as error:
+        raise not_permitted(source, error) from error
     except (OSError, ValueError, OverflowError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise SplatError(

@@ -82,7 +82,7 @@ def _features(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
 def _threads(job: Job) -> int:
     """One per core, as long as their pictures fit in half of the free memory."""
     pixels = max(math.prod(_reduced(camera.width, camera.height)) for camera in job.cameras)
-    available_mib = memory.available_mib() or math.inf
+    available_mib = memory.available_mib()
     return max(1, int(min(job.threads, 0.5 * available_mib / (pixels * _PIXEL_BYTES / MIB))))
 
 

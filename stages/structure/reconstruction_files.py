@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from stages.base.atomic import replacing
+from stages.base.disk import not_permitted
 from stages.base.errors import Family, SplatError
+from stages.base.text import reason_of
 from stages.scene import Camera, Reconstruction, View
 
 FILE_NAME = "reconstruction.json"
@@ -57,10 +59,12 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             light_explained=float(data.get("light_explained", 0.0)),
             **arrays,
         )
+    except PermissionError as error:
+        raise not_permitted(folder, error) from error
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
         raise SplatError(
             "reconstruction-damaged",
-            given=f"The reconstruction in {folder} cannot be read ({error}).",
+            given=f"The reconstruction in {folder} cannot be read ({reason_of(error)}).",
             wanted="The files as `splat sfm` wrote them.",
             hint="Delete that folder and run `splat sfm` again.",
             family=Family.RUN_FOLDER,

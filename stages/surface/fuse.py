@@ -47,10 +47,7 @@ class Volume:
 
 def voxel_budget() -> int:
     """The number of voxels: VOXELS, or as many as a quarter of the free memory holds."""
-    free_mib = available_mib()
-    if free_mib is None:
-        return VOXELS
-    return min(VOXELS, max(1000, int(_SHARE_OF_MEMORY * free_mib * MIB / _BYTES_A_VOXEL)))
+    return min(VOXELS, max(1000, int(_SHARE_OF_MEMORY * available_mib() * MIB / _BYTES_A_VOXEL)))
 
 
 def observed_box(

@@ -33,7 +33,7 @@ class Cap:
     Args:
         splats: the largest number allowed.
         origin: "--max-splats", "free memory", PHOTOGRAPHS or DEVICE_MEMORY.
-        free_mib: memory that was free, if that decided; None where the system does not say.
+        free_mib: memory that was free, if that decided.
     """
 
     splats: int
@@ -41,10 +41,9 @@ class Cap:
     free_mib: float | None = None
 
 
-def splat_cap(available_mib: float | None) -> int:
-    """How many splats can be trained in half of the free memory (of 4 GiB where unknown)."""
-    mib = 4096.0 if available_mib is None else available_mib
-    return max(MIN_CAP, int(0.5 * mib * 1024 * 1024 / BYTES_PER_SPLAT))
+def splat_cap(free_mib: float) -> int:
+    """How many splats can be trained in half of the free memory."""
+    return max(MIN_CAP, int(0.5 * free_mib * 1024 * 1024 / BYTES_PER_SPLAT))
 
 
 def needed_mib(splats: int) -> float:
@@ -68,7 +67,7 @@ def cap_for(folder: Path, max_splats: int, determined: int) -> Cap:
     if max_splats:
         return Cap(max_splats, "--max-splats")
     free_mib = available_mib()
-    by_memory = Cap(splat_cap(free_mib), "free memory", free_mib and round(free_mib))
+    by_memory = Cap(splat_cap(free_mib), "free memory", round(free_mib))
     cap = min(by_memory, Cap(determined, PHOTOGRAPHS), key=lambda cap: cap.splats)
     return _saved(cap, folder)
 

@@ -1,10 +1,10 @@
-"""Words that depend on a number, and names that a terminal can show."""
+"""Words that depend on a number, names that a terminal can show, what is left of a library's."""
 
 from __future__ import annotations
 
 import pytest
 
-from stages.base.text import counted, printable, printable_name
+from stages.base.text import counted, printable, printable_name, reason_of
 
 
 @pytest.mark.parametrize(
@@ -17,6 +17,25 @@ def test_noun_agrees_with_its_number(count: int, text: str) -> None:
 def test_plural_that_takes_more_than_an_s() -> None:
     assert counted(1, "box", "boxes") == "1 box"
     assert counted(2, "box", "boxes") == "2 boxes"
+
+
+@pytest.mark.parametrize(
+    ("said", "left"),
+    [
+        ("colmap::Reconstruction::Read(const std::string&): no such model", "no such model"),
+        ("std::bad_alloc", "RuntimeError"),
+        (
+            "Exceeds the limit (4300 digits) for integer string conversion; "
+            "use sys.set_int_max_str_digits() to increase the limit",
+            "Exceeds the limit (4300 digits) for integer string conversion",
+        ),
+        ("the first line\nTraceback", "the first line"),
+        ("", "RuntimeError"),
+        ("x" * 1000, "x" * 160),
+    ],
+)
+def test_what_a_library_said_keeps_neither_its_names_nor_its_advice(said: str, left: str) -> None:
+    assert reason_of(RuntimeError(said)) == left
 
 
 @pytest.mark.parametrize(

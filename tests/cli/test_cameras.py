@@ -90,7 +90,7 @@ def test_lenses_that_distort_are_refused(splat, tmp_path: Path) -> None:
     assert not Path("t.json").exists()
 
 
-def test_pictures_that_are_not_there_are_said(splat, tmp_path: Path) -> None:
+def test_missing_pictures_are_reported(splat, tmp_path: Path) -> None:
     write_colmap_model(tmp_path / "model", example())
     result = splat("cameras", "model", "t.json")
     assert result.exit_code == 0

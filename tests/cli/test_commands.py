@@ -38,7 +38,7 @@ def started(result) -> list[str]:
     return [e["stage"] for e in events(result) if e["event"] == "started"]
 
 
-def test_process_makes_everything_and_says_where(splat) -> None:
+def test_process_writes_every_asset_and_prints_the_paths(splat) -> None:
     result = splat("process", "photos")
     assert result.exit_code == 0, result.output
     assert str(Path("run/7-export/out.ply")) in result.stdout
@@ -154,7 +154,7 @@ def test_stop_says_how_to_go_on_and_exits_130(splat, pretend, monkeypatch) -> No
     assert splat("process").exit_code == 0  # with nothing named: what was asked before
 
 
-def test_status_says_who_is_at_work(splat, pretend) -> None:
+def test_status_names_the_process_that_holds_the_lock(splat, pretend) -> None:
     def stop(inputs, settings, folder, report) -> None:
         raise Interrupted
 
@@ -192,7 +192,7 @@ def test_format_is_repeatable(splat) -> None:
     assert "('ply', 'usdz')" in Path("run/7-export/out.ply").read_text()
 
 
-def test_one_stage_after_the_other(splat) -> None:
+def test_stages_run_one_by_one(splat) -> None:
     assert splat("ingest", "photos", "--out", "run").exit_code == 0
     for name in STAGES[1:]:
         assert splat(name).exit_code == 0, name
@@ -246,7 +246,7 @@ def test_run_folder_in_which_nothing_succeeded_is_not_offered(splat, pretend) ->
     assert states(splat)["ingest"] == "finished"
 
 
-def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
+def test_a_missing_run_folder_is_reported_with_the_first_command(splat) -> None:
     result = splat("train")
     assert result.exit_code == 5
     assert "splat process PHOTOS" in result.stderr
@@ -273,7 +273,7 @@ def test_no_run_folder_is_said_with_the_first_command(splat) -> None:
         (["view", "--port", "x"], "--port x cannot be used"),
     ],
 )
-def test_wrong_words_are_named_in_our_words_and_exit_2(splat, words: list[str], said: str) -> None:
+def test_command_line_errors_have_our_form_and_exit_2(splat, words: list[str], said: str) -> None:
     result = splat(*words)
     assert result.exit_code == 2, result.output
     assert said in result.stderr
@@ -291,7 +291,9 @@ def test_wrong_words_are_named_in_our_words_and_exit_2(splat, words: list[str], 
         (["--backend", "reference", "--device", "xpu"], "A device that is available: cpu."),
     ],
 )
-def test_what_cannot_draw_here_is_said_before_other_work(splat, monkeypatch, words, said) -> None:
+def test_an_unavailable_backend_is_reported_before_other_work(
+    splat, monkeypatch, words, said
+) -> None:
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setattr(gpu, "missing", lambda: "no card")
     monkeypatch.setattr(torch_device, "is_there", lambda name: name == "cpu")
@@ -309,7 +311,7 @@ def test_cameras_that_cannot_be_read_are_refused_before_anything_is_made(splat) 
         assert not Path("run").exists()
 
 
-def test_wrong_words_are_json_where_json_is_asked_for(splat) -> None:
+def test_command_line_errors_are_json_with_json(splat) -> None:
     for words in (["--steps", "0"], ["--stepz", "0"]):
         (event,) = events(splat("process", "photos", "--json", *words))
         assert (event["event"], event["family"]) == ("error", 2)

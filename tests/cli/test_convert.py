@@ -36,7 +36,7 @@ def test_any_format_becomes_any_other(tmp_path: Path, source: str, target: str) 
 
 
 @pytest.mark.parametrize("ending", ["ply", "splat", "sog"])
-def test_through_the_disk_it_comes_out_the_same(
+def test_the_result_through_scratch_files_is_the_same(
     tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As large scenes go."""
@@ -55,7 +55,7 @@ def test_usd_is_read_and_written_too(tmp_path: Path) -> None:
     assert "ParticleField3DGaussianSplat" in (tmp_path / "c.usda").read_text()
 
 
-def test_what_was_made_is_told(tmp_path: Path) -> None:
+def test_the_written_files_are_printed(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.ply", many_splats(300))
     out, err = converted(tmp_path / "a.ply", tmp_path / "b.compressed.ply")
     assert out == ""
@@ -95,7 +95,7 @@ def test_splats_that_cannot_be_drawn_are_counted(tmp_path: Path) -> None:
     assert "4 splats" in err
 
 
-def test_splats_out_of_range_are_counted_and_told(tmp_path: Path) -> None:
+def test_splats_out_of_range_are_counted_and_reported(tmp_path: Path) -> None:
     splats = replace(many_splats(2000), origin=np.zeros(3))
     splats.means[4] = 1e6
     formats.write(tmp_path / "a.ply", splats)
@@ -119,7 +119,7 @@ def test_outliers_that_coarsen_the_positions_of_a_sog_are_told(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("ending", ["spz", "splat"])
-def test_an_origin_that_a_file_cannot_hold_is_told(tmp_path: Path, ending: str) -> None:
+def test_an_origin_that_a_file_cannot_hold_is_reported(tmp_path: Path, ending: str) -> None:
     formats.write(tmp_path / "a.ply", replace(many_splats(30), origin=np.array([5e5, 0, -4])))
     _, err = converted(tmp_path / "a.ply", tmp_path / f"b.{ending}")
     assert err.count("Warning") == 1
@@ -127,7 +127,7 @@ def test_an_origin_that_a_file_cannot_hold_is_told(tmp_path: Path, ending: str) 
     assert (tmp_path / f"b.{ending}.offset.json").is_file()
 
 
-def test_a_loss_below_30_db_is_told_with_its_cause(tmp_path: Path) -> None:
+def test_a_loss_below_30_db_is_reported_with_its_cause(tmp_path: Path) -> None:
     splats = replace(many_splats(200), origin=np.zeros(3))
     splats.sh[:, 1:] = np.random.default_rng(0).normal(0, 1.5, splats.sh[:, 1:].shape)
     splats.opacity_logits[:] = 3
@@ -141,7 +141,7 @@ def test_a_loss_below_30_db_is_told_with_its_cause(tmp_path: Path) -> None:
     ("outlier", "cause"),
     [(0.0, "too few bits for splats so close together"), (30.0, "1 outlier widened the range")],
 )
-def test_positions_off_by_more_than_neighbours_are_told_with_their_cause(
+def test_positions_off_by_more_than_neighbours_are_reported_with_their_cause(
     tmp_path: Path, outlier: float, cause: str
 ) -> None:
     splats = replace(many_splats(200), origin=np.zeros(3))
@@ -156,7 +156,7 @@ def test_positions_off_by_more_than_neighbours_are_told_with_their_cause(
     assert err.count("Warning") == 1
 
 
-def test_a_conversion_that_loses_little_warns_of_nothing(tmp_path: Path) -> None:
+def test_a_conversion_of_small_loss_has_no_warning(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.ply", replace(many_splats(2000), origin=np.zeros(3)))
     for ending in ("spz", "compressed.ply", "glb"):
         assert "Warning" not in converted(tmp_path / "a.ply", tmp_path / f"b.{ending}")[1]

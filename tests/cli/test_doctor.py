@@ -19,14 +19,14 @@ def checks() -> dict[str, dict]:
     return {check["name"]: check for check in json.loads(result.stdout)["checks"]}
 
 
-def test_every_dependency_is_looked_at_and_the_kernel_cache_told() -> None:
+def test_every_dependency_and_the_kernel_cache_are_checked() -> None:
     found = checks()
     assert set(libraries.needed()) <= set(found)
     assert all(found[name]["ok"] for name in libraries.needed())
     assert found["kernel cache"]["value"].startswith(f"{cache.folder()}, ")
 
 
-def test_what_can_be_read_is_told() -> None:
+def test_readable_formats_are_listed() -> None:
     found = checks()
     assert {"JPEG", "PNG", "HEIF"} <= set(found["photographs read"]["value"].split(", "))
     assert {"h264", "hevc"} <= set(found["videos read"]["value"].split(", "))

@@ -42,7 +42,7 @@ def result_of(path: Path) -> Splats:
     return formats.read(path)
 
 
-def test_operations_are_done_in_the_order_in_which_they_are_typed(
+def test_operations_are_applied_in_the_order_of_the_command_line(
     source: Path, tmp_path: Path
 ) -> None:
     box, out = "box:-9,-9,-9,9,9,9", tmp_path / "b.ply"
@@ -93,7 +93,7 @@ def test_metres_stay_metres_until_the_scene_is_scaled(source: Path, tmp_path: Pa
     assert formats.units_of(tmp_path / "b.ply") == "arbitrary"
 
 
-def test_a_file_is_as_small_as_was_asked(source: Path, tmp_path: Path) -> None:
+def test_a_file_is_at_most_as_large_as_max_mb(source: Path, tmp_path: Path) -> None:
     formats.write(source, many_splats(3000))
     edited(source, tmp_path / "b.ply", "--max-mb", "0.2")
     assert 0.19e6 < (tmp_path / "b.ply").stat().st_size <= 0.2e6
@@ -114,7 +114,7 @@ def test_degree_and_floaters(source: Path, tmp_path: Path) -> None:
     assert len(found) > 290
 
 
-def test_a_dry_run_says_what_would_go_and_writes_nothing(source: Path, tmp_path: Path) -> None:
+def test_a_dry_run_reports_the_removal_and_writes_nothing(source: Path, tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
     out, err = edited(source, "--keep", "x > 0", "--decimate", "10", "--dry-run")
     kept = int((result_of(source).means[:, 0] > 0).sum())
@@ -201,7 +201,7 @@ def test_operations_written_to_a_file_are_read_back(tmp_path: Path) -> None:
         (["--keep"], "command-line", 2),
     ],
 )
-def test_bad_words_are_told_and_nothing_is_written(
+def test_bad_operations_are_reported_and_nothing_is_written(
     source: Path, tmp_path: Path, words: list[str], code: str, status: int
 ) -> None:
     _, err = edited(source, tmp_path / "b.ply", *words, code=status)
@@ -216,7 +216,7 @@ def test_a_bad_line_is_named_by_its_number(source: Path, tmp_path: Path, line: s
     assert "line 2" in err
 
 
-def test_a_target_is_wanted_and_a_known_ending(source: Path, tmp_path: Path) -> None:
+def test_a_target_with_a_known_suffix_is_required(source: Path, tmp_path: Path) -> None:
     _, err = edited(source, code=2)
     assert "edit-no-target" in err
     edited(source, tmp_path / "b.obj", code=2)

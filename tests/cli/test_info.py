@@ -32,7 +32,7 @@ BYTES = {
 
 
 @pytest.mark.parametrize("suffix", BYTES)
-def test_bytes_are_told_by_attribute(tmp_path: Path, suffix: str) -> None:
+def test_bytes_are_reported_by_attribute(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     formats.write(path, many_splats(300))
     facts = info(path)
@@ -63,7 +63,7 @@ def test_bytes_of_packed_files_are_those_on_disk_where_parts_are_packed_alone(
     assert (facts["positions"], facts["SH"]) == (12, 180)
 
 
-def test_a_format_whose_parts_nobody_can_tell_says_so(tmp_path: Path) -> None:
+def test_a_format_without_a_byte_breakdown_says_so(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.usdc", many_splats(3))
     facts = info(tmp_path / "a.usdc")
     assert "how many bytes" in facts["bytes_per_splat_unknown"]
@@ -108,7 +108,7 @@ def test_a_usd_file_that_is_not_finite_is_described_too(tmp_path: Path) -> None:
     assert info(path)["warnings"]["not-finite-positions"].startswith("1 splats")
 
 
-def test_what_a_splat_costs_is_told_at_its_own_degree(tmp_path: Path) -> None:
+def test_bytes_of_a_splat_are_reported_at_its_own_degree(tmp_path: Path) -> None:
     formats.write(tmp_path / "a.ply", many_splats(1000))  # degree 3
     formats.write(tmp_path / "a.splat", many_splats(1000))  # degree 0
     facts, plain = info(tmp_path / "a.ply"), info(tmp_path / "a.splat")
@@ -120,7 +120,7 @@ def test_what_a_splat_costs_is_told_at_its_own_degree(tmp_path: Path) -> None:
     assert np.allclose(shares, [0.393, 0.865, 0.989], atol=1e-3)
 
 
-def test_speed_is_measured_when_asked_for_and_says_of_what(tmp_path: Path) -> None:
+def test_speed_is_measured_on_request_with_its_conditions(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     formats.write(path, many_splats(300))
     assert "frames_a_second" not in info(path)

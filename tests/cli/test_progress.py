@@ -50,7 +50,7 @@ def test_label_that_names_each_photograph_is_one_phase(clock, lines) -> None:
     assert len(lines) == 2
 
 
-def test_another_phase_speaks_at_once(clock, lines) -> None:
+def test_a_new_phase_is_printed_at_once(clock, lines) -> None:
     listener = progress.Lines()
     listener.started(STAGE, 2, "has not run yet", False)
     for label in ("finding features", "registering photographs"):

@@ -131,7 +131,7 @@ def test_a_camera_file_is_drawn_camera_by_camera(splat, scene: Path, captured) -
     assert told["frames"] == 3
 
 
-def test_a_distorted_camera_file_is_drawn_and_said(splat, scene: Path, captured) -> None:
+def test_a_distorted_camera_file_is_drawn_with_a_note(splat, scene: Path, captured) -> None:
     nerfstudio.write(Path("t.json"), captured, Path("images"))
     data = json.loads(Path("t.json").read_text())
     Path("t.json").write_text(json.dumps(data | {"k1": 0.1}))
@@ -148,7 +148,7 @@ def test_frames_of_a_longer_path_are_counted_and_kept(splat, scene: Path) -> Non
     assert len(list(Path("f").iterdir())) == 3
 
 
-def test_half_a_capture_is_said(splat, scene: Path, monkeypatch) -> None:
+def test_half_a_capture_is_reported(splat, scene: Path, monkeypatch) -> None:
     monkeypatch.setattr(results, "views_of", lambda pipeline: around(8)[:3])
     result = splat("render", str(scene), "--frames", "2", "--width", "16", "--out", "f")
     assert "81 degrees" in result.stderr
@@ -173,7 +173,9 @@ def test_half_a_capture_is_said(splat, scene: Path, monkeypatch) -> None:
         (["--out", "no/a.mp4", "--frames", "2", "--width", "16"], 6, "folder"),
     ],
 )
-def test_what_cannot_be_drawn_is_said(splat, scene: Path, words, code: int, said: str) -> None:
+def test_splats_that_cannot_be_drawn_are_reported(
+    splat, scene: Path, words, code: int, said: str
+) -> None:
     before = sorted(os.listdir())
     result = splat("render", str(scene), *words)
     assert result.exit_code == code, result.output

@@ -68,39 +68,39 @@ def failed(result: Any) -> str:
 
 
 @pytest.mark.slow
-def test_the_trade_is_printed_and_its_report_lies_in_the_run(splat: Splat) -> None:
+def test_the_trade_off_is_printed_and_its_report_is_in_the_run_folder(splat: Splat) -> None:
     made(splat, "run")
     result = splat("tradeoff", "run")
     assert result.exit_code == 0, result.output
     assert Path("run/tradeoff/report.html").is_file()
     assert str(Path("run/tradeoff/report.html")) in result.stdout
     assert "CPU" in result.stdout  # the log of training has times
-    assert "nothing was fine-tuned" in result.stdout
+    assert "splat prune --max-splats" in result.stdout
     status = json.loads(splat("status", "run", "--json").stdout)
     assert {row["state"] for row in status["stages"]} == {"finished"}
 
 
-def test_a_run_without_held_out_photographs_is_told_in_words(splat: Splat, views) -> None:
+def test_a_run_without_held_out_photographs_is_reported(splat: Splat, views) -> None:
     views["count"] = 3
     made(splat, "run")
     assert failed(splat("tradeoff", "run", "--json")) == "nothing-held-out"
 
 
-def test_an_unfinished_run_is_told_in_words(splat: Splat) -> None:
+def test_an_unfinished_run_is_reported(splat: Splat) -> None:
     assert splat("ingest", "photos", "--out", "run").exit_code == 0
     assert failed(splat("tradeoff", "run", "--json")) == "stage-not-finished"
     assert failed(splat("compare", "run", "run", "--json")) == "stage-not-finished"
     assert failed(splat("tradeoff", "nowhere", "--json")) == "run-folder-missing"
 
 
-def test_a_run_of_which_half_was_made_anew_is_told_in_words(splat: Splat) -> None:
+def test_a_run_whose_stages_do_not_belong_together_is_reported(splat: Splat) -> None:
     made(splat, "run")
     assert splat("train", "run", "--steps", "30").exit_code == 0
     assert failed(splat("tradeoff", "run", "--json")) == "run-half-anew"
     assert failed(splat("compare", "run", "run", "--json")) == "run-half-anew"
 
 
-def test_a_run_compared_with_itself_is_not_told_apart(splat: Splat) -> None:
+def test_a_run_compared_with_itself_has_no_significant_difference(splat: Splat) -> None:
     made(splat, "run")
     result = splat("compare", "run", "run", "--json")
     reported = json.loads(result.stdout)

@@ -162,7 +162,7 @@ def test_a_file_is_compared_with_another_whose_rows_are_sorted_differently(
     assert found["max_log_scale_error"] < 0.1
 
 
-def test_a_file_alone_is_compared_with_itself_and_that_is_said(
+def test_a_file_without_a_run_is_compared_with_itself_and_says_so(
     scene: SmallScene, tmp_path: Path
 ) -> None:
     formats.write(tmp_path / "a.spz", scene.splats)
@@ -173,7 +173,7 @@ def test_a_file_alone_is_compared_with_itself_and_that_is_said(
     assert events(tmp_path / "a.spz")[-1]["against"] == "itself"
 
 
-def test_a_loss_that_shows_is_a_warning_and_no_failure(scene: SmallScene, tmp_path: Path) -> None:
+def test_a_visible_loss_is_a_warning_and_no_failure(scene: SmallScene, tmp_path: Path) -> None:
     sh = scene.splats.sh.copy()
     sh[:, 1:] = np.random.default_rng(0).normal(0, 1.5, sh[:, 1:].shape)
     gaudy = replace(scene.splats, sh=sh)
@@ -186,7 +186,7 @@ def test_a_loss_that_shows_is_a_warning_and_no_failure(scene: SmallScene, tmp_pa
 
 @pytest.mark.parametrize("name", [name for name in formats.FORMATS if name not in ("usda", "usdc")])
 @pytest.mark.parametrize("damage", ["garbage", "cut short", "empty"])
-def test_a_damaged_file_is_told_in_words(
+def test_a_damaged_file_is_reported(
     scene: SmallScene, tmp_path: Path, name: str, damage: str
 ) -> None:
     path = tmp_path / f"a.{name}"
@@ -201,7 +201,7 @@ def test_a_damaged_file_is_told_in_words(
     assert "splats-unreadable" in err
 
 
-def test_what_cannot_be_verified_is_told_before_any_work(tmp_path: Path) -> None:
+def test_a_format_that_cannot_be_verified_is_reported_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("v 0 0 0")
     assert "format-unknown" in verified(tmp_path / "a.obj", code=2)[1]
     assert "splats-unreadable" in verified(tmp_path / "none.ply", code=3)[1]

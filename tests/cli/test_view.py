@@ -56,7 +56,7 @@ def test_a_file_is_served_until_ctrl_c(tmp_path: Path, suffix: str, stop: signal
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
-def test_a_server_in_the_background_is_deaf_to_ctrl_c_and_ends_when_it_is_told_to(
+def test_a_server_in_the_background_ignores_ctrl_c_and_ends_on_sigterm(
     tmp_path: Path,
 ) -> None:
     """A shell starts what it puts into the background with Ctrl-C ignored: that is for others."""
@@ -106,20 +106,20 @@ def test_the_first_signal_stops_and_the_next_do_not_interrupt_what_is_removed() 
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_what_is_missing_is_said(splat, tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(splat, tmp_path: Path) -> None:
     result = splat("view", "nowhere.ply", "--no-open")
     assert result.exit_code == 3
     assert "nowhere.ply does not exist" in result.stderr
 
 
-def test_nothing_to_see_is_said(splat, tmp_path: Path) -> None:
+def test_a_file_without_splats_is_reported(splat, tmp_path: Path) -> None:
     formats.write(tmp_path / "none.ply", many_splats(4).take(slice(0)))
     result = splat("view", "none.ply", "--no-open")
     assert result.exit_code == 3
     assert "none.ply holds no splat" in result.stderr
 
 
-def test_a_taken_port_is_said(splat, tmp_path: Path) -> None:
+def test_a_port_in_use_is_reported(splat, tmp_path: Path) -> None:
     formats.write(tmp_path / "a.ply", many_splats(4))
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stages.formats.values import concatenate
 from stages.measure.coverage import (
     CameraLayout,
     Patches,
@@ -22,7 +23,7 @@ from tests.measure.rings import MIDDLE, ball, camera, place, ring, surface
 def sides(splats: Splats, cameras: list[Camera]):
     patches = patches_of(splats, cameras, "cpu")
     layout = camera_layout(cameras, patches, levelled=True)
-    return layout, find_gaps(layout, patches)
+    return layout, find_gaps(layout, patches, cameras)
 
 
 def test_a_scene_seen_from_one_side_has_its_gap_at_the_back() -> None:
@@ -57,11 +58,23 @@ def test_no_gap_is_behind_a_wall() -> None:
     wall, n = np.stack([across, up, np.full(len(up), -2.5)], axis=1), len(up)
     once = np.ones((n, 1), bool)
     patches = Patches(wall, 0.5, np.full(n, 0.25), once, np.zeros(n, np.intp), np.zeros(n))
-    free = find_gaps(seen, replace(patches, area=np.zeros(n)))
+    cameras = ring([-80, 80])
+    free = find_gaps(seen, replace(patches, area=np.zeros(n)), cameras)
     assert 4 * free[0].direction[2] < -2.5
-    found = find_gaps(seen, patches)
+    found = find_gaps(seen, patches, cameras)
     assert found
     assert all(4 * gap.direction[2] > -2.5 for gap in found)
+
+
+@pytest.mark.parametrize("headings", [range(-60, 61, 20), range(-30, 31, 15)])
+def test_no_gap_is_behind_the_wall_that_a_thing_hangs_on(headings: range) -> None:
+    """No picture shows the wall's edge, nor how high it is."""
+    line = np.arange(-40.0, 40.0, 0.5)
+    across, up = (axis.ravel() for axis in np.meshgrid(line, line))
+    wall = surface(np.stack([across, up, np.full(len(up), -1.0)], axis=1), 0.4)
+    seen, found = sides(concatenate([surface(ball()), wall]), ring([*headings]))
+    assert found
+    assert all((seen.middle + seen.distance * gap.direction)[2] > -1 for gap in found)
 
 
 def test_cameras_that_look_outward_have_a_gap_where_none_looks() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from stages.photos.find import find
 from stages.photos.sources import natural_key, picture_names
@@ -50,6 +53,29 @@ def test_numbers_sort_as_numbers_and_folders_stay_together() -> None:
     assert sorted(names, key=natural_key) == [
         "a/2.jpg", "a/10.jpg", "a 2/x.jpg", "B1.jpg", "b9.jpg", "b10.jpg",
     ]  # fmt: skip
+
+
+def test_of_a_synthetic_nerf_scene_only_what_its_camera_files_name_is_a_photograph(
+    tmp_path: Path,
+) -> None:
+    """As the download is: maps of depth and normals beside the pictures of the test split, whose
+    names lack their endings in the files."""
+    pose = np.eye(4).tolist()
+    for split in ("train", "test"):
+        (tmp_path / split).mkdir()
+        frames = []
+        for i in range(3):
+            for kind in ("", "_depth_0001", "_normal_0001") if split == "test" else ("",):
+                Image.new("RGBA", (8, 8)).save(tmp_path / split / f"r_{i}{kind}.png")
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose})
+        text = json.dumps({"camera_angle_x": 0.7, "frames": frames})
+        (tmp_path / f"transforms_{split}.json").write_text(text)
+    found = find(tmp_path)
+    named = [f"{split}/r_{i}.png" for split in ("test", "train") for i in range(3)]
+    assert [source.name for source in found.sources] == named
+    assert found.others == 6 + 2
+    (tmp_path / "transforms_train.json").write_text("{")  # damaged: nothing is left out
+    assert len(find(tmp_path).sources) == 12
 
 
 def test_links_to_folders_do_not_trap_the_search(tmp_path: Path) -> None:

@@ -12,18 +12,23 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from stages import formats
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.memory import resident_mib
+from stages.cameras import nerfstudio
 from stages.run import manifest
+from stages.run.failures import as_splat_error
 from stages.run.lock import HOLDER, locked
-from stages.run.manifest import SCHEMA, Manifest
+from stages.run.manifest import SCHEMA, Manifest, read_sealed
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.runfile import RunFile
 from stages.run.runfolder import is_run_folder
+from stages.scene.storage import load_splats
 from tests.run.fakes import CopySettings, CountSettings, fake_stages, photographs
 
 
@@ -251,6 +256,25 @@ def test_run_folder_in_place_of_photographs_is_refused(
     assert caught.value.code == "photographs-run-folder"
     assert int(caught.value.family) == 2
     assert not new.exists()
+
+
+@pytest.mark.parametrize("inside", ["1-copy", "1-copy/inner", "2-count"])
+def test_the_folder_of_a_stage_in_place_of_photographs_is_refused(
+    finished: Pipeline, run_folder: Path, inside: str
+) -> None:
+    (run_folder / inside).mkdir(exist_ok=True)
+    new = run_folder.with_name("new")
+    with pytest.raises(SplatError, match=f"splat process {run_folder}$") as caught:
+        Pipeline(new, run_folder / inside, fake_stages()).run()
+    assert caught.value.code == "photographs-run-folder"
+    assert not new.exists()
+
+
+def test_photographs_that_users_keep_in_a_run_folder_are_accepted(
+    finished: Pipeline, run_folder: Path
+) -> None:
+    kept = photographs(run_folder / "more")
+    assert Pipeline(run_folder.with_name("new"), kept, fake_stages()).run()
 
 
 def test_run_file_of_another_program_is_refused_and_kept(photos: Path, run_folder: Path) -> None:
@@ -533,6 +557,40 @@ def test_folder_without_write_permission_is_refused(
         Pipeline(run_folder, photos, fake_stages()).run()
     assert caught.value.code == "not-permitted"
     assert caught.value.family is Family.RESOURCES
+
+
+def test_what_may_not_be_read_is_said_to_need_reading(tmp_path: Path, monkeypatch) -> None:
+    """Root may read everything: the system's answer is put in its place."""
+    secret, error = tmp_path / "a.ply", PermissionError(errno.EACCES, "Permission denied")
+    secret.write_bytes(b"ply")
+    error.filename = str(secret)
+    refused = {secret: os.R_OK}
+    monkeypatch.setattr(os, "access", lambda path, mode: not refused.get(Path(path), 0) & mode)
+    found = as_splat_error(error, "info", tmp_path)
+    assert found is not None
+    assert (found.code, found.family) == ("not-permitted", Family.RESOURCES)
+    assert "read" in found.wanted
+    assert "--out" not in found.hint
+    refused.clear()
+    written = as_splat_error(error, "info", tmp_path)
+    assert written is not None
+    assert "write" in written.wanted
+
+
+@pytest.mark.parametrize("read", [formats.read, load_splats, nerfstudio.read, read_sealed])
+def test_a_file_that_may_not_be_read_is_not_called_damaged(
+    tmp_path: Path, monkeypatch, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / ("a.json" if read in (nerfstudio.read, read_sealed) else "a.ply")
+    path.write_bytes(b"{}")
+
+    def denied(self: Path, *args, **kwargs) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(SplatError) as caught:
+        read(path)
+    assert (caught.value.code, caught.value.family) == ("not-permitted", Family.RESOURCES)
 
 
 # -- what must survive

@@ -21,7 +21,7 @@ def page_of(body: str) -> str:
 
 
 @pytest.mark.parametrize("family", FONTS)
-def test_letters_of_every_family_are_drawn(browser: Browser, family: str) -> None:
+def test_text_of_every_script_is_drawn(browser: Browser, family: str) -> None:
     browser.open(page_of(f'<p style="font: 20px {family}">Letters <button>again</button>'))
     assert browser.run("document.fonts.ready.then(() => 7)") == 7
     assert (browser.picture().min(axis=2) < 0.5).sum() > 100
@@ -33,7 +33,7 @@ def test_controls_and_other_scripts_do_not_end_it(browser: Browser) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends a signal")
-def test_a_browser_that_dies_says_how_and_its_last_words(tmp_path: Path) -> None:
+def test_a_browser_that_crashes_is_reported_with_its_last_output(tmp_path: Path) -> None:
     try:
         dying = Browser(chromium(), tmp_path, (64, 48))
     except UnavailableError as reason:

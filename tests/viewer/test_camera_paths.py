@@ -85,7 +85,7 @@ def test_the_shorter_way_round_is_taken() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_cameras_in_one_place_are_a_standstill(count: int) -> None:
+def test_cameras_in_one_place_give_a_path_without_motion(count: int) -> None:
     frames = interpolated([camera((0, 0, -5))] * count, SPLATS, 4)
     assert len(frames) == 4
     for frame in frames:

@@ -47,7 +47,7 @@ def test_opencv_reads_every_frame_at_its_size_and_speed(tmp_path: Path) -> None:
     assert not video.read()[0]
 
 
-def test_a_film_says_what_players_ask(tmp_path: Path) -> None:
+def test_a_film_has_the_metadata_that_players_need(tmp_path: Path) -> None:
     import av
 
     path = made(tmp_path / "a.mp4", fps=30000 / 1001)
@@ -89,7 +89,7 @@ def noisy(path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits what a file may hold")
-def test_a_full_disk_is_said(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported(tmp_path: Path) -> None:
     import resource
 
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -103,13 +103,13 @@ def test_a_full_disk_is_said(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
+def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SplatError) as caught, film(tmp_path / "no" / "a.mp4", 96, 64, 30):
         pass
     assert caught.value.code == "file-not-written"
 
 
-def test_a_size_that_no_encoder_takes_is_said(tmp_path: Path) -> None:
+def test_a_size_that_the_encoder_refuses_is_reported(tmp_path: Path) -> None:
     with (
         pytest.raises(SplatError) as caught,
         film(tmp_path / "a.mp4", 20_000, 2, 30) as add,
@@ -119,7 +119,7 @@ def test_a_size_that_no_encoder_takes_is_said(tmp_path: Path) -> None:
     assert "20000 x 2" in caught.value.wanted
 
 
-def test_odd_sizes_are_the_callers_mistake(tmp_path: Path) -> None:
+def test_odd_sizes_raise_value_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="even"), film(tmp_path / "a.mp4", 95, 64, 30):
         pass
 
@@ -151,7 +151,7 @@ def test_depth_is_lighter_where_nearer_and_black_where_nothing_is() -> None:
     assert beyond[2].tolist() == beyond[3].tolist()
 
 
-def test_the_range_of_depth_leaves_out_strays_and_emptiness() -> None:
+def test_the_range_of_depth_excludes_outliers_and_empty_pixels() -> None:
     depth = np.concatenate([np.zeros(500), np.linspace(2, 4, 1000), [1e6]]).astype(np.float32)
     near, far = depth_range([depth[None], np.full((2, 2), np.nan, np.float32)])
     assert near == pytest.approx(2.04, abs=0.01)

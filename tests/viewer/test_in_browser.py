@@ -76,7 +76,9 @@ def test_a_file_of_its_own_draws_the_same_from_disk(browser: Browser, tmp_path: 
     assert not [a for a in browser.requests if not a.startswith((page, "blob:", "data:"))]
 
 
-def test_the_photograph_stands_beside_and_moving_lets_go(browser: Browser, address: str) -> None:
+def test_the_photograph_is_shown_beside_until_the_camera_moves(
+    browser: Browser, address: str
+) -> None:
     browser.open(address + "?webgl")
     assert browser.run("window.splatReady")["name"] == "day 1/<0>.png"
     assert "10 splats" in browser.run("document.getElementById('figures').textContent")
@@ -101,7 +103,7 @@ def test_the_photograph_stands_beside_and_moving_lets_go(browser: Browser, addre
     assert "Moved" in browser.run(note)
 
 
-def test_splats_that_cannot_be_loaded_are_said_to_be(browser: Browser, tmp_path: Path) -> None:
+def test_splats_that_cannot_be_loaded_are_reported(browser: Browser, tmp_path: Path) -> None:
     formats.write(tmp_path / "none.html", coloured_scene().take(np.zeros(10, bool)))
     browser.open((tmp_path / "none.html").as_uri())
     browser.run("window.splatReady.catch(() => 0)")

@@ -139,7 +139,7 @@ def test_the_page_shows_what_is_trained_from_every_camera(browser: Browser, work
     assert not [a for a in browser.requests if not a.startswith((worker.address, "data:"))]
 
 
-def test_dragging_turns_the_scene_with_the_hand(browser: Browser, worker: Any) -> None:
+def test_dragging_turns_the_scene_with_the_pointer(browser: Browser, worker: Any) -> None:
     bare(browser, worker.address)
     _, before = shown(browser)
     camera = views()[0].camera
@@ -157,9 +157,7 @@ def test_dragging_turns_the_scene_with_the_hand(browser: Browser, worker: Any) -
     assert (seen_at(matrix, camera, near) > seen_at(before, camera, near) + 1).all()
 
 
-def test_right_dragging_takes_the_scene_along_and_the_wheel_comes_closer(
-    browser: Browser, worker: Any
-) -> None:
+def test_right_dragging_moves_the_scene_and_the_wheel_zooms(browser: Browser, worker: Any) -> None:
     bare(browser, worker.address)
     _, before = shown(browser)
     camera = views()[0].camera
@@ -175,9 +173,7 @@ def test_right_dragging_takes_the_scene_along_and_the_wheel_comes_closer(
     assert depths[1] == pytest.approx(depths[0] * np.exp(-0.2))
 
 
-def test_the_picture_follows_training_untouched_and_the_end_is_told(
-    browser: Browser, worker: Any
-) -> None:
+def test_the_picture_follows_training_and_the_end_is_shown(browser: Browser, worker: Any) -> None:
     bare(browser, worker.address)
     picture, _ = shown(browser)
     worker.splats = replace(worker.splats, sh=-worker.splats.sh)
@@ -202,7 +198,7 @@ def test_the_picture_follows_training_untouched_and_the_end_is_told(
 
 
 @pytest.mark.slow
-def test_at_rest_a_picture_is_asked_for_seldom(browser: Browser, worker: Any) -> None:
+def test_at_rest_pictures_are_requested_seldom(browser: Browser, worker: Any) -> None:
     bare(browser, worker.address)
     shown(browser)
     browser.requests.clear()

@@ -97,9 +97,7 @@ def test_a_picture_is_drawn_by_the_trainer_for_the_camera_asked_for(
     assert abs(pixels - 32).max() <= 1
 
 
-def test_the_state_is_told_without_numbers_that_json_lacks(
-    server: LocalServer, trainer: Trainer
-) -> None:
+def test_the_state_holds_no_number_that_json_lacks(server: LocalServer, trainer: Trainer) -> None:
     while trainer.steps < 3:
         time.sleep(0.001)
     state = json.loads(ask(server, "/state")[1])
@@ -110,7 +108,7 @@ def test_the_state_is_told_without_numbers_that_json_lacks(
     assert state["drawing_share"] == 0
 
 
-def test_browsers_that_ask_and_do_not_read_hold_nobody_up(
+def test_browsers_that_do_not_read_their_response_delay_nobody(
     server: LocalServer, trainer: Trainer
 ) -> None:
     """Each is sent megabytes and takes none."""
@@ -156,7 +154,7 @@ def test_without_the_token_the_trainer_draws_nothing(page: LivePage, server: Loc
     assert not page.frames.is_watched()
 
 
-def test_the_end_is_told_and_remembered_to_have_been(page: LivePage, server: LocalServer) -> None:
+def test_the_end_is_sent_and_its_delivery_recorded(page: LivePage, server: LocalServer) -> None:
     page.progressed("training", 7, 10, {})
     page.ended("stopped")
     assert not page.end_delivered

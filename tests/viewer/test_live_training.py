@@ -74,7 +74,7 @@ def test_training_is_served_from_its_start_to_the_end_of_the_run(watcher, said) 
         get(address + "state")
 
 
-def test_a_run_that_ends_early_says_so_and_waits_for_nobody_who_does_not_look(
+def test_a_run_that_ends_early_says_so_and_waits_only_for_an_open_page(
     watcher, said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(time, "sleep", lambda s: pytest.fail("waited"))

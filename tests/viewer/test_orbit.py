@@ -82,7 +82,7 @@ def test_a_turn_starts_at_the_first_camera_and_closes_without_a_jump() -> None:
 
 
 @pytest.mark.parametrize("turned", [0.0, 100.0, 200.0])
-def test_half_a_capture_is_swung_over_and_never_left(turned: float) -> None:
+def test_the_path_around_half_a_capture_swings_within_it(turned: float) -> None:
     """Seen from -60 to 60 degrees: to and fro within, however the world is turned, as a loop."""
     frames = orbit(around(np.linspace(-60, 60, 9) + turned), SPLATS, 40)
     away = centres(frames) - MIDDLE

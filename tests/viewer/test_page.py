@@ -159,6 +159,6 @@ def test_photographs_are_served_by_number_and_only_from_their_folder(tmp_path: P
     assert [shot["photo"] for shot in shots] == ["photos/0.jpg", "", ""]
 
 
-def test_a_camera_that_sees_nothing_still_has_something_to_turn_around() -> None:
+def test_a_camera_that_sees_nothing_still_has_an_orbit_target() -> None:
     away = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, look_at(np.zeros(3), np.array([0, 0, -1.0])))
     assert np.isfinite(as_plain(PageCamera("a", away), scenes.cloud(9).means)["target"]).all()

@@ -67,7 +67,7 @@ def edited(browser: Browser, page: Path) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_lasso_selects_on_the_command_line_what_it_did_by_eye(
+def test_a_lasso_selects_the_same_on_the_command_line_as_on_the_page(
     browser: Browser, tmp_path: Path
 ) -> None:
     page = opened(browser, tmp_path)
@@ -86,9 +86,7 @@ def test_a_lasso_selects_on_the_command_line_what_it_did_by_eye(
 
 
 @pytest.mark.slow
-def test_a_box_after_a_lasso_is_a_chain_and_the_last_is_taken_back(
-    browser: Browser, tmp_path: Path
-) -> None:
+def test_undo_removes_the_last_of_several_selections(browser: Browser, tmp_path: Path) -> None:
     page = opened(browser, tmp_path)
     lasso(browser, [(420, 200), (650, 220), (600, 500)])
     lassoed = selected(browser)

@@ -101,7 +101,7 @@ def test_the_asset_s_own_page_shows_it_wherever_it_is_served(
     assert asset.with_suffix(".html") in formats.format_of(asset).files(asset)
 
 
-def test_what_streams_can_be_selected_from_though_not_all_of_it_is_there(
+def test_a_partly_loaded_streamed_asset_can_be_selected_from(
     browser: Browser, address: str, asset: Path
 ) -> None:
     browser.open(address + "?webgl&camera=2")

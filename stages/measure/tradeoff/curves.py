@@ -80,7 +80,7 @@ class Tradeoff:
         own: the run's splats as they are.
         history: evaluations during training; empty where none was logged.
         formats: the same splats in each file format, smallest file first.
-        pruned: fewer splats, not fine-tuned, most first; `own` is the first.
+        pruned: fewer splats, fine-tuned after each removal, most first; `own` is the first.
         scores: of `own`, by held-out view.
         side_px: longer side of the pictures.
         coverage: what the training views show.

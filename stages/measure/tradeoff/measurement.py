@@ -58,6 +58,8 @@ COVERAGE_VIEWS = 200  # at most, that coverage is measured by
 FRAMED_VIEWS = 3  # that extreme framings start from
 
 ProgressCallback = Callable[[str], None]
+FineTune = Callable[[Splats, NDArray[np.int32]], Splats]
+"""Continues the training of splats [N] that are visible in so many views [N] each."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class TradeoffInputs:
         history: as training logged it.
         exported: formats that the run wrote.
         quantised: the precision that was chosen for files; None where none was.
+        finetune: what `splat prune` does after each removal; None does nothing.
     """
 
     splats: Splats
@@ -87,6 +90,7 @@ class TradeoffInputs:
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
     quantised: QuantisedSplats | None = None
+    finetune: FineTune | None = None
 
     @property
     def on_cpu(self) -> bool:
@@ -185,7 +189,8 @@ def _pruned(
     contributions: Contributions,
     progress: ProgressCallback,
 ) -> list[OperatingPoint]:
-    """Fewer and fewer splats: those that change the training pictures least are removed first.
+    """Fewer and fewer splats, as `splat prune --max-splats` leaves them: those that change the
+    training pictures least are removed first, and the rest is fine-tuned each time.
     contributions: of all splats."""
     splats, points = inputs.splats, []
     for share in SHARES:
@@ -196,7 +201,10 @@ def _pruned(
         if len(splats) < len(inputs.splats):
             contributions = measure_contributions(splats, inputs.training, inputs.backend)
         order = np.argsort(-contributions.picture_change, kind="stable")
-        splats = splats.take(np.sort(order[:count]))
+        kept = np.sort(order[:count])
+        splats = splats.take(kept)
+        if inputs.finetune is not None:
+            splats = inputs.finetune(splats, contributions.view_counts[kept])
         points.append(_point(inputs, f"{share:.0%}", splats, _scores(inputs, splats), own))
     return points
 
@@ -218,7 +226,7 @@ def measure_coverage(
         cameras=cameras,
         patches=patches,
         layout=layout,
-        gaps=find_gaps(layout, patches) if layout else (),
+        gaps=find_gaps(layout, patches, cameras) if layout else (),
         regions=poorly_covered_regions(splats, patches, cameras, backend) if layout else (),
         floaters=splats.means[is_floater].astype(np.float64),
     )

@@ -15,9 +15,9 @@ from stages.measure.tradeoff.curves import Coverage, OperatingPoint, Tradeoff, t
 
 SMALL_LOSS_DB = 0.1  # that few people would see
 NO_TIMES = "Training logged no times (an older version trained this run). Run `splat train` again."
-NOT_FINE_TUNED = (
-    "Splats were only removed; nothing was fine-tuned afterwards. Training with so few splats from "
-    "the start, or fine-tuning after the removal, usually loses less."
+FINE_TUNED = (
+    "The rest was fine-tuned after each removal, as `splat prune --max-splats` does. Training with "
+    "so few splats from the start may lose less."
 )
 _OVERHEAD_DEG, _DOWN_DEG = 65.0, 25.0
 _SAME_AZIMUTH_DEG = 20.0
@@ -93,7 +93,7 @@ def about_splats(tradeoff: Tradeoff) -> list[str]:
     half = min(points, key=lambda p: abs(math.log(p.splats / own.splats * 2)))
     if half is not own and abs(points.index(half) - at) > 1:
         lines.append(f"Half: {_fewer(half, own)}.")
-    return [*lines, NOT_FINE_TUNED]
+    return [*lines, FINE_TUNED]
 
 
 def about_drawing(tradeoff: Tradeoff) -> list[str]:

@@ -105,6 +105,27 @@ def test_pruning_by_contribution_is_better_than_by_chance(tradeoff, inputs) -> N
     assert half.psnr_db > mean_psnr_db(chance, inputs.held_out, "cpu") + 1
 
 
+def test_fewer_splats_are_those_that_fine_tuning_left(inputs) -> None:
+    """As `splat prune` does after each removal: the next one starts from there."""
+    seen = []
+
+    def brighter(splats, view_counts):
+        assert len(splats) == len(view_counts)
+        seen.append(float(splats.sh[:, 0].mean()))
+        return replace(splats, sh=splats.sh + np.float32(0.01))
+
+    before = float(inputs.splats.sh[:, 0].mean())
+    found = measure_tradeoff(replace(inputs, finetune=brighter), lambda label: None)
+    assert len(found.pruned) == 1 + len(seen) == 1 + len(SHARES)
+    assert seen[-1] - before > 0.05
+    assert found.pruned[-1].psnr_db != pytest.approx(measured_plain(inputs), abs=1e-3)
+
+
+def measured_plain(inputs) -> float:
+    """PSNR of the fewest splats where nothing was fine-tuned."""
+    return float(measure_tradeoff(inputs, lambda label: None).pruned[-1].psnr_db)
+
+
 def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) -> None:
     files = write_report(tmp_path, "<scene>", tradeoff, inputs)
     assert {file.name for file in files} == {
@@ -115,7 +136,7 @@ def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) 
     assert not re.findall(r"(?:src|href)=\"(?!data:)", text)
     assert "<script" not in text
     assert "Trade-off report: &lt;scene&gt;" in text
-    assert summary.NOT_FINE_TUNED in text
+    assert summary.FINE_TUNED in text
     assert tradeoff.worst.name in text
     assert text.count("shimmer") > len(tradeoff.framings)
     assert "<h2>Coverage</h2>" in text
