@@ -103,7 +103,7 @@ def _errors(a: Splats, b: Splats) -> dict[str, NDArray[np.floating]]:
         "log_scale": _largest_difference(a.log_scales, b.log_scales),
         "opacity": _largest_difference(a.opacities[:, None], b.opacities[:, None]),
         "rotation": rotation_angles(a.quaternions, b.quaternions),
-        "sh": _largest_difference(a.sh.reshape(len(a), -1), b.sh.reshape(len(b), -1)),
+        "sh": _largest_difference(*(s.sh.reshape(len(s), 3 * s.sh.shape[1]) for s in (a, b))),
         "colour": np.abs(colours[0] - colours[1]).max(axis=1, initial=0.0),
         "anisotropy": a.log_scales.max(axis=1) - a.log_scales.min(axis=1),
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +29,6 @@ def test_every_capture_of_a_mode_is_the_sample_or_has_a_source() -> None:
     assert len(quality.MODES["full"].captures) >= 10
 
 
-@pytest.mark.skipif(shutil.which("git") is None, reason="no git")
 def test_a_capture_is_copied_from_a_clone_with_a_part_of_its_pictures(tmp_path: Path) -> None:
     clone = tmp_path / "clone"
     for name in ("a/images", "a/masks", "b"):

@@ -266,7 +266,7 @@ def test_a_jpeg_of_very_many_scans_is_refused(tmp_path: Path) -> None:
 def test_stored_splats_of_no_size_are_refused(tmp_path: Path, value: float) -> None:
     path = save_splats(tmp_path / "splats.bin", red_splat())
     whole = path.read_bytes()
-    path.write_bytes(whole[:-24] + np.float64(value).tobytes() + whole[-16:])
+    path.write_bytes(whole[:-32] + np.float64(value).tobytes() + whole[-24:])
     refused(load_splats, path)
 
 
