@@ -38,7 +38,7 @@ def test_a_run_ends_with_the_same_picture_in_any_unit(sample_run: Path, tmp_path
     start = load_stage("seed").load(run / "3-seed")
     settings = train.TrainSettings(steps=400, train_side=160, sh_degree=1, max_splats=8000)
     found = {}
-    for scale in (1.0, 1e-6, 1e6):
+    for scale in (1.0, 0.999, 1e-6, 1e6):
         inputs = {
             "sfm": in_units(reconstruction, scale),
             "seed": splats_in_units(start, scale),
@@ -47,7 +47,9 @@ def test_a_run_ends_with_the_same_picture_in_any_unit(sample_run: Path, tmp_path
         folder.mkdir()
         train.run(inputs, settings, folder, report)
         found[scale] = report.metrics["psnr_db"]
-    assert found == pytest.approx(dict.fromkeys(found, found[1.0]), abs=0.1)
+    # Rounding decides which splats grow: a unit 0.1 % longer moves so short a run by 0.2 dB.
+    low, high = sorted((found[1.0], found[0.999]))
+    assert all(low - 0.1 < psnr_db < high + 0.1 for psnr_db in found.values()), found
 
 
 def test_dropout_is_decided_by_the_number_of_views_alone(tmp_path: Path) -> None:
