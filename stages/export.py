@@ -97,6 +97,11 @@ def run(
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
     prover = Prover.of(splats, cameras, backend_of_settings(settings))
+    if quantised.plain is None:
+        plain_prover = prover
+    else:
+        plain = drop_undrawable(quantised.plain)[0]
+        plain_prover = Prover.of(plain, cameras, backend_of_settings(settings))
     files, figures = [], {}
     for number, name in enumerate(chosen):
         if report.stop_requested.is_set():
@@ -112,7 +117,11 @@ def run(
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
             # pictures are compared with all SH coefficients, values with what the file should hold
-            **_prove(prover.with_original(held), path, report),
+            **_prove(
+                (prover if held.draw_settings.antialias else plain_prover).with_original(held),
+                path,
+                report,
+            ),
         }
         report.progress(number + 1, len(chosen), f".{name}", verify_db=figures[name]["verify_db"])
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
