@@ -8,7 +8,7 @@ here: `quantise` has fine-tuned the splats to the rounding of the formats.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from stages.formats import Format
     from stages.proof.prover import Prover
     from stages.scene import (
+        Camera,
         ExportedAssets,
         ExportedFile,
         QuantisedSplats,
@@ -86,7 +87,7 @@ def run(
     from stages import formats
     from stages.formats.quantisation import splats_to_write
     from stages.formats.values import drop_undrawable
-    from stages.proof.prover import Prover, cameras_for
+    from stages.proof.prover import cameras_for
     from stages.scene import ExportedAssets, ExportedFile
 
     quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
@@ -96,12 +97,7 @@ def run(
     _warn_of_missing(len(splats), dropped, report)
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
-    prover = Prover.of(splats, cameras, backend_of_settings(settings))
-    if quantised.plain is None:
-        plain_prover = prover
-    else:
-        plain = drop_undrawable(quantised.plain)[0]
-        plain_prover = Prover.of(plain, cameras, backend_of_settings(settings))
+    prover_of = _provers(quantised, cameras, backend_of_settings(settings))
     files, figures = [], {}
     for number, name in enumerate(chosen):
         if report.stop_requested.is_set():
@@ -117,11 +113,7 @@ def run(
             "size_bytes": size,
             "bytes_per_splat": round(size / max(1, len(splats)), 2),
             # pictures are compared with all SH coefficients, values with what the file should hold
-            **_prove(
-                (prover if held.draw_settings.antialias else plain_prover).with_original(held),
-                path,
-                report,
-            ),
+            **_prove(prover_of(held), path, report),
         }
         report.progress(number + 1, len(chosen), f".{name}", verify_db=figures[name]["verify_db"])
     for file in _write_meshes(splats, reconstruction, settings, folder, report):
@@ -134,6 +126,24 @@ def run(
     report.metric("formats", figures)
     _write_index(folder, files)
     return ExportedAssets(folder, tuple(files))
+
+
+def _provers(
+    quantised: QuantisedSplats, cameras: tuple[Camera, ...], backend: str
+) -> Callable[[Splats], Prover]:
+    """The prover for the splats of a file: with the pictures of the run's splats that are drawn in
+    the same way, which show all that the format loses."""
+    from stages.formats.values import drop_undrawable
+    from stages.proof.prover import Prover
+
+    originals = [s for s in (quantised.splats, quantised.plain) if s is not None]
+    provers = {
+        splats.draw_settings.antialias: Prover.of(drop_undrawable(splats)[0], cameras, backend)
+        for splats in originals
+    }
+    return lambda held: provers.get(
+        held.draw_settings.antialias, next(iter(provers.values()))
+    ).with_original(held)
 
 
 def _write_meshes(

@@ -280,15 +280,17 @@ class _Source:
         start, length = whole(view, "byteOffset", 0), whole(view, "byteLength")
         offset = whole(accessor, "byteOffset", 0)
         element = dtype.itemsize * width
-        stride = whole(view, "byteStride", element)
-        if stride < element or (stride > 252 and stride != element):
-            raise BadFileError(f"accessor {index} has stride {stride} for elements of {element}")
-        if start + length > len(content) or offset + (count - 1) * stride + element > length:
+        row_bytes = whole(view, "byteStride", element)
+        if row_bytes < element or (row_bytes > 252 and row_bytes != element):
+            raise BadFileError(
+                f"accessor {index} has byteStride {row_bytes} for elements of {element}"
+            )
+        if start + length > len(content) or offset + (count - 1) * row_bytes + element > length:
             raise BadFileError(f"accessor {index} reaches past its buffer")
         if count * _MIN_SPLAT_BYTES > self.buffers.total_bytes():
             raise BadFileError(f"accessor {index} counts more splats than its buffers can hold")
         raw: NDArray[Any] = np.ndarray(
-            (count, width), dtype, content, start + offset, (stride, dtype.itemsize)
+            (count, width), dtype, content, start + offset, (row_bytes, dtype.itemsize)
         )
         values = raw.astype(np.float32)
         if accessor.get("normalized") is True and dtype.kind in "iu":

@@ -25,7 +25,7 @@ def sizes(most: int) -> Iterator[int]:
 def filled(run: SmallRun, stage: str, room: int, folder: Path) -> str:
     """Run `stage` where only `room` bytes are free, give it more, and run it again.
 
-    Returns "full" (told, and the same bytes after that), "enough" (it had enough room), "no mount",
+    Returns "full" (reported, then the same bytes), "enough" (it had enough room), "no mount",
     or what is wrong.
     """
     disk, log = folder / "disk", folder / "full.log"

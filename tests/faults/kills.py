@@ -39,11 +39,11 @@ class Point:
 def points(run: SmallRun, stage: str, folder: Path) -> list[Point]:
     """All points of a stage."""
     run.before(stage, folder)
-    told = folder / "told"
-    status, shown = forked(lambda: _told(stage, folder, told), folder / "log")
+    record = folder / "events"
+    status, shown = forked(lambda: _record_events(stage, folder, record), folder / "log")
     if status:
         raise RuntimeError(shown)
-    events = told.read_text(encoding="utf-8").splitlines()
+    events = record.read_text(encoding="utf-8").splitlines()
     found = [Point(stage, i, name) for i, name in enumerate(events)]
     seen = sorted((folder / "seen").read_text(encoding="utf-8").splitlines())
     known = {name.partition(" ")[2] for name in events}
@@ -69,8 +69,8 @@ def killed(run: SmallRun, at: Point, again: Point | None, folder: Path) -> tuple
     return hits, run.fault_of(at.stage, folder)
 
 
-def _told(stage: str, folder: Path, told: Path) -> None:
-    """Run the stage and write its events to `told`, and the names that appeared to seen."""
+def _record_events(stage: str, folder: Path, record: Path) -> None:
+    """Run the stage and write its events to `record`, and the names that appeared to seen."""
     events: list[str] = []
     _watch_events(folder / "run", events.append)
     before, seen = set(_paths(folder / "run")), dict[str, None]()
@@ -78,7 +78,7 @@ def _told(stage: str, folder: Path, told: Path) -> None:
     try:
         stage_command(stage, folder)
     finally:
-        told.write_text("\n".join(events), encoding="utf-8")
+        record.write_text("\n".join(events), encoding="utf-8")
         (folder / "seen").write_text("\n".join(set(seen) - before), encoding="utf-8")
 
 

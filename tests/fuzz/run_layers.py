@@ -107,11 +107,11 @@ def _checkpoint(folder: Path) -> None:
 
 def _read_checkpoint(path: Path) -> int:
     """A damaged one is reported, renamed, and not used; here that counts as refused."""
-    told: list[str] = []
-    found = checkpoint.load_checkpoint(path.parent, lambda code, _: told.append(code))
+    warnings: list[str] = []
+    found = checkpoint.load_checkpoint(path.parent, lambda code, _: warnings.append(code))
     if found is None:
-        assert told == ["train-checkpoint-damaged"]
-        (words,) = told
+        assert warnings == ["train-checkpoint-damaged"]
+        (words,) = warnings
         raise SplatError(words, given="", wanted="", hint="", family=Family.RUN_FOLDER)
     return len(found[0])
 
