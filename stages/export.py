@@ -8,7 +8,7 @@ here: `quantise` has fine-tuned the splats to the rounding of the formats.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from stages.formats import Format
     from stages.proof.prover import Prover
     from stages.scene import (
-        Camera,
         ExportedAssets,
         ExportedFile,
         QuantisedSplats,
@@ -87,7 +86,7 @@ def run(
     from stages import formats
     from stages.formats.quantisation import splats_to_write
     from stages.formats.values import drop_undrawable
-    from stages.proof.prover import cameras_for
+    from stages.proof.prover import cameras_for, provers_of
     from stages.scene import ExportedAssets, ExportedFile
 
     quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
@@ -97,7 +96,7 @@ def run(
     _warn_of_missing(len(splats), dropped, report)
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
-    prover_of = _provers(quantised, cameras, backend_of_settings(settings))
+    prover_of = provers_of(quantised, cameras, backend_of_settings(settings))
     files, figures = [], {}
     for number, name in enumerate(chosen):
         if report.stop_requested.is_set():
@@ -126,24 +125,6 @@ def run(
     report.metric("formats", figures)
     _write_index(folder, files)
     return ExportedAssets(folder, tuple(files))
-
-
-def _provers(
-    quantised: QuantisedSplats, cameras: tuple[Camera, ...], backend: str
-) -> Callable[[Splats], Prover]:
-    """The prover for the splats of a file: with the pictures of the run's splats that are drawn in
-    the same way, which show all that the format loses."""
-    from stages.formats.values import drop_undrawable
-    from stages.proof.prover import Prover
-
-    originals = [s for s in (quantised.splats, quantised.plain) if s is not None]
-    provers = {
-        splats.draw_settings.antialias: Prover.of(drop_undrawable(splats)[0], cameras, backend)
-        for splats in originals
-    }
-    return lambda held: provers.get(
-        held.draw_settings.antialias, next(iter(provers.values()))
-    ).with_original(held)
 
 
 def _write_meshes(

@@ -80,7 +80,7 @@ def verify(
     code must read the same. Exit status 7 if a file is wrong.
     """
     from stages import formats
-    from stages.proof.prover import Prover, cameras_for
+    from stages.proof.prover import Prover, cameras_for, provers_of
 
     files = _files(target)
     for file in files:
@@ -88,18 +88,23 @@ def verify(
     quiet = quiet or as_json
     if not quiet:
         console.note_compiling()
-    original, prover, found = None, None, []
+    original, prover_of, found = None, None, []
     for number, file in enumerate(files):
         _report_step(f"verifying {file}", number, len(files), quiet, as_json)
         # Our own reader first: it reports damage that makes other parsers crash.
         read = formats.read(file)
-        if original is None or prover is None:
+        if original is None or prover_of is None:
             original = _original(file, against, read)
             cameras = cameras_for(original.splats, original.views)
-            prover = Prover.of(original.splats, cameras, original.backend, original.source_format)
+            if original.quantised is not None:
+                prover_of = provers_of(original.quantised, cameras, original.backend)
+            else:
+                prover_of = Prover.of(
+                    original.splats, cameras, original.backend, original.source_format
+                ).with_original
         del read
         for splats in original.candidates(file):
-            proof = prover.with_original(splats).prove(file, exact=original.itself)
+            proof = prover_of(splats).prove(file, exact=original.itself)
             if not proof.fault:
                 break
         found.append((file, proof))

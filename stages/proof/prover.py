@@ -7,7 +7,7 @@ because drawing takes more memory than the splats themselves.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from stages.proof.content import FileContent
 from stages.proof.matching import Rows
 from stages.raster.backends import AUTO
 from stages.raster.draw import raster_settings_of, renderer
-from stages.scene import Camera, Splats, View, evenly_spaced, split_held_out
+from stages.scene import Camera, QuantisedSplats, Splats, View, evenly_spaced, split_held_out
 from stages.scene.framing import orbit_cameras
 
 _SIDE_PX = 480
@@ -187,6 +187,21 @@ class Prover:
             capped_psnr_db(draw(camera).image, np.clip(picture, 0.0, 1.0))
             for camera, picture in zip(moved, self.pictures, strict=True)
         ]
+
+
+def provers_of(
+    quantised: QuantisedSplats, cameras: tuple[Camera, ...], backend: str
+) -> Callable[[Splats], Prover]:
+    """The prover for the splats of a file of a run: with the pictures of the run's splats that are
+    drawn in the same way, which show all that the format loses."""
+    originals = [s for s in (quantised.splats, quantised.plain) if s is not None]
+    provers = {
+        splats.draw_settings.antialias: Prover.of(drop_undrawable(splats)[0], cameras, backend)
+        for splats in originals
+    }
+    return lambda held: provers.get(
+        held.draw_settings.antialias, next(iter(provers.values()))
+    ).with_original(held)
 
 
 def _central_rows(splats: Splats) -> NDArray[np.bool_] | slice:
