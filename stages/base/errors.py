@@ -42,7 +42,7 @@ class SplatError(Exception):
         self.family = family
 
     def as_dict(self) -> dict[str, str | int]:
-        """The error as plain data, for `--json` and for passing between processes."""
+        """The error as plain data, for `--json`."""
         return {
             "code": self.code,
             "given": self.given,
@@ -50,16 +50,6 @@ class SplatError(Exception):
             "hint": self.hint,
             "family": int(self.family),
         }
-
-    @classmethod
-    def from_dict(cls, data: dict[str, str | int]) -> SplatError:
-        return cls(
-            str(data["code"]),
-            given=str(data["given"]),
-            wanted=str(data["wanted"]),
-            hint=str(data["hint"]),
-            family=Family(int(data["family"])),
-        )
 
 
 class Interrupted(Exception):  # noqa: N818 - a normal way to stop, not an error

@@ -5,11 +5,50 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 # What the system sends where memory is short, and what libraries get that use memory they lack.
 _LACK_OF_MEMORY = ("SIGKILL", "SIGSEGV", "SIGBUS")
+
+
+def python_module(name: str, *arguments: str) -> list[str]:
+    """The command that runs a module of the project.
+
+    -P: modules in the current folder, such as a file named numpy.py, must not be imported."""
+    return [sys.executable, "-P", "-m", name, *arguments]
+
+
+def start_child(
+    command: list[str], output: Any, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start a process that finds the project's modules.
+
+    It ends when its input does, if it calls `die_with_parent`. It is in a session of its own, so
+    that Ctrl-C reaches this process alone. output: for both of its outputs, as `Popen` has it.
+    """
+    root = str(Path(__file__).resolve().parents[2])
+    paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=output,
+        stderr=output,
+        env={**os.environ, **(environment or {}), "PYTHONPATH": paths},
+        start_new_session=True,
+    )
+
+
+def end_child(child: subprocess.Popen[bytes]) -> None:
+    """Kill a process of `start_child`, unless it has ended."""
+    child.kill()
+    child.wait()
+    if child.stdin is not None:
+        child.stdin.close()
 
 
 def die_with_parent(watch_input: bool = True) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 
 # C0 without the line feed, DEL, C1, and the marks that change the direction of writing.
 _CONTROLS = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
@@ -15,6 +16,12 @@ _ADVICE = re.compile(r"[;,] (?:use|see|set|try|consider|pass)\b.*", re.IGNORECAS
 def counted(count: int, noun: str, plural: str = "") -> str:
     """ "1 photograph", "3 photographs", "1,200 splats". plural: where adding an s is wrong."""
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """Names for a message: the first `most` of them, and how many there are besides."""
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(name[:80] for name in names[:most]) + rest
 
 
 def printable(text: str) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from stages.base.text import counted
-from stages.photos.sources import RAW_ADVICE, Findings, listed
+from stages.base.text import counted, listed
+from stages.photos.sources import RAW_ADVICE, Findings
 from stages.scene import TRANSPARENT, Photo
 
 Warn = Callable[[str, str], None]

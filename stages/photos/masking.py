@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stages.base.errors import SplatError
+from stages.base.text import listed
 from stages.photos.decode import FORMATS, MAX_MEGAPIXELS, UPRIGHT, Decoded
 from stages.photos.masks import FOLDER
-from stages.photos.sources import listed
 from stages.scene import IGNORE, TRANSPARENT, Photo
 from stages.scene.capture import PHOTOS_FOLDER
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -26,7 +26,6 @@ OTHER_PICTURES = frozenset(
      ".pgm", ".eps", ".ai", ".ico", ".insp"}
 )  # fmt: skip
 RAW_ADVICE = "Export raw files as JPEG or TIFF first, all with the same white balance and exposure."
-_LISTED = 8
 
 
 @dataclass(frozen=True)
@@ -77,12 +76,6 @@ def suffix_of(name: str) -> str:
 def stem_of(name: str) -> str:
     """A name without its ending, case-folded, with its folders."""
     return str(PurePosixPath(name).with_suffix("")).casefold()
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names for a message, the first few in full."""
-    shown = ", ".join(names[:_LISTED])
-    return shown + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:

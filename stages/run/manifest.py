@@ -64,11 +64,6 @@ class Manifest:
     metrics: dict[str, Any] = field(default_factory=dict)
     warnings: list[list[str]] = field(default_factory=list)
 
-    @property
-    def output_bytes(self) -> int:
-        """Size of all output files together, bytes."""
-        return sum(record.size for record in self.outputs.values())
-
     def write(self, folder: Path) -> None:
         """Write `manifest.json` into `folder` atomically. Raises OSError."""
         write_sealed(folder / MANIFEST, asdict(self))

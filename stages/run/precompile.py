@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from contextlib import suppress
-from pathlib import Path
 
 from stages.base import threads
+from stages.base.parent import end_child, python_module, start_child
 from stages.base.stage import Stage
 from stages.run.pipeline import Listener
 
@@ -51,28 +49,15 @@ class PrecompileListener(Listener):
 
         if cache.are_compiled(_LAST_KERNEL):
             return
-        root = str(Path(__file__).resolve().parents[2])
-        paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        command = python_module("stages.training.compile_kernels", self._backend)
         with suppress(OSError):
-            self._process = subprocess.Popen(
-                # -P: the current folder may hold anything, also a file named numpy.py.
-                [sys.executable, "-P", "-m", "stages.training.compile_kernels", self._backend],
-                stdin=subprocess.PIPE,  # the child ends when this pipe closes: with this process
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                env=os.environ | {"PYTHONPATH": paths},
-                start_new_session=True,  # Ctrl-C goes to the run alone
-            )
+            self._process = start_child(command, subprocess.DEVNULL)
 
     def _wait(self) -> None:
         process = self._process
         if process is None:
             return
-        try:
+        with suppress(subprocess.TimeoutExpired):
             process.wait(_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        if process.stdin is not None:
-            process.stdin.close()
+        end_child(process)
         self._process = None

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
+from stages.base.text import listed
 from stages.scene import Capture
 from stages.structure.fallbacks import Attempt, best_attempt
-from stages.structure.gates import THRESHOLDS, borderline_failures
+from stages.structure.gates import THRESHOLDS, borderline_failures, failure
 from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PARTIAL_POINTS = 50
@@ -18,7 +17,6 @@ _REPORTED = (
     *("configuration", "keypoints_median", "mean_track_length"),
     *("median_triangulation_angle_deg", "baseline_over_depth"),
 )
-_MOST_NAMES = 12  # photographs that a message names
 
 
 def accepted_model(attempts: list[Attempt], capture: Capture, allow_partial: bool) -> SparseModel:
@@ -32,18 +30,15 @@ def accepted_model(attempts: list[Attempt], capture: Capture, allow_partial: boo
             return model
     worst = best.failures[0]
     groups = best.result.groups if best.result is not None else ()
-    code, given = worst.code, worst.given
-    if code == "sfm-too-few-registered" and len(groups) > 1:
-        code = "sfm-separate-groups"
+    if worst.code == "sfm-too-few-registered" and len(groups) > 1:
         names = {photo.image: photo.name for photo in capture.photos}
         described = "; ".join(
-            f"{len(group)} ({_listed(sorted(names[image] for image in group), 3)})"
+            f"{len(group)} ({listed(sorted(names[image] for image in group), 3)})"
             for group in groups[:4]
         )
-        given += f" The largest models are of: {described}."
-    raise SplatError(
-        code, given=given, wanted=worst.wanted, hint=worst.hint, family=Family.RECONSTRUCTION
-    )
+        given = f"{worst.given} The largest models are of: {described}."
+        raise failure("sfm-separate-groups", given, worst.wanted, worst.hint)
+    raise worst
 
 
 def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -> None:
@@ -57,7 +52,7 @@ def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -
         report.warn(
             "sfm-photographs-left-out",
             f"{len(missing)} of {len(capture.photos)} photographs could not be registered and "
-            f"{'is' if len(missing) == 1 else 'are'} not used: {_listed(missing)}. More overlap "
+            f"{'is' if len(missing) == 1 else 'are'} not used: {listed(missing)}. More overlap "
             "with the others would help.",
         )
     if len(best.result.groups) > 1:
@@ -72,13 +67,13 @@ def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -
             f"The standard configuration failed ({attempts[0].failures[0].given}) but another one "
             f"passed: {best.configuration.name}. Check the result with care.",
         )
-    failed = {failure.code for failure in best.failures}
-    for failure in borderline_failures(best.statistics):
-        if failure.code not in failed:
-            report.warn(failure.code, f"{failure.given} {failure.wanted} {failure.hint}")
-    for failure in best.failures:
+    failed = {found.code for found in best.failures}
+    for found in borderline_failures(best.statistics):
+        if found.code not in failed:
+            report.warn(found.code, f"{found.given} {found.wanted} {found.hint}")
+    for found in best.failures:
         report.warn(
-            failure.code, f"Accepted because of --allow-partial: {failure.given} {failure.wanted}"
+            found.code, f"Accepted because of --allow-partial: {found.given} {found.wanted}"
         )
 
 
@@ -102,12 +97,7 @@ def attempt_metrics(attempt: Attempt) -> dict[str, Any]:
     return {
         "configuration": attempt.configuration.name,
         "passed": attempt.passed,
-        "failures": [failure.code for failure in attempt.failures],
+        "failures": [found.code for found in attempt.failures],
         "keypoints_median": attempt.keypoints_median,
         **statistics,
     }
-
-
-def _listed(names: Sequence[str], most: int = _MOST_NAMES) -> str:
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + rest

@@ -18,19 +18,19 @@ from statistics import median
 from zipfile import BadZipFile
 
 from stages.base.atomic import replacing
+from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.structure import database as sqlite
 from stages.structure.chunks import ChunkExecutor, extract_features_in_chunks, match_pairs_in_chunks
 from stages.structure.fallbacks import CONFIGURATIONS, Attempt, Configuration
 from stages.structure.gates import (
-    Failure,
     ModelStatistics,
     check_keypoints,
     check_model,
     check_pairs,
 )
 from stages.structure.job import Job, compared_pairs_path
-from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_step
+from stages.structure.process import WorkerCrashed, WorkerTimedOut, run_step
 from stages.structure.sparse_model import load_result, model_statistics, without_implausible_views
 
 MORE_FEATURES = 2.0  # factor on the number of features
@@ -91,13 +91,11 @@ class AttemptRunner:
             unmatched = any(failure.code == "sfm-no-matches" for failure in failures)
             if failures and (unmatched or not self.allow_partial):
                 return replace(attempt, failures=tuple(failures))
-        except WorkerTimedOut:
-            return Attempt(configuration, (_too_slow(photographs),), empty)
-        except WorkerCrashed as crash:
-            raise crash_error(crash, self.folder) from crash
+        except WorkerTimedOut as late:
+            return Attempt(configuration, (late,), empty)
         return self._mapped(job, attempt, failures)
 
-    def _mapped(self, job: Job, attempt: Attempt, before: list[Failure]) -> Attempt:
+    def _mapped(self, job: Job, attempt: Attempt, before: list[SplatError]) -> Attempt:
         """The attempt with the model of `job` and its failures, added to those `before`."""
         try:
             self._map(job, attempt.configuration)
@@ -105,9 +103,7 @@ class AttemptRunner:
             statistics = replace(attempt.statistics, timed_out=True)
             return replace(attempt, statistics=statistics, failures=tuple(check_model(statistics)))
         except WorkerCrashed as crash:
-            error = crash_error(crash, self.folder)
-            failure = Failure(error.code, error.given, error.wanted, error.hint)
-            return replace(attempt, failures=(failure,))
+            return replace(attempt, failures=(crash,))
         result = load_result(Path(job.out))
         if result.model is not None:
             result = replace(result, model=without_implausible_views(result.model))
@@ -175,7 +171,7 @@ class AttemptRunner:
 
     def _check_deadline(self) -> None:
         if self.out_of_time():
-            raise WorkerTimedOut
+            raise WorkerTimedOut(len(self.base.names))
 
     def _map(self, job: Job, configuration: Configuration) -> None:
         if _is_mapped(Path(job.out)):
@@ -227,12 +223,3 @@ def _is_mapped(out: Path) -> bool:
         return not load_result(out).timed_out
     except (OSError, ValueError, BadZipFile):
         return False
-
-
-def _too_slow(photographs: int) -> Failure:
-    return Failure(
-        "sfm-timed-out",
-        f"Features and matches of {photographs} photographs were not finished in time.",
-        "Structure from motion must finish within --max-minutes.",
-        "Allow more time with --max-minutes, or use fewer or smaller photographs (--max-side).",
-    )

@@ -22,7 +22,7 @@ from stages.base import threads
 from stages.base.blocks import blocks
 from stages.structure import database as sqlite
 from stages.structure.job import Job, chunks_path, selected_pairs_path
-from stages.structure.process import WorkerCrashed, crash_error, run_worker
+from stages.structure.process import run_worker
 
 if TYPE_CHECKING:
     from stages.structure.pairs import Pair
@@ -103,9 +103,6 @@ def run_chunk(chunk: Chunk) -> None:
         photographs=chunk.photographs,
         pairs=chunk.pairs,
     )
-    try:
-        run_worker(part, folder, Event(), _MAX_SECONDS, lambda: None)
-    except WorkerCrashed as crash:
-        raise crash_error(crash, folder) from crash
+    run_worker(part, folder, Event(), _MAX_SECONDS, lambda: None)
     os.replace(part.database, chunk.out)
     shutil.rmtree(folder, ignore_errors=True)

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from stages.structure.gates import Failure, ModelStatistics
+from stages.base.errors import SplatError
+from stages.structure.gates import ModelStatistics
 from stages.structure.sparse_model import MappingResult
 
 
@@ -35,8 +36,8 @@ class Configuration:
     fixes: frozenset[str] = frozenset()
 
 
-_UNREGISTERED = frozenset({"sfm-too-few-registered", "sfm-no-model", "sfm-weak-photographs"})
-_SPARSE = frozenset({"sfm-too-few-points", "sfm-short-tracks", "sfm-too-few-features"})
+_UNREGISTERED = frozenset({"sfm-too-few-registered", "sfm-no-model"})
+_SPARSE = frozenset({"sfm-too-few-points", "sfm-too-few-features"})
 _UNCONNECTED = frozenset({"sfm-separate-groups", "sfm-no-matches"})
 _CAMERA = frozenset({"sfm-implausible-distortion", "sfm-implausible-focal"})
 
@@ -82,7 +83,7 @@ class Attempt:
     """
 
     configuration: Configuration
-    failures: tuple[Failure, ...]
+    failures: tuple[SplatError, ...]
     statistics: ModelStatistics
     result: MappingResult | None = None
     keypoints_median: float = 0.0

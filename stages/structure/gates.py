@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from stages.base.errors import Family, SplatError
 from stages.base.text import counted
 
 CALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC = 2, 4, 5, 6  # COLMAP's TwoViewGeometry
@@ -37,7 +38,6 @@ class ModelStatistics:
         baseline_over_depth: spread of the cameras over their distance to the points.
         flatness: thickness of the points across their best plane, over their smaller extent in it.
         sideways_share: RMS of the camera motion across the optical axes, over all camera motion.
-        weak_photographs: registered photographs that observe fewer than 30 points.
         distortion: k of SIMPLE_RADIAL, of the camera with the largest |k|.
         focal_over_prior: estimated focal length over that of EXIF, of the camera where this ratio
             is farthest from 1; None without EXIF.
@@ -63,7 +63,6 @@ class ModelStatistics:
     baseline_over_depth: float = 0.0
     flatness: float = 1.0
     sideways_share: float = 1.0
-    weak_photographs: int = 0
     distortion: float = 0.0
     focal_over_prior: float | None = None
     pairs_checked: int = 0
@@ -95,12 +94,10 @@ class Thresholds:
     points_per_view: int = 20
     error_share_of_long_side: float = 0.00125  # 2 px of 1600
     error_floor_px: float = 1.5
-    track_length: float = 2.3
     triangulation_angle_deg: float = 3.0
     baseline_over_depth: float = 0.05
     flatness: float = 0.1
     sideways_share: float = 0.1
-    weak_share: float = 0.25
     distortion: float = 1.0
     focal_ratio: float = 2.0
     inconsistent_share: float = 0.1
@@ -114,14 +111,9 @@ class Thresholds:
 THRESHOLDS = Thresholds()
 
 
-@dataclass(frozen=True)
-class Failure:
-    """A gate that was not passed; the fields are those of `SplatError`."""
-
-    code: str
-    given: str
-    wanted: str
-    hint: str
+def failure(code: str, given: str, wanted: str, hint: str) -> SplatError:
+    """The error for a gate that was not passed. It is raised if no configuration passes."""
+    return SplatError(code, given=given, wanted=wanted, hint=hint, family=Family.RECONSTRUCTION)
 
 
 MORE_OVERLAP = (
@@ -134,13 +126,13 @@ MOVE = (
 )
 
 
-def check_keypoints(counts: list[int]) -> list[Failure]:
+def check_keypoints(counts: list[int]) -> list[SplatError]:
     """Before matching: does the median photograph have enough features?"""
     typical = median(counts) if counts else 0
     if typical >= THRESHOLDS.keypoints:
         return []
     return [
-        Failure(
+        failure(
             "sfm-too-few-features",
             f"The median photograph has only {typical:.0f} features that can be matched.",
             f"At least {THRESHOLDS.keypoints} are needed to find its camera pose.",
@@ -150,14 +142,14 @@ def check_keypoints(counts: list[int]) -> list[Failure]:
     ]
 
 
-def check_pairs(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[Failure]:
+def check_pairs(pairs: list[tuple[int, int, int, int]], photographs: int) -> list[SplatError]:
     """After matching: is the view graph connected, and did the camera move?
 
     pairs: (first, second, inliers, configuration) as `database.verified_pairs` gives them.
     """
     if not pairs:
         return [
-            Failure(
+            failure(
                 "sfm-no-matches",
                 "No two photographs match.",
                 "Neighbouring photographs must overlap.",
@@ -185,7 +177,7 @@ def connected_groups(pairs: list[tuple[int, int, int, int]], photographs: int) -
     return sorted(groups, key=lambda group: (-len(group), group))
 
 
-def check_model(model: ModelStatistics) -> list[Failure]:
+def check_model(model: ModelStatistics) -> list[SplatError]:
     """After mapping: every gate that the largest model fails, the most serious first."""
     if model.timed_out:
         return [_timed_out(model)]
@@ -195,15 +187,15 @@ def check_model(model: ModelStatistics) -> list[Failure]:
     if model.registered < THRESHOLDS.fewest_views or not model.points:
         return [_no_model(model)]
     checks = (_check_geometry, _check_camera, _check_registered, _check_support, _check_consistency)
-    return [failure for check in checks for failure in check(model, THRESHOLDS)]
+    return [found for check in checks for found in check(model, THRESHOLDS)]
 
 
-def borderline_failures(model: ModelStatistics) -> list[Failure]:
+def borderline_failures(model: ModelStatistics) -> list[SplatError]:
     """Failures of stricter thresholds, which deserve a warning but do not refuse a model."""
     return list(_check_consistency(model, Thresholds(inconsistent_share=0.02, cut_points=100)))
 
 
-def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
+def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:
     angle, baseline = model.median_triangulation_angle_deg, model.baseline_over_depth
     if angle < thresholds.triangulation_angle_deg:
         yield _no_parallax(f"The median triangulation angle is {angle:.1f} degrees: photographs")
@@ -218,9 +210,9 @@ def _check_geometry(model: ModelStatistics, thresholds: Thresholds) -> Iterator[
         )
 
 
-def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
+def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:
     if abs(model.distortion) > thresholds.distortion:
-        yield Failure(
+        yield failure(
             "sfm-implausible-distortion",
             f"The radial distortion of the lens was estimated as k = {model.distortion:.2f}.",
             f"Lenses have |k| below {thresholds.distortion:g}.",
@@ -229,7 +221,7 @@ def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Fa
         )
     ratio = model.focal_over_prior
     if ratio is not None and not 1 / thresholds.focal_ratio <= ratio <= thresholds.focal_ratio:
-        yield Failure(
+        yield failure(
             "sfm-implausible-focal",
             f"The focal length was estimated as {ratio:.2f} times what the photographs' EXIF says.",
             f"It should lie within a factor of {thresholds.focal_ratio:g}.",
@@ -239,10 +231,10 @@ def _check_camera(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Fa
         )
 
 
-def _check_registered(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
+def _check_registered(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:
     if model.registered < thresholds.registered_share * max(1, model.photographs):
         others = f" ({len(model.models)} separate models)" if len(model.models) > 1 else ""
-        yield Failure(
+        yield failure(
             "sfm-too-few-registered",
             f"Only {model.registered} of {model.photographs} photographs could be "
             f"registered in one model{others}.",
@@ -252,35 +244,20 @@ def _check_registered(model: ModelStatistics, thresholds: Thresholds) -> Iterato
         )
 
 
-def _check_support(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
-    """Are there enough points, with long enough tracks and small enough errors?"""
+def _check_support(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:
+    """Are there enough points, with small enough errors?"""
     if model.points < thresholds.points_per_view * model.registered:
-        yield Failure(
+        yield failure(
             "sfm-too-few-points",
             f"Only {counted(model.points, 'point')} could be triangulated from "
             f"{counted(model.registered, 'photograph')}.",
             f"At least {thresholds.points_per_view} for each photograph are needed.",
             "Add texture to blank surfaces (patterned paper, cloth), and take more photographs.",
         )
-    if model.weak_photographs > thresholds.weak_share * model.registered:
-        yield Failure(
-            "sfm-weak-photographs",
-            f"{model.weak_photographs} of {model.registered} photographs observe fewer than 30 "
-            "points.",
-            f"At most {thresholds.weak_share:.0%} of them may.",
-            MORE_OVERLAP,
-        )
-    if model.mean_track_length < thresholds.track_length:
-        yield Failure(
-            "sfm-short-tracks",
-            f"A point is observed in {model.mean_track_length:.2f} photographs on average.",
-            f"At least {thresholds.track_length} are needed.",
-            MORE_OVERLAP,
-        )
     relative = thresholds.error_share_of_long_side * model.long_side_px
     largest = max(thresholds.error_floor_px, relative)
     if not model.mean_reprojection_error_px <= largest:
-        yield Failure(
+        yield failure(
             "sfm-high-error",
             f"The mean reprojection error is {model.mean_reprojection_error_px:.2f} px.",
             f"It may be {largest:.2f} px at most.",
@@ -289,7 +266,7 @@ def _check_support(model: ModelStatistics, thresholds: Thresholds) -> Iterator[F
         )
 
 
-def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> Iterator[Failure]:
+def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> Iterator[SplatError]:
     """Do the verified pairs fit the model, and are its parts well connected?"""
     bad, checked = model.pairs_inconsistent, model.pairs_checked
     if bad >= thresholds.fewest_inconsistent and bad > thresholds.inconsistent_share * checked:
@@ -306,7 +283,7 @@ def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> Iterat
     # The global mapper registers every photograph; without common points such a pose is a guess.
     least = thresholds.cut_points_global if model.mapper == "global" else thresholds.cut_points
     if model.cut_views and model.cut_points < least:
-        yield Failure(
+        yield failure(
             "sfm-weak-link",
             f"{model.cut_views} of {model.registered} photographs share only "
             f"{counted(model.cut_points, 'point')} with the others, too few to know where they "
@@ -316,8 +293,8 @@ def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> Iterat
         )
 
 
-def _contradiction(given: str) -> Failure:
-    return Failure(
+def _contradiction(given: str) -> SplatError:
+    return failure(
         "sfm-contradictions",
         given,
         "Nothing may move between photographs, and no part of the scene may look like another.",
@@ -328,8 +305,8 @@ def _contradiction(given: str) -> Failure:
     )
 
 
-def _no_parallax(what: str) -> Failure:
-    return Failure(
+def _no_parallax(what: str) -> SplatError:
+    return failure(
         "sfm-no-parallax",
         f"{what} were taken from nearly the same place.",
         "Depth can be measured only when the camera moves sideways.",
@@ -337,12 +314,12 @@ def _no_parallax(what: str) -> Failure:
     )
 
 
-def _separate(groups: list[list[int]], photographs: int) -> Failure:
+def _separate(groups: list[list[int]], photographs: int) -> SplatError:
     single = sum(len(group) == 1 for group in groups)
     parts = [str(len(group)) for group in groups if len(group) > 1 or group is groups[0]]
     match = "matches" if single == 1 else "match"
     alone = f", and {counted(single, 'photograph')} {match} no other" if single else ""
-    return Failure(
+    return failure(
         "sfm-separate-groups",
         f"The {photographs} photographs fall into unconnected groups of "
         f"{', '.join(parts[:6])}{alone}.",
@@ -352,9 +329,9 @@ def _separate(groups: list[list[int]], photographs: int) -> Failure:
     )
 
 
-def _no_model(model: ModelStatistics) -> Failure:
+def _no_model(model: ModelStatistics) -> SplatError:
     found = f" ({model.registered} were, with {counted(model.points, 'point')})"
-    return Failure(
+    return failure(
         "sfm-no-model",
         f"The {model.photographs} photographs could not be registered"
         f"{found if model.registered else ''}.",
@@ -363,8 +340,8 @@ def _no_model(model: ModelStatistics) -> Failure:
     )
 
 
-def _timed_out(model: ModelStatistics) -> Failure:
-    return Failure(
+def _timed_out(model: ModelStatistics) -> SplatError:
+    return failure(
         "sfm-timed-out",
         f"Mapping ran out of time with {model.registered} of {model.photographs} "
         "photographs registered.",

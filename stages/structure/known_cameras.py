@@ -28,7 +28,7 @@ from stages.structure.known_points import find_points
 from stages.structure.levelling import levelling_rotation, up_direction
 from stages.structure.match_cameras import PosedPhoto, match_cameras
 from stages.structure.metric_scale import KnownScale, find_metric_scale
-from stages.structure.process import WorkerCrashed, WorkerTimedOut, crash_error, run_step
+from stages.structure.process import run_step
 from stages.structure.sparse_model import camera_centres
 from stages.structure.undistorted_images import IMAGES, mask_file, write_undistorted_images
 
@@ -178,17 +178,12 @@ def neighbours(poses: NDArray[np.float64]) -> NDArray[np.int32]:
 
 def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], float]) -> None:
     """Features, matches, and the check of poses and points from matches; skips finished steps."""
-    try:
-        for step in ("features", "neighbours", "triangulation"):
-            marker = work / f"{step}.done"
-            if not marker.exists():
-                sqlite.repair_or_delete(Path(job.database))
-                run_step(replace(job, step=step), work, report, seconds_left())
-                marker.touch()
-    except WorkerTimedOut:
-        raise _timed_out() from None
-    except WorkerCrashed as crash:
-        raise crash_error(crash, work) from crash
+    for step in ("features", "neighbours", "triangulation"):
+        marker = work / f"{step}.done"
+        if not marker.exists():
+            sqlite.repair_or_delete(Path(job.database))
+            run_step(replace(job, step=step), work, report, seconds_left())
+            marker.touch()
 
 
 def _refined(cameras: Sequence[Camera], path: Path, report: Report) -> list[Camera]:
@@ -319,13 +314,3 @@ def _check_usable(posed: Sequence[PosedPhoto], refine: bool) -> None:
             hint="Leave --split away; then every eighth photograph is held out.",
             family=Family.USAGE,
         )
-
-
-def _timed_out() -> SplatError:
-    return SplatError(
-        "sfm-timed-out",
-        given="Features and matches of the photographs were not finished in time.",
-        wanted="The cameras are checked against matches before they are used.",
-        hint="Allow more time with --max-minutes, or use fewer or smaller photographs.",
-        family=Family.RECONSTRUCTION,
-    )

@@ -10,13 +10,12 @@ from pathlib import PurePosixPath
 
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Report
-from stages.base.text import counted
+from stages.base.text import counted, listed
 from stages.cameras.camera_file import CameraFile
 from stages.cameras.lens import Lens
 from stages.photos.sources import LOSSLESS, LOSSY, OTHER_PICTURES, RAW
 from stages.scene import Camera, Capture, Photo, View
 
-_MOST_NAMES = 6  # in a message
 _SUFFIXES = LOSSY | LOSSLESS | RAW | OTHER_PICTURES
 _FEWEST = 3  # photographs
 _SHAPE_TOLERANCE = 0.01
@@ -142,13 +141,12 @@ def _check_missing(
         problems.append(
             f"{counted(len(missing), 'camera')} of the file "
             f"{'names' if len(missing) == 1 else 'name'} photographs that are not there "
-            f"({_listed(missing)})"
+            f"({listed(missing)})"
         )
     if without:
         has = "has" if len(without) == 1 else "have"
         problems.append(
-            f"{counted(len(without), 'photograph')} {has} no camera in the file "
-            f"({_listed(without)})"
+            f"{counted(len(without), 'photograph')} {has} no camera in the file ({listed(without)})"
         )
     if not problems:
         return
@@ -164,15 +162,10 @@ def _check_missing(
     report.warn(code, f"{given} These are left out.")
 
 
-def _listed(names: list[str]) -> str:
-    rest = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return ", ".join(name[:80] for name in names[:_MOST_NAMES]) + rest
-
-
 def _ambiguous(name: str, photos: list[str]) -> SplatError:
     return SplatError(
         "cameras-ambiguous",
-        given=f"The camera of {name[:80]} may belong to any of {_listed(photos)}.",
+        given=f"The camera of {name[:80]} may belong to any of {listed(photos)}.",
         wanted="Names that identify one photograph each.",
         hint="Give a folder of photographs with only one of them.",
     )

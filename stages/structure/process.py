@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +11,7 @@ from threading import Event
 
 from stages.base.disk import disk_full
 from stages.base.errors import Family, Interrupted, SplatError
-from stages.base.parent import how_it_ended
+from stages.base.parent import end_child, how_it_ended, python_module, start_child
 from stages.base.stage import Report
 from stages.structure.job import Job
 from stages.structure.worker_progress import read_progress
@@ -25,16 +23,41 @@ _PROGRESS = re.compile(r"I\d{8} ")  # an INFO line of glog
 _DISK_FULL = ("no space left on device", "database or disk is full", "disk quota exceeded")
 
 
-class WorkerCrashed(Exception):  # noqa: N818 - says what happened
-    """The worker ended with another status than 0. status: negative for a signal."""
+class WorkerCrashed(SplatError):  # noqa: N818 - says what happened
+    """The worker ended with another status than 0 (negative for a signal).
 
-    def __init__(self, step: str, status: int, tail: str) -> None:
-        super().__init__(f"{step} ended with status {status}:\n{tail}")
-        self.step, self.status, self.tail = step, status, tail
+    Args:
+        step: of the job.
+        status: how the worker ended.
+        tail: the last lines of its log.
+        log: where the whole log is.
+    """
+
+    def __init__(self, step: str, status: int, tail: str, log: Path) -> None:
+        lines = [line for line in tail.splitlines() if line.strip()]
+        super().__init__(
+            "sfm-crashed",
+            given=f"COLMAP ended with {how_it_ended(status)} during {step}. "
+            f"The last line of its log: {lines[-1] if lines else '(none)'}",
+            wanted="COLMAP must finish without an error.",
+            hint=f"Give the same command again; if it ends the same way, use smaller photographs "
+            f"(--max-side). The whole log is {log}.",
+            family=Family.RECONSTRUCTION,
+        )
 
 
-class WorkerTimedOut(Exception):  # noqa: N818 - says what happened
-    """The worker was killed because its time was up."""
+class WorkerTimedOut(SplatError):  # noqa: N818 - says what happened
+    """The worker was killed because its time was up. photographs: how many the job has."""
+
+    def __init__(self, photographs: int) -> None:
+        super().__init__(
+            "sfm-timed-out",
+            given=f"Features and matches of {photographs} photographs were not finished in time.",
+            wanted="Structure from motion must finish within --max-minutes.",
+            hint="Allow more time with --max-minutes, or use fewer or smaller photographs "
+            "(--max-side).",
+            family=Family.RECONSTRUCTION,
+        )
 
 
 def run_worker(
@@ -53,35 +76,20 @@ def run_worker(
     """
     path = job.write(folder / "job.json")
     log = folder / "log.txt"
-    root = str(Path(__file__).resolve().parents[2])
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    }
     # A BLAS with several threads may add in another order when cores are busy; COLMAP has its own
     # threads.
-    environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     with log.open("wb") as output:
-        # In a session of its own, so that Ctrl-C reaches the parent alone.
-        worker = subprocess.Popen(
-            _command(path),
-            stdin=subprocess.PIPE,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            start_new_session=True,
-        )
+        worker = start_child(_command(path), output, environment)
         try:
-            _watch(worker, stop, time.monotonic() + max_seconds, tick)
+            _watch(worker, job, stop, time.monotonic() + max_seconds, tick)
         finally:
-            worker.kill()
-            worker.wait()
-            if worker.stdin is not None:
-                worker.stdin.close()
+            end_child(worker)
     if worker.returncode != 0:
         tail = _tail(log)
         if any(words in tail.lower() for words in _DISK_FULL):
             raise disk_full("structure from motion", folder)
-        raise WorkerCrashed(job.step, worker.returncode, tail)
+        raise WorkerCrashed(job.step, worker.returncode, tail, log)
     tick()
 
 
@@ -101,12 +109,15 @@ def run_step(job: Job, folder: Path, report: Report, max_seconds: float, suffix:
 
 
 def _command(job: Path) -> list[str]:
-    # -P: modules in the current folder, such as a file named numpy.py, must not be imported.
-    return [sys.executable, "-P", "-m", "stages.structure.worker", str(job)]
+    return python_module("stages.structure.worker", str(job))
 
 
 def _watch(
-    worker: subprocess.Popen[bytes], stop: Event, deadline: float, tick: Callable[[], None]
+    worker: subprocess.Popen[bytes],
+    job: Job,
+    stop: Event,
+    deadline: float,
+    tick: Callable[[], None],
 ) -> None:
     next_tick = 0.0
     while worker.poll() is None:
@@ -114,7 +125,7 @@ def _watch(
             raise Interrupted
         now = time.monotonic()
         if now > deadline:
-            raise WorkerTimedOut
+            raise WorkerTimedOut(len(job.names))
         if now >= next_tick:
             tick()
             next_tick = now + _TICK_SECONDS
@@ -128,18 +139,3 @@ def _tail(log: Path) -> str:
     # Other threads and processes go on printing their progress.
     errors = [line for line in lines if not _PROGRESS.match(line)]
     return "\n".join((errors or lines)[-_TAIL_LINES:])
-
-
-def crash_error(crash: WorkerCrashed, folder: Path) -> SplatError:
-    """A worker's crash as an error for the user, which names the log in `folder`."""
-    lines = [line for line in crash.tail.splitlines() if line.strip()]
-    last = lines[-1] if lines else "(none)"
-    return SplatError(
-        "sfm-crashed",
-        given=f"COLMAP ended with {how_it_ended(crash.status)} during {crash.step}. "
-        f"The last line of its log: {last}",
-        wanted="COLMAP must finish without an error.",
-        hint=f"Give the same command again; if it ends the same way, use smaller photographs "
-        f"(--max-side). The whole log is {folder / 'log.txt'}.",
-        family=Family.RECONSTRUCTION,
-    )

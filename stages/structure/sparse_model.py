@@ -18,7 +18,6 @@ _SAMPLED_POINTS = 4000  # every pair of rays of a point is compared, so a sample
 _SAMPLED_RAYS = 24
 FEWEST_OBSERVATIONS = 15
 IMPLAUSIBLE_SHARE = 0.1  # of the photographs
-_WEAK_OBSERVATIONS = 30
 CONSISTENT_RATIO = (
     0.25  # of a pair's matches; pairs of a good model have 0.9 and more, false ones 0.05
 )
@@ -243,7 +242,6 @@ def model_statistics(result: MappingResult, photographs: int, mapper: str) -> Mo
     sample = np.arange(0, len(model.points), max(1, len(model.points) // _SAMPLED_POINTS))
     angles = triangulation_angles(model, sample)
     errors = point_errors(model)
-    seen = np.bincount(model.observing_views, minlength=len(model.names))
     inconsistent = np.flatnonzero(model.pair_inlier_ratios < CONSISTENT_RATIO)
     cut = weakest_cut(model.observed_points, model.observing_views, len(model.names))
     return ModelStatistics(
@@ -260,7 +258,6 @@ def model_statistics(result: MappingResult, photographs: int, mapper: str) -> Mo
         baseline_over_depth=baseline_over_depth(model),
         flatness=flatness(model.points) if len(model.points) > 3 else 1.0,
         sideways_share=sideways_share(model),
-        weak_photographs=int(np.sum(seen < _WEAK_OBSERVATIONS)),
         distortion=_largest(model.camera_params[:, 3]),
         focal_over_prior=_focal_over_prior(model),
         pairs_checked=len(model.pairs),

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from stages.base.text import listed
 from stages.photos.advice import about_capture
 from stages.photos.load import load_image
 from stages.photos.quality import measure, near_duplicates
-from stages.photos.sources import listed
 from stages.scene import Photo
 from tests.photos.made_files import textured
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from stages.base.errors import SplatError
 from stages.structure.fallbacks import (
     CONFIGURATIONS,
     Attempt,
@@ -9,11 +10,11 @@ from stages.structure.fallbacks import (
     best_attempt,
     try_configurations,
 )
-from stages.structure.gates import Failure, ModelStatistics
+from stages.structure.gates import ModelStatistics, failure
 
 
-def failing(*codes: str) -> tuple[Failure, ...]:
-    return tuple(Failure(code, "G.", "W.", "H.") for code in codes)
+def failing(*codes: str) -> tuple[SplatError, ...]:
+    return tuple(failure(code, "G.", "W.", "H.") for code in codes)
 
 
 class Script:

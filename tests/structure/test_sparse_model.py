@@ -46,7 +46,6 @@ def test_figures_of_a_half_circle() -> None:
     assert statistics.median_triangulation_angle_deg == pytest.approx(152.0, abs=6)
     assert statistics.focal_over_prior == pytest.approx(1.05)
     assert statistics.distortion == -0.05
-    assert statistics.weak_photographs == 0
     assert (statistics.pairs_checked, statistics.pairs_inconsistent) == (6, 0)
     assert (statistics.cut_points, statistics.cut_views) == (200, 3)
 
