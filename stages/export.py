@@ -91,8 +91,9 @@ def run(
 
     quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
     reconstruction: Reconstruction = inputs["sfm"]
+    place = reconstruction.place
     _clear(folder)
-    splats, dropped = drop_undrawable(quantised.splats)
+    splats, dropped = drop_undrawable(replace(quantised.splats, place=place))
     _warn_of_missing(len(splats), dropped, report)
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
     cameras = cameras_for(splats, reconstruction.views)
@@ -103,7 +104,7 @@ def run(
             raise Interrupted("stopped before a file")
         report.progress(number, len(chosen), f"writing .{name}")
         path = folder / f"{settings.name}.{name}"
-        held = splats_to_write(FORMATS[name], quantised)
+        held = replace(splats_to_write(FORMATS[name], quantised), place=place)
         formats.write(path, held, units=reconstruction.units, views=reconstruction.views)
         _warn_of_losses(FORMATS[name], path, held, report)
         size = FORMATS[name].size_bytes(path)

@@ -43,7 +43,7 @@ def convert(
         begin(f"reading {source}")
         splats = formats.read(source)
         begin(f"writing {target}")
-        dropped = formats.write(target, splats)
+        dropped = formats.write(target, splats, units=formats.units_of(source))
         warnings = [loss.text for loss in losses_of(rows[1], target.name, splats)]
         begin(f"comparing {target}")
         found, loss = _proven(source, target, drop_undrawable(splats)[0])

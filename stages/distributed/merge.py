@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ def merge_blocks(
 
 
 def _concatenated(parts: Sequence[Splats], draw_settings: DrawSettings) -> Splats:
-    arrays = {
+    arrays: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in (*("means", "quaternions", "log_scales"), "opacity_logits", "sh", "sh_degrees")
     }

@@ -149,7 +149,7 @@ def join(first: Splats, second: Splats) -> Splats:
         )
     means = (second.means + (second.origin - first.origin)).astype(first.means.dtype)
     both = concatenate([first, replace(second, means=means)])
-    return replace(both, origin=first.origin, draw_settings=first.draw_settings)
+    return replace(both, origin=first.origin, place=first.place, draw_settings=first.draw_settings)
 
 
 def decimate_scene(scene: EditedScene, count: int) -> Splats:

@@ -30,6 +30,14 @@ class Similarity:
     rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
+    @property
+    def inverse_matrix(self) -> NDArray[np.float64]:
+        """[4, 4] takes transformed points back."""
+        linear = self.rotation.T / self.scale
+        found = np.eye(4)
+        found[:3, :3], found[:3, 3] = linear, -linear @ self.offset
+        return found
+
     def after(self, first: Similarity) -> Similarity:
         """The transform that applies `first` and then this one."""
         offset = self.scale * self.rotation @ first.offset + self.offset
@@ -66,6 +74,7 @@ class Similarity:
             quaternions[rows] = splats.quaternions[rows].astype(np.float64) @ left_product.T
             if sh is not splats.sh:
                 sh[rows] = np.einsum("km,nmc->nkc", sh_rotation, splats.sh[rows].astype(np.float64))
+        place = splats.place and splats.place.moved(self.inverse_matrix)
         return replace(
             splats,
             means=means,
@@ -73,6 +82,7 @@ class Similarity:
             log_scales=logs,
             sh=sh,
             origin=linear @ splats.origin + shift + 0.0,
+            place=place,
             draw_settings=replace(
                 splats.draw_settings, near=splats.draw_settings.near * self.scale
             ),

@@ -53,7 +53,8 @@ def write(
 ) -> int:
     """Write `splats` in the format that the suffix of `path` stands for, completely or not at all.
 
-    Beside a format that cannot hold it, the origin is written to `offset.offset_path(path)`.
+    Beside a format that cannot hold them, origin and place are written to
+    `offset.offset_path(path)`.
 
     Args:
         path: the file to write.
@@ -87,8 +88,13 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     `format_of`, or "splats-unreadable".
     """
     from stages.base.bad_files import reading
+    from stages.formats.offset import offset_path, read_offset
     from stages.formats.values import check_finite, nonfinite_allowed
 
-    path, reader = Path(path), load_object(format_of(path).reader)
+    path, row = Path(path), format_of(path)
     with nullcontext() if strict else nonfinite_allowed(), reading(path):
-        return check_finite(reader(path))
+        splats: Splats = check_finite(load_object(row.reader)(path))
+    if row.holds_origin or not offset_path(path).exists():
+        return splats
+    with reading(offset_path(path)):
+        return read_offset(path, row, splats)

@@ -118,7 +118,10 @@ def _header_text(splats: Splats, degree: int, units: str) -> bytes:
         lines.append(f"element sh {len(splats)}")
         rest = 3 * ((degree + 1) ** 2 - 1)
         lines += [f"property uchar f_rest_{i}" for i in range(rest)]
-    return header_text(units, splats.origin, lines, antialias=splats.draw_settings.antialias)
+    return header_text(
+        *(units, splats.origin, splats.place, lines),
+        antialias=splats.draw_settings.antialias,
+    )
 
 
 def _pack(splats: Splats) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
@@ -208,7 +211,8 @@ def unpack(path: Path, header: Header) -> Splats:
         raise BadFileError("it is a compressed .ply whose words are no uint")
     rest = _sh_rows(path, header)
     degree = 0 if rest is None else math.isqrt(len(rest.dtype.names or ()) // 3 + 1) - 1
-    splats = replace(allocate(len(vertices), degree), origin=header.origin)
+    splats = allocate(len(vertices), degree)
+    splats = replace(splats, origin=header.origin, place=header.place)
     splats = splats.with_antialias(header.antialias)
     for rows in reported_blocks(len(vertices), _BLOCK):
         chunks = ranges[rows.start // CHUNK : -(-rows.stop // CHUNK)]

@@ -17,9 +17,10 @@ from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
 from stages.base.distribution import VERSION
 from stages.base.errors import Family, SplatError
-from stages.formats.json_fields import origin_field
+from stages.formats.json_fields import location_fields
 from stages.scene import Splats
 from stages.scene.flip import flipped
+from stages.scene.place import EarthPlace
 
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121, "<u4": 5125}
@@ -57,16 +58,17 @@ def write_file(
     Args:
         path: the file.
         primitives: attributes by name, all with the same number of rows, y up.
-        splats: for what asset.extras holds: the origin, in the axes of the file, because positions
-            relative to 0 would exceed the precision of float32; whether they are to be drawn with
-            opacity compensation, of which KHR_gaussian_splatting says nothing.
+        splats: for what asset.extras holds: origin and place, in the axes of the file, because
+            positions relative to 0 would exceed the precision of float32; whether they are to be
+            drawn with opacity compensation, of which KHR_gaussian_splatting says nothing.
         units: "metres" or "arbitrary".
         node_scale: scale of the node.
 
     Raises SplatError when a file cannot be written or a .glb would exceed 4 GiB.
     """
     more: dict[str, Any] = {"antialiased": True} if splats.draw_settings.antialias else {}
-    made_of = asset(units, flipped(splats.take(slice(0))).origin, **more)
+    y_up = flipped(splats.take(slice(0)))
+    made_of = asset(units, y_up.origin, y_up.place, **more)
     document = _document(primitives, made_of, node_scale)
     written = [attribute for attributes in primitives for attribute in attributes.values()]
     write = write_glb if path.suffix.lower() == ".glb" else _write_pair
@@ -107,18 +109,28 @@ def _document(
     }
 
 
-def asset(units: str, origin: NDArray[np.float64], made: str = "", **more: Any) -> dict[str, Any]:
+def asset(
+    units: str,
+    origin: NDArray[np.float64],
+    place: EarthPlace | None,
+    made: str = "",
+    **more: Any,
+) -> dict[str, Any]:
     """The `asset` of a document.
 
     Args:
         units: "metres" or "arbitrary".
-        origin: [3] in the axes of the file.
+        origin, place: of the scene, in the axes of the file.
         made: the kind of content, in brackets after the name of the generator.
         more: further extras.
     """
     generator = f"splat {VERSION}{made and f' ({made})'}"
     extras: dict[str, Any] = {"units": units, **more}
-    return {"version": "2.0", "generator": generator, "extras": extras | origin_field(origin)}
+    return {
+        "version": "2.0",
+        "generator": generator,
+        "extras": extras | location_fields(origin, place),
+    }
 
 
 def buffer_view(attribute: Attribute, offset: int, target: int = ARRAY_BUFFER) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
-from stages.formats.json_fields import numbers, origin_of, whole
+from stages.formats.json_fields import located, numbers, whole
 from stages.formats.values import concatenate, log_scales_of, logits_of
 from stages.scene import Splats
 from stages.scene.flip import flipped
@@ -55,7 +55,8 @@ def read(path: Path) -> Splats:
         raise BadFileError(f"it is a mesh, not splats: nothing in it uses {_EXTENSION}")
     splats = concatenate(parts)
     del parts
-    means, origin = recentred(splats.means.astype(np.float64), origin_of(extras))
+    splats = located(splats, extras)
+    means, origin = recentred(splats.means.astype(np.float64), splats.origin)
     splats = replace(splats, means=means, origin=origin)
     splats = splats.with_antialias(bool(extras.get("antialiased", False)))
     return flipped(splats, reuse=True)

@@ -1,13 +1,17 @@
-"""Numbers in the JSON of files, checked before use: a file may come from anywhere."""
+"""Numbers and places in the JSON of files, checked before use: a file may come from anywhere."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
+from stages.scene import Splats
+from stages.scene.place import EarthPlace
 
 _LARGEST = 1 << 53
 
@@ -28,11 +32,37 @@ def numbers(holder: Any, key: str, count: int, default: Any = None) -> NDArray[n
     return array
 
 
-def origin_of(asset: Any) -> NDArray[np.float64]:
-    """[3] the origin that `origin_field` wrote; 0 if there is none."""
-    return numbers(asset if isinstance(asset, dict) else {}, "splat_origin", 3, [0, 0, 0])
+def located(splats: Splats, holder: Any) -> Splats:
+    """The splats, their positions as a file stores them, with the origin and the place that
+    `location_fields` wrote into `holder`. Raises BadFileError."""
+    fields = holder if isinstance(holder, Mapping) else {}
+    origin = numbers(fields, "splat_origin", 3, [0, 0, 0])
+    place = place_of(fields.get("splat_place"), origin)
+    return replace(splats, origin=origin, place=place)
 
 
-def origin_field(origin: NDArray[np.float64]) -> dict[str, list[float]]:
-    """The entry for an origin [3]; none for 0."""
-    return {"splat_origin": [float(v) for v in origin]} if origin.any() else {}
+def location_fields(origin: NDArray[np.float64], place: EarthPlace | None) -> dict[str, Any]:
+    """What a file says of where it lies: nothing for the origin 0 and no place.
+
+    Args:
+        origin: [3] as in `Splats`, in the axes of the file.
+        place: as in `Splats`, of the file's axes. The file holds the place of its own positions, so
+            that who reads it needs no origin.
+    """
+    fields: dict[str, Any] = {}
+    if origin.any():
+        fields["splat_origin"] = [float(v) for v in origin]
+    if place is not None:
+        fields["splat_place"] = place.beside(origin).to_json()
+    return fields
+
+
+def place_of(stated: Any, origin: NDArray[np.float64]) -> EarthPlace | None:
+    """The place of a world whose positions, less `origin` [3], lie where the file has `stated`.
+    Raises BadFileError."""
+    if stated is None:
+        return None
+    try:
+        return EarthPlace.from_json(stated).beside(-origin)
+    except ValueError as error:
+        raise BadFileError(str(error)) from error

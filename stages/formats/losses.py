@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.lazy import load_object
-from stages.formats.offset import offset_path
+from stages.formats.offset import is_located, offset_path
 from stages.formats.table import Format
 from stages.formats.values import drop_undrawable
 from stages.scene import Splats
@@ -41,13 +41,12 @@ def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
                 f"`splat export run --format {row.ending} --drawing plain`.",
             )
         )
-    if not row.holds_origin and splats.origin.any():
-        offset = ", ".join(f"{value:.10g}" for value in splats.origin)
+    if not row.holds_origin and is_located(splats):
         found.append(
             Loss(
                 "origin",
-                f"{file_name} has no field for the origin of the scene ({offset}), which was "
-                f"written to {offset_path(Path(file_name)).name}.",
+                f"{file_name} has no field for where the scene lies, which was written to "
+                f"{offset_path(Path(file_name)).name}.",
             )
         )
     return found

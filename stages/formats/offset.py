@@ -1,14 +1,17 @@
-"""The origin of a georeferenced scene, in a file of JSON beside those that have no field for it."""
+"""Origin and place of a scene, in a file of JSON beside those that have no field for them."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from stages.base.atomic import replacing
+from stages.formats.json_fields import located
 from stages.formats.table import Format
 from stages.scene import Splats
-from stages.scene.flip import FLIP
+from stages.scene.flip import flipped
 
 
 def offset_path(path: Path) -> Path:
@@ -17,18 +20,39 @@ def offset_path(path: Path) -> Path:
 
 
 def write_offset(path: Path, row: Format, splats: Splats, units: str) -> None:
-    """Write the origin of `splats` beside `path`, in the axes of the format; remove the file that
-    an earlier scene left if there is no origin. Raises SplatError when it cannot be written."""
+    """Write origin and place of `splats` beside `path`, in the axes of the format; if there is
+    neither, remove the file that an earlier scene left. Raises SplatError when it cannot be
+    written."""
     beside = offset_path(path)
-    if not splats.origin.any():
+    if not is_located(splats):
         beside.unlink(missing_ok=True)
         return
-    offset = splats.origin * (FLIP if row.y_up else 1) + 0.0  # no negative zeros
-    content = {
+    said = flipped(splats.take(slice(0))) if row.y_up else splats
+    content: dict[str, Any] = {
         "file": path.name,
-        "offset": [float(value) for value in offset],
+        "offset": [float(value) for value in said.origin],
         "axes": "right, up, back" if row.y_up else "right, down, forward",
         "units": units,
     }
+    if said.place is not None:
+        content["splat_place"] = said.place.beside(said.origin).to_json()
     with replacing(beside) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def read_offset(path: Path, row: Format, splats: Splats) -> Splats:
+    """The splats of the file at `path` with the origin and the place that the file beside it holds.
+    Raises BadFileError, or what damaged bytes cause."""
+    content = json.loads(offset_path(path).read_text(encoding="utf-8"))
+    holder = {
+        "splat_origin": content.get("offset", [0, 0, 0]),
+        "splat_place": content.get("splat_place"),
+    }
+    said = located(splats.take(slice(0)), holder)
+    said = flipped(said) if row.y_up else said
+    return replace(splats, origin=said.origin, place=said.place)
+
+
+def is_located(splats: Splats) -> bool:
+    """Whether there is something to say of where they lie."""
+    return bool(splats.origin.any()) or splats.place is not None

@@ -66,7 +66,10 @@ def blocks(splats: Splats, units: str) -> Iterator[bytes]:
 def _header_text(splats: Splats, units: str) -> bytes:
     properties = [f"property float {name}" for name in property_names(splats.sh_degree)]
     elements = [f"element vertex {len(splats)}", *properties]
-    return header_text(units, splats.origin, elements, antialias=splats.draw_settings.antialias)
+    return header_text(
+        *(units, splats.origin, splats.place, elements),
+        antialias=splats.draw_settings.antialias,
+    )
 
 
 def _table(splats: Splats, rows: slice) -> NDArray[np.float32]:
@@ -111,9 +114,9 @@ def read(path: Path) -> Splats:
             else:
                 splats.means[rows] = _floats(table, ["x", "y", "z"])
     if exact is None:
-        return replace(splats, origin=header.origin)
+        return replace(splats, origin=header.origin, place=header.place)
     means, origin = recentred(exact, header.origin)
-    return replace(splats, means=means, origin=origin)
+    return replace(splats, means=means, origin=origin, place=header.place)
 
 
 def _fill(splats: Splats, table: NDArray[Any], rest_count: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
+from stages.formats.json_fields import place_of
+from stages.scene.place import EarthPlace
 
 HEADER_LIMIT_BYTES = 1 << 20
 _MOST_PROPERTIES = 1000
@@ -30,6 +33,7 @@ TYPES = {
 def header_text(
     units: str,
     origin: NDArray[np.float64],
+    place: EarthPlace | None,
     elements: Sequence[str],
     note: str = "",
     antialias: bool = False,
@@ -38,7 +42,7 @@ def header_text(
 
     Args:
         units: "metres" or "arbitrary".
-        origin: [3] of the scene, world units.
+        origin, place: of the scene, as in `Splats`.
         elements: the lines of elements and properties.
         note: a comment.
         antialias: whether the splats are to be drawn with opacity compensation. Said in the comment
@@ -49,6 +53,8 @@ def header_text(
     lines.append(f"comment units: {units}")
     if origin.any():
         lines.append("comment splat_origin " + " ".join(repr(float(v)) for v in origin))
+    if place is not None:
+        lines.append(f"comment splat_place {json.dumps(place.beside(origin).to_json())}")
     if antialias:
         lines.append("comment SplatRenderMode: mip")
     return "\n".join([*lines, *elements, "end_header", ""]).encode("ascii")
@@ -64,11 +70,12 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """antialias: whether a comment asks for opacity compensation."""
+    """origin, place: as in `Splats`. antialias: whether a comment asks for opacity compensation."""
 
     encoding: str
     elements: tuple[Element, ...]
     origin: NDArray[np.float64]
+    place: EarthPlace | None
     antialias: bool
     data_starts: int
 
@@ -108,6 +115,7 @@ def read_header(file: BinaryIO) -> Header:
     if end is None:
         raise BadFileError("its header does not end")
     encoding, origin, elements = "", np.zeros(3), []
+    stated = None
     antialias: set[bool] = set()
     for line in re.split(r"[\r\n]+", start[: end.start()].decode("utf-8", "replace"))[1:]:
         words = line.split()
@@ -116,6 +124,8 @@ def read_header(file: BinaryIO) -> Header:
                 pass
             case ["comment", "splat_origin", x, y, z]:
                 origin = np.array([float(x), float(y), float(z)])
+            case ["comment", "splat_place", *rest]:
+                stated = json.loads(" ".join(rest))
             case ["element", name, count]:
                 elements.append(Element(name, _count(count), (), False))
             case ["property", *rest] if elements:
@@ -130,7 +140,8 @@ def read_header(file: BinaryIO) -> Header:
         raise BadFileError(f"its encoding {encoding[:40]!r} is not known")
     if len(antialias) > 1:
         raise BadFileError("its comments contradict each other about antialiasing")
-    return Header(encoding, tuple(elements), origin, True in antialias, end.end())
+    place = place_of(stated, origin)
+    return Header(encoding, tuple(elements), origin, place, True in antialias, end.end())
 
 
 def _antialias(words: list[str]) -> set[bool]:

@@ -26,7 +26,7 @@ from stages.base.blocks import reported_blocks
 from stages.base.text import counted
 from stages.formats import codebook, smallest_three
 from stages.formats.compressed_ply import outlier_shells
-from stages.formats.json_fields import origin_field
+from stages.formats.json_fields import location_fields
 from stages.formats.sog_read import ANTIALIASED, PALETTE_LIMIT, PER_LINE
 from stages.formats.values import linear_opacities, unit_quaternions
 from stages.scene import Splats, morton
@@ -65,7 +65,11 @@ def sog_members(splats: Splats, places: NDArray[np.intp], units: str) -> dict[st
     meta: dict[str, Any] = {"version": 2, "count": len(splats), "antialias": antialias}
     if antialias:
         meta["model"] = ANTIALIASED  # as splat-transform writes and reads it
-    meta["asset"] = {"generator": "splat", "units": units} | origin_field(splats.origin)
+    meta["asset"] = {
+        "generator": "splat",
+        "units": units,
+        **location_fields(splats.origin, splats.place),
+    }
     pictures: dict[str, NDArray[np.uint8]] = {}
     for part in (_positions, _shapes, _colours):
         pictures |= part(splats, places, meta)

@@ -13,7 +13,7 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.json_fields import numbers, origin_of, whole
+from stages.formats.json_fields import located, numbers, whole
 from stages.formats.values import allocate, logits_of
 from stages.scene import Splats
 
@@ -105,7 +105,7 @@ class Source:
         books = [numbers(_part(meta, part), "codebook", 256) for part in ("sh0", "scales")]
         palette, labels = self._palette(meta, count)
         splats = allocate(count, math.isqrt(1 + palette.shape[1]) - 1)
-        splats = replace(splats, origin=origin_of(meta.get("asset")))
+        splats = located(splats, meta.get("asset"))
         splats = splats.with_antialias(antialias_of(meta))
         for rows in reported_blocks(count):
             out = splats.take(rows)

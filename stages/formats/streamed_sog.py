@@ -12,7 +12,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,7 +23,7 @@ from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
-from stages.formats.json_fields import origin_field, origin_of, whole
+from stages.formats.json_fields import located, location_fields, whole
 from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
 from stages.formats.table import CHUNK
 from stages.formats.values import allocate, fill
@@ -87,7 +87,11 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
         counts = [len(level) for level in levels]
         meta = {
             "version": 1,
-            "asset": {"generator": "splat", "units": units} | origin_field(levels[0].origin),
+            "asset": {
+                "generator": "splat",
+                "units": units,
+                **location_fields(levels[0].origin, levels[0].place),
+            },
             "count": sum(counts),
             "counts": counts,
             "lodLevels": len(levels),
@@ -220,7 +224,7 @@ def read(path: Path) -> Splats:
         for offset, count in each:
             fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
             end += count
-    splats = replace(splats, origin=origin_of(meta.get("asset")))
+    splats = located(splats, meta.get("asset"))
     return splats.with_antialias(_antialias(sources))
 
 

@@ -29,9 +29,8 @@ _ROOT, _PRIM = "/Scene", "/Scene/Splats"
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """Write `splats` as `path` (.usda, .usdc or .usdz).
 
-    Positions stay relative to `splats.origin`; customLayerData holds it, in the axes of the file,
-    together with the units. Raises SplatError when the file cannot be
-    written.
+    Positions stay relative to `splats.origin`; customLayerData holds it, the place, both in the
+    axes of the file, and the units. Raises SplatError when the file cannot be written.
     """
     path = Path(path)
     with replacing(path) as temporary:
@@ -53,8 +52,17 @@ def _layer(splats: Splats, units: str, suffix: str) -> Any:
     root = UsdGeom.Xform.Define(stage, _ROOT).GetPrim()
     stage.SetDefaultPrim(root)
     note: dict[str, Any] = {"units": units}
+    y_up = flipped(splats.take(slice(0)))
     if splats.origin.any():
-        note["origin"] = Gf.Vec3d(*map(float, flipped(splats.take(slice(0))).origin))
+        note["origin"] = Gf.Vec3d(*map(float, y_up.origin))
+    if y_up.place is not None:
+        stated = y_up.place.beside(y_up.origin).to_json()
+        axes = [value for row in stated["axes"] for value in row]
+        note["place"] = {
+            "crs": stated["crs"],
+            "offset": Gf.Vec3d(*stated["offset"]),
+            "axes": Gf.Matrix3d(*axes),
+        }
     if splats.draw_settings.antialias:
         note["antialiased"] = True
     layer.customLayerData = {"splat": note}

@@ -23,6 +23,7 @@ from stages.base.bad_files import BadFileError
 from stages.base.parent import how_it_ended
 from stages.base.text import reason_of
 from stages.base.usd_path import accepted_path
+from stages.formats.json_fields import place_of
 from stages.formats.values import (
     allows_nonfinite,
     check_finite,
@@ -96,8 +97,9 @@ def _parsed(stage: Any) -> Splats:
     note = stage.GetRootLayer().customLayerData.get("splat")
     note = note if isinstance(note, dict) else {}
     origin = np.array(note.get("origin", np.zeros(3)), np.float64).reshape(3)
+    place = place_of(note.get("place"), origin)
     means, origin = recentred(splats.means.astype(np.float64), origin)
-    splats = replace(splats, means=means, origin=origin)
+    splats = replace(splats, means=means, origin=origin, place=place)
     splats = splats.with_antialias(bool(note.get("antialiased", False)))
     return check_finite(flipped(splats, reuse=True))
 

@@ -196,9 +196,10 @@ def count_nonfinite(values: NDArray[np.floating]) -> int:
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
-    """All rows of `parts`, at the highest SH degree among them, with the origin 0."""
+    """All rows of `parts`, at the highest SH degree among them, with the origin 0 and no
+    place."""
     if len(parts) == 1:
-        return replace(parts[0], origin=np.zeros(3))
+        return replace(parts[0], origin=np.zeros(3), place=None)
     if not parts:
         return allocate(0, 0)
     count, width = sum(map(len, parts)), max(part.sh.shape[1] for part in parts)

@@ -45,7 +45,9 @@ def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
     if name == "quantise" and not antialias and output.plain is not None:
         output = replace(output, splats=output.plain)
     splats: Splats = output.splats if name in ("train", "quantise") else output
-    return splats
+    if pipeline.manifest("sfm") is None:
+        return splats
+    return replace(splats, place=pipeline.load("sfm").place)
 
 
 def final_splats(pipeline: Pipeline) -> Splats:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
 from stages.scene.light import Light
+from stages.scene.place import EarthPlace
 
 Item = TypeVar("Item")
 HELD_OUT_EVERY = 8
@@ -104,6 +105,7 @@ class Reconstruction:
         tracks: [P] number of photographs that see the point.
         origin: [3] float64, added to positions to get back to the coordinates of `units`.
         units: "metres", or "arbitrary" if the scale of the scene is unknown.
+        place: where the world is on the earth; None if that is unknown.
         levelled: whether the up direction (-Y) was found from the cameras.
         light_explained: by which share the variance of a point's values over its views falls when
             the lights of the views are corrected.
@@ -117,6 +119,7 @@ class Reconstruction:
     tracks: NDArray[np.int32]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     units: str = "arbitrary"
+    place: EarthPlace | None = None
     levelled: bool = False
     light_explained: float = 0.0
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from stages.scene import Splats
+from stages.scene.place import EarthPlace
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -42,4 +43,10 @@ def flipped(splats: Splats, *, reuse: bool = False) -> Splats:
         with np.errstate(invalid="ignore"):  # a damaged file's NaN; `checked` refuses it
             arrays[name] = np.multiply(values, sign, out=values if reuse else None)
     # + 0.0: an origin of -0 would be written as such
-    return replace(splats, **arrays, origin=splats.origin * FLIP + 0.0)
+    origin, place = splats.origin * FLIP + 0.0, flipped_place(splats.place)
+    return replace(splats, **arrays, origin=origin, place=place)
+
+
+def flipped_place(place: EarthPlace | None) -> EarthPlace | None:
+    """The place of the other frame."""
+    return place and place.moved(np.diag([*FLIP, 1.0]))

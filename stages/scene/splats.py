@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
 from stages.scene.draw_settings import DrawSettings
+from stages.scene.place import EarthPlace
 
 SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
@@ -28,6 +29,7 @@ class Splats:
     origin [3] float64: what to add to `means` to be back in the capture's coordinates. float32
         positions near zero keep their precision however far away the capture lies.
     draw_settings: how they are drawn and evaluated.
+    place: where these coordinates are on the earth; None if that is unknown.
     """
 
     means: NDArray[np.floating]
@@ -38,6 +40,7 @@ class Splats:
     sh_degrees: NDArray[np.uint8]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     draw_settings: DrawSettings = field(default_factory=DrawSettings)
+    place: EarthPlace | None = None
 
     def __post_init__(self) -> None:
         n = len(self.means)

@@ -1,13 +1,15 @@
 """Splats on disk between stages: exact, deterministic, and quick to load.
 
 Layout: the 8 bytes of `MAGIC`, then one block in NumPy's .npy format (version 1.0) for each array
-in the order of `FIELDS`, and a last one [4] float64 for the draw settings: near plane, side,
-background and light. There is no compression and no timestamp (a zip file, and so .npz, would have
-them), so equal splats give equal bytes.
+in the order of `FIELDS`, and one for the draw settings: near plane, side, background and light.
+Where the splats have a place on the earth, a last one holds its JSON in UTF-8. There is no
+compression and no timestamp (a zip file, and so .npz, would have them), so equal splats give equal
+bytes.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import astuple
 from pathlib import Path
@@ -21,6 +23,7 @@ from stages.base.atomic import replacing
 from stages.base.disk import not_permitted
 from stages.base.errors import Family, SplatError
 from stages.scene.draw_settings import DrawSettings
+from stages.scene.place import EarthPlace
 from stages.scene.splats import Splats
 
 MAGIC = b"SPLATS4\n"
@@ -44,6 +47,9 @@ def save_splats(path: Path, splats: Splats) -> Path:
             npy.write_array(file, array, version=(1, 0), allow_pickle=False)
         draw_settings = np.array(astuple(splats.draw_settings), "<f8")
         npy.write_array(file, draw_settings, version=(1, 0), allow_pickle=False)
+        if splats.place is not None:
+            text = np.frombuffer(json.dumps(splats.place.to_json()).encode(), np.uint8)
+            npy.write_array(file, text, version=(1, 0), allow_pickle=False)
     return target
 
 
@@ -61,12 +67,15 @@ def load_splats(path: Path) -> Splats:
             arrays = {name: _read_array(file, size, name) for name in FIELDS}
             drawn = _read_array(file, size, "draw settings").astype(np.float64)
             near, side, grey, light, antialias = drawn
+            place = None
+            if file.tell() < size:
+                place = EarthPlace.from_json(json.loads(_read_array(file, size, "place").tobytes()))
             if file.read(1):
                 raise ValueError("bytes follow its end")
         draw_settings = DrawSettings(
             float(near), int(side), float(grey), bool(light), bool(antialias)
         )
-        return Splats(**arrays, draw_settings=draw_settings)  # type: ignore[arg-type]
+        return Splats(**arrays, draw_settings=draw_settings, place=place)  # type: ignore[arg-type]
     except PermissionError as error:
         raise not_permitted(source, error) from error
     except (OSError, ValueError, OverflowError, EOFError) as error:

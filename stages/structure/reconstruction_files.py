@@ -13,6 +13,7 @@ from stages.base.disk import not_permitted
 from stages.base.errors import Family, SplatError
 from stages.base.text import reason_of
 from stages.scene import Camera, Reconstruction, View
+from stages.scene.place import EarthPlace
 
 FILE_NAME = "reconstruction.json"
 _INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -31,6 +32,7 @@ def save_reconstruction(folder: Path, reconstruction: Reconstruction) -> None:
         "units": reconstruction.units,
         "levelled": reconstruction.levelled,
         "origin": [float(value) for value in reconstruction.origin],
+        **({} if reconstruction.place is None else {"place": reconstruction.place.to_json()}),
         "light_explained": float(reconstruction.light_explained),
         "points": len(reconstruction.points),
         "views": [_view_to_dict(view) for view in reconstruction.views],
@@ -55,6 +57,7 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             views=tuple(_view_from_dict(view) for view in data["views"]),
             origin=np.array(data["origin"], np.float64).reshape(3),
             units=str(data["units"]),
+            place=EarthPlace.from_json(data["place"]) if "place" in data else None,
             levelled=bool(data["levelled"]),
             light_explained=float(data.get("light_explained", 0.0)),
             **arrays,

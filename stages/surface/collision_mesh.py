@@ -73,7 +73,7 @@ def make_collision_mesh(
     if not len(mesh.faces):
         return _empty_mesh(report)
     mesh = colour.colour_vertices(mesh, maps, fuse.TRUNCATION * volume.voxel)
-    mesh = replace(mesh, origin=splats.origin)
+    mesh = replace(mesh, origin=splats.origin, place=splats.place)
     covered = _covered(mesh, maps, volume.voxel)
     figures = {
         "triangles": len(mesh.faces),

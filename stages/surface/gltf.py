@@ -16,7 +16,7 @@ from stages.formats.gltf_file import (
     buffer_view,
     write_glb,
 )
-from stages.scene.flip import FLIP
+from stages.scene.flip import FLIP, flipped_place
 from stages.surface.mesh import NOTE, Mesh
 
 _ELEMENT_ARRAY_BUFFER = 34963
@@ -24,12 +24,19 @@ _TRIANGLES = 4
 
 
 def write(path: Path, mesh: Mesh, units: str) -> None:
-    """Write `mesh`. Positions stay relative to `mesh.origin`, which asset.extras holds in the axes
-    of the file. The unit of glTF is the metre; asset.extras says where it is "arbitrary".
+    """Write `mesh`. Positions stay relative to `mesh.origin`, which asset.extras holds with the
+    place, in the axes of the file. The unit of glTF is the metre; asset.extras says where it is
+    "arbitrary".
 
     Raises SplatError when the file cannot be written."""
     document: dict[str, Any] = {
-        "asset": asset(units, mesh.origin * FLIP + 0.0, "collision proxy", note=NOTE),
+        "asset": asset(
+            units,
+            mesh.origin * FLIP + 0.0,
+            flipped_place(mesh.place),
+            "collision proxy",
+            note=NOTE,
+        ),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
     }

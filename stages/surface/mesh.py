@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.scene.place import EarthPlace
+
 NOTE = "collision proxy: where surfaces are, for physics; not made to be looked at"
 
 
@@ -18,13 +20,14 @@ class Mesh:
         vertices: [V, 3] float32 in the world (y down), relative to `origin`.
         faces: [F, 3] int32, counterclockwise seen from the cameras.
         colours: [V, 3] uint8, sRGB.
-        origin: [3] float64.
+        origin, place: as in `Splats`.
     """
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
     colours: NDArray[np.uint8]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    place: EarthPlace | None = None
 
     @classmethod
     def of(cls, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> Mesh:

@@ -33,4 +33,4 @@ def _header(mesh: Mesh, units: str) -> bytes:
     lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
     lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
-    return header_text(units, mesh.origin, lines, NOTE)
+    return header_text(units, mesh.origin, mesh.place, lines, NOTE)

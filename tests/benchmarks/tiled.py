@@ -25,7 +25,8 @@ def main(source: Path, count: int, target: Path, degree: int | None = None) -> N
     wide = int(np.ceil(np.sqrt(count / len(tile))))
     columns = [f"property float {name}" for name in ply.property_names(tile.sh_degree)]
     with target.open("wb") as file:
-        file.write(header_text("arbitrary", np.zeros(3), [f"element vertex {count}", *columns]))
+        elements = [f"element vertex {count}", *columns]
+        file.write(header_text("arbitrary", np.zeros(3), None, elements))
         for number, start in enumerate(range(0, count, len(tile))):
             place = (high - low) * (number % wide, 0, number // wide)
             part = _unlike(tile, place, number).take(slice(0, count - start))

@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stages import formats
+from stages.base.errors import SplatError
 from stages.formats import usd_read
+from stages.formats.offset import offset_path
 from stages.formats.ply import property_names
+from stages.scene.place import EAST_DOWN_NORTH, GEOGRAPHIC, EarthPlace
 from stages.scene.recentring import recentred
 from tests.formats.files import edited_glb, ply_bytes
 from tests.formats.truth import many_splats, red_splat
@@ -81,8 +85,59 @@ def test_the_table_says_which_formats_hold_the_origin(tmp_path: Path, name: str)
     splats = replace(many_splats(30), origin=UTM)
     path = tmp_path / row.file_name("a")
     formats.write(path, splats)
+    beside = offset_path(path)
+    assert row.holds_origin != beside.exists()
+    beside.unlink(missing_ok=True)
     back = usd_read.parse(path) if name.startswith("usd") else formats.read(path)
     assert row.holds_origin == bool(back.origin.any())
+
+
+@pytest.mark.parametrize("name", list(formats.BY_ENDING))
+@pytest.mark.parametrize("crs", [GEOGRAPHIC, "EPSG:25832"])
+def test_the_place_on_the_earth_survives_every_format(tmp_path: Path, name: str, crs: str) -> None:
+    """With what lies beside the file; and the file says it of its own positions and axes."""
+    offset = np.array([47.3769, 8.5417, 408.5] if crs == GEOGRAPHIC else UTM)
+    place = EarthPlace(crs, offset, EAST_DOWN_NORTH)
+    splats = replace(many_splats(30), origin=np.array([1000.0, -20.0, 300.0]), place=place)
+    path = tmp_path / formats.BY_ENDING[name].file_name("a")
+    formats.write(path, splats, units="metres")
+    back = usd_read.parse(path) if name.startswith("usd") else formats.read(path)
+    assert back.place is not None
+    assert back.place.crs == crs
+    np.testing.assert_allclose(back.place.offset, offset, atol=1e-9)
+    np.testing.assert_allclose(back.place.axes, EAST_DOWN_NORTH, atol=1e-9)
+    np.testing.assert_array_equal(back.origin, splats.origin)
+
+
+def test_a_file_states_the_place_of_its_own_positions(tmp_path: Path) -> None:
+    """By hand: 7 m right, 2 m down and 30 m ahead of the world's zero point; glTF is y up."""
+    place = EarthPlace("EPSG:25832", UTM, EAST_DOWN_NORTH)
+    splats = replace(many_splats(5), origin=np.array([7.0, 2.0, 30.0]), place=place)
+    formats.write(tmp_path / "a.gltf", splats, units="metres")
+    said = json.loads((tmp_path / "a.gltf").read_text())["asset"]["extras"]["splat_place"]
+    np.testing.assert_allclose(said["offset"], np.add(UTM, [7.0, 30.0, -2.0]), atol=1e-9)
+    assert said["axes"] == [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    formats.write(tmp_path / "a.spz", splats, units="metres")
+    beside = json.loads((tmp_path / "a.spz.offset.json").read_text())
+    assert beside["splat_place"] == said
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"crs": "nowhere"}, {"offset": [1, 2]}, {"offset": [1, 2, "x"]}, {"offset": [1, 2, 1e300]},
+        {"axes": [[0, 0, 0]] * 3}, {"axes": None}, {"axes": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},
+    ],
+)  # fmt: skip
+def test_a_damaged_place_is_an_error(tmp_path: Path, damage: dict[str, Any]) -> None:
+    place = EarthPlace("EPSG:25832", UTM, EAST_DOWN_NORTH)
+    formats.write(tmp_path / "a.gltf", replace(many_splats(5), place=place))
+    data = json.loads((tmp_path / "a.gltf").read_text())
+    data["asset"]["extras"]["splat_place"] |= damage
+    (tmp_path / "a.gltf").write_text(json.dumps(data))
+    with pytest.raises(SplatError) as raised:
+        formats.read(tmp_path / "a.gltf")
+    assert raised.value.code == "splats-unreadable"
 
 
 def test_what_lies_near_zero_is_left_where_it_is() -> None:
