@@ -3,32 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from stages.base.atomic import replacing
-from stages.base.errors import Family, SplatError
+from stages.base.bad_files import BadFileError, reading, stage_output
 from stages.scene import Capture, Photo
 
 FILE = "capture.json"
 _SCHEMA = 4
-_TYPES: dict[str, tuple[type, ...]] = {
-    "name": (str,),
-    "image": (str,),
-    "width": (int,),
-    "height": (int,),
-    "focal_px": (float, int, type(None)),
-    "camera": (str,),
-    "sharpness": (float, int),
-    "log2_luminance": (float, int),
-    "exposure_ev": (float, int, type(None)),
-    "duplicate_of": (str,),
-    "mask": (str,),
-    "outside": (str,),
-    "gps": (list, type(None)),
-}
 
 
 def save_capture(capture: Capture) -> None:
@@ -42,53 +26,19 @@ def save_capture(capture: Capture) -> None:
 def load_capture(folder: Path) -> Capture:
     """The capture of a finished folder. Raises SplatError "ingest-capture-damaged"."""
     path = folder / FILE
-    try:
+    with reading(path, stage_output("ingest-capture-damaged")):
         data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise _damaged(path, "it is missing") from error
-    except (ValueError, RecursionError) as error:
-        raise _damaged(path, f"it is not JSON ({str(error)[:80]})") from error
-    if not isinstance(data, dict) or data.get("schema") != _SCHEMA:
-        raise _damaged(path, f"it is not of schema {_SCHEMA}")
-    rows = data.get("photos")
-    if not isinstance(rows, list) or not rows:
-        raise _damaged(path, "it lists no photographs")
-    photos = tuple(_photo(path, number, row) for number, row in enumerate(rows, 1))
-    for what in ("name", "image"):
-        if len({getattr(photo, what) for photo in photos}) != len(photos):
-            raise _damaged(path, f"two photographs have the same {what}")
-    return Capture(folder, photos)
+        if data["schema"] != _SCHEMA or not data["photos"]:
+            raise BadFileError(f"it lists no photographs of schema {_SCHEMA}")
+        photos = tuple(_photo(dict(row)) for row in data["photos"])
+        masks = [photo.mask for photo in photos if photo.mask]
+        for file in [*(photo.image for photo in photos), *masks]:
+            inside = PurePosixPath(file)
+            if inside.is_absolute() or ".." in inside.parts or not (folder / inside).is_file():
+                raise BadFileError(f"its picture {file} is not there")
+        return Capture(folder, photos)
 
 
-def _photo(path: Path, number: int, row: Any) -> Photo:
-    where = f"photograph {number}"
-    if not isinstance(row, dict) or set(row) != {item.name for item in fields(Photo)}:
-        raise _damaged(path, f"{where} has missing or unknown fields")
-    for name, types in _TYPES.items():
-        value = row[name]
-        if not isinstance(value, types) or isinstance(value, bool):
-            raise _damaged(path, f"{name} of {where} is {value!r}")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise _damaged(path, f"{name} of {where} is {value}")
-    for name in ("width", "height", "focal_px"):
-        if row[name] is not None and row[name] <= 0:
-            raise _damaged(path, f"{name} of {where} is {row[name]}")
-    for what, file in (("picture", row["image"]), ("mask", row["mask"])):
-        inside = PurePosixPath(file)
-        outside = inside.is_absolute() or ".." in inside.parts
-        if outside or (not (path.parent / inside).is_file() and (file or what == "picture")):
-            raise _damaged(path, f"the {what} of {where}, {file}, is not there")
+def _photo(row: dict[str, Any]) -> Photo:
     gps = row.pop("gps")
-    if gps is not None and not (len(gps) == 2 and all(isinstance(v, float) for v in gps)):
-        raise _damaged(path, f"gps of {where} is {gps!r}")
-    return Photo(**row, gps=None if gps is None else (gps[0], gps[1]))
-
-
-def _damaged(path: Path, why: str) -> SplatError:
-    return SplatError(
-        "ingest-capture-damaged",
-        given=f"{path} cannot be used: {why}.",
-        wanted="The file as ingest wrote it, with its pictures beside it.",
-        hint="Delete the ingest folder of this run and run the command again.",
-        family=Family.RUN_FOLDER,
-    )
+    return Photo(**row, gps=None if gps is None else (float(gps[0]), float(gps[1])))

@@ -20,8 +20,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
-from stages.base.disk import not_permitted
-from stages.base.errors import Family, SplatError
+from stages.base.bad_files import reading, stage_output
 from stages.scene.draw_settings import DrawSettings
 from stages.scene.place import EarthPlace
 from stages.scene.splats import Splats
@@ -59,34 +58,22 @@ def load_splats(path: Path) -> Splats:
     Raises SplatError "splats-file-damaged" if it is missing, cut short or not such a file.
     """
     source = _file_of(path)
-    try:
-        with source.open("rb") as file:
-            size = source.stat().st_size
-            if file.read(len(MAGIC)) != MAGIC:
-                raise ValueError("it does not start as a splats file")
-            arrays = {name: _read_array(file, size, name) for name in FIELDS}
-            drawn = _read_array(file, size, "draw settings").astype(np.float64)
-            near, side, grey, light, antialias = drawn
-            place = None
-            if file.tell() < size:
-                place = EarthPlace.from_json(json.loads(_read_array(file, size, "place").tobytes()))
-            if file.read(1):
-                raise ValueError("bytes follow its end")
+    with reading(source, stage_output("splats-file-damaged")), source.open("rb") as file:
+        size = source.stat().st_size
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ValueError("it does not start as a splats file")
+        arrays = {name: _read_array(file, size, name) for name in FIELDS}
+        drawn = _read_array(file, size, "draw settings").astype(np.float64)
+        near, side, grey, light, antialias = drawn
+        place = None
+        if file.tell() < size:
+            place = EarthPlace.from_json(json.loads(_read_array(file, size, "place").tobytes()))
+        if file.read(1):
+            raise ValueError("bytes follow its end")
         draw_settings = DrawSettings(
             float(near), int(side), float(grey), bool(light), bool(antialias)
         )
         return Splats(**arrays, draw_settings=draw_settings, place=place)  # type: ignore[arg-type]
-    except PermissionError as error:
-        raise not_permitted(source, error) from error
-    except (OSError, ValueError, OverflowError, EOFError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise SplatError(
-            "splats-file-damaged",
-            given=f"{source} cannot be read: {reason}.",
-            wanted="A splats file as a stage wrote it.",
-            hint="Delete the stage's folder and run the command again; it is then made again.",
-            family=Family.RUN_FOLDER,
-        ) from error
 
 
 def _file_of(path: Path) -> Path:

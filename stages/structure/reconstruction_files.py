@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 
 from stages.base.atomic import replacing
-from stages.base.disk import not_permitted
-from stages.base.errors import Family, SplatError
-from stages.base.text import reason_of
+from stages.base.bad_files import reading, stage_output
 from stages.scene import Camera, Reconstruction, View
 from stages.scene.place import EarthPlace
 
@@ -46,7 +44,7 @@ def load_reconstruction(folder: Path) -> Reconstruction:
 
     Raises SplatError "reconstruction-damaged" if something is missing or inconsistent.
     """
-    try:
+    with reading(folder / FILE_NAME, stage_output("reconstruction-damaged")):
         data = json.loads((folder / FILE_NAME).read_text(encoding="utf-8"))
         arrays = {name: _load_array(folder, name, dtype) for name, dtype in _ARRAYS.items()}
         count = int(data["points"])
@@ -54,7 +52,7 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             raise ValueError("its arrays differ in length")
         return Reconstruction(
             folder=folder,
-            views=tuple(_view_from_dict(view) for view in data["views"]),
+            views=tuple(_view_from_dict(dict(view)) for view in data["views"]),
             origin=np.array(data["origin"], np.float64).reshape(3),
             units=str(data["units"]),
             place=EarthPlace.from_json(data["place"]) if "place" in data else None,
@@ -62,16 +60,6 @@ def load_reconstruction(folder: Path) -> Reconstruction:
             light_explained=float(data.get("light_explained", 0.0)),
             **arrays,
         )
-    except PermissionError as error:
-        raise not_permitted(folder, error) from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
-        raise SplatError(
-            "reconstruction-damaged",
-            given=f"The reconstruction in {folder} cannot be read ({reason_of(error)}).",
-            wanted="The files as `splat sfm` wrote them.",
-            hint="Delete that folder and run `splat sfm` again.",
-            family=Family.RUN_FOLDER,
-        ) from error
 
 
 def _load_array(folder: Path, name: str, dtype: str) -> Any:
@@ -99,15 +87,8 @@ def _view_to_dict(view: View) -> dict[str, Any]:
 
 
 def _view_from_dict(data: dict[str, Any]) -> View:
-    matrix = np.array(data["world_to_camera"], np.float64).reshape(4, 4)
-    numbers = {name: float(data[name]) for name in _INTRINSICS}
-    camera = Camera(
-        width=int(data["width"]), height=int(data["height"]), world_to_camera=matrix, **numbers
-    )
-    duplicate_of, role, mask, outside = (
-        str(data.get(name, "")) for name in ("duplicate_of", "role", "mask", "outside")
-    )
-    red, green, blue = data.get("light", (None,) * 3)
-    light = None if red is None else (float(red), float(green), float(blue))
-    name, image = str(data["name"]), str(data["image"])
-    return View(name, image, camera, duplicate_of, role, mask, outside, light)
+    matrix = np.array(data.pop("world_to_camera"), np.float64).reshape(4, 4)
+    numbers = {name: data.pop(name) for name in ("width", "height", *_INTRINSICS)}
+    light = data.pop("light", None)
+    camera = Camera(**numbers, world_to_camera=matrix)
+    return View(camera=camera, light=tuple(light) if light else None, **data)
