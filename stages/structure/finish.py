@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from stages.base.stage import Report
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import ColmapModel, write_colmap_model
+from stages.cameras.lens import Lens
 from stages.scene import Camera, Capture, Photo, Reconstruction, View
 from stages.structure.levelling import level_and_recentre
 from stages.structure.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric_scale
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistorted_images import IMAGES, mask_file, write_undistorted_images
-from stages.structure.undistortion import AnyLens, SimpleRadial, undistorted_px
+from stages.structure.undistortion import undistorted_px
 
 COLMAP = "colmap"
 SPARSE = f"{COLMAP}/sparse/0"
@@ -79,15 +80,15 @@ def finish(
     )
 
 
-def _cameras_and_lenses(model: SparseModel) -> tuple[list[Camera], list[AnyLens]]:
+def _cameras_and_lenses(model: SparseModel) -> tuple[list[Camera], list[Lens]]:
     """Camera and lens of each view."""
     cameras: list[Camera] = []
-    lenses: list[AnyLens] = []
+    lenses: list[Lens] = []
     for number, pose in zip(model.view_cameras, model.world_to_camera, strict=True):
         width, height = (int(side) for side in model.camera_sizes[number])
         focal, cx, cy, k = (float(value) for value in model.camera_params[number])
         cameras.append(Camera(width, height, focal, focal, cx, cy, pose))
-        lenses.append(SimpleRadial(k))
+        lenses.append(Lens(radial=(k,)))
     return cameras, lenses
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from stages.base.atomic import replacing
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
+from stages.cameras.lens import Lens
 from stages.scene import TRANSPARENT, Camera, Photo
 from stages.structure.undistortion import (
-    AnyLens,
     remap_tables,
     undistorted_camera,
     visible_share,
@@ -39,7 +39,7 @@ def mask_file(photo: Photo) -> str:
 def write_undistorted_images(
     photos: Sequence[Photo],
     cameras: Sequence[Camera],
-    lenses: Sequence[AnyLens],
+    lenses: Sequence[Lens],
     source: Path,
     folder: Path,
     report: Report,

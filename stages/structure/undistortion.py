@@ -6,7 +6,7 @@ rectangle that the photograph covers, so it has no black borders (as COLMAP's im
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,41 +17,11 @@ from stages.scene import Camera
 _LARGEST_GROWTH = 2.0  # of either side, as COLMAP limits it
 _SMALLEST_SHARE = 0.2  # of either side; below, the pinhole camera keeps the photograph's rectangle
 _WIDEST = np.tan(np.radians(60.0))  # beyond, a pinhole picture spends many pixels on little
+_EDGE = 129  # samples along each edge, for the rectangle that fits
 _GRID = 33  # samples along either side, for the share of the photograph that stays visible
-_NEWTON_STEPS = 100
 
 
-@dataclass(frozen=True)
-class SimpleRadial:
-    """COLMAP's SIMPLE_RADIAL distortion, x (1 + k |x|^2), with the methods of `Lens`."""
-
-    k: float
-    distorts = True
-
-    def distort(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[..., 2] distorted from undistorted image-plane coordinates."""
-        return np.asarray(uv * (1.0 + self.k * np.sum(uv**2, axis=-1, keepdims=True)))
-
-    def undistort(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[..., 2] inverse of `distort` where it is monotonic around the centre; NaN beyond the
-        largest radius that this lens model can show (k < 0)."""
-        k = self.k
-        wanted = np.linalg.norm(seen, axis=-1)
-        limit = np.inf if k >= 0 else 1.0 / np.sqrt(-3.0 * k)
-        reachable = wanted <= 2.0 / 3.0 * limit  # k limit^2 = -1/3
-        radius = np.minimum(wanted, limit)
-        for _ in range(_NEWTON_STEPS):  # on r + k r^3 = wanted, kept on the monotonic branch
-            slope = np.maximum(1.0 + 3.0 * k * radius**2, 1e-9)
-            radius = np.clip(radius - (radius + k * radius**3 - wanted) / slope, 0.0, limit)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(wanted > 0, radius / wanted, 1.0)
-        return seen * np.where(reachable, ratio, np.nan)[..., None]
-
-
-AnyLens = Lens | SimpleRadial
-
-
-def undistorted_camera(camera: Camera, lens: AnyLens) -> Camera:
+def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
     """The pinhole camera for a photograph's `camera` and its `lens`."""
     if not lens.distorts:
         return camera
@@ -61,7 +31,7 @@ def undistorted_camera(camera: Camera, lens: AnyLens) -> Camera:
     return replace(camera, width=width, height=height, cx=-left, cy=-top)
 
 
-def visible_share(camera: Camera, lens: AnyLens, pinhole: Camera) -> float:
+def visible_share(camera: Camera, lens: Lens, pinhole: Camera) -> float:
     """The share of the photograph that its pinhole picture shows."""
     if not lens.distorts:
         return 1.0
@@ -73,7 +43,7 @@ def visible_share(camera: Camera, lens: AnyLens, pinhole: Camera) -> float:
     return float(pinhole.shows(undistorted_px(xy, camera, lens, pinhole)).mean())
 
 
-def remap_tables(camera: Camera, lens: AnyLens, pinhole: Camera) -> tuple[np.ndarray, np.ndarray]:
+def remap_tables(camera: Camera, lens: Lens, pinhole: Camera) -> tuple[np.ndarray, np.ndarray]:
     """x and y [H, W] float32: where each pixel of the pinhole picture lies in the photograph, for
     cv2.remap (whose pixel centres are whole numbers)."""
     u = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
@@ -85,7 +55,7 @@ def remap_tables(camera: Camera, lens: AnyLens, pinhole: Camera) -> tuple[np.nda
 
 
 def undistorted_px(
-    xy: NDArray[np.float64], camera: Camera, lens: AnyLens, pinhole: Camera
+    xy: NDArray[np.float64], camera: Camera, lens: Lens, pinhole: Camera
 ) -> NDArray[np.float64]:
     """[N, 2] where photograph pixels `xy` lie in the pinhole picture (NaN if nowhere)."""
     found = _from_principal_point(xy, camera, lens)
@@ -94,20 +64,18 @@ def undistorted_px(
 
 
 def _from_principal_point(
-    xy: NDArray[np.float64], camera: Camera, lens: AnyLens
+    xy: NDArray[np.float64], camera: Camera, lens: Lens
 ) -> NDArray[np.float64]:
     """[N, 2] undistorted pixels, relative to the principal point."""
     focal = np.array([camera.fx, camera.fy])
     return focal * lens.undistort((xy - (camera.cx, camera.cy)) / focal)
 
 
-def _inner_rectangle(camera: Camera, lens: AnyLens) -> tuple[float, float, float, float]:
+def _inner_rectangle(camera: Camera, lens: Lens) -> tuple[float, float, float, float]:
     """left, top, right, bottom relative to the principal point. An edge that no pinhole camera can
     show does not limit the rectangle."""
-    simple = isinstance(lens, SimpleRadial)
-    samples, widest = (257, np.inf) if simple else (129, _WIDEST)
     width, height = camera.width, camera.height
-    x, y = np.linspace(0.0, width, samples), np.linspace(0.0, height, samples)
+    x, y = np.linspace(0.0, width, _EDGE), np.linspace(0.0, height, _EDGE)
 
     def edge(
         xs: NDArray[np.float64] | float, ys: NDArray[np.float64] | float, axis: int
@@ -117,7 +85,7 @@ def _inner_rectangle(camera: Camera, lens: AnyLens) -> tuple[float, float, float
         return found[np.isfinite(found)]
 
     def limit(side: float, focal: float) -> float:
-        return float(min(_LARGEST_GROWTH * max(side, 1.0), focal * widest))
+        return float(min(_LARGEST_GROWTH * max(side, 1.0), focal * _WIDEST))
 
     left = max([-limit(camera.cx, camera.fx), *edge(0.0, y, 0)])
     right = min([limit(width - camera.cx, camera.fx), *edge(float(width), y, 0)])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.cameras.lens import Lens
 from stages.scene import look_at
 from stages.structure.sparse_model import SparseModel
-from stages.structure.undistortion import SimpleRadial
 
 FOCAL, K = 500.0, -0.05
 SIZE = (640, 480)
@@ -32,7 +32,7 @@ def orbit_model(views: int, points: int, seed: int = 0, radius: float = 4.0) -> 
     )
     camera_points = np.einsum("vij,pj->pvi", poses[:, :3, :3], cloud) + poses[:, :3, 3]
     uv = camera_points[..., :2] / camera_points[..., 2:]
-    px = FOCAL * SimpleRadial(K).distort(uv) + np.array(SIZE) / 2
+    px = FOCAL * Lens(radial=(K,)).distort(uv) + np.array(SIZE) / 2
     pairs = np.array([(i, i + 1) for i in range(views - 1)], np.int32)
     return SparseModel(
         names=tuple(f"{i:02d}.jpg" for i in range(views)),

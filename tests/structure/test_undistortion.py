@@ -11,12 +11,17 @@ from hypothesis import strategies as st
 from stages.cameras.lens import PINHOLE, Lens
 from stages.scene import Camera
 from stages.structure.undistortion import (
-    SimpleRadial,
     remap_tables,
     undistorted_camera,
     undistorted_px,
     visible_share,
 )
+
+
+def simple_radial(k: float) -> Lens:
+    """COLMAP's SIMPLE_RADIAL."""
+    return Lens(radial=(k,))
+
 
 TAKEN = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
 CAMERA = Camera(640, 480, 500.0, 510.0, 330.0, 235.0, np.eye(4))
@@ -35,25 +40,25 @@ LENSES = {
 )
 def test_undistort_is_the_inverse_of_distort(k: float, u: float, v: float) -> None:
     uv = np.array([[u, v]])
-    assert np.allclose(SimpleRadial(k).undistort(SimpleRadial(k).distort(uv)), uv, atol=1e-9)
+    assert np.allclose(simple_radial(k).undistort(simple_radial(k).distort(uv)), uv, atol=1e-9)
 
 
 def test_radii_that_no_lens_of_this_model_shows_are_nan() -> None:
-    assert np.isnan(SimpleRadial(-0.3).undistort(np.array([[3.0, 0.0]]))).all()
+    assert np.isnan(simple_radial(-0.3).undistort(np.array([[3.0, 0.0]]))).all()
 
 
 def test_without_distortion_the_picture_stays_as_it_is() -> None:
-    pinhole = undistorted_camera(TAKEN, SimpleRadial(0.0))
+    pinhole = undistorted_camera(TAKEN, simple_radial(0.0))
     assert (pinhole.width, pinhole.height, pinhole.cx, pinhole.cy) == (640, 480, 320, 240)
-    x, y = remap_tables(TAKEN, SimpleRadial(0.0), pinhole)
+    x, y = remap_tables(TAKEN, simple_radial(0.0), pinhole)
     assert np.allclose(x[0], np.arange(640), atol=1e-4)
     assert np.allclose(y[:, 0], np.arange(480), atol=1e-4)
 
 
 @pytest.mark.parametrize("k", [-0.3, -0.1, -0.01, 0.01, 0.1, 0.5, 1.0])
 def test_every_pixel_of_the_new_picture_lies_in_the_photograph(k: float) -> None:
-    pinhole = undistorted_camera(TAKEN, SimpleRadial(k))
-    x, y = remap_tables(TAKEN, SimpleRadial(k), pinhole)
+    pinhole = undistorted_camera(TAKEN, simple_radial(k))
+    x, y = remap_tables(TAKEN, simple_radial(k), pinhole)
     assert x.shape == (pinhole.height, pinhole.width)
     # Half a pixel beyond the outer centres is still inside the outer pixels.
     assert x.min() > -0.52
@@ -64,28 +69,28 @@ def test_every_pixel_of_the_new_picture_lies_in_the_photograph(k: float) -> None
 
 @pytest.mark.parametrize("k", [-0.1, 0.1])
 def test_the_new_picture_is_the_largest_that_fits(k: float) -> None:
-    pinhole = undistorted_camera(TAKEN, SimpleRadial(k))
-    x, y = remap_tables(TAKEN, SimpleRadial(k), pinhole)
+    pinhole = undistorted_camera(TAKEN, simple_radial(k))
+    x, y = remap_tables(TAKEN, simple_radial(k), pinhole)
     assert min(x[:, 0].min(), 639 - x[:, -1].max()) < 1.0
     assert min(y[0].min(), 479 - y[-1].max()) < 1.0
 
 
 def test_keypoints_move_with_the_pixels() -> None:
     k = -0.08
-    pinhole = undistorted_camera(TAKEN, SimpleRadial(k))
-    x, y = remap_tables(TAKEN, SimpleRadial(k), pinhole)
+    pinhole = undistorted_camera(TAKEN, simple_radial(k))
+    x, y = remap_tables(TAKEN, simple_radial(k), pinhole)
     row, column = 37, 512
     there = np.array([[x[row, column], y[row, column]]], np.float64) + 0.5
-    moved = undistorted_px(there, TAKEN, SimpleRadial(k), pinhole)
+    moved = undistorted_px(there, TAKEN, simple_radial(k), pinhole)
     assert np.allclose(moved, [[column + 0.5, row + 0.5]], atol=1e-3)
 
 
 @pytest.mark.parametrize("k", [-5.0, 20.0, -0.9])
 def test_absurd_lenses_still_give_a_picture(k: float) -> None:
-    pinhole = undistorted_camera(TAKEN, SimpleRadial(k))
+    pinhole = undistorted_camera(TAKEN, simple_radial(k))
     assert 100 < pinhole.width < 2000
     assert 80 < pinhole.height < 2000
-    assert np.isfinite(remap_tables(TAKEN, SimpleRadial(k), pinhole)[0]).all()
+    assert np.isfinite(remap_tables(TAKEN, simple_radial(k), pinhole)[0]).all()
 
 
 def test_a_lens_without_distortion_changes_nothing() -> None:
