@@ -16,6 +16,7 @@ from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
     content_of,
+    file_points,
     make_views,
     size_of_picture,
 )
@@ -49,8 +50,6 @@ def read(path: Path) -> CameraFile:
             shifts = cameras[:, 12:] @ OPENGL_FROM_OURS
         poses = np.concatenate([rotations, shifts[:, :, None]], axis=2)
         views = make_views(names, sizes, lens, poses)
-        if not np.isfinite(cameras).all():
-            raise BadFileError("a lens has a parameter that is not a number")
         lenses = tuple(Lens(radial=(float(k1), float(k2))) for k1, k2 in cameras[:, 1:3])
         return CameraFile(views, path.parent, lenses)
 
@@ -59,13 +58,7 @@ def read_points(path: Path) -> FilePoints | None:
     """Its points. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         _, points = _numbers(path)
-        if not len(points):
-            return None
-        if not np.isfinite(points).all():
-            raise BadFileError("a point has a value that is not a number")
-        colours = np.clip(points[:, 3:6], 0, 255).astype(np.uint8)
-        tracks = points[:, 6].astype(np.int32)
-        return FilePoints(points[:, :3], colours, np.zeros(len(points)), tracks)
+        return file_points(points[:, :3], points[:, 3:6], points[:, 6])
 
 
 def _numbers(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

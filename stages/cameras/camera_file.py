@@ -83,12 +83,34 @@ class FilePoints:
     tracks: NDArray[np.int32]
 
 
+def file_points(
+    points: NDArray[np.floating],
+    colours: NDArray[Any] | None = None,
+    tracks: NDArray[np.floating] | None = None,
+) -> FilePoints | None:
+    """Points [P, 3] of a file that does not say their errors; None if there are none.
+
+    Without colours [P, 3], in 0 to 255, they are grey. Raises BadFileError if a value is not
+    finite."""
+    if not len(points):
+        return None
+    none = np.zeros(len(points))
+    colours = np.full((len(points), 3), 128.0) if colours is None else colours
+    if not (np.isfinite(points).all() and np.isfinite(colours).all()):
+        raise BadFileError("a point has a value that is not a number")
+    return FilePoints(
+        points.astype(np.float64),
+        np.clip(colours, 0, 255).astype(np.uint8),
+        none,
+        (none if tracks is None else tracks).astype(np.int32),
+    )
+
+
 def make_views(
     names: Sequence[str],
     sizes: NDArray[np.floating],
     intrinsics: NDArray[np.float64],
     world_to_camera: NDArray[np.float64],
-    images: Sequence[str] | None = None,
 ) -> tuple[View, ...]:
     """Checked views from plain arrays.
 
@@ -97,7 +119,6 @@ def make_views(
         sizes: [V, 2] width and height, pixels.
         intrinsics: [V, 4] fx, fy, cx, cy, pixels.
         world_to_camera: [V, 3 or 4, 4]; rounded rotations are made orthogonal.
-        images: V paths of pictures, if they differ from the names.
 
     Raises:
         BadFileError: there is no camera, or one is invalid.
@@ -120,14 +141,8 @@ def make_views(
     matrices[:, :3] = poses
     matrices[inexact, :3, :3] = left @ right
     return tuple(
-        View(
-            name=name,
-            image=image,
-            camera=Camera(int(size[0]), int(size[1]), *lens.tolist(), matrix),  # type: ignore[call-arg]
-        )
-        for name, image, size, lens, matrix in zip(
-            names, images or names, sizes, intrinsics, matrices, strict=True
-        )
+        View(name, name, Camera(int(size[0]), int(size[1]), *lens.tolist(), matrix))  # type: ignore[call-arg]
+        for name, size, lens, matrix in zip(names, sizes, intrinsics, matrices, strict=True)
     )
 
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.bad_files import BadFileError
+
 MAX_ANGLE = 1.5  # radians from the axis; a pinhole camera sees less than pi / 2
 _ITERATIONS = 60
 _STEP = 1e-6
@@ -41,18 +43,19 @@ class Lens:
     parameters: tuple[float, ...] = ()
     skew: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not np.isfinite(self._terms).all():
+            raise BadFileError("a lens has a parameter that is not a number")
+
+    @property
+    def _terms(self) -> tuple[float, ...]:
+        bent = (*self.radial, *self.denominator, *self.tangential, *self.prism)
+        return (*bent, *self.parameters, self.skew)
+
     @property
     def distorts(self) -> bool:
         """Whether it differs from a pinhole."""
-        terms = (
-            *self.radial,
-            *self.denominator,
-            *self.tangential,
-            *self.prism,
-            *self.parameters,
-            self.skew,
-        )
-        return "fisheye" in self.kind or any(terms)
+        return "fisheye" in self.kind or any(self._terms)
 
     def distort(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """[..., 2] distorted coordinates of `uv` [..., 2]."""

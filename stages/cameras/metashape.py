@@ -128,12 +128,9 @@ def _optics(sensor: Element) -> tuple[list[float], Lens]:
         return float(calibration.findtext(name) or 0.0)
 
     width, height = float(resolution.get("width", 0)), float(resolution.get("height", 0))
-    terms = [value(name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")]
-    if not np.isfinite(terms).all():
-        raise BadFileError("a lens has a parameter that is not a number")
     if value("p3") or value("p4"):
         raise BadFileError("a lens has terms p3 and p4, which are not supported")
-    k1, k2, k3, k4, p1, p2 = terms
+    k1, k2, k3, k4, p1, p2 = (value(name) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
     focal = value("f")
     across = focal + value("b1")
     numbers = [width, height, across, focal]

@@ -30,6 +30,7 @@ from stages.cameras.camera_file import (
     FilePoints,
     check_inside,
     content_of,
+    file_points,
     make_views,
     poses_of,
     stored_size,
@@ -130,9 +131,7 @@ def read_points(path: Path) -> FilePoints | None:
     with reading(path.parent / named, CAMERAS):
         points, colours = _ply_points(path.parent / named)
         turn, shift, scale = _applied(data)
-        none = np.zeros(len(points))
-        points = (points / scale - shift) @ turn
-        return FilePoints(points, colours, none, none.astype(np.int32))
+        return file_points((points / scale - shift) @ turn, colours)
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -233,11 +232,9 @@ def _read_lens(merged: Mapping[str, Any]) -> Lens:
     fisheye = model == _FISHEYE or bool(merged.get("is_fisheye", False))
     if not fisheye and model not in _PERSPECTIVE:
         raise BadFileError(f"its camera model {model[:40]} is not known")
-    k1, k2, k3, k4, p1, p2 = values = [
+    k1, k2, k3, k4, p1, p2 = (
         float(merged.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")
-    ]
-    if not np.isfinite(values).all():
-        raise BadFileError("a lens has a parameter that is not a number")
+    )
     return Lens("fisheye" if fisheye else "perspective", (k1, k2, k3, k4), tangential=(p1, p2))
 
 
@@ -267,18 +264,16 @@ def _write_points(path: Path, points: NDArray[np.float64], colours: NDArray[np.u
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(partial))
 
 
-def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Positions [P, 3] and colours [P, 3], grey where there are none."""
+def _ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+    """Positions [P, 3], and colours [P, 3] or None."""
     with path.open("rb") as file:
         header = read_header(file)
         names = [name for name, _ in header.vertex.properties]
         parts = [table for _, table in tables(file, path, header)]
     if not parts:
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+        return np.zeros((0, 3)), None
     points = np.concatenate([columns(part, ["x", "y", "z"]) for part in parts]).astype(np.float64)
-    if not np.isfinite(points).all():
-        raise BadFileError("a point has a value that is not a number")
     channels = ["red", "green", "blue"]
     if not set(channels) <= set(names):
-        return points, np.full((len(points), 3), 128, np.uint8)
+        return points, None
     return points, np.concatenate([columns(part, channels) for part in parts]).astype(np.uint8)

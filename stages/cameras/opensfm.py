@@ -23,6 +23,7 @@ from stages.cameras.camera_file import (
     FilePoints,
     Georeference,
     content_of,
+    file_points,
     make_views,
 )
 from stages.cameras.lens import Lens
@@ -93,15 +94,9 @@ def read_points(path: Path) -> FilePoints | None:
     """The points of the largest reconstruction. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
         points = list((_largest(path).get("points") or {}).values())
-        if not points:
-            return None
         where = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
         colours = np.array([point.get("color", (128,) * 3) for point in points], np.float64)
-        if not (np.isfinite(where).all() and np.isfinite(colours).all()):
-            raise BadFileError("a point has a value that is not a number")
-        none = np.zeros(len(points))
-        rgb = np.clip(colours.reshape(-1, 3), 0, 255).astype(np.uint8)
-        return FilePoints(where, rgb, none, none.astype(np.int32))
+        return file_points(where, colours.reshape(-1, 3))
 
 
 def _largest(path: Path) -> dict[str, Any]:
@@ -130,8 +125,6 @@ def _optics(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
     cx, cy = float(camera.get("c_x", 0.0)), float(camera.get("c_y", 0.0))
     k = [float(camera.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4")]
     p = float(camera.get("p1", 0.0)), float(camera.get("p2", 0.0))
-    if not np.isfinite([*k, *p]).all():
-        raise BadFileError("a lens has a parameter that is not a number")
     # Here pixel coordinates start at the corner of the first pixel, there at its centre.
     centre = (width / 2 + side * cx, height / 2 + side * cy)
     lens = Lens("fisheye" if kind in _FISHEYE else "perspective", tuple(k), tangential=p)
