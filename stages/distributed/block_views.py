@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.distributed.partition import Cell
-from stages.raster.backends import rasteriser_of
-from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import raster_settings_of
+from stages.measure.contribution import blend_weights
 from stages.scene import Camera, Splats
 
 SIDE = 160  # longer side of the renderings, pixels
@@ -22,20 +20,11 @@ def block_fractions(
 ) -> NDArray[np.float64]:
     """[blocks, cameras] the fraction of each picture that comes from splats in each cell, 0 to 1;
     occluded splats do not count. All 0 for a camera that sees nothing."""
-    rasteriser, arrays, settings = (
-        rasteriser_of(backend),
-        splat_arrays(splats),
-        raster_settings_of(splats),
-    )
     inside = [cell.holds(splats.means) for cell in cells]
     found = []
-    for camera in cameras:
-        small = camera.fitted(SIDE)
-        forward = rasteriser.forward(arrays, small, settings)
-        no_gradient = np.zeros((3, small.height, small.width), np.float32)
-        contributions = rasteriser.contributions(forward, no_gradient)
-        weight = contributions[:, WEIGHT].astype(np.float64)
-        rows, total = forward.visible, float(weight.sum())
+    small = (camera.fitted(SIDE) for camera in cameras)
+    for rows, weight in blend_weights(splats, small, backend):
+        total = float(weight.sum())
         found.append([float(weight[own[rows]].sum()) / total if total else 0.0 for own in inside])
     return np.array(found).T.reshape(len(cells), -1)
 

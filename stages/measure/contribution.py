@@ -6,7 +6,7 @@ by if that splat alone were removed (see `raster.definition`). Here these sums a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -188,6 +188,19 @@ class _ShTruncation:
         by_residual = 2 * (self.dg + s * self.g)
         of_picture = self.ddq + 2 * s * self.dq + s * s * self.q
         return (by_residual + of_picture).sum(2), of_picture.sum(2), s
+
+
+def blend_weights(
+    splats: Splats, cameras: Iterable[Camera], backend: str
+) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float64]]]:
+    """For each camera: the rows [K] of the splats that it shows, and the sum of each one's blend
+    weights over the picture [K], pixels."""
+    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    settings = raster_settings_of(splats)
+    for camera in cameras:
+        forward = rasteriser.forward(arrays, camera, settings)
+        no_residual = np.zeros((3, camera.height, camera.width), np.float32)
+        yield forward.visible, rasteriser.contributions(forward, no_residual)[:, WEIGHT]
 
 
 def colours_by_degree(splats: Splats, centre: NDArray[np.floating]) -> NDArray[np.float64]:

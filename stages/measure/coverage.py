@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.backends import rasteriser_of
-from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import raster_settings_of, render
+from stages.measure.contribution import blend_weights
+from stages.raster.draw import render
 from stages.scene import Camera, Splats, look_at
 
 MIN_VIEWS = 3  # one shows a surface, two measure its depth, the third confirms it
@@ -77,21 +76,16 @@ class Patches:
 def patches_of(splats: Splats, cameras: Sequence[Camera], backend: str) -> Patches:
     """The patches that the cameras see of `splats`; none where they see nothing."""
     small = [camera.fitted(_SIDE_PX) for camera in cameras]
-    rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
-    settings = raster_settings_of(splats)
     pixels = np.zeros((len(splats), len(small)), np.float32)
-    for column, camera in enumerate(small):
-        forward = rasteriser.forward(arrays, camera, settings)
-        no_residual = np.zeros((3, camera.height, camera.width), np.float32)
-        found = rasteriser.contributions(forward, no_residual)
-        pixels[forward.visible, column] = found[:, WEIGHT]
+    for column, (rows, weights) in enumerate(blend_weights(splats, small, backend)):
+        pixels[rows, column] = weights
     means, total = splats.means.astype(np.float64), pixels.sum(axis=1)
     shown = np.flatnonzero(total > 0)
     if not len(shown):
         none = np.zeros(0)
         seen = np.zeros((0, len(small)), bool)
         return Patches(np.zeros((0, 3)), 1.0, none, seen, np.zeros(0, np.intp), none)
-    low, high = (_weighted_quantile(means[shown], total[shown], q) for q in (0.05, 0.95))
+    low, high = (weighted_quantile(means[shown], total[shown], q) for q in (0.05, 0.95))
     side = max(float(np.linalg.norm(high - low)) / PATCHES_ACROSS, 1e-9)
     cubes, which = np.unique(np.floor(means[shown] / side), axis=0, return_inverse=True)
     which = which.ravel()
@@ -124,7 +118,7 @@ def _patches(
     return Patches(centres, side, area, seen, best, angles)
 
 
-def _weighted_quantile(
+def weighted_quantile(
     points: NDArray[np.float64], weights: NDArray[np.floating], share: float
 ) -> NDArray[np.float64]:
     """[3] for each coordinate."""
@@ -195,7 +189,7 @@ def camera_layout(cameras: Sequence[Camera], patches: Patches, levelled: bool) -
     if not levelled:
         up = _normalised(-np.mean([camera.world_to_camera[1, :3] for camera in cameras], axis=0))
     subject = patches.counts >= SUBJECT_SHARE * patches.counts.max()
-    middle = _weighted_quantile(patches.centres[subject], patches.area[subject], 0.5)
+    middle = weighted_quantile(patches.centres[subject], patches.area[subject], 0.5)
     eyes = np.array([camera.centre for camera in cameras])
     inward = np.mean([_shows(camera, middle) for camera in cameras]) > 0.5
     forward = np.array([camera.forward for camera in cameras])

@@ -9,10 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.measure.contribution import colours_by_degree
-from stages.raster.backends import rasteriser_of
-from stages.raster.definition import WEIGHT, splat_arrays
-from stages.raster.draw import raster_settings_of
+from stages.measure.contribution import blend_weights, colours_by_degree
 from stages.scene import Camera, Splats, dc_to_rgb, rgb_to_dc
 
 
@@ -59,21 +56,14 @@ def view_averaged_dc(
     """[N, 3] the DC coefficients of each splat's mean colour over the cameras that see it, weighted
     by its blend weights in their pictures; its own DC where none sees it. For formats whose colours
     do not change with the view."""
-    rasteriser, arrays, settings = (
-        rasteriser_of(backend),
-        splat_arrays(splats),
-        raster_settings_of(splats),
-    )
     own = dc_to_rgb(splats.sh[:, 0].astype(np.float64))
     total, weights = np.zeros((len(splats), 3)), np.zeros((len(splats), 1))
-    for camera in cameras:
-        forward = rasteriser.forward(arrays, camera, settings)
-        no_residual = np.zeros((3, camera.height, camera.width), np.float32)
-        weight = rasteriser.contributions(forward, no_residual)[:, WEIGHT, None]
-        rows = forward.visible
+    cameras = list(cameras)
+    shown = blend_weights(splats, cameras, backend)
+    for camera, (rows, weight) in zip(cameras, shown, strict=True):
         colours = colours_by_degree(splats.take(rows), camera.centre)[:, -1]
-        total[rows] += weight * colours
-        weights[rows] += weight
+        total[rows] += weight[:, None] * colours
+        weights[rows] += weight[:, None]
     seen = weights[:, 0] > 0
     own[seen] = total[seen] / weights[seen]
     return rgb_to_dc(own).astype(np.float32)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import mmap
 import tempfile
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +36,9 @@ class Album:
     def __enter__(self) -> Album:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *exception: object) -> None:
         self._file.flush()
-        if error is None and self._starts[-1]:
+        if kind is None and self._starts[-1]:
             self._map = mmap.mmap(self._file.fileno(), self._starts[-1])
         self._file.close()
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.measure.coverage import weighted_quantile
 from stages.measure.plots import BLUE, GREY, ORANGE, new_maps, new_plot, write_plot
 from stages.measure.tradeoff.curves import Coverage, OperatingPoint, Tradeoff
 
@@ -233,14 +234,8 @@ def _map_corners(
     at: NDArray[np.float64], area: NDArray[np.float64], marks: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Corners of a map that shows all marks, and most of what is seen."""
-    ends = []
-    for column in at.T:
-        order = np.argsort(column)
-        running = np.cumsum(area[order])
-        rows = np.searchsorted(running, np.array(_SHOWN) * running[-1])
-        ends.append(column[order[rows]])
-    low = np.minimum(np.array(ends)[:, 0], marks.min(axis=0))
-    high = np.maximum(np.array(ends)[:, 1], marks.max(axis=0))
+    shown = [weighted_quantile(at, area, share) for share in _SHOWN]
+    low, high = np.minimum(shown[0], marks.min(axis=0)), np.maximum(shown[1], marks.max(axis=0))
     margin = _MARGIN * max(float((high - low).max()), 1e-9)
     return low - margin, high + margin
 
