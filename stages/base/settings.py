@@ -57,6 +57,8 @@ class Setting:
     needs: str = ""
     panel: str = ""
     may_be_empty: bool = False
+    affects_output: bool = True
+    midway: bool = False
 
     def check(self, value: Any) -> None:
         """Raises SplatError "option-value" for a value out of bounds."""
@@ -111,6 +113,9 @@ class Setting:
         return f"{what} of at least {self.low:,}." if self.low is not None else f"{what}."
 
 
+_KEYS = {field.name for field in fields(Setting)}
+
+
 def setting(default: Any, help: str, **metadata: Any) -> Any:
     """A field of a settings dataclass. metadata: as listed in this module's docstring."""
     return dataclass_field(default=default, metadata={"help": help, **metadata})
@@ -128,6 +133,7 @@ def settings_of(settings_type: type) -> list[Setting]:
         many = get_origin(hint) in (tuple, list)
         default = field.default if field.default_factory is MISSING else field.default_factory()
         option = field.name.removesuffix("s") if many else field.name
+        more = {key: value for key, value in field.metadata.items() if key in _KEYS}
         found.append(
             Setting(
                 name=field.name,
@@ -138,14 +144,7 @@ def settings_of(settings_type: type) -> list[Setting]:
                 optional=optional,
                 low=field.metadata.get("min"),
                 high=field.metadata.get("max"),
-                choices=tuple(field.metadata.get("choices", ())),
-                pattern=field.metadata.get("pattern", ""),
-                wanted=field.metadata.get("wanted", ""),
-                help=field.metadata.get("help", ""),
-                together=field.metadata.get("together", ""),
-                needs=field.metadata.get("needs", ""),
-                panel=field.metadata.get("panel", ""),
-                may_be_empty=field.metadata.get("may_be_empty", False),
+                **more,
             )
         )
     return found

@@ -95,49 +95,35 @@ class Planner:
 
     def request(self, stage: Stage, settings: Any) -> Request:
         """The request for `stage`. Raises SplatError (photographs-missing), OSError."""
-        if stage.reads:
-            inputs = {name: self._digests[name] for name in stage.reads}
-            files = self._files_of(stage, settings)
-            inputs |= {name: combined_digest(records) for name, records in files.items()}
-            return request_for(stage, settings, inputs, files)
-        if self._photo_records is None:
-            done = Manifest.read(self.layout.workspace(stage).final)
-            known = done.input_files.get(PHOTOS) if done else None
-            self._photo_records = record_files(self.existing_photos(), known, users=True)
-        files = {PHOTOS: self._photo_records, **self._masks(stage, settings)}
-        inputs = {name: combined_digest(records) for name, records in files.items()}
+        files = self._files(stage, settings)
+        inputs = {name: self._digests[name] for name in stage.reads}
+        inputs |= {name: combined_digest(records) for name, records in files.items()}
         return request_for(stage, settings, inputs, files)
 
-    def _masks(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
-        """The records of masks in a folder of their own, if there is one."""
+    def _files(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
+        """Records of the user's own files that the stage reads, by input: photographs, masks, and
+        files that settings name. Masks and named files that were removed after the stage finished
+        count as unchanged."""
+        from stages.cameras.table import files_of
         from stages.photos.masks import mask_folder
 
-        folder = mask_folder(self.existing_photos(), getattr(settings, MASKS, None))
-        if folder is None:
-            return {}
         done = Manifest.read(self.layout.workspace(stage).final)
-        known = done.input_files.get(MASKS) if done else None
-        if known is not None and not folder.exists():
-            return {MASKS: known}
-        return {MASKS: record_files(folder, known, users=True)}
-
-    def _files_of(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
-        """Records of the user's own files that settings name, by setting. Files that were removed
-        after the stage finished count as unchanged, as photographs do. Raises SplatError,
-        OSError."""
-        from stages.cameras.table import files_of
-
+        known = done.input_files if done else {}
+        named = {name: value for name, value in vars(settings).items() if isinstance(value, Path)}
         found = {}
-        done = Manifest.read(self.layout.workspace(stage).final)
-        for name, value in vars(settings).items():
-            if not isinstance(value, Path):
+        if not stage.reads:
+            photos = self.existing_photos()
+            if self._photo_records is None:
+                self._photo_records = record_files(photos, known.get(PHOTOS), users=True)
+            found[PHOTOS] = self._photo_records
+            masks = mask_folder(photos, named.get(MASKS))
+            named = {MASKS: masks} if masks is not None else {}
+        for name, path in named.items():
+            if name in known and not path.exists():
+                found[name] = known[name]
                 continue
-            known = done.input_files.get(name) if done else None
-            if known is not None and not value.exists():
-                found[name] = known
-                continue
-            files = files_of(value)
-            records = (record_files(path, known, users=True) for path in files)
+            files = [path] if name == MASKS else files_of(path)
+            records = (record_files(file, known.get(name), users=True) for file in files)
             found[name] = {key: record for part in records for key, record in part.items()}
         return found
 

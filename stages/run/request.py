@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+from stages.base.settings import settings_of
 from stages.base.stage import Stage
 from stages.base.text import counted
 from stages.run.digests import FileRecords, differences
@@ -33,7 +34,8 @@ class Request:
     def key(self, settings_type: type) -> dict[str, Any]:
         """What must be equal to resume an interrupted attempt, as plain data. Settings that do not
         affect the output, and those that may change on resuming ("midway"), are left out."""
-        free = _quiet_fields(settings_type) | _midway_fields(settings_type)
+        midway = {setting.name for setting in settings_of(settings_type) if setting.midway}
+        free = _quiet_fields(settings_type) | midway
         settings = {k: v for k, v in self.settings.items() if k not in free}
         return {"version": self.version, "settings": settings, "inputs": self.inputs}
 
@@ -118,11 +120,7 @@ def _show(value: Any) -> str:
 
 
 def _quiet_fields(settings_type: type) -> set[str]:
-    return {f.name for f in fields(settings_type) if not f.metadata.get("affects_output", True)}
-
-
-def _midway_fields(settings_type: type) -> set[str]:
-    return {f.name for f in fields(settings_type) if f.metadata.get("midway", False)}
+    return {setting.name for setting in settings_of(settings_type) if not setting.affects_output}
 
 
 def request_for(
