@@ -80,6 +80,7 @@ class _Ingested:
         inside: share of the photograph that its mask keeps.
         mask_scaled: whether its mask had another size.
         hdr, bad_profile: as in `Decoded`.
+        two_places: whether its tags contradict each other about where it was taken.
     """
 
     name: str
@@ -91,6 +92,7 @@ class _Ingested:
     mask_scaled: bool = False
     hdr: bool = False
     bad_profile: bool = False
+    two_places: bool = False
 
 
 def run(
@@ -131,6 +133,7 @@ def run(
         report.warn,
     )
     inside = [one.inside for one in ingested if one.photo is not None]
+    advice.about_places([one.name for one in ingested if one.two_places], report.warn)
     masking.check_shares(photos, inside, bool(found.masks))
     advice.about_masks(
         photos,
@@ -256,7 +259,9 @@ def _write(
         sharpness=measures.sharpness,
         log2_luminance=measures.log2_luminance,
         exposure_ev=round(exif.exposure_ev, 3) if exif.exposure_ev is not None else None,
-        gps=exif.gps,
+        gps=exif.gps.position,
+        gps_height=exif.gps.height,
+        gps_error_m=exif.gps.error_m,
         mask=masked.file(image),
         outside=masked.outside,
     )
@@ -269,6 +274,7 @@ def _write(
         mask_scaled=masked.scaled,
         hdr=decoded.hdr,
         bad_profile=decoded.bad_profile,
+        two_places=exif.gps.contradicts,
     )
 
 
@@ -325,4 +331,4 @@ def _too_few(root: Path, usable: int, unusable: list[tuple[str, str, str]]) -> S
     )
 
 
-STAGE = Stage(name="ingest", version=6, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=7, reads=(), settings_type=IngestSettings, run=run, load=load)

@@ -93,6 +93,14 @@ class SfmSettings:
         min=0.0,
         max=1000.0,
     )
+    crs: str = setting(
+        "",
+        "Turn a scene with GPS to this grid: a projected coordinate reference system in metres, "
+        "such as EPSG:25832.",
+        panel="Known cameras",
+        pattern=r"(EPSG:[0-9]{4,6})?",
+        wanted="An EPSG code, such as EPSG:25832.",
+    )
     max_minutes: float = setting(
         120.0,
         "Stop with an error after this time (minutes).",
@@ -125,9 +133,12 @@ def run(
     Raises SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
     from stages.structure import light, metric_scale, reconstruction_files
+    from stages.structure.crs import check_crs
 
     capture: Capture = inputs["ingest"]
     _check_count(capture)
+    if settings.crs:
+        check_crs(settings.crs)
     if settings.scale:
         metric_scale.check_distance(settings.scale, capture.photos)  # before hours of work
     if (folder / _FINISHED).exists():
@@ -179,7 +190,7 @@ def _from_photographs(
     report.metric("attempts", [acceptance.attempt_metrics(attempt) for attempt in attempts])
     model = acceptance.accepted_model(attempts, capture, settings.allow_partial)
     acceptance.report_warnings(attempts, capture, report)
-    known_scale = metric_scale.KnownScale(settings.scale, settings.marker)
+    known_scale = metric_scale.KnownScale(settings.scale, settings.marker, crs=settings.crs)
     found = finish.finish(model, capture, folder, report, known_scale)
     best = fallbacks.best_attempt(attempts)
     _report_model(found, best.statistics.mean_reprojection_error_px, capture, report)
@@ -207,7 +218,10 @@ def _from_known_cameras(
         allow_partial=settings.allow_partial,
         seed=settings.seed,
         max_features=settings.max_features,
-        known_scale=KnownScale(settings.scale, settings.marker, float(settings.metres), "--metres"),
+        known_scale=KnownScale(
+            *(settings.scale, settings.marker, float(settings.metres), "--metres"),
+            crs=settings.crs,
+        ),
         seconds_left=lambda: deadline - time.monotonic(),
     )
     _report_model(found, float(found.errors_px.mean()), capture, report)
@@ -281,5 +295,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=14, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=15, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError
 from stages.cameras.lens import Lens
 from stages.scene import Camera, View
+from stages.scene.place import EarthPlace
 
 MAX_FILE_BYTES = 1 << 30  # cameras and points of thousands of photographs take less
 MAX_SIDE_PX = 100_000
@@ -28,17 +29,19 @@ _EXACT = 1e-9  # of R^T R: a larger error is not rounding of float64
 
 @dataclass(frozen=True)
 class Georeference:
-    """What a file says of the scale and orientation of its world.
+    """What a file says of the scale, orientation and place of its world.
 
     Args:
         metres_per_unit: 0 where it does not say.
         axes: [3, 3] rows that point east, north and up; None where it does not say.
         source: which part of the file says it, in words.
+        place: of its world on the earth; None where it does not say.
     """
 
     metres_per_unit: float = 0.0
     axes: NDArray[np.float64] | None = None
     source: str = ""
+    place: EarthPlace | None = None
 
 
 NO_GEOREFERENCE = Georeference()

@@ -29,6 +29,7 @@ from stages.cameras.camera_file import (
     poses_of,
 )
 from stages.cameras.lens import Lens
+from stages.scene.place import GEOGRAPHIC, EarthPlace, east_north_up, geodetic
 
 _EARTH_RADII = (6.2e6, 6.5e6)  # metres, of places where photographs are taken
 _SOURCE = "the chunk's transform"
@@ -77,7 +78,10 @@ def _georeference(root: Element) -> Georeference:
     if scale <= 0 or np.abs(turn @ turn.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise BadFileError("the chunk's transform is not a rotation and scale")
     if _EARTH_RADII[0] < np.linalg.norm(shift) < _EARTH_RADII[1]:
-        return Georeference(float(scale), _east_north_up(shift) @ turn, _SOURCE)
+        offset = geodetic(shift)
+        axes = east_north_up(offset) @ turn
+        place = EarthPlace(GEOGRAPHIC, offset, float(scale) * axes)
+        return Georeference(float(scale), axes, _SOURCE, place)
     reference = (root.findtext(".//chunk/reference") or root.findtext("reference") or "").strip()
     unit = re.search(r'UNIT\["[^"]*",\s*([0-9.]+)', reference)
     changes = scale != 1.0 or shift.any() or (turn != np.eye(3)).any()
@@ -91,15 +95,6 @@ def _numbers(transform: Element, name: str, count: int) -> NDArray[np.float64]:
     if len(values) != count or not np.isfinite(values).all():
         raise BadFileError(f"the {name} of its chunk does not have {count} numbers")
     return values
-
-
-def _east_north_up(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3, 3] rows at a geocentric position [3]. Up is away from the centre of the earth, which
-    differs from the vertical by a fifth of a degree at most."""
-    up = position / np.linalg.norm(position)
-    east = np.cross([0.0, 0.0, 1.0], up)
-    east = east / max(float(np.linalg.norm(east)), 1e-9)
-    return np.stack([east, np.cross(up, east), up])
 
 
 def _parsed(path: Path) -> Element:

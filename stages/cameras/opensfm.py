@@ -28,6 +28,7 @@ from stages.cameras.camera_file import (
 )
 from stages.cameras.lens import Lens
 from stages.scene import View
+from stages.scene.place import GEOGRAPHIC, EarthPlace
 from stages.scene.rotations import matrices_of
 
 _NAME = "reconstruction.json"
@@ -87,7 +88,9 @@ def _georeference(data: Mapping[str, Any], views: tuple[View, ...]) -> Georefere
         spread = np.linalg.norm((there - there.mean(axis=0))[:, :2], axis=1).mean()
         if len(rows) < _MIN_GPS or not apart <= _MAX_RESIDUAL * spread:
             return NO_GEOREFERENCE
-    return Georeference(1.0, np.eye(3), "the file's GPS reference")
+    offset = [float(reference.get(key, 0.0)) for key in ("latitude", "longitude", "altitude")]
+    place = EarthPlace(GEOGRAPHIC, np.array(offset), np.eye(3))
+    return Georeference(1.0, np.eye(3), "the file's GPS reference", place)
 
 
 def read_points(path: Path) -> FilePoints | None:

@@ -63,6 +63,16 @@ def about_conversions(
         )
 
 
+def about_places(contradicting: Sequence[str], warn: Warn) -> None:
+    """contradicting: names of photographs whose tags state two places."""
+    if contradicting:
+        warn(
+            "ingest-gps-contradicts",
+            f"Exif and XMP state places more than 50 m apart: {listed(contradicting)}. The GPS of "
+            "these photographs is not used. Write one of the two anew, or remove it.",
+        )
+
+
 def about_masks(
     photos: Sequence[Photo],
     by_alpha: Sequence[str],

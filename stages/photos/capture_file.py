@@ -12,7 +12,7 @@ from stages.base.bad_files import BadFileError, reading, stage_output
 from stages.scene import Capture, Photo
 
 FILE = "capture.json"
-_SCHEMA = 4
+_SCHEMA = 5
 
 
 def save_capture(capture: Capture) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+from stages.photos.gps import Gps, read_gps
 
 FULL_FRAME_WIDTH_MM = 36.0
 _EXIF_IFD, _INTEROPERABILITY_IFD, _GPS_IFD = 0x8769, 0xA005, 0x8825
@@ -29,7 +31,7 @@ class Exif:
         focal_plane_px_per_mm: FocalPlaneXResolution in pixels per millimetre.
         adobe_rgb: whether the colour space is declared as Adobe RGB without a profile
             (InteroperabilityIndex "R03" of DCF).
-        gps: GPSLatitude and GPSLongitude in degrees, north and east positive.
+        gps: where it was taken.
     """
 
     make: str = ""
@@ -44,7 +46,7 @@ class Exif:
     pixels: tuple[float, float] | None = None
     focal_plane_px_per_mm: float | None = None
     adobe_rgb: bool = False
-    gps: tuple[float, float] | None = None
+    gps: Gps = field(default_factory=Gps)
 
     @property
     def exposure_ev(self) -> float | None:
@@ -119,6 +121,7 @@ def read_exif(image: Any) -> Exif:
         gps = dict(main.get_ifd(_GPS_IFD))
     except Exception:
         gps = {}
+    xmp = getattr(image, "info", {}).get("xmp")
     orientation = _number(tags.get(0x0112))
     width, height = _number(tags.get(0xA002)), _number(tags.get(0xA003))
     return Exif(
@@ -134,24 +137,8 @@ def read_exif(image: Any) -> Exif:
         pixels=(width, height) if width and height else None,
         focal_plane_px_per_mm=_focal_plane_px_per_mm(tags),
         adobe_rgb=_text(interoperability.get(1)) == "R03",
-        gps=_gps(gps),
+        gps=read_gps(gps, xmp if isinstance(xmp, bytes) else b""),
     )
-
-
-def _gps(tags: dict[int, Any]) -> tuple[float, float] | None:
-    """Latitude and longitude in degrees; None also at 0, 0, which receivers without a fix write."""
-    found = []
-    for reference, number, most in ((1, 2, 90.0), (3, 4, 180.0)):
-        sign = {"N": 1, "E": 1, "S": -1, "W": -1}.get(_text(tags.get(reference)).upper()[:1])
-        try:
-            degrees, minutes, seconds = (float(part) for part in tags[number])
-        except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
-            return None
-        value = degrees + minutes / 60 + seconds / 3600
-        if sign is None or not 0 <= value <= most:
-            return None
-        found.append(round(sign * value, 8))
-    return (found[0], found[1]) if any(found) else None
 
 
 def _iso(tags: dict[int, Any]) -> float | None:

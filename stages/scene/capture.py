@@ -38,7 +38,9 @@ class Photo:
             outside.
         outside: what pixels outside the mask mean. IGNORE: unknown content, which counts nowhere.
             TRANSPARENT: nothing is there; `image` is composited over black, and the mask is alpha.
-        gps: latitude and longitude in degrees from EXIF, or None.
+        gps: latitude and longitude in degrees from EXIF or XMP, or None.
+        gps_height: metres, above sea level or the ellipsoid as the receiver has it, or None.
+        gps_error_m: standard deviation of `gps` as the receiver states it, metres, or None.
     """
 
     name: str
@@ -54,6 +56,8 @@ class Photo:
     mask: str = ""
     outside: str = ""
     gps: tuple[float, float] | None = None
+    gps_height: float | None = None
+    gps_error_m: float | None = None
 
     @property
     def picture(self) -> str:

@@ -15,6 +15,7 @@ from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.cameras.lens import Lens
 from stages.scene import Camera, Capture, Photo, Reconstruction, View
+from stages.structure.gps import MetricScale
 from stages.structure.levelling import level_and_recentre
 from stages.structure.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric_scale
 from stages.structure.sparse_model import SparseModel, point_errors
@@ -76,7 +77,7 @@ def finish(
         FilePoints(model.points, model.colours, point_errors(model), model.tracks),
         Observations(model.observed_points, model.observing_views, observed_px),
         levelled=levelled,
-        metric=scale is not None,
+        metric=scale,
     )
 
 
@@ -100,7 +101,7 @@ def write_reconstruction(
     observations: Observations,
     *,
     levelled: bool,
-    metric: bool,
+    metric: MetricScale | None,
     roles: Sequence[str] = (),
 ) -> Reconstruction:
     """Write the COLMAP model of the undistorted pictures, and return the reconstruction.
@@ -111,7 +112,7 @@ def write_reconstruction(
         cloud: the points.
         observations: of these points.
         levelled: whether up is -Y.
-        metric: whether units are metres.
+        metric: how the world became metric; None if it is not.
     """
     write_colmap_model(
         folder / SPARSE,
@@ -147,4 +148,5 @@ def write_reconstruction(
         tracks=cloud.tracks,
         levelled=levelled,
         units="metres" if metric else "arbitrary",
+        place=metric.place if metric else None,
     )

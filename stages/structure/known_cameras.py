@@ -97,6 +97,7 @@ def reconstruct(
             metres_per_unit=georeference.metres_per_unit,
             source=georeference.source,
         )
+    known_scale = replace(known_scale, place=georeference.place)
     axes = georeference.axes
     return _finish(posed, cameras, cloud, observations, folder, report, known_scale, axes)
 
@@ -265,6 +266,8 @@ def _finish(
     points = (cloud.points - middle) @ turn.T
     photos = [one.photo for one in posed]
     pictures = [folder / IMAGES / photo.picture for photo in photos]
+    if known_scale.place is not None:
+        known_scale = replace(known_scale, place=known_scale.place.moved(world_from_new))
     scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
     if scale is not None:
         points, cameras = scale.points(points), scale.cameras(cameras)
@@ -277,7 +280,7 @@ def _finish(
         replace(cloud, points=points),
         observations,
         levelled=levelled,
-        metric=scale is not None,
+        metric=scale,
         roles=[one.role for one in posed],
     )
 

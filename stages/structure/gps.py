@@ -1,0 +1,228 @@
+"""Scale, north and place of a reconstruction from the photographs' GPS."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.stage import Report
+from stages.scene import Camera, Photo
+from stages.scene.place import EAST_DOWN_NORTH, GEOGRAPHIC, EarthPlace, local_positions
+from stages.scene.similarity import similarity
+
+_FEWEST = 5
+_AGREEING_SHARE = 0.6  # of the photographs with GPS
+_WORST_RESIDUAL = 0.15  # of the spread of the cameras; beyond, GPS is too inaccurate
+_PHONE_ERROR_M = 10.0  # of a phone's receiver; positions that spread less say nothing of the scale
+_HYPOTHESES = 2000  # of the robust fit, at most
+_EXACT_M = 1e-3  # of positions, as tags state them
+_ACCURATE_M = 0.2  # as positions corrected by a base station (RTK) are
+_FLATTEST = 0.05  # second over first extent of the positions that may tilt the world
+_MOST_TILT_DEG = 10.0  # by which accurate positions may correct the level of the cameras
+
+
+@dataclass(frozen=True)
+class MetricScale:
+    """How the world becomes metric.
+
+    Args:
+        metres: per unit of the old world.
+        source: a description for the manifest.
+        turn: [3, 3] rotation from the old to the new world, after which +Z is north and +X east,
+            if north is known.
+        place: of the new world; None if it is not known.
+    """
+
+    metres: float
+    source: str
+    turn: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    place: EarthPlace | None = None
+
+    def poses(self, world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[V, 4, 4] the poses in the new world."""
+        moved = np.array(world_to_camera)
+        moved[:, :3, :3] = moved[:, :3, :3] @ self.turn.T
+        moved[:, :3, 3] *= self.metres
+        return moved
+
+    def cameras(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """The cameras in the new world."""
+        poses = self.poses(np.array([camera.world_to_camera for camera in cameras]))
+        return [replace(c, world_to_camera=pose) for c, pose in zip(cameras, poses, strict=True)]
+
+    def points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[P, 3] the points in the new world."""
+        return np.asarray(self.metres * points @ self.turn.T)
+
+    def followed_by(self, metres: float, turn: NDArray[np.float64]) -> MetricScale:
+        """Scaled and rotated once more; the place moves with the world."""
+        old_from_new = np.eye(4)
+        old_from_new[:3, :3] = turn.T / metres
+        place = self.place and self.place.moved(old_from_new)
+        return replace(self, metres=self.metres * metres, turn=turn @ self.turn, place=place)
+
+
+def about_vertical(heading: float) -> NDArray[np.float64]:
+    """[3, 3] rotation by `heading` (radians) about y, which points down."""
+    c, s = math.cos(heading), math.sin(heading)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def scale_from_gps(
+    photos: Sequence[Photo], centres: NDArray[np.float64], levelled: bool, report: Report
+) -> MetricScale | None:
+    """The scale that takes the cameras to their GPS positions; None if these cannot be used.
+
+    By horizontal positions alone, because GPS heights are less accurate than levelling by cameras;
+    where positions are accurate, by all three coordinates.
+
+    Args:
+        photos: [V] the registered photographs.
+        centres: [V, 3] of their cameras.
+        levelled: whether up is -Y.
+        report: receives metrics, and a warning where GPS cannot be used.
+    """
+    rows = np.array([i for i, photo in enumerate(photos) if photo.gps is not None], np.intp)
+    report.metric("with_gps", len(rows))
+    if not len(rows):
+        return None
+    around, there, heights_known = _positions([photos[i] for i in rows])
+    here = centres[rows]
+    flat_here, flat_there = here[:, 0] + 1j * here[:, 2], there[:, 0] + 1j * there[:, 1]
+    spread = float(np.sqrt(np.mean(np.abs(flat_there - flat_there.mean()) ** 2)))
+    report.metric("gps_spread_m", round(spread, 3))
+    factor, inliers, residual = 0j, np.zeros(len(rows), np.bool_), math.inf
+    if levelled and len(rows) >= _FEWEST:
+        factor, inliers, residual = fit_similarity_2d(flat_here, flat_there)
+    agreeing = int(inliers.sum())
+    if abs(factor):
+        report.metric("gps_residual_m", round(residual, 3))
+        report.metric("gps_agreeing", agreeing)
+    unused = ""
+    if len(rows) < _FEWEST:
+        unused = f"{_FEWEST} photographs are needed"
+    elif not levelled:
+        unused = "the up direction was not found"
+    elif abs(factor) == 0:
+        unused = "most cameras or positions are at one place"
+    elif agreeing < max(_FEWEST, _AGREEING_SHARE * len(rows)):
+        unused = f"only {agreeing} of them agree with the cameras"
+    elif residual > _WORST_RESIDUAL * spread:
+        unused = f"they differ from the cameras by {residual:.1f} m (RMS)"
+    if unused:
+        _report_unused(unused, len(rows), len(photos), spread, report)
+        return None
+    # (x + iz) e^(i angle) rotates x towards z; `about_vertical` rotates the other way.
+    metres, turn = float(abs(factor)), about_vertical(-float(np.angle(factor)))
+    errors = [photos[i].gps_error_m for i in rows]
+    exact = inliers & heights_known & [e is not None and e <= _ACCURATE_M for e in errors]
+    if (by_all := _fit_3d(here[exact], there[exact])) is not None:
+        metres, turn = by_all
+        report.metric("gps_in_three_dimensions", int(exact.sum()))
+    scale = MetricScale(metres, f"GPS of {agreeing} photographs, {residual:.2g} m off", turn)
+    place = _place(around, scale.points(here), there, inliers, heights_known)
+    return replace(scale, place=place)
+
+
+def _positions(
+    photos: Sequence[Photo],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """(latitude, longitude and height [3] of a place in the middle, metres east, north and up of it
+    [N, 3], whose heights are known [N]). Heights that are not known are those of the middle."""
+    places = np.array([[*(photo.gps or (0.0, 0.0)), photo.gps_height or 0.0] for photo in photos])
+    known = np.array([photo.gps_height is not None for photo in photos])
+    unwrapped = places.copy()
+    unwrapped[:, 1] = np.unwrap(places[:, 1], period=360.0)  # across the 180th meridian
+    middle = np.median(unwrapped, axis=0)
+    middle[2] = np.median(places[known, 2]) if known.any() else 0.0
+    places[~known, 2] = middle[2]
+    return middle, local_positions(places, middle), known
+
+
+def _fit_3d(
+    here: NDArray[np.float64], there: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]] | None:
+    """(metres per unit, rotation [3, 3] to the new world) by accurate positions [N, 3]; None if
+    they are few or nearly on a line, or contradict the level of the cameras."""
+    if len(here) < _FEWEST:
+        return None
+    extents = np.linalg.svd(there - there.mean(axis=0), compute_uv=False)
+    if extents[1] < _FLATTEST * extents[0]:
+        return None
+    metres, rotation, _ = similarity(here, there)
+    turn = EAST_DOWN_NORTH.T @ rotation
+    if not metres > 0 or turn[1, 1] < math.cos(math.radians(_MOST_TILT_DEG)):
+        return None
+    return metres, turn
+
+
+def _place(
+    around: NDArray[np.float64],
+    here: NDArray[np.float64],
+    there: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
+    heights_known: NDArray[np.bool_],
+) -> EarthPlace:
+    """The place of the new world.
+
+    Args:
+        around: [3] latitude, longitude and height.
+        here: [N, 3] the cameras in the new world.
+        there: [N, 3] their GPS positions, east, north and up of `around`.
+        inliers, heights_known: [N].
+    """
+    shift = (there - here @ EAST_DOWN_NORTH.T)[inliers].mean(axis=0)
+    with_heights = inliers & heights_known
+    ups = there[:, 2] + here[:, 1]
+    shift[2] = np.median(ups[with_heights if with_heights.any() else inliers])
+    return EarthPlace(GEOGRAPHIC, around, EAST_DOWN_NORTH).beside(EAST_DOWN_NORTH.T @ shift)
+
+
+def _report_unused(why: str, count: int, total: int, spread: float, report: Report) -> None:
+    """Report why GPS is not used; as a warning if the scale could have come from it.
+
+    Args:
+        why: the reason.
+        count, total: photographs with GPS, and all photographs.
+        spread: of the GPS positions, metres.
+        report: receives a metric and the warning.
+    """
+    report.metric("gps_unused", why)
+    if spread >= _PHONE_ERROR_M:
+        report.warn(
+            "sfm-gps-unused",
+            f"{count} of {total} photographs have GPS, spread over {spread:.0f} m (RMS). It is not "
+            f"used for scale and north: {why}. Give a known distance with --scale if the scene "
+            "must be in metres.",
+        )
+
+
+def fit_similarity_2d(
+    here: NDArray[np.complex128], there: NDArray[np.complex128]
+) -> tuple[complex, NDArray[np.bool_], float]:
+    """Robust fit of a similarity of the plane that maps `here` [N] to `there` [N].
+
+    Least median of squares over hypotheses from two points each (Rousseeuw 1984), then least
+    squares over inliers, in metres. Returns (complex factor, inliers [N], RMS residual of the
+    inliers).
+    """
+    first, second = np.triu_indices(len(here), 1)
+    chosen = np.linspace(0, len(first) - 1, min(len(first), _HYPOTHESES)).astype(int)
+    best, least = 0j, math.inf
+    for i, j in zip(first[chosen], second[chosen], strict=True):
+        if abs(here[j] - here[i]) == 0:
+            continue
+        factor = (there[j] - there[i]) / (here[j] - here[i])
+        off = float(np.median(np.abs(there - there[i] - factor * (here - here[i]))))
+        if off < least:
+            best, least, anchor = factor, off, i
+    if not math.isfinite(least):
+        return 0j, np.zeros(len(here), np.bool_), math.inf
+    inliers = np.abs(there - there[anchor] - best * (here - here[anchor])) <= 3.0 * least + _EXACT_M
+    a, b = here[inliers] - here[inliers].mean(), there[inliers] - there[inliers].mean()
+    factor = complex((a.conj() @ b) / max(float((a.conj() @ a).real), 1e-300))
+    return factor, inliers, float(np.sqrt(np.mean(np.abs(b - factor * a) ** 2)))
