@@ -18,7 +18,7 @@ from sample_captures.render import Lens, Light, photograph
 from stages import sfm
 from stages.run.manifest import plain
 from stages.scene import Reconstruction
-from stages.scene.similarity import similarity
+from stages.scene.rotations import similarity
 
 CAPTURE = Path(__file__).parents[1] / "sample_captures" / "still_life"
 IMAGES = sorted((CAPTURE / "images").iterdir())

@@ -86,8 +86,7 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
     """(the figures of the comparison, a warning of what was lost or "").
     Raises SplatError "convert-verify-failed"."""
     from stages.formats import format_of
-    from stages.proof.prover import Prover, cameras_for
-    from stages.proof.reason import losses_shown
+    from stages.proof.prover import Prover, cameras_for, losses_shown
 
     cameras = cameras_for(splats, results.views_of(results.run_around(source)))
     prover = Prover.of(splats, cameras, source_format=format_of(source).ending)

@@ -16,7 +16,7 @@ from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.proof.cost import Memory as MemoryUse
+    from stages.proof.statistics import Memory as MemoryUse
     from stages.proof.statistics import Statistics
     from stages.scene import ExportedFile, Splats
 
@@ -86,7 +86,7 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
 def _memory(splats: Splats) -> dict[str, Any]:
     """Floats and bytes in memory for each splat and for all, and the mass of a Gaussian within 1, 2
     and 3 standard deviations."""
-    from stages.proof.cost import DEGREES, floats_of, mass_within, memory_of
+    from stages.proof.statistics import DEGREES, floats_of, mass_within, memory_of
 
     one, every = (memory_of(splats.sh_degree, count) for count in (1, len(splats)))
     return {

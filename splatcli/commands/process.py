@@ -15,7 +15,7 @@ from stages.base.errors import Family, SplatError
 from stages.distributed import blocks, cluster, sfm_chunks
 from stages.distributed.tasks import Executor
 from stages.run import runfolder
-from stages.run.listeners import Listeners
+from stages.run.attempt import Listeners
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.precompile import PrecompileListener
 from stages.run.runfile import RunFile

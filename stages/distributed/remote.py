@@ -22,7 +22,7 @@ from stages.base.distribution import install_command
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Stage
 from stages.distributed.tasks import Location, RunTask
-from stages.run.listeners import Listeners
+from stages.run.attempt import Listeners
 from stages.run.lock import locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Listener

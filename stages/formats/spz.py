@@ -28,7 +28,7 @@ from stages.formats.spz_read import ANTIALIASED, COLOUR_SCALE, HEADER, MAGIC, MA
 from stages.formats.values import linear_opacities, unit_quaternions
 from stages.scene import Splats
 from stages.scene.flip import FLIP, flipped
-from stages.scene.spacing import median_spacing
+from stages.scene.quantiles import median_spacing
 
 _LEVEL = 6  # 9 takes eight times as long for 1 % less
 _USUAL_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 23

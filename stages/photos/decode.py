@@ -1,9 +1,14 @@
-"""Decodes a photograph of any supported format to upright 8-bit sRGB of limited size."""
+"""Decodes a photograph of any supported format to upright 8-bit sRGB of limited size.
+
+Also: what is wrong with a JPEG that decoders accept without a word: they fill what is missing with
+grey, and walk over the whole picture for each of any number of scans.
+"""
 
 from __future__ import annotations
 
 import io
 import logging
+import re
 import threading
 import warnings
 from collections.abc import Iterator
@@ -21,7 +26,6 @@ from PIL import Image, ImageCms, ImageFile, UnidentifiedImageError
 from stages.base.text import reason_of
 from stages.photos import colour
 from stages.photos.exif import Exif, read_exif
-from stages.photos.jpeg import fault_of
 from stages.scene import fitted_size
 
 MAX_MEGAPIXELS = 200
@@ -149,7 +153,7 @@ def _read(path: Path) -> bytes:
         raise Unusable(f"it cannot be opened ({error.strerror or error})") from error
     if not data:
         raise Unusable("the file is empty")
-    if data[:3] == b"\xff\xd8\xff" and (fault := fault_of(data)):
+    if data[:3] == b"\xff\xd8\xff" and (fault := jpeg_fault(data)):
         raise Unusable(fault)
     return data
 
@@ -286,3 +290,43 @@ def _unidentified(data: bytes) -> Unusable:
     if data[:64].isascii() and b"\0" not in data[:64]:
         return Unusable("it holds text, not a picture", "Remove it, or replace it by the picture")
     return Unusable("it is not a picture, or is damaged")
+
+
+# In a scan's data every FF is followed by 00 (stuffing) or D0-D7 (restart), or it is fill (FF FF).
+_MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]", re.DOTALL)
+_TRUNCATED = "the file is truncated"
+_MOST_SCANS = 100  # a progressive JPEG has about ten
+_START, _END, _SCAN, _TEM = 0xD8, 0xD9, 0xDA, 0x01
+
+
+def jpeg_fault(data: bytes) -> str:
+    """Why the first image in `data` is refused: it lacks its end-of-image marker (ITU-T T.81, annex
+    B), or has very many scans. "" if it is well.
+
+    Walks over the segments, so that an end marker within a thumbnail or a comment does not count.
+    """
+    if data[:2] != b"\xff\xd8":
+        return _TRUNCATED
+    position, scans = 2, 0
+    while position + 1 < len(data):
+        if data[position] != 0xFF:
+            return _TRUNCATED
+        marker = data[position + 1]
+        if marker == 0xFF:  # fill byte
+            position += 1
+            continue
+        if marker == _END:
+            return ""
+        if marker == _TEM or _START > marker >= 0xD0:
+            position += 2
+            continue
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == _SCAN:
+            found = _MARKER_IN_SCAN.search(data, position)
+            scans += 1
+            if scans > _MOST_SCANS:
+                return f"it has more than {_MOST_SCANS} scans"
+            if found is None:
+                return _TRUNCATED
+            position = found.end() - 2
+    return _TRUNCATED

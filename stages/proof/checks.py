@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.base.bad_files import reading
 from stages.formats import format_of
-from stages.proof import byte_breakdown, independent_packed, independent_readers, usd_validators
+from stages.proof import byte_breakdown, independent_packed, independent_readers
 from stages.proof.byte_breakdown import ByteBreakdown
 from stages.proof.content import Y_DOWN, Y_UP, FileContent
 from stages.scene import Splats
@@ -39,7 +39,7 @@ class Checks:
 
 _PLY = Checks(independent_readers.ply, byte_breakdown.ply)
 _GLTF = Checks(independent_readers.gltf, byte_breakdown.gltf)
-_USD = Checks(independent_readers.usd, byte_breakdown.usd, usd_validators.errors_in)
+_USD = Checks(independent_readers.usd, byte_breakdown.usd, independent_readers.usd_errors)
 CHECKS = {
     "ply": _PLY,
     "splat": Checks(independent_readers.splat, byte_breakdown.splat),

@@ -1,11 +1,14 @@
-"""One attempt at one stage: run it in its working folder, measure it, make its output final."""
+"""One attempt at one stage: run it in its working folder, measure it, make its output final.
+
+Also: several listeners of a run as one.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
@@ -156,3 +159,20 @@ class _Usage:
 def _cpu_seconds() -> float:
     """User and system time of this process and of its child processes that have ended."""
     return sum(os.times()[:4])
+
+
+class Listeners(Listener):
+    """Passes each event of a run on to several listeners, in the order given."""
+
+    def __init__(self, *listeners: Listener) -> None:
+        for event in vars(Listener):
+            if not event.startswith("_"):
+                setattr(self, event, _every([getattr(one, event) for one in listeners]))
+
+
+def _every(methods: list[Callable[..., None]]) -> Callable[..., None]:
+    def call(*values: Any) -> None:
+        for method in methods:
+            method(*values)
+
+    return call

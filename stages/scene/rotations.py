@@ -1,4 +1,7 @@
-"""Rotation matrices and unit quaternions w, x, y, z of the same rotations."""
+"""Rotation matrices and unit quaternions w, x, y, z of the same rotations.
+
+Also: the similarity transform between two sets of corresponding points.
+"""
 
 from __future__ import annotations
 
@@ -33,3 +36,18 @@ def matrices_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def similarity(
+    a: NDArray[np.float64], b: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """(scale, rotation [3, 3], offset [3]) that take points a [N, 3] nearest b by
+    scale * rotation @ a + offset (Umeyama 1991). For collinear or
+    equal points it is one of many solutions."""
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    u, sizes, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a) / len(a))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(signs) @ vt
+    spread = max(float(np.square(a - mean_a).sum(1).mean()), 1e-300)
+    scale = float((sizes * signs).sum() / spread)
+    return scale, rotation, mean_b - scale * rotation @ mean_a

@@ -19,8 +19,7 @@ from stages.base import memory
 from stages.base.memory import MIB
 from stages.structure import database as sqlite
 from stages.structure import new_database
-from stages.structure.job import Job, chunks_path
-from stages.structure.worker_progress import ProgressWriter
+from stages.structure.job import Job, ProgressWriter, chunks_path
 
 LARGEST_SIDE = 3200  # pixels; features of larger photographs are found at this size
 LAYERS = 3  # per octave

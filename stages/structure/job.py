@@ -1,9 +1,14 @@
-"""A job of the worker process: plain data, passed as JSON."""
+"""A job of the worker process: plain data, passed as JSON.
+
+Also: progress of the worker process, in a small file that its parent reads.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +17,7 @@ from stages.base import threads
 
 if TYPE_CHECKING:
     from stages.scene import Capture
+
 
 STEPS = (
     *("features", "matching", "mapping"),
@@ -177,3 +183,34 @@ def selected_pairs_path(job: Job) -> Path:
 def chunks_path(job: Job) -> Path:
     """Folder for finished chunks of the job."""
     return Path(job.database).with_suffix(".chunks")
+
+
+_SECONDS = 0.2  # between two writes
+
+
+class ProgressWriter:
+    """Writes the file at `path`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._next = 0.0
+
+    def write(self, phase: str, done: int, total: int) -> None:
+        """Record that `done` of `total` units of `phase` are finished; at most every 0.2 s, and
+        always at the end."""
+        now = time.monotonic()
+        if now < self._next and done < total:
+            return
+        self._next = now + _SECONDS
+        partial = self._path.with_name(self._path.name + ".partial")
+        partial.write_text(json.dumps([phase, done, total]))
+        os.replace(partial, self._path)
+
+
+def read_progress(path: Path) -> tuple[str, int, int] | None:
+    """(phase, done, total) as last written; None before the first time."""
+    try:
+        phase, done, total = json.loads(path.read_text())
+        return str(phase), int(done), int(total)
+    except (OSError, ValueError, TypeError):
+        return None

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from stages.scene.similarity import similarity
+from stages.scene.rotations import similarity
 from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
 from stages.structure.job import Job, known_cameras_path
 from stages.structure.mapping import point_arrays

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from stages.structure import database as sqlite
 from stages.structure.epipolar import MatchedPair, epipolar_distances, inlier_ratios
-from stages.structure.job import Job
+from stages.structure.job import Job, ProgressWriter
 from stages.structure.sparse_model import SparseModel, save_model
-from stages.structure.worker_progress import ProgressWriter
 
 # A smaller model is compared with the largest one only if it has this many photographs, this share
 # of the largest model's photographs, and this many points for each of its photographs.

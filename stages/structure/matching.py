@@ -19,6 +19,7 @@ from stages.structure import new_database, pairs, retrieval
 from stages.structure.descriptor_matching import match_descriptors
 from stages.structure.job import (
     Job,
+    ProgressWriter,
     chunks_path,
     compared_pairs_path,
     selected_pairs_path,
@@ -33,7 +34,6 @@ from stages.structure.vocabulary import (
     index_by_word,
     word_pairs,
 )
-from stages.structure.worker_progress import ProgressWriter
 
 LARGEST_FEATURES = 1000  # compared for pair selection; they are seen from the farthest
 FEWEST_COMPARED_SMALL = 64  # as `vocabulary.FEWEST_COMPARED`, for pair selection: it may err more

@@ -13,8 +13,7 @@ from stages.base.disk import disk_full
 from stages.base.errors import Family, Interrupted, SplatError
 from stages.base.parent import end_child, how_it_ended, python_module, start_child
 from stages.base.stage import Report
-from stages.structure.job import Job
-from stages.structure.worker_progress import read_progress
+from stages.structure.job import Job, read_progress
 
 _POLL_SECONDS = 0.1
 _TICK_SECONDS = 0.5

@@ -1,4 +1,7 @@
-"""Splats and their cameras -> the collision mesh and its quality figures."""
+"""Splats and their cameras -> the collision mesh and its quality figures.
+
+Also: vertex colours of the mesh from the drawn views.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.raster.draw import raster_settings_of
 from stages.scene import Reconstruction, Splats, split_held_out
-from stages.surface import colour, depth_maps, extract, fuse
+from stages.surface import depth_maps, extract, fuse
 from stages.surface.depth_maps import DepthMap
 from stages.surface.distance import distances_to_mesh
 from stages.surface.mesh import Mesh
@@ -72,7 +75,7 @@ def make_collision_mesh(
     mesh = extract.simplify(fine, triangles)
     if not len(mesh.faces):
         return _empty_mesh(report)
-    mesh = colour.colour_vertices(mesh, maps, fuse.TRUNCATION * volume.voxel)
+    mesh = colour_vertices(mesh, maps, fuse.TRUNCATION * volume.voxel)
     mesh = replace(mesh, origin=splats.origin, place=splats.place)
     covered = _covered(mesh, maps, volume.voxel)
     figures = {
@@ -133,3 +136,35 @@ def _sparse_point_figures(
 
 def _rounded(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.4g}")
+
+
+def colour_vertices(mesh: Mesh, maps: list[DepthMap], tolerance: float) -> Mesh:
+    """The mesh with colours: the weighted mean of the pixels that see each vertex.
+
+    tolerance: the largest distance in depth between a pixel and a vertex that it sees, world units.
+    A vertex that no pixel sees takes the colour of the nearest one that is seen.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(mesh.vertices):
+        return mesh
+    sums, weights = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
+    for found in maps:
+        camera = found.camera
+        pixels, z = camera.project(mesh.vertices.astype(np.float64))
+        inside = (z > 0) & camera.shows(pixels)
+        columns, rows = pixels[inside].astype(int).T
+        agrees = np.abs(found.depth[rows, columns] - z[inside]) < tolerance
+        seen = np.flatnonzero(inside)[agrees]
+        rows, columns = rows[agrees], columns[agrees]
+        weight = found.weight[rows, columns].astype(np.float64)
+        sums[seen] += weight[:, None] * found.colour[rows, columns]
+        weights[seen] += weight
+    known = weights > 0
+    if not known.any():
+        return mesh
+    colours = np.zeros((len(weights), 3))
+    colours[known] = sums[known] / weights[known, None]
+    _, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[~known])
+    colours[~known] = colours[known][nearest]
+    return replace(mesh, colours=np.rint(colours).astype(np.uint8))

@@ -19,7 +19,7 @@ from sample_captures import make
 from sample_captures.render import Lens, Light, photograph
 from stages.measure.evaluation import EvaluationView, load_evaluation_views
 from stages.scene import Camera, DrawSettings, Reconstruction, View
-from stages.scene.similarity import similarity
+from stages.scene.rotations import similarity
 
 TRUTH = Path(make.__file__).parent / "still_life" / "truth.json"
 PINHOLE = Lens(width=640, height=480, focal_px=600.0, k=0.0)

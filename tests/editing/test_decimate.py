@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.editing.decimate import RemovalCosts, decimate
-from stages.editing.moments import Moments, merge
+from stages.editing.decimate import Moments, RemovalCosts, decimate, merge
 from stages.measure.image_metrics import capped_psnr_db
 from stages.raster.definition import ALPHA_MAX
 from stages.raster.draw import render

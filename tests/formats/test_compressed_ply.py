@@ -14,7 +14,7 @@ from stages import formats
 from stages.base.errors import SplatError
 from stages.formats import compressed_ply
 from stages.scene import Splats, morton
-from stages.scene.spacing import median_spacing
+from stages.scene.quantiles import median_spacing
 from tests.formats.files import angles, three_splats
 from tests.formats.truth import C0, extreme_splats, many_splats
 

@@ -17,7 +17,7 @@ from stages.formats import spz, spz_read
 from stages.proof.checks import read_back
 from stages.proof.prover import Prover, cameras_for
 from stages.scene import Splats
-from stages.scene.spacing import median_spacing
+from stages.scene.quantiles import median_spacing
 from tests.formats.files import angles
 from tests.formats.truth import C0, extreme_splats, many_splats, red_splat
 

@@ -23,9 +23,8 @@ from stages.cameras import nerfstudio, realityscan
 from stages.cameras.camera_file import size_of_picture
 from stages.formats import streamed_sog
 from stages.formats.spz_read import MAGIC
-from stages.photos.decode import PixelBudget, Unusable, decode, readers_set_up
+from stages.photos.decode import PixelBudget, Unusable, decode, jpeg_fault, readers_set_up
 from stages.photos.exif import Exif
-from stages.photos.jpeg import fault_of
 from stages.run.manifest import MANIFEST, Manifest, write_sealed
 from stages.run.runfile import RUN_FILE, RunFile
 from stages.scene import load_splats, save_splats
@@ -241,8 +240,8 @@ def test_the_exposure_of_any_numbers_is_a_number(
 def test_the_end_of_a_jpeg_with_a_long_fill_is_found_soon() -> None:
     scan = b"\xff\xd8\xff\xda\x00\x02"
     meter = Meter()
-    assert fault_of(scan + (b"\xff" * 60_000 + b"\x00") * 3)
-    assert not fault_of(scan + b"\xff" * 60_000 + b"\x00\x01" + b"\xff\xff\xd9")
+    assert jpeg_fault(scan + (b"\xff" * 60_000 + b"\x00") * 3)
+    assert not jpeg_fault(scan + b"\xff" * 60_000 + b"\x00\x01" + b"\xff\xff\xd9")
     assert meter.stop().cpu_s < _CPU_S
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.proof.cost import DEGREES, Memory, floats_of, mass_within, memory_of
+from stages.proof.statistics import DEGREES, Memory, floats_of, mass_within, memory_of
 from stages.raster.definition import splat_arrays, used_columns
 from stages.training.optimiser import new_model
 from tests.scenes import cloud

@@ -12,8 +12,8 @@ from plyfile import PlyData
 
 from stages import formats
 from stages.formats import splat32
+from stages.proof import independent_readers
 from stages.proof import prover as proving
-from stages.proof import usd_validators
 from stages.proof.checks import read_back
 from stages.proof.prover import Proof, Prover, cameras_for
 from stages.scene import Splats
@@ -260,7 +260,7 @@ def test_the_usd_librarys_validators_find_no_errors(
     scene: SmallScene, tmp_path: Path, name: str
 ) -> None:
     formats.write(tmp_path / f"a.{name}", scene.splats)
-    assert usd_validators.errors_in(tmp_path / f"a.{name}") == []
+    assert independent_readers.usd_errors(tmp_path / f"a.{name}") == []
 
 
 @pytest.mark.parametrize("name", ["usda", "usdc", "usdz"])

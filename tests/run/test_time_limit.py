@@ -10,8 +10,7 @@ import pytest
 
 from stages.base.stage import Stage
 from stages.prune import PruneSettings
-from stages.run.pipeline import Pipeline
-from stages.run.time_limit import LEAST, within_limit
+from stages.run.pipeline import LEAST_S, Pipeline, within_limit
 from stages.train import TrainSettings
 from tests.run.fakes import photographs
 
@@ -55,5 +54,5 @@ def test_the_limit_of_a_single_stage_is_its_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("stage", "kind"), [("train", TrainSettings), ("prune", PruneSettings)])
 def test_without_a_limit_there_is_none_and_when_time_is_over_a_second_is_left(stage, kind) -> None:
     assert within_limit(stage, kind(), 1000.0) == kind()
-    assert within_limit(stage, kind(seconds=60.0), 100.0).seconds == LEAST
+    assert within_limit(stage, kind(seconds=60.0), 100.0).seconds == LEAST_S
     assert 20 < within_limit(stage, kind(seconds=60.0), 10.0).seconds < 40

@@ -7,7 +7,7 @@ import pytest
 
 from stages.base.errors import SplatError
 from stages.scene import Camera, look_at
-from stages.structure.common_view import count_views, random_points
+from stages.structure.known_points import count_views, random_points
 
 MIDDLE = np.array([5.0, -2.0, 7.0])
 

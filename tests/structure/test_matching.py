@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from stages.structure import database as sqlite
-from stages.structure import worker_progress
-from stages.structure.job import Job
+from stages.structure.job import Job, read_progress
 from stages.structure.pairs import exhaustive_pairs
 from tests.structure import sample_jobs as jobs
 
@@ -62,7 +61,7 @@ def test_three_threads_find_what_one_finds(
     jobs.work(job)
     assert (found(job, "matches"), found(job, "two_view_geometries")) == whole
     assert len(whole[0]) == len(exhaustive_pairs(PHOTOGRAPHS))
-    assert worker_progress.read_progress(Path(job.progress)) == ("matching", 36, 36)
+    assert read_progress(Path(job.progress)) == ("matching", 36, 36)
 
 
 @pytest.mark.slow

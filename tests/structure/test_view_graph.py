@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.structure.view_graph import Cut, weakest_cut
+from stages.structure.sparse_model import Cut, weakest_cut
 
 Seen = tuple[NDArray[np.int64], NDArray[np.int64]]
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from stages.base.errors import SplatError
-from stages.viewer.film_file import film
 from stages.viewer.image_files import (
     depth_colours,
     depth_range,
@@ -19,6 +18,7 @@ from stages.viewer.image_files import (
     save_depth,
     save_picture,
 )
+from stages.viewer.sinks import film
 from tests.tolerances import FILM_LEVELS
 
 COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128), (200, 100, 50), (10, 200, 150)]
