@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stages.base.stage import Report
 from stages.scene import Camera, Photo
 from stages.scene.place import EAST_DOWN_NORTH, GEOGRAPHIC, EarthPlace, local_positions
-from stages.scene.similarity import similarity
+from stages.scene.rotations import similarity
 
 _FEWEST = 5
 _AGREEING_SHARE = 0.6  # of the photographs with GPS
