@@ -6,7 +6,7 @@ is written, and takes sharp frames from videos. Warnings say what a photographer
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -76,23 +76,16 @@ class _Ingested:
         photo: None for a file that cannot be used.
         measures: of the photograph.
         error: why the file cannot be used.
-        transparent: whether the file has transparent pixels.
         inside: share of the photograph that its mask keeps.
-        mask_scaled: whether its mask had another size.
-        hdr, bad_profile: as in `Decoded`.
-        two_places: whether its tags contradict each other about where it was taken.
+        remarks: codes of `advice.TEXTS` that apply to it.
     """
 
     name: str
     photo: Photo | None = None
     measures: Measures | None = None
     error: Unusable | None = None
-    transparent: bool = False
     inside: float = 1.0
-    mask_scaled: bool = False
-    hdr: bool = False
-    bad_profile: bool = False
-    two_places: bool = False
+    remarks: tuple[str, ...] = ()
 
 
 def run(
@@ -122,26 +115,23 @@ def run(
     for source in found.videos:
         ingested += _ingest_video(source, settings, folder, report)
     unusable = [(one.name, str(one.error), one.error.hint) for one in ingested if one.error]
-    advice.about_files(found, report.warn)
     advice.about_left_out(unusable, report.warn)
     photos = tuple(one.photo for one in ingested if one.photo is not None)
     if len(photos) < FEWEST_PHOTOGRAPHS:
         raise _too_few(root, len(photos), unusable)
-    advice.about_conversions(
-        [one.name for one in ingested if one.hdr],
-        [one.name for one in ingested if one.bad_profile],
-        report.warn,
-    )
     inside = [one.inside for one in ingested if one.photo is not None]
-    advice.about_places([one.name for one in ingested if one.two_places], report.warn)
     masking.check_shares(photos, inside, bool(found.masks))
-    advice.about_masks(
-        photos,
-        [one.name for one in ingested if one.transparent],
-        [one.name for one in ingested if one.mask_scaled],
-        found.stray_masks,
-        report.warn,
-    )
+    bare = [photo.name for photo in photos if not photo.mask]
+    remarks: dict[str, Sequence[str]] = {
+        code: [o.name for o in ingested if code in o.remarks] for code in advice.TEXTS
+    }
+    remarks |= {
+        "ingest-raw-not-read": found.raws,
+        "ingest-format-not-read": found.other_pictures,
+        "ingest-mask-unused": found.stray_masks,
+        "ingest-mask-missing": bare if len(bare) < len(photos) else (),
+    }
+    advice.about_names(remarks, report.warn)
     duplicates = near_duplicates([one.measures.thumbnail for one in ingested if one.measures])
     photos = _with_duplicates(photos, duplicates)
     _report_capture(photos, duplicates, report)
@@ -236,7 +226,7 @@ def _write(
     from stages.photos.masking import MaskedPhoto
     from stages.photos.quality import measure
     from stages.photos.write import write_mask, write_picture
-    from stages.scene import Photo
+    from stages.scene import TRANSPARENT, Photo
 
     masked = MaskedPhoto.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
     decoded = masked.decoded
@@ -265,17 +255,15 @@ def _write(
         mask=masked.file(image),
         outside=masked.outside,
     )
-    return _Ingested(
-        name,
-        photo,
-        measures,
-        transparent=decoded.alpha is not None,
-        inside=masked.share,
-        mask_scaled=masked.scaled,
-        hdr=decoded.hdr,
-        bad_profile=decoded.bad_profile,
-        two_places=exif.gps.contradicts,
-    )
+    remarks = {
+        "ingest-transparency": decoded.alpha is not None and masked.outside == TRANSPARENT,
+        "ingest-mask-scaled": masked.scaled,
+        "ingest-hdr": decoded.hdr,
+        "ingest-colour-profile": decoded.bad_profile,
+        "ingest-gps-contradicts": exif.gps.contradicts,
+    }
+    codes = tuple(code for code, applies in remarks.items() if applies)
+    return _Ingested(name, photo, measures, inside=masked.share, remarks=codes)
 
 
 def _video_key(video: str, width: int, height: int) -> str:

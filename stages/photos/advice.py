@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from stages.base.text import counted, listed
-from stages.photos.sources import RAW_ADVICE, Findings
-from stages.scene import TRANSPARENT, Photo
+from stages.photos.sources import RAW_ADVICE
+from stages.scene import Photo
 
 Warn = Callable[[str, str], None]
 
@@ -23,16 +23,36 @@ SMALL_BELOW_PX = 640
 _NAMED = 8
 
 
-def about_files(found: Findings, warn: Warn) -> None:
-    """Files that may belong to the capture but are not read."""
-    if found.raws:
-        warn("ingest-raw-not-read", f"Raw files are not read: {listed(found.raws)}. {RAW_ADVICE}")
-    if found.other_pictures:
-        warn(
-            "ingest-format-not-read",
-            f"These formats are not read: {listed(found.other_pictures)}. "
-            "Save the pictures as JPEG, PNG or TIFF if they belong to the capture.",
-        )
+TEXTS = {  # by code, in the order of the warnings; {names} of files or photographs
+    "ingest-raw-not-read": f"Raw files are not read: {{names}}. {RAW_ADVICE}",
+    "ingest-format-not-read": "These formats are not read: {names}. "
+    "Save the pictures as JPEG, PNG or TIFF if they belong to the capture.",
+    "ingest-hdr": "High dynamic range is not used and colours may look pale: {names}. "
+    "Switch HDR off in the camera, or export as SDR.",
+    "ingest-colour-profile": "The colour profile is damaged, so sRGB was assumed: {names}. "
+    "Export these photographs again if their colours look wrong.",
+    "ingest-gps-contradicts": "Exif and XMP state places more than 50 m apart: {names}. The GPS of "
+    "these photographs is not used. Write one of the two anew, or remove it.",
+    "ingest-transparency": "Transparent parts are treated as empty space: {names}. "
+    "With --mask-means ignore they are treated as unknown.",
+    "ingest-mask-scaled": "Masks of another size than their photographs were scaled: {names}. "
+    "Masks as large as the photographs have sharper edges.",
+    "ingest-mask-unused": "Masks that belong to no photograph by their names are not used: "
+    "{names}.",
+    "ingest-mask-missing": "Some photographs have no mask: {names}. There everything counts.",
+    "ingest-blurred": "Blurred, compared with the others: {names}. "
+    "Take these again or remove them; more light or a shorter exposure helps.",
+    "ingest-small": f"Smaller than {SMALL_BELOW_PX} pixels: {{names}}. "
+    "Use the camera's original files; 1600 pixels and more are best.",
+    "ingest-dark": "Very dark: {names}. Use more light, or a tripod and a longer exposure.",
+}
+
+
+def about_names(names: Mapping[str, Sequence[str]], warn: Warn) -> None:
+    """Warn with the text of each code for which there are names."""
+    for code, text in TEXTS.items():
+        if found := names.get(code):
+            warn(code, text.format(names=listed(found)))
 
 
 def about_left_out(unusable: Sequence[tuple[str, str, str]], warn: Warn) -> None:
@@ -41,83 +61,6 @@ def about_left_out(unusable: Sequence[tuple[str, str, str]], warn: Warn) -> None
         warn("ingest-left-out", f"{name} is left out: {why}. {hint}.")
     if rest := [name for name, *_ in unusable[_NAMED:]]:
         warn("ingest-left-out", f"Also left out, for similar reasons: {listed(rest)}.")
-
-
-def about_conversions(
-    hdr: Sequence[str],
-    bad_profiles: Sequence[str],
-    warn: Warn,
-) -> None:
-    """Names of photographs that lost something in the conversion to 8-bit sRGB."""
-    if hdr:
-        warn(
-            "ingest-hdr",
-            f"High dynamic range is not used and colours may look pale: {listed(hdr)}. "
-            "Switch HDR off in the camera, or export as SDR.",
-        )
-    if bad_profiles:
-        warn(
-            "ingest-colour-profile",
-            f"The colour profile is damaged, so sRGB was assumed: {listed(bad_profiles)}. "
-            "Export these photographs again if their colours look wrong.",
-        )
-
-
-def about_places(contradicting: Sequence[str], warn: Warn) -> None:
-    """contradicting: names of photographs whose tags state two places."""
-    if contradicting:
-        warn(
-            "ingest-gps-contradicts",
-            f"Exif and XMP state places more than 50 m apart: {listed(contradicting)}. The GPS of "
-            "these photographs is not used. Write one of the two anew, or remove it.",
-        )
-
-
-def about_masks(
-    photos: Sequence[Photo],
-    by_alpha: Sequence[str],
-    scaled: Sequence[str],
-    stray: Sequence[str],
-    warn: Warn,
-) -> None:
-    """Warn about masks.
-
-    Args:
-        photos: all of the capture.
-        by_alpha: names of photographs that are partly transparent.
-        scaled: names of photographs whose masks had another size.
-        stray: names of masks that belong to no photograph.
-        warn: is called with the code and the text.
-    """
-    transparent = [name for name in by_alpha if _outside(photos, name) == TRANSPARENT]
-    if transparent:
-        warn(
-            "ingest-transparency",
-            f"Transparent parts are treated as empty space: {listed(transparent)}. "
-            "With --mask-means ignore they are treated as unknown.",
-        )
-    if scaled:
-        warn(
-            "ingest-mask-scaled",
-            f"Masks of another size than their photographs were scaled: {listed(scaled)}. "
-            "Masks as large as the photographs have sharper edges.",
-        )
-    if stray:
-        warn(
-            "ingest-mask-unused",
-            f"Masks that belong to no photograph by their names are not used: {listed(stray)}.",
-        )
-    bare = [photo.name for photo in photos if not photo.mask]
-    if 0 < len(bare) < len(photos):
-        warn(
-            "ingest-mask-missing",
-            f"{counted(len(bare), 'photograph has', 'photographs have')} no mask: {listed(bare)}. "
-            "There everything counts.",
-        )
-
-
-def _outside(photos: Sequence[Photo], name: str) -> str:
-    return next((photo.outside for photo in photos if photo.name == name), "")
 
 
 def about_capture(
@@ -130,7 +73,23 @@ def about_capture(
             f"The capture holds {counted(len(photos), 'usable photograph')}. An object or a room "
             "needs 20 to 50: take more, in small steps around the scene, with 60-80 % overlap.",
         )
-    blurred = _about_sharpness(photos, warn)
+    median = float(np.median([photo.sharpness for photo in photos]))
+    blurred = [photo.name for photo in photos if photo.sharpness < BLURRED_BELOW * median]
+    if median < SOFT_BELOW:
+        warn(
+            "ingest-soft",
+            "Most photographs are blurred or have been enlarged: they hold little fine detail. "
+            "Use the camera's original files, hold it still and check the focus.",
+        )
+    sides = [(max(photo.width, photo.height), photo.name) for photo in photos]
+    about_names(
+        {
+            "ingest-blurred": blurred,
+            "ingest-small": [name for side, name in sides if side < SMALL_BELOW_PX],
+            "ingest-dark": [p.name for p in photos if p.log2_luminance < DARK_BELOW],
+        },
+        warn,
+    )
     _about_light(photos, warn)
     _about_cameras(photos, warn)
     if duplicates:
@@ -141,31 +100,6 @@ def about_capture(
             f"{extra} of {len(photos)} photographs {'shows' if extra == 1 else 'show'} nearly the "
             f"same as another: {groups}. "
             "They add no depth: take a step sideways between photographs.",
-        )
-    return blurred
-
-
-def _about_sharpness(photos: Sequence[Photo], warn: Warn) -> list[str]:
-    median = float(np.median([photo.sharpness for photo in photos]))
-    blurred = [photo.name for photo in photos if photo.sharpness < BLURRED_BELOW * median]
-    if blurred:
-        warn(
-            "ingest-blurred",
-            f"Blurred, compared with the others: {listed(blurred)}. "
-            "Take these again or remove them; more light or a shorter exposure helps.",
-        )
-    if median < SOFT_BELOW:
-        warn(
-            "ingest-soft",
-            "Most photographs are blurred or have been enlarged: they hold little fine detail. "
-            "Use the camera's original files, hold it still and check the focus.",
-        )
-    small = [photo.name for photo in photos if max(photo.width, photo.height) < SMALL_BELOW_PX]
-    if small:
-        warn(
-            "ingest-small",
-            f"Smaller than {SMALL_BELOW_PX} pixels: {listed(small)}. "
-            "Use the camera's original files; 1600 pixels and more are best.",
         )
     return blurred
 
@@ -189,12 +123,6 @@ def _about_light(photos: Sequence[Photo], warn: Warn) -> None:
                 "ingest-brightness-varies",
                 f"Brightness differs by {high - low:.1f} stops between photographs. {advice}",
             )
-    dark = [photo.name for photo in photos if photo.log2_luminance < DARK_BELOW]
-    if dark:
-        warn(
-            "ingest-dark",
-            f"Very dark: {listed(dark)}. Use more light, or a tripod and a longer exposure.",
-        )
 
 
 def _about_cameras(photos: Sequence[Photo], warn: Warn) -> None:
