@@ -16,7 +16,6 @@ from stages.run import results
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.proof.statistics import Memory as MemoryUse
     from stages.proof.statistics import Statistics
     from stages.scene import ExportedFile, Splats
 
@@ -92,17 +91,9 @@ def _memory(splats: Splats) -> dict[str, Any]:
     return {
         "floats_per_splat": floats_of(splats.sh_degree),
         "floats_per_splat_by_degree": {str(degree): floats_of(degree) for degree in DEGREES},
-        "memory_bytes_per_splat": _by_precision(one),
-        "memory_bytes": _by_precision(every),
+        "memory_bytes_per_splat": one,
+        "memory_bytes": every,
         "mass_share_within_sigmas": {str(n): round(mass_within(n), 4) for n in (1, 2, 3)},
-    }
-
-
-def _by_precision(memory: MemoryUse) -> dict[str, int]:
-    return {
-        "float32": memory.single,
-        "half precision": memory.half,
-        "in training": memory.trained,
     }
 
 

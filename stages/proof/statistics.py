@@ -168,20 +168,15 @@ def floats_of(degree: int) -> int:
     return 3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2
 
 
-@dataclass(frozen=True)
-class Memory:
-    """Bytes of some splats: as float32, in half precision, in training."""
-
-    single: int
-    half: int
-    trained: int
-
-
-def memory_of(degree: int, count: int = 1) -> Memory:
-    """The memory of `count` splats of one SH degree."""
+def memory_of(degree: int, count: int = 1) -> dict[str, int]:
+    """Bytes of `count` splats of one SH degree, by precision."""
     numbers = floats_of(degree) * count
     single = SINGLE_BYTES * numbers
-    return Memory(single, HALF_BYTES * numbers, TRAINED_COPIES * single)
+    return {
+        "float32": single,
+        "half precision": HALF_BYTES * numbers,
+        "in training": TRAINED_COPIES * single,
+    }
 
 
 def mass_within(sigmas: float) -> float:

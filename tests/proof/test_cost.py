@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.proof.statistics import DEGREES, Memory, floats_of, mass_within, memory_of
+from stages.proof.statistics import DEGREES, floats_of, mass_within, memory_of
 from stages.raster.definition import splat_arrays, used_columns
 from stages.training.optimiser import new_model
 from tests.scenes import cloud
@@ -14,19 +14,22 @@ def test_the_ladder_of_numbers_by_degree():
 
 
 def test_a_splat_of_degree_three_in_bytes():
-    assert memory_of(3) == Memory(single=236, half=118, trained=944)
+    assert memory_of(3) == {"float32": 236, "half precision": 118, "in training": 944}
 
 
 def test_a_million_splats_of_degree_three_in_megabytes():
     scene = memory_of(3, 1_000_000)
-    assert (scene.single / 1e6, scene.half / 1e6, scene.trained / 1e6) == (236, 118, 944)
+    assert [size / 1e6 for size in scene.values()] == [236, 118, 944]
 
 
 @pytest.mark.parametrize("degree", DEGREES)
 def test_our_splats_hold_as_many_numbers(degree):
     scene = cloud(7, degree=3).with_sh_degree(degree)
     assert sum(a.size for a in scene.arrays) == 7 * floats_of(degree)
-    assert sum(a.astype(np.float16).nbytes for a in scene.arrays) == memory_of(degree, 7).half
+    assert (
+        sum(a.astype(np.float16).nbytes for a in scene.arrays)
+        == memory_of(degree, 7)["half precision"]
+    )
 
 
 def test_the_model_in_training_holds_each_number_and_its_two_moments():
@@ -37,7 +40,7 @@ def test_the_model_in_training_holds_each_number_and_its_two_moments():
 
     model = new_model(*splat_arrays(cloud(7, degree=3)))
     held = sum(a.nbytes for a in model.arrays)
-    assert held == memory_of(3, 7).single
+    assert held == memory_of(3, 7)["float32"]
     assert held + used(model.moment1) + used(model.moment2) == 3 * held
 
 
