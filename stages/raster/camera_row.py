@@ -17,21 +17,26 @@ CAMERA_CENTRE = 23  # 23:26, the camera's centre in the world
 WIDTH, HEIGHT = 26, 27
 
 
-def camera_row(camera: Camera, settings: RasterSettings) -> NDArray[np.float64]:
-    """[28] as named above."""
+def clamp_limits(camera: Camera) -> tuple[float, float, float, float]:
+    """Range of x/z and of y/z outside which the affine approximation is frozen: the picture's own
+    range and 0.3 of the half field of view on each side (the reference trainer's 1.3)."""
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
-    limits = (
+    return (
         -camera.cx / camera.fx - margin_x,
         (camera.width - camera.cx) / camera.fx + margin_x,
         -camera.cy / camera.fy - margin_y,
         (camera.height - camera.cy) / camera.fy + margin_y,
     )
+
+
+def camera_row(camera: Camera, settings: RasterSettings) -> NDArray[np.float64]:
+    """[28] as named above."""
     return np.concatenate(
         [
             camera.world_to_camera[:3, :3].ravel(),
             camera.world_to_camera[:3, 3],
             (camera.fx, camera.fy, camera.cx, camera.cy),
-            limits,
+            clamp_limits(camera),
             (settings.near, settings.dilation_px2, float(settings.antialias)),
             camera.centre,
             (camera.width, camera.height),

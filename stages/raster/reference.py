@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.raster.camera_row import clamp_limits
 from stages.raster.definition import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -179,18 +180,6 @@ def project(
     return Projected(
         index[order],
         *(t[order] for t in (means2d, a0 + e, b, c0 + e, det, opacities, z)),
-    )
-
-
-def clamp_limits(camera: Camera) -> tuple[float, float, float, float]:
-    """Range of x/z and of y/z outside which the affine approximation is frozen: the picture's own
-    range and 0.3 of the half field of view on each side (the reference trainer's 1.3)."""
-    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
-    return (
-        -camera.cx / camera.fx - margin_x,
-        (camera.width - camera.cx) / camera.fx + margin_x,
-        -camera.cy / camera.fy - margin_y,
-        (camera.height - camera.cy) / camera.fy + margin_y,
     )
 
 

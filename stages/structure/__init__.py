@@ -2,7 +2,7 @@
 
 Without known cameras (`stages.sfm`):
 - `fallbacks` lists the configurations and tries them; `attempt_runner` runs one of them as jobs
-  (`job`) in worker processes (`process`, `worker`, `worker_progress`), or in `chunks`;
+  (`job`) in worker processes (`process`, `worker`), or in `chunks`;
 - in the worker: `features` (SIFT), then pairs by `retrieval` over a `vocabulary` of visual words
   and `pairs`, `matching` with `descriptor_matching` and two-view geometry, then `mapping`;
 - `sparse_model` holds the result with its statistics (`view_graph`, `epipolar`), `gates` check

@@ -44,7 +44,7 @@ class Job:
         images_root: folder that `names` and `masks` are relative to.
         database: COLMAP's database.
         out: folder for the model of mapping (`sparse_model.save_model`).
-        progress: file for the worker's progress (`worker_progress`).
+        progress: file for the worker's progress (`ProgressWriter`).
         names: [P] in the capture's order, which fixes the image ids (position + 1).
         camera_of: [P] index into `cameras`.
         cameras: known intrinsics.

@@ -6,9 +6,9 @@ from stages.raster.camera_row import camera_row
 from stages.raster.cpu.projection import (
     AXES,
     COMPENSATION,
-    footprint_values,
 )
 from stages.raster.definition import splat_arrays
+from tests.raster.kernel_values import footprint_values
 
 
 def rotation(scene, view, settings):

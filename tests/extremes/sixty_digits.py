@@ -6,8 +6,8 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
+from stages.raster.camera_row import clamp_limits
 from stages.raster.definition import RasterSettings
-from stages.raster.reference import clamp_limits
 from stages.raster.sh import C0
 from tests.scenes import PARAMETERS
 

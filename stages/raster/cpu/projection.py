@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.raster.camera_row import (
     ANTIALIAS,
@@ -41,9 +40,7 @@ from stages.raster.definition import (
 )
 from stages.raster.kernels.simd import kernel
 from stages.raster.kernels.simd64 import (
-    LANES,
     at,
-    bits8,
     dand,
     deq,
     dexp,
@@ -380,18 +377,3 @@ def _quaternion_gradient(cam, w, out):
     put(out, ROTATION + 1, (n1 - along * q1) / norm)
     put(out, ROTATION + 2, (n2 - along * q2) / norm)
     put(out, ROTATION + 3, (n3 - along * q3) / norm)
-
-
-@kernel
-def _fill(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w):
-    return bits8(footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w))
-
-
-def footprint_values(
-    row: int, cam: NDArray[np.float64], arrays: tuple[NDArray[np.float32], ...]
-) -> NDArray[np.float64]:
-    """[WORK_ROW] the result of `footprint` for one row, for tests."""
-    work = np.zeros(WORK_ROW * LANES)
-    rows = np.full(LANES, row, np.int64)
-    _fill(rows, cam, *arrays[:4], np.zeros(0, np.float32), work)
-    return work.reshape(WORK_ROW, LANES)[:, 0].copy()

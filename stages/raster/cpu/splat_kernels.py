@@ -62,7 +62,7 @@ _LN2 = math.log(2.0)
 
 
 @kernel
-def _name_rows(rows, start, end):
+def name_rows(rows, start, end):
     """The next eight rows from `start`; the last one is repeated beyond `end`."""
     for lane in range(LANES):
         rows[lane] = min(start + lane, end - 1)
@@ -119,7 +119,7 @@ def project_splats(
         last = min(first + chunk, n)
         n_seen = 0
         for start in range(first, last, LANES):
-            _name_rows(rows, start, last)
+            name_rows(rows, start, last)
             good = bits8(drawable(rows, means, quaternions, log_scales, opacity_logits, smoothing))
             in_front = bits8(
                 footprint(rows, cam, means, quaternions, log_scales, opacity_logits, smoothing, w)
@@ -250,7 +250,7 @@ def splat_gradients(
             break
         last = min(first + chunk, n)
         for start in range(first, last, LANES):
-            _name_rows(places, start, last)
+            name_rows(places, start, last)
             for lane in range(LANES):
                 place = places[lane]
                 rows[lane] = visible[place]
@@ -319,19 +319,3 @@ def _exponent_gradient(rows, cam, geometry, w, sums, shifts, smoothed, places, m
     )
     scatter8(means2d, places, 2, 0, g_x)
     scatter8(means2d, places, 2, 1, g_y)
-
-
-@kernel
-def sh_basis_values(degree, directions):
-    """[N, (degree + 1)^2] basis functions of unit directions [N, 3], for tests."""
-    n, coefficients = len(directions), (degree + 1) * (degree + 1)
-    out = np.empty((n, coefficients), np.float64)
-    basis = np.empty(16 * LANES, np.float64)
-    rows = np.empty(LANES, np.int64)
-    for start in range(0, n, LANES):
-        _name_rows(rows, start, n)
-        x, y = gather8(directions, rows, 3, 0), gather8(directions, rows, 3, 1)
-        sh_basis(degree, x, y, gather8(directions, rows, 3, 2), basis)
-        for coefficient in range(coefficients):
-            scatter8(out, rows, coefficients, coefficient, at(basis, coefficient))
-    return out
