@@ -11,24 +11,22 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.base.text import reason_of
 from stages.cameras.camera_file import (
     NO_GEOREFERENCE,
     ROTATION_TOLERANCE,
     CameraFile,
     Georeference,
-    content_of,
     make_views,
     poses_of,
 )
 from stages.cameras.lens import Lens
+from stages.cameras.xml_file import parsed
 from stages.scene.place import GEOGRAPHIC, EarthPlace, east_north_up, geodetic
 
 _EARTH_RADII = (6.2e6, 6.5e6)  # metres, of places where photographs are taken
@@ -44,7 +42,7 @@ def locate(path: Path) -> Path | None:
 def read(path: Path) -> CameraFile:
     """The cameras that were aligned. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        root = _parsed(path)
+        root = parsed(path)
         optics = {
             sensor.get("id", ""): _optics(sensor)
             for sensor in root.iter("sensor")
@@ -95,18 +93,6 @@ def _numbers(transform: Element, name: str, count: int) -> NDArray[np.float64]:
     if len(values) != count or not np.isfinite(values).all():
         raise BadFileError(f"the {name} of its chunk does not have {count} numbers")
     return values
-
-
-def _parsed(path: Path) -> Element:
-    data = content_of(path)
-    ascii_part = data.replace(b"\0", b"")  # of UTF-16 too, in either byte order
-    # An entity may expand to gigabytes.
-    if b"<!DOCTYPE" in ascii_part or b"<!ENTITY" in ascii_part:
-        raise BadFileError("it declares entities, which Metashape does not")
-    try:
-        return ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        raise BadFileError(f"it is damaged ({reason_of(error)})") from error
 
 
 def _optics(sensor: Element) -> tuple[list[float], Lens]:

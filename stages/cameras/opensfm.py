@@ -56,7 +56,7 @@ def read(path: Path) -> CameraFile:
     with reading(path, CAMERAS):
         data = _largest(path)
         shots = data["shots"]
-        optics = {name: _optics(camera) for name, camera in data["cameras"].items()}
+        optics = {name: optics_of(camera) for name, camera in data["cameras"].items()}
         missing = {str(shot["camera"]) for shot in shots.values()} - optics.keys()
         if missing:
             raise BadFileError(f"there is no camera {min(missing)[:80]!r}")
@@ -64,7 +64,7 @@ def read(path: Path) -> CameraFile:
         turns = np.array([shot["rotation"] for shot in shots.values()], np.float64).reshape(-1, 3)
         shifts = np.array([shot["translation"] for shot in shots.values()], np.float64)
         with np.errstate(all="ignore"):  # `make_views` checks the result
-            rotations = _rotations(turns)
+            rotations = rotations_of(turns)
         poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
         views = make_views(list(shots), numbers[:, :2], numbers[:, 2:], poses)
         lenses = tuple(optics[shot["camera"]][1] for shot in shots.values())
@@ -114,7 +114,7 @@ def _largest(path: Path) -> dict[str, Any]:
     return largest
 
 
-def _optics(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
+def optics_of(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
     """(width, height, fx, fy, cx, cy in pixels; the lens)."""
     width, height = float(camera["width"]), float(camera["height"])
     kind = str(camera.get("projection_type", "perspective"))
@@ -134,7 +134,7 @@ def _optics(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
     return [width, height, side * fx, side * fy, *centre], lens
 
 
-def _rotations(turns: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotations_of(turns: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 3] of axis-angle vectors [V, 3]."""
     angles = np.linalg.norm(turns, axis=1, keepdims=True)
     axes = turns / np.where(angles > 0, angles, 1.0)

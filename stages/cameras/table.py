@@ -5,7 +5,8 @@ To add one:
 1. Write a module here with `locate(path)`, which returns the path to read, or None if `path` is not
    such a file.
 2. Give it `read(path)`, which returns a `CameraFile` made by `camera_file.make_views`.
-3. Give it `read_points(path)` if the file has sparse points.
+3. Give it `read_points(path)` if the file has sparse points, and `files(path)` if other files than
+   the .ply beside it, or those of the folder, are read with it.
 4. Add a row to `CAMERA_FILES`; the first format that locates a file reads it.
 5. Add a writer to `tests/cameras/drawn.py`: the tests run over all of them.
 """
@@ -31,6 +32,8 @@ class CameraFormat:
 
 CAMERA_FILES = (
     CameraFormat("opensfm", "OpenSfM's and ODM's reconstruction.json"),
+    CameraFormat("odm_shots", "ODM's shots.geojson"),
+    CameraFormat("arkit", "a folder with ARKit's frame_*.json, or Polycam's keyframes"),
     CameraFormat("nerfstudio", "a transforms.json of nerfstudio's or instant-ngp's"),
     CameraFormat("blender", "a folder with a synthetic NeRF scene's transforms_train.json"),
     CameraFormat("colmap", "a folder with COLMAP's images.bin or images.txt"),
@@ -38,8 +41,10 @@ CAMERA_FILES = (
     CameraFormat("bundler", "Bundler's .out"),
     CameraFormat("metashape", "Metashape's cameras as .xml"),
     CameraFormat("realityscan", "RealityScan's camera parameters as .csv"),
+    CameraFormat("realityscan_xmp", "a folder with RealityScan's .xmp beside the photographs"),
+    CameraFormat("opf", "Pix4D's project.opf"),
 )
-_READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply")  # in a folder of cameras
+_READ_TOGETHER = (".json", ".bin", ".txt", ".npy", ".ply", ".xmp")  # in a folder of cameras
 
 
 def read_cameras(path: Path) -> CameraFile:
@@ -61,7 +66,10 @@ def read_points(path: Path) -> FilePoints | None:
 
 def files_of(path: Path) -> list[Path]:
     """All files that the cameras are read from. Raises SplatError."""
-    source = _reader(path)[1]
+    module, source = _reader(path)
+    if hasattr(module, "files"):
+        found: list[Path] = module.files(source)
+        return found
     folder = source if source.is_dir() else source.parent
     suffixes = _READ_TOGETHER if source.is_dir() else (".ply",)
     beside = [child for child in sorted(folder.iterdir()) if child.suffix.lower() in suffixes]

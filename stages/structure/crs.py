@@ -64,7 +64,8 @@ def in_crs(place: EarthPlace, crs: str, report: Report) -> EarthPlace:
             at = geodetic(geocentric(place.offset) + local @ east_north_up(place.offset))
             x, y, z = transform(at[:, 1], at[:, 0], at[:, 2])
         else:
-            x, y, z = transform(*(place.offset + local).T)
+            at = place.offset + local
+            x, y, z = transform(at[:, 0], at[:, 1], at[:, 2])
         return np.stack([x, y, z], axis=1)
 
     steps = _STEP_M * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])

@@ -18,22 +18,22 @@ from stages.cameras.table import CAMERA_FILES, files_of, read_cameras, read_poin
 from tests.cameras.drawn import (
     COLOURS,
     HEIGHT,
-    MADE,
     POINTS,
     POSES,
     WIDTH,
     blender,
     nerfstudio,
 )
+from tests.cameras.drawn_surveys import MADE, polycam
 
 
 def test_every_format_of_the_table_is_drawn() -> None:
     assert set(MADE) == {row.module for row in CAMERA_FILES}
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", [*MADE, "polycam"])
 def test_points_are_where_the_pictures_show_them(tmp_path: Path, name: str) -> None:
-    found = read_cameras(MADE[name](tmp_path))
+    found = read_cameras((MADE | {"polycam": polycam})[name](tmp_path))
     assert len(found.views) == len(POSES)
     for view, lens in zip(found.views, found.lenses, strict=True):
         image = found.folder / view.image
@@ -112,6 +112,12 @@ def _cut(path: Path) -> None:
         ("bundler", "bundle.out"),
         ("metashape", "cameras.xml"),
         ("realityscan", "cameras.csv"),
+        ("odm_shots", "odm_report/shots.geojson"),
+        ("odm_shots", "cameras.json"),
+        ("arkit", "frame_00006.json"),
+        ("realityscan_xmp", "p_2.xmp"),
+        ("opf", "project.opf"),
+        ("opf", "calibrated-cameras.json"),
     ],
 )
 def test_half_a_file_is_refused_in_words(tmp_path: Path, name: str, file: str) -> None:

@@ -1,0 +1,147 @@
+"""ODM's odm_report/shots.geojson, with the lenses of the project's cameras.json.
+
+`translation` is the centre of the camera in the projection of the project, metres east, north and
+up, less a whole number here; `rotation` is an axis-angle vector, world to camera with our axes, of
+the same world. The coordinates of the point are longitude, latitude and height. The file does not
+name its projection: it is the zone of UTM in which both agree. Focal lengths are in units of the
+longer side. Without cameras.json the lens is a pinhole of that focal length.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.base.bad_files import CAMERAS, BadFileError, reading
+from stages.cameras.camera_file import (
+    CameraFile,
+    Georeference,
+    content_of,
+    make_views,
+    poses_of,
+)
+from stages.cameras.lens import PINHOLE, Lens
+from stages.cameras.opensfm import optics_of, rotations_of
+from stages.scene.place import EarthPlace
+
+_NAME = "shots.geojson"
+_SOURCE = "the projection of shots.geojson"
+_AGREEING_M = 5.0
+_HALF_AXIS, _ECCENTRICITY2, _UTM_SCALE = 6_378_137.0, 6.69437999014e-3, 0.9996
+
+
+def locate(path: Path) -> Path | None:
+    """A .geojson, itself or in the folder `path` or ODM's project `path`."""
+    if path.is_dir():
+        near = (path / _NAME, path / "odm_report" / _NAME)
+        return next((file for file in near if file.is_file()), None)
+    return path if path.suffix.lower() == ".geojson" and path.is_file() else None
+
+
+def read(path: Path) -> CameraFile:
+    """The cameras of all shots; pictures are in `images` of the project. Raises SplatError
+    "cameras-unreadable"."""
+    lenses = _lenses(path)
+    with reading(path, CAMERAS):
+        shots = json.loads(content_of(path).decode("utf-8-sig"))["features"]
+        if not shots:
+            raise BadFileError("it holds no camera")
+        about = [shot["properties"] for shot in shots]
+        optics = [_optics(shot, lenses) for shot in about]
+        names = [str(shot["filename"]) for shot in about]
+        numbers = np.array([values for values, _ in optics], np.float64).reshape(-1, 6)
+        turns = np.array([shot["rotation"] for shot in about], np.float64).reshape(-1, 3)
+        centres = np.array([shot["translation"] for shot in about], np.float64).reshape(-1, 3)
+        where = np.array([shot["geometry"]["coordinates"][:2] for shot in shots], np.float64)
+        if not np.isfinite(where).all():
+            raise BadFileError("a place is not two numbers")
+        with np.errstate(all="ignore"):  # `make_views` checks the result
+            rotations = rotations_of(turns)
+        place = _place(where.reshape(-1, 2), centres)
+        poses = poses_of(rotations, centres - place.offset if place else centres)
+        views = make_views(names, numbers[:, :2], numbers[:, 2:], poses)
+        georeference = Georeference(1.0, np.eye(3), _SOURCE, place)
+        root = path.parent.parent if path.parent.name == "odm_report" else path.parent
+        return CameraFile(views, root / "images", tuple(lens for _, lens in optics), georeference)
+
+
+def files(path: Path) -> list[Path]:
+    """The file, and cameras.json beside it or in the project."""
+    near = (folder / "cameras.json" for folder in (path.parent, path.parent.parent))
+    return [path, *(file for file in near if file.is_file())][:2]
+
+
+def _lenses(path: Path) -> dict[str, tuple[list[float], Lens]]:
+    """By the name of the camera."""
+    file = files(path)[-1]
+    if file == path:
+        return {}
+    with reading(file, CAMERAS):
+        cameras = json.loads(content_of(file).decode("utf-8-sig"))
+        # OpenSfM's names begin with a version, which ODM leaves out here
+        return {str(name): optics_of(camera) for name, camera in cameras.items()}
+
+
+def _optics(
+    shot: dict[str, Any], lenses: dict[str, tuple[list[float], Lens]]
+) -> tuple[list[float], Lens]:
+    """(width, height, fx, fy, cx, cy in pixels; the lens) of a shot. Older files do not name the
+    camera: then it is that of the project, if it has one only."""
+    size = [float(shot["width"]), float(shot["height"])]
+    only = next(iter(lenses)) if len(lenses) == 1 else ""
+    found = lenses.get(str(shot.get("camera", only)).removeprefix("v2 "))
+    if found is not None and found[0][:2] == size:
+        return found
+    focal = float(shot["focal"]) * max(size)
+    return [*size, focal, focal, size[0] / 2, size[1] / 2], PINHOLE
+
+
+def _place(where: NDArray[np.float64], centres: NDArray[np.float64]) -> EarthPlace | None:
+    """The zone of UTM in which longitudes and latitudes [N, 2] have these coordinates [N, 3], and a
+    place in their middle."""
+    longitude, latitude = np.median(where, axis=0)
+    nearest = math.floor((longitude + 180) / 6)
+    for zone in (nearest, nearest - 1, nearest + 1):
+        number = zone % 60 + 1
+        south = latitude < 0
+        off = utm(where, number, bool(south)) - centres[:, :2]
+        if np.abs(off).max() < _AGREEING_M:
+            crs = f"EPSG:{(32700 if south else 32600) + number}"
+            return EarthPlace(crs, np.rint(np.median(centres, axis=0)), np.eye(3))
+    return None
+
+
+def utm(where: NDArray[np.float64], zone: int, south: bool) -> NDArray[np.float64]:
+    """[N, 2] easting and northing of longitudes and latitudes [N, 2], degrees, on WGS 84.
+
+    By the series of Snyder (Map Projections, USGS 1987, equations 8-9 to 8-15, 3-21), good to a
+    millimetre within 3 degrees of the zone's middle: to recognise a zone.
+    """
+    phi = np.radians(where[:, 1])
+    e2 = _ECCENTRICITY2
+    minor = e2 / (1 - e2)
+    across = np.radians((where[:, 0] - (6 * zone - 183) + 180) % 360 - 180) * np.cos(phi)
+    t, c = np.tan(phi) ** 2, minor * np.cos(phi) ** 2
+    radius = _HALF_AXIS / np.sqrt(1 - e2 * np.sin(phi) ** 2)
+    arc = _HALF_AXIS * (
+        (1 - e2 / 4 - 3 * e2**2 / 64 - 5 * e2**3 / 256) * phi
+        - (3 * e2 / 8 + 3 * e2**2 / 32 + 45 * e2**3 / 1024) * np.sin(2 * phi)
+        + (15 * e2**2 / 256 + 45 * e2**3 / 1024) * np.sin(4 * phi)
+        - 35 * e2**3 / 3072 * np.sin(6 * phi)
+    )
+    fifth = 5 - 18 * t + t**2 + 72 * c - 58 * minor
+    sixth = 61 - 58 * t + t**2 + 600 * c - 330 * minor
+    east = across + (1 - t + c) * across**3 / 6 + fifth * across**5 / 120
+    north = across**2 / 2 + (5 - t + 9 * c + 4 * c**2) * across**4 / 24 + sixth * across**6 / 720
+    return np.stack(
+        [
+            500_000 + _UTM_SCALE * radius * east,
+            (10_000_000 if south else 0) + _UTM_SCALE * (arc + radius * np.tan(phi) * north),
+        ],
+        axis=1,
+    )
