@@ -129,19 +129,16 @@ def warnings_of(statistics: Statistics) -> list[tuple[str, str]]:
         what = f"{_share(count, statistics)} not finite in their {_ATTRIBUTES[name]}"
         found.append((f"not-finite-{_ATTRIBUTES[name]}", f"{what}: no viewer can draw them."))
     kinds = {
-        "no-rotation": (statistics.no_rotation, "without a rotation: no viewer can draw them."),
-        "too-large": (statistics.too_large, "larger than numbers go: no viewer can draw them."),
-        "transparent": (statistics.transparent, "below an opacity of 1/255, and so never seen."),
-        "needles": (statistics.needles, f"needles, over {NEEDLE_ASPECT:g} times as long as wide."),
-        "giants": (statistics.giants, f"giants, larger than {GIANT_PART:g} of the scene."),
-        "outliers": (
-            statistics.outliers,
-            f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
-        ),
-        "duplicates": (statistics.duplicates, "duplicates of others."),
+        "no-rotation": "without a rotation: no viewer can draw them.",
+        "too-large": "larger than numbers go: no viewer can draw them.",
+        "transparent": "below an opacity of 1/255, and so never seen.",
+        "needles": f"needles, over {NEEDLE_ASPECT:g} times as long as wide.",
+        "giants": f"giants, larger than {GIANT_PART:g} of the scene.",
+        "outliers": f"outliers, over {OUTLIER_BOXES:g} times as far out as the middle 98 %.",
+        "duplicates": "duplicates of others.",
     }
-    for code, (count, what) in kinds.items():
-        if count:
+    for code, what in kinds.items():
+        if count := statistics.troubles.get(code, 0):
             found.append((code, f"{_share(count, statistics)} {what}"))
     return found
 

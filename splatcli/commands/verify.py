@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -193,17 +194,8 @@ def _print(found: list[tuple[Path, Proof]], original: _Original, quiet: bool) ->
             what = each["fault"] or console.fidelity(each["verify_db"])
             console.out.print(f"{each['file']}: {what}", markup=False)
         return
-    shown = dict.fromkeys(name for each in facts for name in each)
-    for name in (
-        "file",
-        "size_bytes",
-        "against",
-        "right",
-        "fault",
-        "worst_attribute",
-        "worst_splat",
-    ):
-        shown.pop(name, None)
+    hidden = {"file", "size_bytes", "against", "right", "fault", "worst_attribute", "worst_splat"}
+    shown = [name for name in dict.fromkeys(chain(*facts)) if name not in hidden]
     rows = [
         (_label(name), *(_figure(name, each.get(name, "-")) for each in facts)) for name in shown
     ]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.distributed.partition import Cell
+from stages.formats.values import concatenate
 from stages.measure.contribution import measure_contributions, squared_error
 from stages.measure.evaluation import EvaluationView
 from stages.scene import DrawSettings, Splats
@@ -57,11 +57,8 @@ def merge_blocks(
 
 
 def _concatenated(parts: Sequence[Splats], draw_settings: DrawSettings) -> Splats:
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in (*("means", "quaternions", "log_scales"), "opacity_logits", "sh", "sh_degrees")
-    }
-    return replace(parts[0], draw_settings=draw_settings, **arrays)
+    origin, place = parts[0].origin, parts[0].place
+    return replace(concatenate(parts), origin=origin, place=place, draw_settings=draw_settings)
 
 
 def at_seams(splats: Splats, counts: Sequence[int], cells: Sequence[Cell]) -> NDArray[np.bool_]:

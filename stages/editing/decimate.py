@@ -17,13 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base import scratch
 from stages.base.blocks import blocks, reported_blocks
+from stages.formats.values import empty_rows
 from stages.raster.definition import ALPHA_MAX
 from stages.scene import SH_C0, Splats, logit, morton
 from stages.scene.rotations import matrices_of, quaternions_of
@@ -146,10 +145,7 @@ def _with_merged(
 ) -> Splats:
     """The splats at the curve positions `kept`. into [N]: the position of the splat that is merged
     into each one, or -1."""
-    arrays: dict[str, Any] = {}
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees"):
-        values = getattr(splats, name)
-        arrays[name] = scratch.empty((len(kept), *values.shape[1:]), values.dtype)
+    arrays = empty_rows(splats, len(kept))
     for block in blocks(len(kept), _BLOCK):
         places = kept[block]
         part = splats.take(order[places])

@@ -15,12 +15,11 @@ from stages.base import scratch
 from stages.base.bad_files import BadFileError
 from stages.base.blocks import blocks, reported_blocks
 from stages.raster.definition import LOG_SCALE_MAX, QUATERNION_MIN
-from stages.scene import Splats
+from stages.scene import ROW_FIELDS, Splats
 
 LOG_SCALE_MIN = -87.0  # below it a scale is not a normal float32
 # The logits of opacities 0 and 1. Alpha is drawn between 1/255 and 0.99, so both look exact.
 LOGIT_MIN, LOGIT_MAX = -88.0, 17.0
-_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
 
 _allows_nonfinite: ContextVar[bool] = ContextVar("allows_nonfinite", default=False)
 
@@ -72,19 +71,21 @@ def select_rows(splats: Splats, keep: NDArray[np.bool_]) -> Splats:
     """The rows where `keep` [N] is true."""
     if keep.all():
         return splats
-    count = int(keep.sum())
-    arrays: dict[str, Any] = {}
-    for name in _FIELDS:
-        values = getattr(splats, name)
-        arrays[name] = scratch.empty((count, *values.shape[1:]), values.dtype)
+    arrays = empty_rows(splats, int(keep.sum()))
     start = 0
     for rows in reported_blocks(len(splats)):
         mask = keep[rows]
         there = slice(start, start + int(mask.sum()))
-        for name in _FIELDS:
-            arrays[name][there] = getattr(splats, name)[rows][mask]
+        for name, values in arrays.items():
+            values[there] = getattr(splats, name)[rows][mask]
         start = there.stop
     return replace(splats, **arrays)
+
+
+def empty_rows(like: Splats, count: int) -> dict[str, Any]:
+    """Arrays for `count` splats of the types and SH degree of `like`, by field."""
+    every = {name: getattr(like, name) for name in ROW_FIELDS}
+    return {name: scratch.empty((count, *a.shape[1:]), a.dtype) for name, a in every.items()}
 
 
 def _by_blocks(
@@ -154,7 +155,7 @@ def allocate(count: int, degree: int) -> Splats:
 
 def fill(out: Splats, values: Splats) -> None:
     """Copy all values but the degrees into `out`, which are views of some rows."""
-    for name in _FIELDS[:-1]:
+    for name in ROW_FIELDS[:-1]:
         getattr(out, name)[:] = getattr(values, name)
 
 
@@ -181,7 +182,7 @@ def check_finite(splats: Splats) -> Splats:
         logits[opaque] = np.clip(logits[opaque], LOGIT_MIN, LOGIT_MAX)
         np.clip(logits, -1e30, 1e30, out=logits)
     clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
-    for name in (*_FIELDS[:-1], "origin"):
+    for name in (*ROW_FIELDS[:-1], "origin"):
         bad = count_nonfinite(getattr(clean, name))
         if bad and not allows_nonfinite():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")
@@ -202,18 +203,13 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
         return replace(parts[0], origin=np.zeros(3), place=None)
     if not parts:
         return allocate(0, 0)
-    count, width = sum(map(len, parts)), max(part.sh.shape[1] for part in parts)
-    arrays: dict[str, Any] = {}
-    for name in _FIELDS:
-        values = getattr(parts[0], name)
-        shape = (width, 3) if name == "sh" else values.shape[1:]
-        arrays[name] = scratch.empty((count, *shape), values.dtype)
+    arrays = empty_rows(max(parts, key=lambda part: part.sh_degree), sum(map(len, parts)))
     start = 0
     for part in parts:
         for rows in reported_blocks(len(part)):
-            for name in _FIELDS:
+            for name, every in arrays.items():
                 values = getattr(part, name)[rows]
-                out = arrays[name][start + rows.start : start + rows.stop]
+                out = every[start + rows.start : start + rows.stop]
                 if name == "sh":
                     out[:, values.shape[1] :] = 0
                     out = out[:, : values.shape[1]]

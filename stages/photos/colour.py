@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-_P3_PRIMARIES = 12  # ITU-T H.273: SMPTE EG 432-1 (Display P3)
-_HDR_TRANSFERS = (16, 18)  # PQ, HLG
+P3 = 12  # ITU-T H.273: SMPTE EG 432-1 (Display P3)
+HDR_TRANSFERS = (16, 18)  # PQ, HLG
 # Linear RGB to linear sRGB; both spaces have the white point D65. From the primaries in
 # SMPTE EG 432-1 and in Adobe RGB (1998) Color Image Encoding, section 4.3.
-_P3_TO_SRGB = np.array(
+P3_TO_SRGB = np.array(
     [[1.22494018, -0.22494018, 0.0], [-0.04205695, 1.04205695, 0.0],
      [-0.01963755, -0.07863605, 1.09827360]]
 )  # fmt: skip
@@ -66,17 +66,17 @@ def _transform(profile: bytes, mode: str) -> Any:
 
 def nclx_is_p3(nclx: dict[str, Any] | None) -> bool:
     """Whether the nclx box of a HEIF file without ICC profile declares Display P3."""
-    return nclx is not None and int(nclx.get("color_primaries", 1)) == _P3_PRIMARIES
+    return nclx is not None and int(nclx.get("color_primaries", 1)) == P3
 
 
 def nclx_is_hdr(nclx: dict[str, Any] | None) -> bool:
     """Whether the nclx box declares a transfer function of high dynamic range, PQ or HLG."""
-    return nclx is not None and int(nclx.get("transfer_characteristics", 13)) in _HDR_TRANSFERS
+    return nclx is not None and int(nclx.get("transfer_characteristics", 13)) in HDR_TRANSFERS
 
 
 def p3_to_srgb(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Display P3 [H, W, 3] to sRGB; colours outside sRGB are clipped."""
-    return _convert(pixels, _srgb_decoded(np.arange(256) / 255), _P3_TO_SRGB)
+    return _convert(pixels, _srgb_decoded(np.arange(256) / 255), P3_TO_SRGB)
 
 
 def adobe_to_srgb(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.photos.colour import srgb_encoded
+from stages.photos.colour import HDR_TRANSFERS, P3, P3_TO_SRGB, srgb_encoded
 
 _FULL_RANGE = 2
-_PQ, _HLG = 16, 18
-_BT2020, _P3 = 9, 12
+_PQ, _HLG = HDR_TRANSFERS
+_BT2020 = 9
 _KR_KB = {  # by MatrixCoefficients
     1: (0.2126, 0.0722),  # BT.709
     4: (0.30, 0.11),  # FCC
@@ -27,15 +27,13 @@ _KR_KB = {  # by MatrixCoefficients
     10: (0.2627, 0.0593),
 }
 _HD_HEIGHT = 720  # from here on, BT.709 unless declared otherwise
-# Linear RGB to linear sRGB, white point D65. From the primaries in BT.2020 and SMPTE EG 432-1.
+# Linear RGB to linear sRGB, white point D65. From the primaries in BT.2020.
 _TO_SRGB = {
     _BT2020: np.array(
         [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349],
          [-0.018151, -0.100579, 1.118730]]
     ),
-    _P3: np.array(
-        [[1.224940, -0.224940, 0.0], [-0.042057, 1.042057, 0.0], [-0.019638, -0.078636, 1.098274]]
-    ),
+    P3: P3_TO_SRGB,
 }  # fmt: skip
 _BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
 # cd/m2. Peak of the HLG reference display and of most PQ video; HDR reference white (BT.2408).
@@ -75,7 +73,7 @@ class Colours:
                 f"from {PEAK:,.0f} to {WHITE:.0f} cd/m2, BT.2020 primaries to sRGB"
             )
         if self.primaries in _TO_SRGB:
-            return {_BT2020: "BT.2020", _P3: "Display P3"}[self.primaries] + " to sRGB"
+            return {_BT2020: "BT.2020", P3: "Display P3"}[self.primaries] + " to sRGB"
         return "read as sRGB"
 
 

@@ -19,22 +19,22 @@ Also: parameters and memory of a splat, in figures that can be checked by hand.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.raster.definition import ALPHA_MIN, LOG_SCALE_MAX, QUATERNION_MIN
-from stages.scene import Splats
+from stages.scene import ROW_FIELDS, Splats
 from stages.scene.quantiles import quantiles
 
 NEEDLE_ASPECT = 100.0
 GIANT_PART = 0.1  # of the extent
 OUTLIER_BOXES = 5.0
 _BOX = {"low": 0.0, "middle_low": 0.01, "median_centre": 0.5, "middle_high": 0.99, "high": 1.0}
-_VALUES = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+_VALUES = ROW_FIELDS[:-1]
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Statistics:
         extent: diagonal of the middle box.
         median_scale: median standard deviation.
         median_opacity: in 0..1.
-        needles ... duplicates: numbers of troublesome splats, see above.
+        troubles: the number of splats of each kind of trouble, see above.
     """
 
     count: int
@@ -67,13 +67,7 @@ class Statistics:
     extent: float
     median_scale: float
     median_opacity: float
-    needles: int
-    giants: int
-    outliers: int
-    transparent: int
-    no_rotation: int
-    too_large: int
-    duplicates: int
+    troubles: dict[str, int]
 
 
 def statistics_of(splats: Splats) -> Statistics:
@@ -83,16 +77,15 @@ def statistics_of(splats: Splats) -> Statistics:
     whole, not_finite = _finite(splats)
     box = dict(zip(_BOX, quantiles(splats.means[whole], tuple(_BOX.values())), strict=True))
     extent = float(np.linalg.norm(box["middle_high"] - box["middle_low"]))
-    found: dict[str, Any] = dict.fromkeys(
-        ("needles", "giants", "outliers", "transparent", "no_rotation", "too_large"), 0
-    )
+    troubles: Counter[str] = Counter()
     keys = np.empty(len(splats), np.uint64)
     for rows in blocks(len(splats)):
         block = splats.take(rows)
         keys[rows] = _fingerprints(block)
         for name, marks in _troubles(block.take(whole[rows]), box, extent).items():
-            found[name] += int(np.count_nonzero(marks))
+            troubles[name] += int(np.count_nonzero(marks))
     keys = keys[whole]
+    troubles["duplicates"] = len(keys) - len(np.unique(keys))
     return Statistics(
         count=len(splats),
         by_degree=by_degree,
@@ -102,8 +95,7 @@ def statistics_of(splats: Splats) -> Statistics:
         extent=extent,
         median_scale=float(np.exp(_median(splats.log_scales[whole]))),
         median_opacity=1 / (1 + float(np.exp(-_median(splats.opacity_logits[whole])))),
-        **found,
-        duplicates=len(keys) - len(np.unique(keys)),
+        troubles=dict(troubles),
     )
 
 
@@ -133,8 +125,8 @@ def _troubles(
             "giants": logs[:, 2] > np.log(GIANT_PART * extent or np.inf),
             "outliers": (np.abs(splats.means - middle) > OUTLIER_BOXES * half).any(axis=1),
             "transparent": splats.opacities < ALPHA_MIN,
-            "no_rotation": np.abs(splats.quaternions).max(axis=1, initial=0.0) < QUATERNION_MIN,
-            "too_large": logs[:, 2] > LOG_SCALE_MAX,
+            "no-rotation": np.abs(splats.quaternions).max(axis=1, initial=0.0) < QUATERNION_MIN,
+            "too-large": logs[:, 2] > LOG_SCALE_MAX,
         }
 
 

@@ -21,6 +21,7 @@ from stages.scene.capture import (
 )
 from stages.scene.draw_settings import DrawSettings, draw_settings_of, near_plane
 from stages.scene.splats import (
+    ROW_FIELDS,
     SH_C0,
     QuantisedSplats,
     Splats,
@@ -34,6 +35,7 @@ from stages.scene.storage import load_splats, save_splats
 
 __all__ = [
     "IGNORE",
+    "ROW_FIELDS",
     "SH_C0",
     "TRANSPARENT",
     "Camera",

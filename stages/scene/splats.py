@@ -13,6 +13,8 @@ from stages.scene.draw_settings import DrawSettings
 from stages.scene.place import EarthPlace
 
 SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
+ROW_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees")
+"""The fields of `Splats` that have a row for each splat."""
 
 
 @dataclass(frozen=True)
@@ -81,15 +83,7 @@ class Splats:
 
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_] | slice) -> Splats:
         """The rows named by an index, a mask or a slice."""
-        return replace(
-            self,
-            means=self.means[index],
-            quaternions=self.quaternions[index],
-            log_scales=self.log_scales[index],
-            opacity_logits=self.opacity_logits[index],
-            sh=self.sh[index],
-            sh_degrees=self.sh_degrees[index],
-        )
+        return replace(self, **{name: getattr(self, name)[index] for name in ROW_FIELDS})
 
     def local(self, camera: Camera) -> Camera:
         """A camera of the capture's coordinates, in the frame of `means`; shifted in float64, so

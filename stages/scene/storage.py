@@ -23,10 +23,10 @@ from stages.base.atomic import replacing
 from stages.base.bad_files import reading, stage_output
 from stages.scene.draw_settings import DrawSettings
 from stages.scene.place import EarthPlace
-from stages.scene.splats import Splats
+from stages.scene.splats import ROW_FIELDS, Splats
 
 MAGIC = b"SPLATS4\n"
-FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "sh_degrees", "origin")
+FIELDS = (*ROW_FIELDS, "origin")
 FILE_NAME = "splats.bin"
 _DTYPES = {"<f4", "<f8", "|u1"}
 
