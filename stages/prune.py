@@ -45,7 +45,7 @@ class PruneSettings:
     )
     max_loss_db: float = setting(
         0.1,
-        "Mean PSNR that training views may lose, at strength 1 (dB); none may lose more than 0.3.",
+        "Mean PSNR that held-out views may lose, at strength 1 (dB); none may lose more than 0.3.",
         min=0,
         max=100,
     )
@@ -200,7 +200,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=12,
+    version=13,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

@@ -1,6 +1,7 @@
 """Pruning removes floaters and splats that contribute little; the pictures stay."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.measure.floaters import near_camera_floaters
 from stages.raster.draw import render
-from stages.scene import Splats, TrainedSplats, split_held_out
+from stages.scene import Splats, TrainedSplats, View, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -52,6 +53,16 @@ def training_db(scene: SmallScene, found: Splats) -> float:
     training, _ = split_held_out(scene.reconstruction.views)
     photographs = load_evaluation_views(scene.reconstruction.folder, training, found.draw_settings)
     return mean_psnr_db(found, photographs, "cpu")
+
+
+def showing(scene: SmallScene, trained: Splats, views: Sequence[View], folder: Path) -> SmallScene:
+    """The scene with photographs in `folder`, of which these views show `trained`."""
+    reconstruction = scene.reconstruction
+    shutil.copytree(reconstruction.folder, folder)
+    for view in views:
+        image = render(trained, view.camera).image
+        Image.fromarray(np.uint8(image.clip(0, 1) * 255 + 0.5)).save(folder / view.image)
+    return replace(scene, reconstruction=replace(reconstruction, folder=folder))
 
 
 @pytest.fixture(scope="module")
@@ -121,14 +132,33 @@ def test_the_loss_stays_below_what_the_strength_allows(scene, tmp_path) -> None:
     assert sizes[1] < sizes[0]
 
 
+def test_validation_views_halve_what_held_out_views_lose(scene, tmp_path, monkeypatch) -> None:
+    """Where nothing is overfitted, and nothing is fine-tuned."""
+    found, report = run(scene, scene.splats, tmp_path)
+    assert len(found) < len(scene.splats)
+    monkeypatch.setattr(pruning, "VALIDATION_FROM", len(scene.reconstruction.views))
+    _, without = run(scene, scene.splats, tmp_path)
+    assert 0 < -report.metrics["psnr_change_db"] < -0.5 * without.metrics["psnr_change_db"]
+
+
+def test_what_costs_a_validation_view_too_much_stays(scene, tmp_path) -> None:
+    """The fifth training view shows a splat that harms the others, which choose."""
+    trained = join(scene.splats, floater_before(scene, 1))
+    validation = split_held_out(scene.reconstruction.views)[0][4]
+    moved = showing(scene, trained, [validation], tmp_path / "photographs")
+    result, _ = run(moved, trained, tmp_path)
+    photographs = load_evaluation_views(
+        moved.reconstruction.folder, [validation], trained.draw_settings
+    )
+    before, after = (mean_psnr_db(s, photographs, "cpu") for s in (trained, result))
+    assert after >= before - 0.1
+
+
 def test_held_out_views_that_lose_more_are_in_a_warning(scene, tmp_path) -> None:
     """Held-out views show what no training view shows, so that it is removed."""
-    trained, reconstruction = join(scene.splats, floater_before(scene, 1)), scene.reconstruction
-    folder = shutil.copytree(reconstruction.folder, tmp_path / "photographs")
-    for view in split_held_out(reconstruction.views)[1]:
-        image = render(trained, view.camera).image
-        Image.fromarray(np.uint8(image.clip(0, 1) * 255 + 0.5)).save(folder / view.image)
-    moved = replace(scene, reconstruction=replace(reconstruction, folder=folder))
+    trained = join(scene.splats, floater_before(scene, 1))
+    held_out = split_held_out(scene.reconstruction.views)[1]
+    moved = showing(scene, trained, held_out, tmp_path / "photographs")
     _, report = run(moved, trained, tmp_path)
     lost_db = -report.metrics["psnr_change_db"]
     assert lost_db > 0.1
@@ -150,7 +180,8 @@ def test_the_loss_of_a_round_is_predicted(scene, tmp_path) -> None:
     _, report = run(scene, scene.splats, tmp_path, max_splats=230)
     first = report.metrics["rounds"][0]
     assert first["removed"] == 20
-    assert first["measured_sse"] == pytest.approx(first["predicted_sse"], rel=0.1, abs=0.05)
+    # at first a fifth of the prediction is what splats cost that could replace each other
+    assert first["measured_sse"] == pytest.approx(first["predicted_sse"], rel=0.25)
 
 
 def test_finetuning_recovers_a_part_of_the_loss(scene, tmp_path) -> None:

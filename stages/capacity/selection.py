@@ -50,6 +50,7 @@ class Removal:
 def select_removal(
     splats: Splats,
     contributions: Contributions,
+    validation: Contributions,
     cameras: Sequence[Camera],
     sse_per_parameter: float,
     most: int,
@@ -70,15 +71,21 @@ def select_removal(
 
     Args:
         splats: N splats.
-        contributions: of them to the views.
-        cameras: of these views, in the same order.
+        contributions: of them to the views that choose.
+        validation: of them to views that do not choose. Floaters are what few views of either need.
+        cameras: of both, in the same order.
         sse_per_parameter: the Lagrange multiplier of the rate-distortion cost.
         most: splats to remove.
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
         by_error: measure contributions by the change of the error instead.
     """
     seen, near = contributions.view_counts > 0, near_view_frusta(splats, list(cameras))
-    floaters = near_camera_floaters(splats, contributions, list(cameras))
+    every = replace(
+        contributions,
+        view_counts=contributions.view_counts + validation.view_counts,
+        scene_depth=np.append(contributions.scene_depth, validation.scene_depth),
+    )
+    floaters = near_camera_floaters(splats, every, list(cameras))
     free = floaters | (~seen & ~near)
     change = contributions.sse_change if by_error else contributions.picture_change
     ratio = change / parameters_per_splat(splats.sh_degrees)

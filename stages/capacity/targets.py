@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,10 @@ from stages.base.errors import Family, SplatError
 from stages.base.text import counted
 from stages.scene import Splats
 
+Psnr = NDArray[np.float64]  # of each view, or a difference, dB
+# What views that are trained on may lose, of what is promised for others, which lose a quarter more
+# where nothing is overfitted (0.097 dB for 0.076 with 72 photographs, 0.40 for 0.35 with 255).
+MARGIN = 0.75
 WORST_VIEW_DB = 0.3  # that any one view may lose, at strength 1
 
 
@@ -42,18 +46,15 @@ class Targets:
             allowed = min(allowed, int(count * self.max_bytes / size))
         return count - max(1, min(allowed, count))
 
-    def allows(self, psnr_db: NDArray[np.float64], best_db: NDArray[np.float64]) -> bool:
-        """Whether V training views may have `psnr_db` [V] where they had `best_db` [V].
-
-        Other views lose as much where nothing is overfitted, and less elsewhere. Training views
-        that fine-tuning leaves out would be no better measure: they lose 0.6 to 1.6 dB in 90 steps
-        even if nothing is removed.
-        """
+    def allows(self, psnr_db: Sequence[Psnr], best_db: Sequence[Psnr]) -> bool:
+        """Whether groups of training views may have `psnr_db` where they had `best_db`, with
+        `MARGIN` for views that are not trained on."""
         if self.min_psnr_db:
-            return float(psnr_db.mean()) >= self.min_psnr_db
-        return not self.broken_by(best_db - psnr_db)
+            return float(np.concatenate(psnr_db).mean()) >= self.min_psnr_db
+        pairs = zip(best_db, psnr_db, strict=True)
+        return not any(self.broken_by((best - now) / MARGIN) for best, now in pairs)
 
-    def broken_by(self, loss_db: NDArray[np.float64]) -> bool:
+    def broken_by(self, loss_db: Psnr) -> bool:
         """Whether views lose more than the strength allows. loss_db: [V]."""
         mean, worst = (float(f(loss_db)) / self.strength for f in (np.mean, np.max))
         return mean > self.max_loss_db or worst > WORST_VIEW_DB
