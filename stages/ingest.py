@@ -54,7 +54,8 @@ class IngestSettings:
     mask_means: str = setting(
         "auto",
         "How pixels outside a mask are treated: ignore (as unknown), transparent (as "
-        "empty space) or auto (ignore for mask files, transparent for transparent pictures).",
+        "empty space) or auto (transparent for transparent pictures and for mask files that cut "
+        "out an object, ignore for other mask files).",
         panel="Light and masks",
         choices=("auto", "ignore", "transparent"),
     )
@@ -104,12 +105,15 @@ def run(
     from stages.photos.find import find
     from stages.photos.masks import check_pairing, mask_folder
     from stages.photos.quality import near_duplicates
-    from stages.scene import Capture
+    from stages.scene import TRANSPARENT, Capture
 
     root = Path(inputs["photos"])
     apart = mask_folder(root, settings.masks)
     found = find(root, apart)
     check_pairing(found, apart, settings.masks)
+    cut_out = _masks_cut_out(found, settings)
+    if cut_out:
+        settings = replace(settings, mask_means=TRANSPARENT)
     folder.mkdir(parents=True, exist_ok=True)
     ingested = _ingest_photographs(found, settings, folder, report)
     for source in found.videos:
@@ -128,6 +132,7 @@ def run(
     remarks |= {
         "ingest-raw-not-read": found.raws,
         "ingest-format-not-read": found.other_pictures,
+        "ingest-masks-cut-out": [photo.name for photo in photos] if cut_out else (),
         "ingest-mask-unused": found.stray_masks,
         "ingest-mask-missing": bare if len(bare) < len(photos) else (),
     }
@@ -147,6 +152,20 @@ def load(folder: Path) -> Capture:
     from stages.photos.capture_file import load_capture
 
     return load_capture(folder)
+
+
+def _masks_cut_out(found: Findings, settings: IngestSettings) -> bool:
+    """Whether mask files cut out an object and nothing else was asked for. All photographs must
+    have masks: of the others everything would be seen."""
+    from stages.photos.masking import AUTO, cuts_out_object
+
+    masks = [found.masks[one.name] for one in found.sources if one.name in found.masks]
+    asked = settings.mask_means != AUTO or bool(found.videos)
+    return (
+        not asked
+        and len(masks) == len(found.sources)
+        and cuts_out_object(masks, settings.invert_masks)
+    )
 
 
 def _ingest_photographs(
@@ -319,4 +338,4 @@ def _too_few(root: Path, usable: int, unusable: list[tuple[str, str, str]]) -> S
     )
 
 
-STAGE = Stage(name="ingest", version=7, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=8, reads=(), settings_type=IngestSettings, run=run, load=load)

@@ -35,6 +35,8 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "these photographs is not used. Write one of the two anew, or remove it.",
     "ingest-transparency": "Transparent parts are treated as empty space: {names}. "
     "With --mask-means ignore they are treated as unknown.",
+    "ingest-masks-cut-out": "Masks keep one object in nearly every photograph, so what is outside "
+    "is treated as empty space: {names}. With --mask-means ignore it is treated as unknown.",
     "ingest-mask-scaled": "Masks of another size than their photographs were scaled: {names}. "
     "Masks as large as the photographs have sharper edges.",
     "ingest-mask-unused": "Masks that belong to no photograph by their names are not used: "

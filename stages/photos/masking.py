@@ -15,12 +15,17 @@ from stages.base.errors import SplatError
 from stages.base.text import listed
 from stages.photos.decode import FORMATS, MAX_MEGAPIXELS, UPRIGHT, Decoded
 from stages.photos.masks import FOLDER
-from stages.scene import IGNORE, TRANSPARENT, Photo
+from stages.scene import IGNORE, TRANSPARENT, Photo, evenly_spaced
 from stages.scene.capture import PHOTOS_FOLDER
 
 AUTO = "auto"
 MAX_ASPECT_DIFFERENCE = 0.03  # relative; more: a mask of another photograph
 MIN_SHARE = 1e-3  # of a photograph; less inside its mask counts as nothing
+# Masks cut out an object if, in so many of them, what is kept is at most so much of the picture and
+# of its border, and nearly all of it is connected. One that is the same in all pictures is of the
+# lens: this much of what any mask keeps is then kept by all.
+CUTS_OUT, OBJECT, OBJECT_AT_BORDER, OBJECT_CONNECTED, OF_LENS = 0.9, 0.5, 0.25, 0.9, 0.95
+_LOOKED_AT, _SIDE = 48, 128  # masks, evenly spaced, at this size
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,40 @@ class MaskedPhoto:
     def file(self, image: str) -> str:
         """Where the mask of the normalised picture `image` goes; "" without one."""
         return f"{FOLDER}/{image.removeprefix(PHOTOS_FOLDER)}.png" if self.outside else ""
+
+
+def cuts_out_object(masks: Sequence[Path], invert: bool) -> bool:
+    """Whether the masks of a capture keep one object that stands free in nearly every photograph,
+    and are not those of a lens.
+
+    Around an object cut out, nothing is known of the rest in any view: splats there would hide
+    nothing and be seen from everywhere, as fog.
+
+    Args:
+        masks: files, one for each photograph; unreadable ones do not count.
+        invert: they are black inside.
+    """
+    kept = []
+    for path in evenly_spaced(masks, _LOOKED_AT):
+        try:
+            values = _values(_opened(path, path.name))
+        except SplatError:
+            continue
+        inside = values > 0.5 * max(float(values.max()), 1.0)
+        small = cv2.resize(inside.astype(np.float32), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
+        kept.append((small > 0.5) ^ invert)
+    if not kept or np.mean([_is_object(one) for one in kept]) < CUTS_OUT:
+        return False
+    return bool(np.all(kept, axis=0).sum() < OF_LENS * np.any(kept, axis=0).sum())
+
+
+def _is_object(kept: NDArray[np.bool_]) -> bool:
+    """Whether what a mask [S, S] keeps is an object that stands free."""
+    border = np.concatenate([kept[0], kept[-1], kept[1:-1, 0], kept[1:-1, -1]])
+    if not 0 < kept.mean() <= OBJECT or border.mean() > OBJECT_AT_BORDER:
+        return False
+    areas = cv2.connectedComponentsWithStats(kept.astype(np.uint8))[2][1:, cv2.CC_STAT_AREA]
+    return bool(areas.max() >= OBJECT_CONNECTED * areas.sum())
 
 
 def check_shares(photos: Sequence[Photo], shares: Sequence[float], files: bool) -> None:

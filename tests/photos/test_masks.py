@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -110,6 +111,41 @@ def test_what_is_cut_out_stands_before_black(photos: Path, tmp_path: Path) -> No
 def test_black_may_be_what_counts(photos: Path, tmp_path: Path) -> None:
     capture, _ = taken(photos, masks=masked(tmp_path / "m", photos), invert_masks=True)
     np.testing.assert_array_equal(mask_of(capture), 255 - HALF)
+
+
+def discs(photos: Path, folder: Path, *columns: int) -> Path:
+    """Masks of photographs of 64 x 96 pixels that keep a disc at the given columns."""
+    folder.mkdir(exist_ok=True)
+    for name, column in zip(names(photos), columns, strict=True):
+        mask = cv2.circle(np.zeros((64, 96), np.uint8), (column, 32), 16, 255, -1)
+        save(folder / f"{Path(name).stem}.png", mask)
+    return folder
+
+
+def test_masks_that_cut_out_an_object_mean_empty_unless_said_otherwise(
+    photos: Path, tmp_path: Path
+) -> None:
+    folder = discs(photos, tmp_path / "m", 40, 48, 56)
+    capture, warnings = taken(photos, masks=folder)
+    assert {photo.outside for photo in capture.photos} == {"transparent"}
+    assert "--mask-means ignore" in warnings["ingest-masks-cut-out"]
+    capture, warnings = taken(photos, masks=folder, mask_means="ignore")
+    assert {photo.outside for photo in capture.photos} == {"ignore"}
+    assert "ingest-masks-cut-out" not in warnings
+
+
+@pytest.mark.parametrize(
+    ("columns", "invert"),
+    [
+        ((48, 48, 48), False),  # the same in all: of the lens
+        ((40, 48, 56), True),  # an object is left out
+    ],
+)
+def test_other_masks_mean_unknown(photos: Path, tmp_path: Path, columns, invert) -> None:
+    folder = discs(photos, tmp_path / "m", *columns)
+    capture, warnings = taken(photos, masks=folder, invert_masks=invert)
+    assert {photo.outside for photo in capture.photos} == {"ignore"}
+    assert "ingest-masks-cut-out" not in warnings
 
 
 def test_alpha_means_empty_unless_said_otherwise(photos: Path) -> None:
