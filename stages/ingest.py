@@ -155,14 +155,16 @@ def load(folder: Path) -> Capture:
 
 
 def _masks_cut_out(found: Findings, settings: IngestSettings) -> bool:
-    """Whether mask files cut out an object and nothing else was asked for. All photographs must
-    have masks: of the others everything would be seen."""
+    """Whether mask files cut out an object, and --mask-means does not say otherwise.
+
+    All photographs must have masks: of the others everything would be seen.
+    """
     from stages.photos.masking import AUTO, cuts_out_object
 
     masks = [found.masks[one.name] for one in found.sources if one.name in found.masks]
-    asked = settings.mask_means != AUTO or bool(found.videos)
+    decided = settings.mask_means != AUTO or bool(found.videos)
     return (
-        not asked
+        not decided
         and len(masks) == len(found.sources)
         and cuts_out_object(masks, settings.invert_masks)
     )

@@ -215,13 +215,13 @@ class Pruner:
         costs more than is allowed: of a model that was trained long on many photographs, 90 steps
         may cost all views 0.2 dB."""
         counts = before.choosing.view_counts + before.validation.view_counts
-        tuned = self.finetuner.finetune(splats, steps, counts[~removal.removed])
-        after = self._measure(tuned, before, removal)
+        trained = self.finetuner.finetune(splats, steps, counts[~removal.removed])
+        after = self._measure(trained, before, removal)
         if steps and not self.targets.allows(after.psnr_db, best_db):
             plain = self._measure(splats, before, removal)
             if self.targets.allows(plain.psnr_db, best_db):
                 return splats, plain
-        return tuned, after
+        return trained, after
 
     def _remove_harmful(self, found: PruningResult, state: _State) -> _State:
         """Remove splats without which the views are matched better. Of those that seem so one by
