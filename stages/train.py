@@ -297,5 +297,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=19, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=20, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -1,5 +1,10 @@
-"""Adaptive density control (Kerbl et al. 2023, section 5.2): splats are cloned and split where the
-gradient of their positions is large, and faint, oversized or invalid splats are removed.
+"""Adaptive density control (Kerbl et al. 2023, section 5.2): splats are split where the gradient of
+their positions is large, and faint, oversized or invalid splats are removed.
+
+A split replaces a splat by two along its longest axis (Deng et al. 2024, "Efficient Density Control
+for 3D Gaussian Splatting"), instead of a copy of a small splat and two random samples of a large
+one: together the two still look like the splat that they replace, so that training need not repair
+what a split breaks.
 """
 
 from __future__ import annotations
@@ -13,8 +18,11 @@ from stages.scene import logit
 from stages.scene.rotations import matrices_of
 from stages.training.optimiser import Model
 
-SPLIT_FACTOR = 1.6  # the children of a split splat are smaller by this factor
-LARGE = 0.01  # x scene extent: a larger splat is split, a smaller one cloned
+# The children of a split, in terms of their parent: distance of their centres from its centre in
+# standard deviations of its longest axis; their scale along this axis and across it; their opacity.
+CHILD_OFFSET = 0.6
+CHILD_LENGTH, CHILD_WIDTH = 0.7, 0.9
+CHILD_OPACITY = 0.7
 GIANT = 0.1  # x scene extent: a larger splat is removed
 GRADIENT_THRESHOLD = 2e-4  # of the mean gradient by the 2D position, as published
 # Splats that fewer views see are densified last: floaters are among them.
@@ -46,10 +54,10 @@ class AdaptiveDensity:
             keep &= np.exp(model.log_scales.max(1)) <= GIANT * self.extent
         return model.take(keep)
 
-    def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
-        """The model with cloned and split splats, at most `budget` splats in all. Where the budget
-        is short, splats with the largest gradients that enough views see come first. The
-        accumulated gradients are reset."""
+    def grow(self, model: Model, budget: int) -> Model:
+        """The model with splats split, at most `budget` splats in all. Where the budget is short,
+        splats with the largest gradients that enough views see come first. The accumulated
+        gradients are reset."""
         gradient = model.gradient_sum / np.maximum(model.gradient_count, 1)
         chosen = np.flatnonzero(gradient >= self.threshold)
         room = max(0, budget - len(model))
@@ -58,12 +66,9 @@ class AdaptiveDensity:
             priority = gradient[chosen] * np.minimum(1.0, seen_by / ENOUGH_VIEWS)
             first = np.argsort(-priority, kind="stable")
             chosen = np.sort(chosen[first[:room]])
-        large = np.exp(model.log_scales[chosen].max(1)) > LARGE * self.extent
-        clones = model.take(chosen[~large]).fresh()
-        parents = model.take(chosen[large])
         keep = np.ones(len(model), bool)
-        keep[chosen[large]] = False
-        grown = model.take(keep).joined(clones).joined(_children(parents, rng))
+        keep[chosen] = False
+        grown = model.take(keep).joined(split_along_longest_axis(model.take(chosen)))
         grown.reset_gradients()
         return grown
 
@@ -87,12 +92,12 @@ class BoundedDensity:
         outer = self.rule.prune(model.take(~inside), False)
         return self.rule.prune(model.take(inside), remove_giants).joined(outer)
 
-    def grow(self, model: Model, budget: int, rng: np.random.Generator) -> Model:
+    def grow(self, model: Model, budget: int) -> Model:
         """See `AdaptiveDensity.grow`."""
         inside = self._inside(model)
         outer = model.take(~inside)
         outer.reset_gradients()
-        return self.rule.grow(model.take(inside), budget - len(outer), rng).joined(outer)
+        return self.rule.grow(model.take(inside), budget - len(outer)).joined(outer)
 
     def _inside(self, model: Model) -> NDArray[np.bool_]:
         ground = model.means[:, [0, 2]]
@@ -107,12 +112,25 @@ def estimated_view_counts(counts: NDArray[np.int32], views: int) -> NDArray[np.f
     return np.asarray(views * ((counts + 1.0) / (most + 1.0)))
 
 
-def _children(parents: Model, rng: np.random.Generator) -> Model:
-    """Two for each parent, at positions drawn from its own Gaussian."""
-    twice = parents.take(np.repeat(np.arange(len(parents)), 2)).fresh()
-    offsets = rng.normal(size=(len(twice), 3)) * np.exp(twice.log_scales.astype(np.float64))
-    twice.means += np.einsum("nij,nj->ni", matrices_of(twice.quaternions), offsets).astype(
-        np.float32
-    )
-    twice.log_scales -= np.float32(np.log(SPLIT_FACTOR))
-    return twice
+def split_along_longest_axis(parents: Model) -> Model:
+    """Two children for each parent, one on either side of its centre on its longest axis, with a
+    new optimiser state."""
+    children = parents.take(np.repeat(np.arange(len(parents)), 2)).fresh()
+    rows = np.arange(len(children))
+    longest = children.log_scales.argmax(1)
+    axes = matrices_of(children.quaternions)[rows, :, longest]
+    sigma = np.exp(children.log_scales[rows, longest].astype(np.float64))
+    side = np.where(rows % 2 == 0, CHILD_OFFSET, -CHILD_OFFSET)
+    children.means += ((side * sigma)[:, None] * axes).astype(np.float32)
+    children.log_scales += np.float32(np.log(CHILD_WIDTH))
+    children.log_scales[rows, longest] += np.float32(np.log(CHILD_LENGTH / CHILD_WIDTH))
+    children.opacity_logits[:] = _logits_scaled(children.opacity_logits, CHILD_OPACITY)
+    return children
+
+
+def _logits_scaled(logits: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
+    """The logits of opacities that are `factor` (below 1) times those of `logits`. From
+    1 / opacity = 1 + exp(-logit), which rounds neither near 0 nor near 1."""
+    with np.errstate(over="ignore"):
+        rest = np.exp(-logits.astype(np.float64))
+    return np.asarray(-np.log((1.0 + rest) / factor - 1.0), np.float32)

@@ -132,7 +132,3 @@ class Schedule:
     def dropout_key(self, step: int) -> int:
         """32 random bits for `dropout.Dropout`."""
         return int(np.random.default_rng([self.seed, 4, step]).integers(1 << 32))
-
-    def rng(self, step: int) -> np.random.Generator:
-        """Random numbers of one step, independent of all others."""
-        return np.random.default_rng([self.seed, 2, step])

@@ -342,7 +342,7 @@ def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
 def test_nothing_at_all_can_be_taken_grown_and_pruned():
     empty = new_model(*splat_arrays(grid(2).take(np.zeros(4, bool))))
     strategy = AdaptiveDensity(1.0, views=8)
-    assert len(strategy.grow(empty, 100, np.random.default_rng(0))) == 0
+    assert len(strategy.grow(empty, 100)) == 0
     assert len(strategy.prune(empty, remove_giants=True)) == 0
     assert len(empty.take(np.zeros(0, bool))) == 0
 

@@ -30,8 +30,8 @@ BLOCK = BoundedDensity(AdaptiveDensity(extent=1.0, views=8), (0.0, -9.0, 9.0, 9.
 
 
 def test_a_block_is_densified_only_in_its_own_rectangle(model) -> None:
-    grown = BLOCK.grow(model.take(np.arange(3)), 100, np.random.default_rng(0))
-    assert sorted(grown.means[:, 0]) == [-2, -1, 1, 1]
+    grown = BLOCK.grow(model.take(np.arange(3)), 100)
+    assert np.sort(grown.means[:, 0]) == pytest.approx([-2, -1, 1, 1], abs=0.01)
 
 
 def test_giants_are_removed_only_inside(model) -> None:
