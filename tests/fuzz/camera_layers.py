@@ -13,17 +13,21 @@ from types import ModuleType
 import numpy as np
 
 from stages.cameras import (
+    arkit,
     blender,
     bundler,
     colmap,
     llff,
     metashape,
     nerfstudio,
+    odm_shots,
     opensfm,
+    opf,
     realityscan,
+    realityscan_xmp,
 )
 from stages.scene import Camera, View
-from tests.cameras import drawn
+from tests.cameras.drawn_surveys import MADE, NAMES
 from tests.cameras.models import example
 from tests.fuzz.layer import Layer
 
@@ -101,7 +105,7 @@ def _points_layer(text: bool) -> Layer:
 
 def _picture() -> Layer:
     """A picture whose size a camera file needs."""
-    name = f"images/{drawn.NAMES[0]}"
+    name = f"images/{NAMES[0]}"
 
     def read(path: Path) -> int:
         file = path.parents[1] / "cameras.csv"
@@ -134,18 +138,18 @@ def _part(kind: str, name: str) -> Layer:
 def _drawn(kind: str) -> dict[str, bytes]:
     """A capture of four views, its pictures too, as `kind` names them."""
     with tempfile.TemporaryDirectory() as name:
-        drawn.MADE[kind](Path(name))
+        MADE[kind](Path(name))
         files = [path for path in Path(name).rglob("*") if path.is_file()]
         return {path.relative_to(name).as_posix(): path.read_bytes() for path in files}
 
 
-def _other(module: ModuleType, name: str, text: bool = True) -> Layer:
-    """A file of a format of one reader, with what lies around it. The split's folder is read
-    whole."""
+def _other(module: ModuleType, name: str, text: bool = True, source: str = "") -> Layer:
+    """A file of a format of one reader, with what lies around it. source: what is read, if it is
+    another file or the folder (".")."""
     kind = module.__name__.rpartition(".")[2]
 
     def read(path: Path) -> int:
-        place = path.parent if kind == "blender" else path
+        place = path.parents[name.count("/")] / (source or name)
         if hasattr(module, "read_points"):
             found = module.read_points(place)
             assert found is None or np.isfinite(found.points).all()
@@ -168,13 +172,22 @@ def _content(kind: str, name: str) -> Callable[[], bytes]:
 
 
 LAYERS = {
-    "synthetic NeRF transforms_train.json": _other(blender, "transforms_train.json"),
+    "synthetic NeRF transforms_train.json": _other(blender, "transforms_train.json", source="."),
     "poses_bounds.npy": _other(llff, "poses_bounds.npy", text=False),
     "OpenSfM reconstruction.json": _other(opensfm, "reconstruction.json"),
     "Metashape cameras.xml": _other(metashape, "cameras.xml"),
     "RealityScan cameras.csv": _other(realityscan, "cameras.csv"),
     "Bundler bundle.out": _other(bundler, "bundle.out"),
     "Bundler list.txt": replace(_other(bundler, "list.txt"), read=_bundle_of_list),
+    "ODM shots.geojson": _other(odm_shots, "odm_report/shots.geojson"),
+    "ODM cameras.json": _other(odm_shots, "cameras.json", source="odm_report/shots.geojson"),
+    "ARKit frame_00006.json": _other(arkit, "frame_00006.json", source="."),
+    "RealityScan .xmp": _other(realityscan_xmp, "p_1.xmp", source="."),
+    "OPF project.opf": _other(opf, "project.opf"),
+    **{
+        f"OPF {part}.json": _other(opf, f"{part}.json", source="project.opf")
+        for part in ("calibrated-cameras", "input-cameras", "scene-reference-frame")
+    },
     "transforms.json": Layer(
         "transforms.json",
         _content("json", "transforms.json"),
