@@ -205,9 +205,9 @@ def _ingest_photograph(
 
     try:
         decoded = decode(source.path, settings.max_side, budget)
+        return _write(source.name, source.image, decoded, settings, folder, mask)
     except Unusable as error:
         return _Ingested(source.name, error=error)
-    return _write(source.name, source.image, decoded, settings, folder, mask)
 
 
 def _ingest_video(
@@ -243,12 +243,17 @@ def _write(
     mask: Path | None = None,
     video: str = "",
 ) -> _Ingested:
-    """Write a normalised picture and its mask, and measure it. video: that it is a frame of."""
+    """Write a normalised picture and its mask, and measure it. video: that it is a frame of. Raises
+    Unusable for a panorama."""
+    from stages.photos.decode import Unusable
     from stages.photos.masking import MaskedPhoto
+    from stages.photos.panorama import CUT, panorama
     from stages.photos.quality import measure
     from stages.photos.write import write_mask, write_picture
     from stages.scene import TRANSPARENT, Photo
 
+    if kind := panorama(decoded.pixels, decoded.stored, decoded.exif.projection):
+        raise Unusable(f"it is {kind}", CUT)
     masked = MaskedPhoto.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
     decoded = masked.decoded
     target = folder / image

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from stages.photos.gps import Gps, read_gps
+from stages.photos.panorama import projection_of
 
 FULL_FRAME_WIDTH_MM = 36.0
 _EXIF_IFD, _INTEROPERABILITY_IFD, _GPS_IFD = 0x8769, 0xA005, 0x8825
@@ -32,6 +33,7 @@ class Exif:
         adobe_rgb: whether the colour space is declared as Adobe RGB without a profile
             (InteroperabilityIndex "R03" of DCF).
         gps: where it was taken.
+        projection: of a panorama, see `panorama.projection_of`.
     """
 
     make: str = ""
@@ -47,6 +49,7 @@ class Exif:
     focal_plane_px_per_mm: float | None = None
     adobe_rgb: bool = False
     gps: Gps = field(default_factory=Gps)
+    projection: str = ""
 
     @property
     def exposure_ev(self) -> float | None:
@@ -122,6 +125,7 @@ def read_exif(image: Any) -> Exif:
     except Exception:
         gps = {}
     xmp = getattr(image, "info", {}).get("xmp")
+    xmp = xmp if isinstance(xmp, bytes) else b""
     orientation = _number(tags.get(0x0112))
     width, height = _number(tags.get(0xA002)), _number(tags.get(0xA003))
     return Exif(
@@ -137,7 +141,8 @@ def read_exif(image: Any) -> Exif:
         pixels=(width, height) if width and height else None,
         focal_plane_px_per_mm=_focal_plane_px_per_mm(tags),
         adobe_rgb=_text(interoperability.get(1)) == "R03",
-        gps=read_gps(gps, xmp if isinstance(xmp, bytes) else b""),
+        gps=read_gps(gps, xmp),
+        projection=projection_of(xmp),
     )
 
 

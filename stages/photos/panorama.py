@@ -1,0 +1,82 @@
+"""Recognises 360-degree pictures, which no perspective camera describes.
+
+By the metadata of Google's photo sphere (GPano), or by what an equirectangular picture of the whole
+sphere cannot avoid: it is exactly twice as wide as high, its left edge goes on at its right edge,
+and its first and its last row are one point of the sphere each. Twice as wide as high alone says
+nothing: phones take such photographs.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+_PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w{1,40})")
+_COLUMNS = 256  # of the reduced picture
+_FEWEST = 64  # columns; smaller pictures are not examined
+_SEAM = 2.5  # times the median difference of neighbouring columns
+_EDGE = 0.5  # of the variation along an edge
+_POLE = 0.3  # of the variation along a row in the middle
+_CONTRAST = 4.0  # of 255: below, edges and rows say nothing
+_DARK = 12.0  # of 255: what is outside the circles of two fisheyes
+_SHARE = 0.95  # of the pixels outside the circles that are dark, and just inside that are not
+CUT = (
+    "Cut it into perspective pictures that overlap by half (ns-process-data of nerfstudio does, "
+    "with --camera-type equirectangular), or photograph with a plain lens"
+)
+
+
+def projection_of(xmp: bytes) -> str:
+    """GPano's ProjectionType in lower case ("equirectangular"); "" if there is none."""
+    found = _PROJECTION.search(xmp)
+    return found[1].decode("ascii").lower() if found else ""
+
+
+def panorama(pixels: NDArray[np.uint8], stored: tuple[int, int], projection: str) -> str:
+    """What kind of panorama a picture is, as the end of "it is ..."; "" for an ordinary one.
+
+    Args:
+        pixels: [H, W, 3] upright.
+        stored: (width, height) in the file.
+        projection: see `projection_of`.
+    """
+    if projection:
+        return f"a panorama ({projection}, as its metadata say)"
+    if max(stored) != 2 * min(stored) or pixels.shape[1] < _FEWEST:
+        return ""
+    small = _reduced(pixels)
+    if _two_fisheyes(small):
+        return "a pair of fisheye pictures side by side"
+    return "a 360-degree panorama (equirectangular)" if _wraps(small) else ""
+
+
+def _reduced(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """[H, W] mean of the channels over blocks, at most about `_COLUMNS` wide; the borders stay."""
+    step = max(1, pixels.shape[1] // _COLUMNS)
+    height, width = (side // step * step for side in pixels.shape[:2])
+    grey = pixels[:height, :width].mean(axis=2)
+    blocks: NDArray[np.float64] = grey.reshape(height // step, step, width // step, step)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _wraps(grey: NDArray[np.float64]) -> bool:
+    steps = np.abs(np.diff(grey, axis=1)).mean(axis=0)
+    seam = float(np.abs(grey[:, 0] - grey[:, -1]).mean())
+    across, edge = float(np.median(grey.std(axis=1))), float(grey[:, 0].std())
+    pole = min(float(grey[0].std()), float(grey[-1].std()))  # the other may be filled in or cut
+    if min(across, edge) < _CONTRAST:
+        return False
+    goes_on = seam <= min(_SEAM * float(np.median(steps)), _EDGE * edge)
+    return goes_on and pole <= _POLE * across
+
+
+def _two_fisheyes(grey: NDArray[np.float64]) -> bool:
+    height, width = grey.shape
+    y, x = np.mgrid[:height, :width] + 0.5
+    left, right = (np.hypot(x - share * width, y - height / 2) for share in (0.25, 0.75))
+    away = np.minimum(left, right) / (height / 2)
+    rim = (away > 0.8) & (away < 0.92)
+    lit = grey > _DARK
+    return bool((~lit)[away > 1.08].mean() > _SHARE and lit[rim].mean() > _SHARE)
