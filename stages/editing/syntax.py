@@ -6,7 +6,6 @@ To add an operation, add a row to `OPERATIONS` and a case to `operations.prepare
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,11 +87,6 @@ def _parse_line(line: str, where: str) -> ParsedOperation:
     if bool(value) != bool(OPERATIONS[name].takes):
         raise _invalid(f"{where}: {name} takes {OPERATIONS[name].takes or 'no value'}.")
     return ParsedOperation(name, value)
-
-
-def format_operations(operations: Iterable[ParsedOperation]) -> str:
-    """The text that `parse_file` reads."""
-    return "".join(f"{one.name} {one.value}".rstrip() + "\n" for one in operations)
 
 
 def _invalid(given: str) -> SplatError:

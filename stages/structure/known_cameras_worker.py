@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from stages.scene.rotations import similarity
 from stages.structure.epipolar import likely_mistakes, median_inlier_ratio
 from stages.structure.job import Job, known_cameras_path
-from stages.structure.mapping import point_arrays
+from stages.structure.mapping import point_arrays, verified_matches
 from stages.structure.matching import match_pairs
 from stages.structure.sparse_model import camera_centres
 
 # Factor on COLMAP's error thresholds of triangulation, for each round of refinement: with the usual
 # thresholds, rough poses give no points to begin with.
 REFINEMENTS = (8.0, 4.0, 2.0, 1.0, 1.0)
-FEWEST_MATCHES = 30  # of a pair by which poses are checked
 
 
 def match_neighbours(job: Job) -> None:
@@ -75,17 +74,12 @@ def _camera(number: int, lens: NDArray[np.float64], size: NDArray[np.int32]) -> 
 
 
 def _matched_points(path: Path) -> list[tuple[int, int, NDArray[np.float64], NDArray[np.float64]]]:
-    """(first, second, pixels in the first [N, 2], in the second) of each pair with enough matches
-    that two-view geometry verified, independently of the given poses."""
+    """(first, second, pixels in the first [N, 2], in the second) of each pair of
+    `verified_matches`, which does not depend on the given poses."""
     found = []
     with pycolmap.Database.open(path) as database:
-        ids, geometries = database.read_two_view_geometries()
         keypoints: dict[int, NDArray[np.float64]] = {}
-        for pair_id, geometry in zip(ids, geometries, strict=True):
-            first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            matches = np.asarray(geometry.inlier_matches)
-            if len(matches) < FEWEST_MATCHES:
-                continue
+        for (first, second), matches in verified_matches(database):
             for image in (first, second):
                 if image not in keypoints:
                     keypoints[image] = database.read_keypoints(image)[:, :2].astype(np.float64)

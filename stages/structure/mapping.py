@@ -244,6 +244,18 @@ def point_arrays(model: pycolmap.Reconstruction, position: dict[int, int]) -> di
     }
 
 
+def verified_matches(
+    database: pycolmap.Database,
+) -> list[tuple[tuple[int, int], NDArray[np.integer]]]:
+    """(both image ids, keypoints that match [N, 2]) of each pair with enough matches that two-view
+    geometry verified."""
+    found = [
+        (pycolmap.pair_id_to_image_pair(pair_id), np.asarray(geometry.inlier_matches))
+        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
+    ]
+    return [(both, inliers) for both, inliers in found if len(inliers) >= PAIR_INLIERS]
+
+
 def _pair_inlier_ratios(
     job: Job, model: pycolmap.Reconstruction, position: dict[int, int]
 ) -> dict[str, np.ndarray]:
@@ -257,12 +269,10 @@ def _pair_inlier_ratios(
     side = max(max(c.width, c.height) for c in model.cameras.values())
     pairs, ratios, turns = [], [], []
     with pycolmap.Database.open(job.database) as database:
-        ids, geometries = database.read_two_view_geometries()
-        for done, (pair_id, geometry) in enumerate(zip(ids, geometries, strict=True), 1):
-            both = pycolmap.pair_id_to_image_pair(pair_id)
-            inliers = np.asarray(geometry.inlier_matches)
-            progress.write("checking pairs", done, len(ids))
-            if len(inliers) < PAIR_INLIERS or any(image not in position for image in both):
+        verified = verified_matches(database)
+        for done, (both, inliers) in enumerate(verified, 1):
+            progress.write("checking pairs", done, len(verified))
+            if any(image not in position for image in both):
                 continue
             for image in both:
                 if image not in normalised:

@@ -16,7 +16,7 @@ from splatcli.commands import edit as command
 from stages import formats
 from stages.base import scratch
 from stages.editing.scene import EditedScene
-from stages.editing.syntax import OPERATIONS, ParsedOperation, format_operations, parse_file
+from stages.editing.syntax import OPERATIONS, ParsedOperation, parse_file
 from stages.scene import Splats, View, look_at
 from tests import scenes
 from tests.cli.help_text import help_of
@@ -165,14 +165,13 @@ def test_a_file_of_operations_is_done_where_it_stands(source: Path, tmp_path: Pa
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "c.ply").read_bytes()
 
 
-def test_operations_written_to_a_file_are_read_back(tmp_path: Path) -> None:
-    chain = [
+def test_operations_of_a_file_are_read_in_order(tmp_path: Path) -> None:
+    (tmp_path / "ops").write_text("keep x > 0 and y < 1\ndrop-floaters\nmove -1,0,0\n")
+    assert parse_file(tmp_path / "ops") == [
         ParsedOperation("keep", "x > 0 and y < 1"),
         ParsedOperation("drop-floaters"),
         ParsedOperation("move", "-1,0,0"),
     ]
-    (tmp_path / "ops").write_text(format_operations(chain))
-    assert parse_file(tmp_path / "ops") == chain
 
 
 @pytest.mark.parametrize(
