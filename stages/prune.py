@@ -200,7 +200,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=13,
+    version=14,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

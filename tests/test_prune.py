@@ -19,7 +19,7 @@ from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.measure.floaters import near_camera_floaters
 from stages.raster.draw import render
-from stages.scene import Splats, TrainedSplats, View, split_held_out
+from stages.scene import IGNORE, Splats, TrainedSplats, View, split_held_out
 from tests.scenes import camera, join, splats
 from tests.small_scene import SmallScene, small_scene
 
@@ -100,6 +100,26 @@ def test_a_splat_close_to_one_camera_is_removed(scene, tmp_path, view, counted_a
     assert not rows_of(floater, result).any()
     assert report.metrics[counted_as] > reference.metrics[counted_as]
     assert report.metrics["psnr_change_db"] >= -0.05
+
+
+def test_splats_that_only_masks_ignore_are_floaters(scene, tmp_path) -> None:
+    """Masks ignore the upper third of all photographs."""
+    folder = shutil.copytree(scene.reconstruction.folder, tmp_path / "photographs")
+    mask = np.zeros((54, 72), np.uint8)
+    mask[18:] = 255
+    Image.fromarray(mask).save(folder / "mask.png")
+    views = tuple(
+        replace(view, mask="mask.png", outside=IGNORE) for view in scene.reconstruction.views
+    )
+    masked = replace(
+        scene, reconstruction=replace(scene.reconstruction, folder=folder, views=views)
+    )
+    fog = splats([[0.0, -0.9, 0.0], [0.1, -0.85, 0.1]], scales=0.03, rgb=(0.4, 0.3, 0.1))
+    in_sight = splats([[0.0, 1.0, 0.0]], scales=0.03, rgb=(0.9, 0.3, 0.1))
+    result, report = run(masked, join(scene.splats, fog, in_sight), tmp_path, strength=0.01)
+    assert not rows_of(fog, result).any()
+    assert report.metrics["floaters_removed"] >= 2
+    assert rows_of(scene.splats, result).mean() > 0.5
 
 
 def test_splats_that_no_view_shows_are_removed(scene, tmp_path) -> None:
@@ -302,7 +322,9 @@ def contributions_of(view_counts, sse_change, scene_depth=(4.0,)) -> Contributio
     weight = (seen > 0).astype(np.float64)
     change, depth = np.asarray(sse_change, np.float64), np.asarray(scene_depth, np.float64)
     no_sh = np.zeros((len(seen), 0))
-    return Contributions(change, change, weight, seen, 1.0, depth, no_sh, no_sh, no_sh, depth)
+    return Contributions(
+        change, change, weight, weight, seen, 1.0, depth, no_sh, no_sh, no_sh, depth
+    )
 
 
 def test_a_floater_is_close_to_a_camera_and_needed_by_few() -> None:

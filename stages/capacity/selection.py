@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.measure.contribution import Contributions, near_view_frusta
-from stages.measure.floaters import near_camera_floaters
+from stages.measure.floaters import near_camera_floaters, splats_in_masks
 from stages.scene import SH_C0, Camera, Splats, morton, parameters_per_splat
 
 # Predictions for single splats add up only while few are removed at once, and of so many
@@ -82,10 +82,12 @@ def select_removal(
     seen, near = contributions.view_counts > 0, near_view_frusta(splats, list(cameras))
     every = replace(
         contributions,
+        weight=contributions.weight + validation.weight,
+        kept_weight=contributions.kept_weight + validation.kept_weight,
         view_counts=contributions.view_counts + validation.view_counts,
         scene_depth=np.append(contributions.scene_depth, validation.scene_depth),
     )
-    floaters = near_camera_floaters(splats, every, list(cameras))
+    floaters = near_camera_floaters(splats, every, list(cameras)) | splats_in_masks(every)
     free = floaters | (~seen & ~near)
     change = contributions.sse_change if by_error else contributions.picture_change
     ratio = change / parameters_per_splat(splats.sh_degrees)

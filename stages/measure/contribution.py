@@ -22,11 +22,13 @@ from stages.raster.definition import (
     SQUARED_WEIGHT,
     WEIGHT,
     WEIGHTED_RESIDUAL,
+    Forward,
+    Rasteriser,
     splat_arrays,
 )
 from stages.raster.draw import raster_settings_of
 from stages.raster.reference import sh_basis
-from stages.scene import Camera, Splats
+from stages.scene import IGNORE, Camera, Splats
 
 VISIBLE_WEIGHT = 1.0 / 255.0  # a smaller blend weight cannot change an 8-bit picture
 MARGIN = 0.25  # of the longer side: as far as seeding continues a picture beyond its edge
@@ -43,6 +45,7 @@ class Contributions:
             negative where the views would be matched better without it.
         picture_change: [N] summed squared change of the pictures then, whatever the views show.
         weight: [N] summed blend weight.
+        kept_weight: [N] that over the pixels that no mask ignores.
         view_counts: [N] views in which a pixel has a blend weight of 1/255 or more.
         sse: summed squared error of the pictures as they are.
         scene_depth: [V] median depth of each picture, world units; inf where nothing is drawn.
@@ -59,6 +62,7 @@ class Contributions:
     sse_change: NDArray[np.float64]
     picture_change: NDArray[np.float64]
     weight: NDArray[np.float64]
+    kept_weight: NDArray[np.float64]
     view_counts: NDArray[np.int32]
     sse: float
     scene_depth: NDArray[np.float64]
@@ -77,6 +81,7 @@ class Contributions:
             sse_change=self.sse_change[rows],
             picture_change=self.picture_change[rows],
             weight=self.weight[rows],
+            kept_weight=self.kept_weight[rows],
             view_counts=self.view_counts[rows],
             sh_sums=tuple(sums[rows] for sums in self.sh_sums),
         )
@@ -98,11 +103,12 @@ def measure_contributions(
             before the splats around them changed a little. The result includes them.
     """
     n = len(splats)
-    change, picture, weight = np.zeros(n), np.zeros(n), np.zeros(n)
+    change, picture, weight, kept_weight = np.zeros((4, n))
     view_counts, sse, depths, psnr_db = np.zeros(n, np.int32), 0.0, [], []
     if previous is not None:
         change, picture = previous.sse_change.copy(), previous.picture_change.copy()
         weight, view_counts = previous.weight.copy(), previous.view_counts.copy()
+        kept_weight = previous.kept_weight.copy()
         sse, depths = previous.sse, previous.scene_depth.tolist()
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
     settings = raster_settings_of(splats)
@@ -125,6 +131,7 @@ def measure_contributions(
         change[rows] += found[:, ERROR_CHANGE]
         picture[rows] += without_residual
         weight[rows] += found[:, WEIGHT]
+        kept_weight[rows] += _kept_weight(rasteriser, forward, view, found)
         view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
         truncation.add(view.camera.centre, rows, found)
     truncated_sse_change, truncated_picture_change, truncated_colour = truncation.figures()
@@ -132,6 +139,7 @@ def measure_contributions(
         sse_change=change,
         picture_change=picture,
         weight=weight,
+        kept_weight=kept_weight,
         view_counts=view_counts,
         sse=sse,
         scene_depth=np.array(depths),
@@ -142,6 +150,20 @@ def measure_contributions(
         sh_sums=truncation.sums,
         previous=previous,
     )
+
+
+def _kept_weight(
+    rasteriser: Rasteriser,
+    forward: Forward,
+    view: EvaluationView,
+    found: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """[K] summed blend weight over the pixels that the view's mask does not ignore. found:
+    [K, ...] the rasteriser's contributions to the view."""
+    if view.mask is None or view.outside != IGNORE:
+        return found[:, WEIGHT]
+    kept = np.repeat((view.mask > 0).astype(np.float32)[None], 3, axis=0)
+    return rasteriser.contributions(forward, kept)[:, WEIGHTED_RESIDUAL]
 
 
 class _ShTruncation:

@@ -1,7 +1,7 @@
 """Floaters: splats in free space, where no surface is.
 
 A floater fits the few training views that it was made for and hides the scene from others. What can
-be known of free space differs by the moment, so there are three rules, from the most to the least
+be known of free space differs by the moment, so there are four rules, from the most to the least
 that is known. Merging any two would change which splats go.
 
 - `stages.training.free_space`, during training: free space is what at least two and fewer than four
@@ -10,6 +10,8 @@ that is known. Merging any two would change which splats go.
 - `near_camera_floaters`, once training is over: a splat close to a camera, compared with the depth
   that is drawn there, which at most two views need. It needs the views and a measurement of each
   splat's contribution.
+- `splats_in_masks`, then, too: a splat that is shown only where masks ignore what is there. It
+  needs the same.
 - `isolated_splats`, for a file without its views: a splat far from its neighbours, compared with
   their own distances.
 """
@@ -22,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import reported_blocks
-from stages.measure.contribution import Contributions
+from stages.measure.contribution import VISIBLE_WEIGHT, Contributions
 from stages.scene import Camera, Splats
 
 NEAR_CAMERA = 0.25  # of the median depth that is drawn for that camera
@@ -51,6 +53,12 @@ def near_camera_floaters(
             distance = np.linalg.norm(splats.means - camera.centre, axis=1)
             close |= distance < NEAR_CAMERA * depth
     return np.asarray(close & (contributions.view_counts <= MOST_VIEWS))
+
+
+def splats_in_masks(contributions: Contributions) -> NDArray[np.bool_]:
+    """[N] splats that views show, but only where their masks ignore what is there."""
+    shown = contributions.weight >= VISIBLE_WEIGHT
+    return np.asarray(shown & (contributions.kept_weight < VISIBLE_WEIGHT))
 
 
 def isolated_splats(splats: Splats) -> NDArray[np.bool_]:
