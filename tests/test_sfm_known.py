@@ -14,6 +14,7 @@ from stages import sfm
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.scene import Reconstruction, split_held_out
+from stages.scene.place import local_positions
 from stages.scene.rotations import quaternions_of
 from tests.structure import bad_captures
 from tests.structure.truth import TRUTH, centres, similarity
@@ -99,8 +100,18 @@ def test_a_file_that_knows_north_gives_the_world_its_directions(tmp_path: Path) 
     }
     path = tmp_path / "reconstruction.json"
     path.write_text(json.dumps([data]))
-    found, _ = reconstructed(tmp_path / "sfm", path)
+    found, report = reconstructed(tmp_path / "sfm", path)
     assert (found.units, found.levelled) == ("metres", True)
+    home = np.array([48.0, 11.0, 500.0])
+    for view in found.views:
+        assert found.place is not None
+        here = local_positions(found.place.beside(view.camera.centre).offset, home)
+        rotation, shift = (np.array(shots[view.name][key]) for key in ("rotation", "translation"))
+        np.testing.assert_allclose(here, -cv2.Rodrigues(rotation)[0].T @ shift, atol=1e-6)
+    stored = sfm.load(tmp_path / "sfm").place
+    assert stored is not None
+    assert found.place is not None
+    assert stored.to_json() == found.place.to_json() == report.metrics["place"]
     wanted = [POSES[view.name][:3, :3] @ file_from_truth[:3, :3].T for view in found.views]
     have = [view.camera.world_to_camera[:3, :3] for view in found.views]
     ours_from_file = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])

@@ -79,6 +79,8 @@ def describe(splats: Splats, statistics: Statistics) -> dict[str, Any]:
     drawing = "antialiased" if splats.draw_settings.antialias else "plain"
     facts["drawing"] = drawing
     facts["origin"] = [float(value) for value in splats.origin]
+    if splats.place is not None:
+        facts["place"] = splats.place.to_json()
     return facts | _memory(splats)
 
 
