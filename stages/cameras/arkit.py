@@ -32,6 +32,7 @@ from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 _FRAMES = "frame_*.json"
 _POLYCAM = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".heic")
+_CENTRE = 0.5  # ARKit counts pixels from the centre of the first one, we from its corner
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # ahead stands for north
 _SESSION = Georeference(1.0, _UP, "ARKit's tracking")
 
@@ -91,7 +92,8 @@ def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Optics:
     (fx, _, cx), (_, fy, cy), _ = intrinsics.reshape(3, 3).tolist()
     if picture is None:
         raise BadFileError("its picture is not beside it, and the size of that is needed")
-    return [*map(float, stored_size(picture)), fx, fy, cx, cy], pose.reshape(4, 4)[:3]
+    centre = [cx + _CENTRE, cy + _CENTRE]
+    return [*map(float, stored_size(picture)), fx, fy, *centre], pose.reshape(4, 4)[:3]
 
 
 def _polycam(frame: dict[str, Any], _: Path | None) -> Optics:

@@ -80,7 +80,7 @@ def arkit(folder: Path) -> Path:
         (folder / name).rename(folder / f"frame_{6 * number:05}.png")
         frame = {
             "cameraPoseARFrame": pose.ravel().tolist(),
-            "intrinsics": [FOCAL, 0, 157, 0, FOCAL, 123, 0, 0, 1],
+            "intrinsics": [FOCAL, 0, 156.5, 0, FOCAL, 122.5, 0, 0, 1],
             "time": 0.1 * number,
         }
         (folder / f"frame_{6 * number:05}.json").write_text(json.dumps(frame))
