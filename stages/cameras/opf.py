@@ -9,6 +9,7 @@ shift.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -121,21 +122,31 @@ def _known(table: dict[int, Any], number: Any, what: str) -> int:
 
 
 def _optics(internals: dict[str, Any], size: Any) -> tuple[list[float], Lens]:
-    """(width, height, fx, fy, cx, cy in pixels; the lens). Fisheyes have a polynomial of the angle
-    that COLMAP's models do not express."""
+    """(width, height, fx, fy, cx, cy in pixels; the lens).
+
+    A fisheye's radius is a polynomial of the angle from the axis in quarter turns, whose first two
+    coefficients are 0 and 1; an affine matrix by rows turns it into pixels.
+    """
     kind = str(internals["type"])
-    if kind != "perspective":
-        raise BadFileError(f"a lens of type {kind[:40]} is not supported, only perspective ones")
+    if kind not in ("perspective", "fisheye"):
+        raise BadFileError(f"a lens of type {kind[:40]} is not supported")
     if size is None:
         raise BadFileError("the size of a sensor's pictures is not in its input cameras")
+    centre = [float(value) for value in internals["principal_point_px"]]
+    if kind == "fisheye":
+        c, d, e, f = (float(value) for value in internals["affine"])
+        zero, one, *terms = (float(value) for value in internals["polynomial"])
+        if not np.isfinite([c, d, e, f, *terms]).all() or (zero, one, e) != (0.0, 1.0, 0.0):
+            raise BadFileError("a fisheye lens has an offset or a shear that is not supported")
+        lens = Lens("polynomial fisheye", parameters=tuple(terms), skew=d / c if c else 0.0)
+        return [*map(float, size), c * 2 / math.pi, f * 2 / math.pi, *centre], lens
     focal = float(internals["focal_length_px"])
-    cx, cy = (float(value) for value in internals["principal_point_px"])
     r1, r2, r3 = (float(value) for value in internals["radial_distortion"])
     t1, t2 = (float(value) for value in internals["tangential_distortion"])
     if not np.isfinite([r1, r2, r3, t1, t2]).all():
         raise BadFileError("a lens has a parameter that is not a number")
     lens = Lens(radial=(r1, r2, r3), tangential=(t1, t2))
-    return [float(size[0]), float(size[1]), focal, focal, cx, cy], lens
+    return [*map(float, size), focal, focal, *centre], lens
 
 
 def _world_to_camera(omega: float, phi: float, kappa: float) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stages.base.errors import SplatError
@@ -29,7 +30,12 @@ def replaced(path: Path, before: str, after: str) -> None:
 @pytest.mark.parametrize(
     ("file", "before", "after", "why"),
     [
-        ("calibrated-cameras.json", '"perspective"', '"fisheye"', "type fisheye is not supported"),
+        (
+            "calibrated-cameras.json",
+            '"perspective"',
+            '"spherical"',
+            "type spherical is not supported",
+        ),
         ("calibrated-cameras.json", '"sensor_id": 7', '"sensor_id": 8', "sensor 8 is not listed"),
         ("camera-list.json", "9223372036854775808", "5", "picture 9223372036854775808 is not"),
         ("input-cameras.json", '"id": 7', '"id": 8', "size of a sensor's pictures"),
@@ -45,6 +51,33 @@ def test_an_opf_project_that_does_not_agree_is_refused(
     path = opf(tmp_path)
     replaced(tmp_path / file, before, after)
     assert why in refused(path)
+
+
+def test_opfs_fisheye_is_a_polynomial_of_the_angle(tmp_path: Path) -> None:
+    """By Pix4D's description: theta in quarter turns, rho = theta + p2 theta^2 + p3 theta^3."""
+    path = opf(tmp_path)
+    calibrated = tmp_path / "calibrated-cameras.json"
+    data = json.loads(calibrated.read_text())
+    p2, p3, affine = 0.0152646, -0.161096, [300.0, 2.0, 0.0, 301.0]
+    data["sensors"][0]["internals"] = {
+        "type": "fisheye",
+        "principal_point_px": [158, 122],
+        "affine": affine,
+        "polynomial": [0.0, 1.0, p2, p3],
+    }
+    calibrated.write_text(json.dumps(data))
+    found = read_cameras(path)
+    camera, lens = found.views[0].camera, found.lenses[0]
+    at = np.random.default_rng(0).uniform([-1, -1, 1], [1, 1, 2], (50, 3))
+    across = np.hypot(at[:, 0], at[:, 1])
+    theta = 2 / np.pi * np.arctan(across / at[:, 2])
+    rho = (theta + p2 * theta**2 + p3 * theta**3)[:, None]
+    wanted = rho * at[:, :2] / across[:, None] @ np.reshape(affine, (2, 2)).T + [158, 122]
+    uv = at[:, :2] / at[:, 2:]
+    pixels = lens.distort(uv) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    np.testing.assert_allclose(pixels, wanted, atol=1e-9)
+    seen = (wanted - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    np.testing.assert_allclose(lens.undistort(seen), uv, atol=1e-6)
 
 
 def test_a_folder_with_an_opf_project_is_enough(tmp_path: Path) -> None:
