@@ -17,7 +17,7 @@ from stages.base.bad_files import BadFileError
 MAX_ANGLE = 1.5  # radians from the axis; a pinhole camera sees less than pi / 2
 _ITERATIONS = 60
 _STEP = 1e-6
-_TOLERANCE, _CONVERGED = 1e-9, 1e-13
+_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,6 @@ class Lens:
                 step = np.einsum("nij,nj->ni", _inverse(self._jacobian(at)), off)
                 length = np.linalg.norm(step, axis=1, keepdims=True)
                 at = at - step * np.minimum(1.0, 0.3 / np.maximum(length, 1e-12))
-                if not (length > _CONVERGED).any():
-                    break
             found = np.abs(self._distorted(at) - seen).max(axis=1) < _TOLERANCE
             # A step may jump over a fold: from the axis on, the determinant must stay positive.
             for share in np.linspace(0.0, 1.0, 17):

@@ -20,7 +20,7 @@ from stages.structure.levelling import level_and_recentre
 from stages.structure.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric_scale
 from stages.structure.sparse_model import SparseModel, point_errors
 from stages.structure.undistorted_images import IMAGES, mask_file, write_undistorted_images
-from stages.structure.undistortion import undistorted_px
+from stages.structure.undistortion import SimpleRadial, undistorted_px
 
 COLMAP = "colmap"
 SPARSE = f"{COLMAP}/sparse/0"
@@ -89,7 +89,7 @@ def _cameras_and_lenses(model: SparseModel) -> tuple[list[Camera], list[Lens]]:
         width, height = (int(side) for side in model.camera_sizes[number])
         focal, cx, cy, k = (float(value) for value in model.camera_params[number])
         cameras.append(Camera(width, height, focal, focal, cx, cy, pose))
-        lenses.append(Lens(radial=(k,)))
+        lenses.append(SimpleRadial(radial=(k,)))
     return cameras, lenses
 
 

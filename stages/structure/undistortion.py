@@ -17,8 +17,26 @@ from stages.scene import Camera
 _LARGEST_GROWTH = 2.0  # of either side, as COLMAP limits it
 _SMALLEST_SHARE = 0.2  # of either side; below, the pinhole camera keeps the photograph's rectangle
 _WIDEST = np.tan(np.radians(60.0))  # beyond, a pinhole picture spends many pixels on little
-_EDGE = 129  # samples along each edge, for the rectangle that fits
 _GRID = 33  # samples along either side, for the share of the photograph that stays visible
+_NEWTON_STEPS = 100
+
+
+class SimpleRadial(Lens):
+    """COLMAP's SIMPLE_RADIAL: one radial term, whose inverse needs the radius only."""
+
+    def undistort(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Lens`. NaN beyond the largest radius that this lens model can show (k < 0)."""
+        (k,) = self.radial
+        wanted = np.linalg.norm(seen, axis=-1)
+        limit = np.inf if k >= 0 else 1.0 / np.sqrt(-3.0 * k)
+        reachable = wanted <= 2.0 / 3.0 * limit  # k limit^2 = -1/3
+        radius = np.minimum(wanted, limit)
+        for _ in range(_NEWTON_STEPS):  # on r + k r^3 = wanted, kept on the monotonic branch
+            slope = np.maximum(1.0 + 3.0 * k * radius**2, 1e-9)
+            radius = np.clip(radius - (radius + k * radius**3 - wanted) / slope, 0.0, limit)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(wanted > 0, radius / wanted, 1.0)
+        return seen * np.where(reachable, ratio, np.nan)[..., None]
 
 
 def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
@@ -74,8 +92,9 @@ def _from_principal_point(
 def _inner_rectangle(camera: Camera, lens: Lens) -> tuple[float, float, float, float]:
     """left, top, right, bottom relative to the principal point. An edge that no pinhole camera can
     show does not limit the rectangle."""
+    samples, widest = (257, np.inf) if isinstance(lens, SimpleRadial) else (129, _WIDEST)
     width, height = camera.width, camera.height
-    x, y = np.linspace(0.0, width, _EDGE), np.linspace(0.0, height, _EDGE)
+    x, y = np.linspace(0.0, width, samples), np.linspace(0.0, height, samples)
 
     def edge(
         xs: NDArray[np.float64] | float, ys: NDArray[np.float64] | float, axis: int
@@ -85,7 +104,7 @@ def _inner_rectangle(camera: Camera, lens: Lens) -> tuple[float, float, float, f
         return found[np.isfinite(found)]
 
     def limit(side: float, focal: float) -> float:
-        return float(min(_LARGEST_GROWTH * max(side, 1.0), focal * _WIDEST))
+        return float(min(_LARGEST_GROWTH * max(side, 1.0), focal * widest))
 
     left = max([-limit(camera.cx, camera.fx), *edge(0.0, y, 0)])
     right = min([limit(width - camera.cx, camera.fx), *edge(float(width), y, 0)])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from stages.cameras.lens import PINHOLE, Lens
 from stages.scene import Camera
 from stages.structure.undistortion import (
+    SimpleRadial,
     remap_tables,
     undistorted_camera,
     undistorted_px,
@@ -20,7 +21,7 @@ from stages.structure.undistortion import (
 
 def simple_radial(k: float) -> Lens:
     """COLMAP's SIMPLE_RADIAL."""
-    return Lens(radial=(k,))
+    return SimpleRadial(radial=(k,))
 
 
 TAKEN = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
