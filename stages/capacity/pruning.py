@@ -185,7 +185,8 @@ class Pruner:
             fewer = removal.apply(found.splats)
             measured = self._sse_change(fewer, state.choosing)
             steps = self.finetune_steps * self.rounds // planned
-            fewer, after = self._finetuned(fewer, steps, state, removal, best_db)
+            allowed = None if excess > 0 else best_db
+            fewer, after = self._finetuned(fewer, steps, state, removal, allowed)
             kept = excess > 0 or self.targets.allows(after.psnr_db, best_db)
             predicted = removal.predicted_sse * (overlap if removal.predicted_sse > 0 else 1)
             found.add_round(removal, predicted, measured, _mean(after.psnr_db), kept)
@@ -209,15 +210,15 @@ class Pruner:
         steps: int,
         before: _State,
         removal: Removal,
-        best_db: tuple[Psnr, ...],
+        best_db: tuple[Psnr, ...] | None,
     ) -> tuple[Splats, _State]:
         """The splats that `removal` left after so many steps, or as they are if only fine-tuning
-        costs more than is allowed: of a model that was trained long on many photographs, 90 steps
-        may cost all views 0.2 dB."""
+        costs more than is allowed against `best_db`: of a model that was trained long on many
+        photographs, 90 steps may cost all views 0.2 dB. best_db: None if any loss is."""
         counts = before.choosing.view_counts + before.validation.view_counts
         trained = self.finetuner.finetune(splats, steps, counts[~removal.removed])
         after = self._measure(trained, before, removal)
-        if steps and not self.targets.allows(after.psnr_db, best_db):
+        if steps and best_db and not self.targets.allows(after.psnr_db, best_db):
             plain = self._measure(splats, before, removal)
             if self.targets.allows(plain.psnr_db, best_db):
                 return splats, plain
