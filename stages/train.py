@@ -142,7 +142,7 @@ class TrainSettings:
 
 _TRAINED = "training.json"
 PRESETS: dict[str, TrainSettings] = {
-    "preview": TrainSettings(steps=3000, train_side=480, sh_degree=1, max_splats=60_000),
+    "preview": TrainSettings(steps=2000, train_side=480, sh_degree=1, max_splats=60_000),
     "standard": TrainSettings(steps=7000, train_side=800, sh_degree=2, max_splats=250_000),
     "best": TrainSettings(steps=30_000, train_side=1600, sh_degree=3),
 }
