@@ -296,5 +296,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=15, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=16, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -22,7 +22,9 @@ _HYPOTHESES = 2000  # of the robust fit, at most
 _EXACT_M = 1e-3  # of positions, as tags state them
 _ACCURATE_M = 0.2  # as positions corrected by a base station (RTK) are
 _FLATTEST = 0.05  # second over first extent of the positions that may tilt the world
-_MOST_TILT_DEG = 10.0  # by which accurate positions may correct the level of the cameras
+_MOST_TILT_DEG = 30.0  # by which positions may correct the level of the cameras
+_FEWEST_TILTED = 8  # positions without stated errors that may
+_DECISIVE = 0.25  # of the spread of heights that they must explain: all but this share
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,9 @@ def scale_from_gps(
 ) -> MetricScale | None:
     """The scale that takes the cameras to their GPS positions; None if these cannot be used.
 
-    By horizontal positions alone, because GPS heights are less accurate than levelling by cameras;
-    where positions are accurate, by all three coordinates.
+    By horizontal positions alone, because heights of phones are less accurate than levelling by
+    cameras; by all three coordinates where positions are accurate, or where a tilt explains nearly
+    all differences of height: cameras that look straight down say little of the level.
 
     Args:
         photos: [V] the registered photographs.
@@ -120,9 +123,12 @@ def scale_from_gps(
     metres, turn = float(abs(factor)), about_vertical(-float(np.angle(factor)))
     errors = [photos[i].gps_error_m for i in rows]
     exact = inliers & heights_known & [e is not None and e <= _ACCURATE_M for e in errors]
-    if (by_all := _fit_3d(here[exact], there[exact])) is not None:
+    accurate = int(exact.sum()) >= _FEWEST
+    chosen = exact if accurate else inliers & heights_known
+    level = None if accurate else metres * turn
+    if (by_all := _fit_3d(here[chosen], there[chosen], level)) is not None:
         metres, turn = by_all
-        report.metric("gps_in_three_dimensions", int(exact.sum()))
+        report.metric("gps_in_three_dimensions", int(chosen.sum()))
     scale = MetricScale(metres, f"GPS of {agreeing} photographs, {residual:.2g} m off", turn)
     place = _place(around, scale.points(here), there, inliers, heights_known)
     return replace(scale, place=place)
@@ -144,20 +150,27 @@ def _positions(
 
 
 def _fit_3d(
-    here: NDArray[np.float64], there: NDArray[np.float64]
+    here: NDArray[np.float64], there: NDArray[np.float64], level: NDArray[np.float64] | None
 ) -> tuple[float, NDArray[np.float64]] | None:
-    """(metres per unit, rotation [3, 3] to the new world) by accurate positions [N, 3]; None if
-    they are few or nearly on a line, or contradict the level of the cameras."""
-    if len(here) < _FEWEST:
+    """(metres per unit, rotation [3, 3] to the new world) by positions [N, 3]; None if they are few
+    or nearly on a line, or contradict the level of the cameras.
+
+    level: [3, 3] scale and rotation to the new world by the level of the cameras, for positions
+    whose errors are not known: these must then explain the heights much better.
+    """
+    if len(here) < (_FEWEST if level is None else _FEWEST_TILTED):
         return None
     extents = np.linalg.svd(there - there.mean(axis=0), compute_uv=False)
     if extents[1] < _FLATTEST * extents[0]:
         return None
     metres, rotation, _ = similarity(here, there)
     turn = EAST_DOWN_NORTH.T @ rotation
-    if not metres > 0 or turn[1, 1] < math.cos(math.radians(_MOST_TILT_DEG)):
+    if not metres > 0:
         return None
-    return metres, turn
+    after = float(np.std(there[:, 2] - metres * here @ rotation[2]))
+    if level is not None and after > _DECISIVE * float(np.std(there[:, 2] + here @ level[1])):
+        return None
+    return (metres, turn) if turn[1, 1] >= math.cos(math.radians(_MOST_TILT_DEG)) else None
 
 
 def _place(

@@ -93,11 +93,23 @@ def test_corrected_positions_level_the_world_and_others_do_not() -> None:
     """Three degrees of tilt are 3 m of height over 60 m; RTK knows better, a phone does not."""
     local = flight()
     centres, truth = world_of(local, tilt=np.radians(3.0)), on_earth(local)
-    rough, _ = placed(photographs(truth), centres)
+    measured = truth + [0, 0, 1] * np.random.default_rng(1).normal(0, 3, (len(truth), 1))
+    rough, report = placed(photographs(measured), centres)
+    assert "gps_in_three_dimensions" not in report.metrics
+    np.testing.assert_allclose(rough.turn[1], [0, 1, 0], atol=1e-12)
     exact, report = placed(photographs(truth, error_m=0.02), centres)
-    assert metres_apart(geographic(rough, centres), truth) > 1.0
     assert metres_apart(geographic(exact, centres), truth) < CENTIMETRE
     assert report.metrics["gps_in_three_dimensions"] == len(local)
+
+
+def test_heights_that_a_tilt_explains_level_the_world() -> None:
+    """A drone that looks straight down: its cameras say little of the level, its barometer more."""
+    local = flight()
+    centres, truth = world_of(local, tilt=np.radians(15.0)), on_earth(local)
+    measured = truth + [0, 0, 1] * np.random.default_rng(2).normal(0, 0.3, (len(truth), 1))
+    found, report = placed(photographs(measured), centres)
+    assert report.metrics["gps_in_three_dimensions"] == len(local)
+    assert metres_apart(geographic(found, centres), truth) < 0.5
 
 
 def test_corrected_positions_on_a_line_do_not_tilt_the_world() -> None:
