@@ -21,7 +21,7 @@ _HEAD = (
     "| stage | points | runs killed | kills | the same bytes after | full disks "
     "| the same bytes after | room that is enough |\n|---|--:|--:|--:|--:|--:|--:|--:|\n"
 )
-_MOST_ROOM = 1 << 20  # bytes: no stage of the small run writes more
+_MOST_ROOM = 1 << 25  # bytes: no stage of the small run writes more
 
 
 def main() -> None:
