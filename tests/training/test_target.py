@@ -56,7 +56,9 @@ def test_a_splat_that_only_an_ignored_part_shows_stays_as_it_is(backend: str) ->
 
 
 def trained(outside: str, folder: Path) -> Splats:
-    """A red disc on the left, and black splats over the right half, which is masked."""
+    """A red disc on the left, and black splats over the right half, which is masked. Trained for so
+    many steps that no splat which covers the black of the left half still reaches into the right.
+    """
     red = splats([[-0.3, 0.0, 1.0]], rgb=(0.9, 0.1, 0.1), scales=0.08, opacities=0.9)
     dark = splats(
         [[x, y, 0.9] for x in (0.1, 0.2, 0.3) for y in (-0.3, -0.1, 0.1, 0.3)],
@@ -67,7 +69,7 @@ def trained(outside: str, folder: Path) -> Splats:
     picture = render(red, WHERE).image.copy()
     view = TrainingView("a", tuple(level(np.clip(picture, 0, 1), outside) for _ in RESOLUTIONS))
     start = join(red, dark)
-    schedule = Schedule(steps=200, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
+    schedule = Schedule(steps=800, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
     draw_settings = DrawSettings(near=0.1)
     made = Trainer(schedule, [view], [], draw_settings, len(start), folder, Report())
     model = made.run(start)
