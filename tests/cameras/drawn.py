@@ -236,6 +236,19 @@ def metashape(folder: Path) -> Path:
     return folder / "cameras.xml"
 
 
+def radial_projection(pose: NDArray[np.float64]) -> Callable[..., NDArray[Any]]:
+    """The pixels of points through a lens with K1 and K2 and its principal point at (163, 117)."""
+
+    def project(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        at = points @ pose[:3, :3].T + pose[:3, 3]
+        x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
+        r2 = x * x + y * y
+        radial = 1 + K1 * r2 + K2 * r2 * r2
+        return np.stack([163 + FOCAL * x * radial, 117 + FOCAL * y * radial], axis=1)
+
+    return project
+
+
 def realityscan(folder: Path) -> Path:
     """As nerfstudio and rc2nerf read it: heading and pitch of the picture's top, clockwise from
     north and above the horizon; roll about it; the lens in units of a 36 mm wide picture."""
@@ -246,15 +259,7 @@ def realityscan(folder: Path) -> Path:
         pitch, heading = np.arcsin(-down[2]), np.arctan2(-down[0], -down[1])
         roll = np.arctan2(-right[2], -ahead[2])
         turns = np.degrees([heading, pitch, roll])
-
-        def project(points: NDArray[np.float64], pose: NDArray = pose) -> NDArray[np.float64]:
-            at = points @ pose[:3, :3].T + pose[:3, 3]
-            x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
-            r2 = x * x + y * y
-            radial = 1 + K1 * r2 + K2 * r2 * r2
-            return np.stack([163 + FOCAL * x * radial, 117 + FOCAL * y * radial], axis=1)
-
-        projects.append(project)
+        projects.append(radial_projection(pose))
         lens = [FOCAL * unit, 3 * unit, -3 * unit, K1, K2, 0, 0, 0, 0]
         rows.append(",".join([name, *map(repr, map(float, [*eye, *turns, *lens]))]))
     draw(folder / "images", projects)

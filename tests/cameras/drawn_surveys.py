@@ -24,6 +24,7 @@ from tests.cameras.drawn import (
     Project,
     draw,
     opengl_pose,
+    radial_projection,
 )
 
 EQUATOR = np.array([500_000.0, 0.0, 100.0])  # longitude 9, latitude 0 in zone 32 of UTM
@@ -108,18 +109,7 @@ def polycam(folder: Path) -> Path:
 def realityscan_xmp(folder: Path) -> Path:
     """As the program's help describes it, once with attributes and once with elements; of the last
     photograph only the calibration is known."""
-    projects = []
-    for pose in POSES:
-
-        def project(points: NDArray[np.float64], pose: NDArray = pose) -> NDArray[np.float64]:
-            at = points @ pose[:3, :3].T + pose[:3, 3]
-            x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
-            r2 = x * x + y * y
-            radial = 1 + K1 * r2 + K2 * r2 * r2
-            return np.stack([163 + FOCAL * x * radial, 117 + FOCAL * y * radial], axis=1)
-
-        projects.append(project)
-    draw(folder, projects)
+    draw(folder, [radial_projection(pose) for pose in POSES])
     for number, (name, pose) in enumerate(zip(NAMES, POSES, strict=True)):
         values = {
             "Rotation": pose[:3, :3].ravel(),
