@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from splatcli import console
-from stages.base.errors import Family, SplatError
+from stages.base.errors import Family, SplatError, UsageError
 
 _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
@@ -60,12 +60,11 @@ def _as_splat_error(error: Any) -> SplatError:
         given = f"{command} needs a {error.param.name}, and none is named."
     else:
         given, hint = _reworded(command, error.format_message(), hint)
-    return SplatError(
+    return UsageError(
         "command-line",
         given=given,
         wanted="A command with the options and arguments that it knows.",
         hint=hint,
-        family=Family.USAGE,
     )
 
 

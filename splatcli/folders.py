@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import RunFolderError, SplatError, UsageError
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 
@@ -35,19 +35,17 @@ def find_run_folder(named: Path | None = None) -> Path:
     if len(found) == 1:
         return found[0]
     if found:
-        raise SplatError(
+        raise UsageError(
             "run-folder-unclear",
             given=f"There are several run folders here: {', '.join(map(str, found))}.",
             wanted="One of them.",
             hint=f"Name it: splat status {found[0]}",
-            family=Family.USAGE,
         )
-    raise SplatError(
+    raise RunFolderError(
         "run-folder-missing",
         given=f"There is no run folder in {here.resolve()}.",
         wanted="A run folder, named or in the current folder.",
         hint="Start one with `splat process PHOTOS`, or name one that exists.",
-        family=Family.RUN_FOLDER,
     )
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from splatcli import console
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError, SplatError
 from stages.base.parent import die_with_parent, how_it_ended
 
 _FORWARDED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGCONT")
@@ -55,11 +55,10 @@ def _forward_signals(child: int) -> None:
 
 
 def _crashed(status: int) -> SplatError:
-    return SplatError(
+    return ResourceError(
         "command-crashed",
         given=f"splat was ended by {how_it_ended(status)} and could not finish.",
         wanted="Enough free memory, also where `ulimit -v` or a container limits it.",
         hint="Free memory, or ask for less (--max-splats, --train-side, --max-side), and give the "
         "same command again: what was finished is kept.",
-        family=Family.RESOURCES,
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
-from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.errors import Interrupted, QualityError, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
@@ -212,12 +212,11 @@ def _prove(prover: Prover, path: Path, report: Report) -> dict[str, Any]:
 
 
 def _failed(path: Path, reason: str, held: str) -> SplatError:
-    return SplatError(
+    return QualityError(
         "export-verify-failed",
         given=f"{path.name} came out wrong: {reason}.",
         wanted=f"A file that another program reads as the same {held}.",
         hint="Leave this format out with --format, and report this with the run's manifest.",
-        family=Family.QUALITY,
     )
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
-from stages.base.errors import Family, SplatError
+from stages.base.errors import RunFolderError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.capacity import DECIDING_VIEWS, SOG_LOSS_DB
@@ -220,12 +220,11 @@ def _measures(
 
     training, held_out = split_held_out(reconstruction.views)
     if not training:
-        raise SplatError(
+        raise RunFolderError(
             "quantise-no-views",
             given="The reconstruction has no photographs.",
             wanted="At least one, to measure on.",
             hint="Run `splat sfm` again.",
-            family=Family.RUN_FOLDER,
         )
     deciding = tuple(evenly_spaced(training, settings.max_views))
     evaluated, what = (held_out, "held out") if held_out else (deciding, "training")

@@ -244,7 +244,6 @@ def _check_count(capture: Capture) -> None:
             given=f"The capture holds {counted(len(capture.photos), 'usable photograph')}.",
             wanted=f"At least {_FEWEST_PHOTOGRAPHS}; 20 to 50 do an object or a room well.",
             hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
-            family=Family.INPUT,
         )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
-from stages.base.errors import Family, SplatError
+from stages.base.errors import QualityError, SplatError
 from stages.base.stage import Report, Stage
 from stages.capacity.output_formats import drawing_setting
 from stages.formats.table import PLAIN
@@ -265,13 +265,12 @@ def _does_not_fit(full: MemoryFull, cap: int) -> SplatError:
 
 
 def _nothing_left() -> SplatError:
-    return SplatError(
+    return QualityError(
         "train-nothing-left",
         given="Every splat became transparent or invalid in training.",
         wanted="A scene that the photographs agree on.",
         hint="Check the reconstruction with `splat status`; retake blurred photographs, or try "
         "another --seed.",
-        family=Family.QUALITY,
     )
 
 

@@ -11,7 +11,7 @@ import typer
 from splatcli import console
 from splatcli.arguments import AsJson
 from stages.base.atomic import make_folder
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 
@@ -81,12 +81,11 @@ def _is_json(out: Path) -> bool:
         return True
     if out.is_dir() or (not out.suffix and not out.exists()):
         return False
-    raise SplatError(
+    raise UsageError(
         "cameras-target",
         given=f"{out} cannot hold cameras.",
         wanted="A name that ends in .json for nerfstudio, or a folder's for COLMAP.",
         hint="For example transforms.json, or sparse",
-        family=Family.USAGE,
     )
 
 
@@ -98,12 +97,11 @@ def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
     if runfolder.is_run_folder(source):
         pipeline = Pipeline(source)
         if pipeline.manifest("sfm") is None:
-            raise SplatError(
+            raise UsageError(
                 "no-cameras-yet",
                 given=f"No cameras of {source} have been found yet.",
                 wanted="A run in which `sfm` has finished.",
                 hint="Run `splat process` to go on.",
-                family=Family.USAGE,
             )
         source = pipeline.stage_folder("sfm") / "colmap"
     folder = locate(source)

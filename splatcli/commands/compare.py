@@ -10,7 +10,7 @@ import typer
 from splatcli import console
 from splatcli.arguments import AsJson, Quiet
 from splatcli.folders import find_run_folder
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.run import results
 from stages.run.pipeline import Pipeline
 from stages.run.planning import PHOTOS
@@ -78,12 +78,11 @@ def _check_photographs(first: Pipeline, second: Pipeline) -> None:
         manifest = run.manifest("ingest")
         digests.append(manifest.inputs.get(PHOTOS) if manifest else None)
     if digests[0] != digests[1]:
-        raise SplatError(
+        raise UsageError(
             "compare-other-photographs",
             given=f"{first.run_folder} and {second.run_folder} were made from other photographs.",
             wanted="Two runs of the same photographs: others are not equally hard to draw.",
             hint="Run `splat process` on the same folder twice, with another --out.",
-            family=Family.USAGE,
         )
 
 

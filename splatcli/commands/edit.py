@@ -13,7 +13,7 @@ from splatcli import console
 from splatcli.arguments import ENDINGS, AsJson, Quiet
 from splatcli.folders import load_target
 from splatcli.operation_options import parsed_operations
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.run import results
 
 if TYPE_CHECKING:
@@ -44,12 +44,11 @@ def edit(
     operation.
     """
     if target is None and not dry_run:
-        raise SplatError(
+        raise UsageError(
             "edit-no-target",
             given=f"splat edit {source} names no file to write.",
             wanted="A second file name, or --dry-run.",
             hint=f"splat edit {source} edited.ply --keep 'opacity > 0.1'",
-            family=Family.USAGE,
         )
     parsed = parsed_operations(ctx)
     facts = _edit(source, target or Path("scene.ply"), parsed, dry_run, quiet, as_json)

@@ -11,7 +11,7 @@ from splatcli import console, log, options, progress, run_settings, summary
 from splatcli.arguments import AsJson, Cluster, Out, Photos, Quiet, Run, Verbose
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.distributed import blocks, cluster, sfm_chunks
 from stages.distributed.tasks import Executor
 from stages.run import runfolder
@@ -86,12 +86,11 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
         return find_run_folder(out), None
     if runfolder.is_run_folder(photos):
         if out is not None and out.absolute() != photos.absolute():
-            raise SplatError(
+            raise UsageError(
                 "option-out",
                 given=f"{photos} is itself a run folder, and --out names {out}.",
                 wanted="Photographs to start from, or one run folder to continue.",
                 hint=f"Leave --out away to continue {photos}.",
-                family=Family.USAGE,
             )
         return photos, None
     return out or DEFAULT, photos

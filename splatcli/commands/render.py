@@ -17,7 +17,7 @@ from splatcli.folders import load_target
 from splatcli.options import number
 from splatcli.progress import counting
 from stages.base import memory
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError, SplatError, UsageError
 from stages.run import results
 
 if TYPE_CHECKING:
@@ -56,23 +56,21 @@ class _Options:
         if self.camera is not None and (suffix == ".mp4" or not suffix or out.is_dir()):
             raise _clash(f"--camera makes one picture, and {out} is for many.", "view.png")
         if self.frames is not None and self.seconds is not None:
-            raise SplatError(
+            raise UsageError(
                 "render-length",
                 given=f"--frames {self.frames} and --seconds {self.seconds:g}.",
                 wanted="One of them: the other follows from --fps.",
                 hint="Leave one of them away.",
-                family=Family.USAGE,
             )
         if suffix == ".mp4" and not out.is_dir():
             return "film"
         if out.is_dir() or (not suffix and not out.exists()):
             return "folder"
-        raise SplatError(
+        raise UsageError(
             "render-picture-type",
             given=f"{out} cannot hold a rendering.",
             wanted=f"A name that ends in one of {' '.join((*PICTURES, '.mp4'))}, or a folder's.",
             hint="For example --out view.png, --out film.mp4 or --out frames",
-            family=Family.USAGE,
         )
 
 
@@ -195,12 +193,11 @@ def _check_memory(camera: Camera) -> None:
     free = memory.available_mib()
     needed = camera.width * camera.height * _BYTES_PER_PIXEL / memory.MIB
     if needed > free:
-        raise SplatError(
+        raise ResourceError(
             "render-too-large",
             given=f"A picture of {camera.width} x {camera.height} takes about {needed:,.0f} MiB.",
             wanted=f"At most the {free:,.0f} MiB that are free.",
             hint="Choose a smaller --width.",
-            family=Family.RESOURCES,
         )
 
 
@@ -260,10 +257,9 @@ def _print(out: Path, kind: str, facts: dict[str, Any]) -> None:
 
 
 def _clash(given: str, example: str) -> SplatError:
-    return SplatError(
+    return UsageError(
         "render-one-or-many",
         given=given,
         wanted="One picture of one camera, or many along a path.",
         hint=f"For example --out {example}",
-        family=Family.USAGE,
     )

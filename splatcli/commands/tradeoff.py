@@ -10,7 +10,7 @@ import typer
 from splatcli import console
 from splatcli.arguments import AsJson, Quiet, Run
 from splatcli.folders import find_run_folder
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.run import results
 from stages.run.pipeline import Pipeline
 
@@ -78,12 +78,11 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     reconstruction = pipeline.load("sfm")
     training, held = split_held_out(reconstruction.views)
     if not held:
-        raise SplatError(
+        raise UsageError(
             "nothing-held-out",
             given=f"{pipeline.run_folder} has no held-out view: there are too few photographs.",
             wanted="A run with photographs that training did not use, to measure quality on.",
             hint="Take more photographs: at least four; one of every eight is held out.",
-            family=Family.USAGE,
         )
     trained = pipeline.manifest("train")
     views = load_evaluation_views(reconstruction.folder, training, settings)

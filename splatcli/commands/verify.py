@@ -13,7 +13,7 @@ import typer
 from splatcli import console
 from splatcli.arguments import AsJson, Quiet
 from splatcli.folders import find_run_folder
-from stages.base.errors import Family, SplatError
+from stages.base.errors import QualityError, UsageError
 from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 
@@ -128,12 +128,11 @@ def _files(target: Path | None) -> list[Path]:
     assets = pipeline.load("export")
     files = [file for file in assets.files if file.format not in MESHES]
     if not files:
-        raise SplatError(
+        raise UsageError(
             "verify-no-splats",
             given=f"{assets.folder} holds meshes only.",
             wanted="Files of splats: meshes were read back and compared when they were written.",
             hint="Export one, for example: splat export --format ply",
-            family=Family.USAGE,
         )
     return [assets.folder / file.path for file in files]
 
@@ -241,7 +240,7 @@ def _raise_if_wrong(found: list[tuple[Path, Proof]], original: _Original) -> Non
     wrong = [(file, proof.fault) for file, proof in found if proof.fault]
     if not wrong:
         return
-    raise SplatError(
+    raise QualityError(
         "verify-failed",
         given="; ".join(f"{file.name} is wrong: {fault}" for file, fault in wrong) + ".",
         wanted="A file that two readers understand alike."
@@ -250,5 +249,4 @@ def _raise_if_wrong(found: list[tuple[Path, Proof]], original: _Original) -> Non
         hint="Report this with the file."
         if original.itself
         else "Write it again with `splat export` or `splat convert`.",
-        family=Family.QUALITY,
     )

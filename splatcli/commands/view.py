@@ -17,7 +17,7 @@ from splatcli import console
 from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from splatcli.options import number
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 from stages.run import results
 from stages.run.pipeline import Pipeline
 
@@ -61,12 +61,11 @@ def view(
         try:
             server = LocalServer(items, port)
         except OSError as error:
-            raise SplatError(
+            raise UsageError(
                 "view-port",
                 given=f"Port {port} of this machine cannot be listened on: {error.strerror}.",
                 wanted="A port that is free and allowed.",
                 hint="Leave --port away to get a free one.",
-                family=Family.USAGE,
             ) from error
         with server:
             _serve(server, count, open_browser)

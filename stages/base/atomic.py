@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stages.base.disk import DISK_FULL, disk_full, is_full
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError, SplatError
 
 _PARTIAL = ".partial-"
 
@@ -84,12 +84,11 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SplatError(
+        raise ResourceError(
             "folder-not-made",
             given=f"{folder} cannot be made: {error.strerror or error}.",
             wanted="A place where a folder may be made.",
             hint="Name another one.",
-            family=Family.RESOURCES,
         ) from error
 
 
@@ -98,10 +97,9 @@ def _refused(path: Path, error: OSError) -> SplatError:
     # NumPy and the USD library do not say why a write failed.
     if error.errno in DISK_FULL or (error.errno is None and is_full(path.parent)):
         return disk_full(f"writing {path.name}", path.parent)
-    return SplatError(
+    return ResourceError(
         "file-not-written",
         given=f"{path} could not be written: {reason}.",
         wanted="Its folder must exist and be writable.",
         hint="Check the folder's permissions, or choose another one.",
-        family=Family.RESOURCES,
     )

@@ -7,7 +7,7 @@ import os
 import shutil
 from pathlib import Path
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError, SplatError
 
 # Windows has no quota of this kind.
 DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
@@ -16,13 +16,12 @@ _FULL_BELOW_BYTES = 4 * 1024 * 1024
 
 def disk_full(doing: str, folder: Path) -> SplatError:
     """The error for a disk that became full. doing: what was going on, such as "train"."""
-    return SplatError(
+    return ResourceError(
         "disk-full",
         given=f"The disk of {folder} became full during {doing}.",
         wanted="Free space for the output.",
         hint="Free some space, or use a folder on another disk, and run the same command again: "
         "what was finished is kept.",
-        family=Family.RESOURCES,
     )
 
 
@@ -45,11 +44,10 @@ def not_permitted(path: Path, error: OSError) -> SplatError:
     place = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     needed = os.R_OK | os.X_OK if os.path.isdir(place) else os.R_OK
     reads = error.errno != errno.EROFS and not os.access(place, needed)
-    return SplatError(
+    return ResourceError(
         "not-permitted",
         given=f"{path}: {error.strerror or error}.",
         wanted=f"A file or folder that you may {'read' if reads else 'write to'}.",
         hint="Change its permissions, or name another "
         + ("one." if reads else "folder with --out."),
-        family=Family.RESOURCES,
     )

@@ -29,17 +29,20 @@ class SplatError(Exception):
 
     code: stable, kebab-case, prefixed by the part it comes from ("sfm-too-few-registered").
     given, wanted, hint: one or two sentences each. `hint` says what to do next.
+    family: where it is known only when the error is raised; else that of the class.
     """
 
+    family = Family.INPUT
+
     def __init__(
-        self, code: str, *, given: str, wanted: str, hint: str, family: Family = Family.INPUT
+        self, code: str, *, given: str, wanted: str, hint: str, family: Family | None = None
     ) -> None:
         super().__init__(f"{given} {wanted} {hint}")
         self.code = code
         self.given = given
         self.wanted = wanted
         self.hint = hint
-        self.family = family
+        self.family = family or type(self).family
 
     def as_dict(self) -> dict[str, str | int]:
         """The error as plain data, for `--json`."""
@@ -50,6 +53,30 @@ class SplatError(Exception):
             "hint": self.hint,
             "family": int(self.family),
         }
+
+
+class UsageError(SplatError):
+    """See `Family.USAGE`."""
+
+    family = Family.USAGE
+
+
+class RunFolderError(SplatError):
+    """See `Family.RUN_FOLDER`."""
+
+    family = Family.RUN_FOLDER
+
+
+class ResourceError(SplatError):
+    """See `Family.RESOURCES`."""
+
+    family = Family.RESOURCES
+
+
+class QualityError(SplatError):
+    """See `Family.QUALITY`."""
+
+    family = Family.QUALITY
 
 
 class Interrupted(Exception):  # noqa: N818 - a normal way to stop, not an error

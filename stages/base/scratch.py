@@ -16,7 +16,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError
 
 LARGE_BYTES = 1 << 26
 _folder: ContextVar[tuple[Path, bool] | None] = ContextVar("scratch", default=None)
@@ -59,12 +59,11 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     except OSError as error:
         if spare:
             return np.empty(shape, dtype)
-        raise SplatError(
+        raise ResourceError(
             "disk-full",
             given=f"{folder} has no {size / 1e9:.1f} GB for temporary data: {error.strerror}.",
             wanted="The disk must have room for temporary data and for the output.",
             hint="Free some space, or write to a folder on another disk.",
-            family=Family.RESOURCES,
         ) from error
     _maps.add(found._mmap)  # type: ignore[attr-defined]
     return found

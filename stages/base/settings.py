@@ -25,7 +25,7 @@ from dataclasses import MISSING, dataclass, fields
 from dataclasses import field as dataclass_field
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 
 PANELS = (
     *("Input", "Quality and time", "Size", "Output"),
@@ -94,12 +94,11 @@ class Setting:
         return not self.pattern or re.fullmatch(self.pattern, str(value)) is not None
 
     def _refused(self, value: Any) -> SplatError:
-        return SplatError(
+        return UsageError(
             "option-value",
             given=f"{self.flag} {value if str(value) else chr(34) * 2} cannot be used.",
             wanted=self.wanted or self._wanted(),
             hint="Leave it out to get the default.",
-            family=Family.USAGE,
         )
 
     def _wanted(self) -> str:
@@ -160,10 +159,9 @@ def check_settings(settings: Any) -> None:
             continue
         other = every[setting.needs]
         if getattr(settings, other.name) == other.default:
-            raise SplatError(
+            raise UsageError(
                 "option-alone",
                 given=f"{setting.flag} means nothing without {other.flag}.",
                 wanted="Both, or neither.",
                 hint=f"Add {other.flag}, or leave {setting.flag} out.",
-                family=Family.USAGE,
             )

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.cameras.camera_file import CameraFile, FilePoints
 
 
@@ -83,10 +83,9 @@ def _reader(path: Path) -> tuple[ModuleType, Path]:
         located = module.locate(path)
         if located is not None:
             return module, located
-    raise SplatError(
+    raise UsageError(
         "cameras-unknown",
         given=f"{path} is not a known camera file.",
         wanted=f"{'; or '.join(row.description for row in CAMERA_FILES)}.",
         hint="Check the path; a run's cameras are written by `splat cameras RUN OUT`.",
-        family=Family.USAGE,
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from stages import STAGE_NAMES
 from stages.base.atomic import replacing
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 from stages.distributed import remote
 from stages.distributed.tasks import Location, TaskResult
 from stages.run.manifest import Manifest
@@ -48,12 +48,11 @@ def run_names(captures: Sequence[Location]) -> dict[str, Location]:
         name = remote.capture_name(location)
         if not name or name.casefold() in taken:
             other = taken.get(name.casefold(), location)
-            raise SplatError(
+            raise UsageError(
                 "batch-same-name",
                 given=f"{other} and {location} would both be the run {name or 'without a name'}.",
                 wanted="Captures of different names: each gives its run folder its own.",
                 hint="Name the folders above them (captures/*), or rename one.",
-                family=Family.USAGE,
             )
         found[name] = taken[name.casefold()] = location
     return found

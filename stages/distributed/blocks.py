@@ -18,7 +18,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.base.stage import Numbers, Report, Stage
 from stages.base.text import counted
 from stages.distributed import block_folders
@@ -325,18 +325,16 @@ def _with_roles(whole: Reconstruction) -> Reconstruction:
 def _check(settings: Any) -> None:
     """Raises SplatError for settings that do not go with blocks."""
     if not settings.max_splats:
-        raise SplatError(
+        raise UsageError(
             "blocks-without-cap",
             given="--blocks was given, and no maximum of splats.",
             wanted="A maximum that the blocks can share: the free memory limits only one block.",
             hint="Give --max-splats, for example 250000 for each block.",
-            family=Family.USAGE,
         )
     if settings.seconds or settings.within:
-        raise SplatError(
+        raise UsageError(
             "blocks-without-end",
             given="--blocks cannot be combined with --seconds or --within.",
             wanted="Steps, which each block makes: --steps.",
             hint="Leave --seconds and --within away.",
-            family=Family.USAGE,
         )

@@ -20,7 +20,7 @@ from typing import Any
 
 from stages import STAGE_NAMES, load_stage
 from stages.base.distribution import NAME, VERSION, install_command
-from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.errors import Family, Interrupted, ResourceError, SplatError, UsageError
 from stages.distributed.tasks import (
     Executor,
     Location,
@@ -96,13 +96,12 @@ class RayExecutor:
         memory_mib = least if need.memory_mib is None else need.memory_mib
         largest = max(worker.memory_mib for worker in self.workers)
         if memory_mib > largest:
-            raise SplatError(
+            raise ResourceError(
                 "cluster-too-small",
                 given=f"One task may take {memory_mib:,.0f} MiB, and no worker has more than "
                 f"{largest:,.0f}.",
                 wanted="A worker with memory for the splats and photographs of one run.",
                 hint="Ask for less: --max-splats, --train-side; or add a larger worker.",
-                family=Family.RESOURCES,
             )
         every = sum(worker.cpus for worker in self.workers)
         fewest = min(worker.cpus for worker in self.workers)
@@ -178,23 +177,21 @@ def check(workers: Sequence[Worker], ours: str, token: Path | None = None) -> No
     for worker in workers:
         if worker.edition != ours:
             theirs = f"splat {worker.edition}" if worker.edition else "no splat"
-            raise SplatError(
+            raise UsageError(
                 "cluster-other-splat",
                 given=f"The worker {worker.host} has {theirs}; here it is splat {ours}.",
                 wanted="The same splat everywhere: another one makes other bytes.",
                 hint=f"Install the same on all of them: {install_command('cluster')}",
-                family=Family.USAGE,
             )
         if worker.unseen:
             new = token is not None and str(token) in worker.unseen
             folder = token.parent if token is not None and new else worker.unseen[0]
-            raise SplatError(
+            raise UsageError(
                 "cluster-folder-unseen",
                 given=f"The worker {worker.host} does not see {folder}.",
                 wanted="Photographs and run folders where all workers see them, at the same path.",
                 hint="Put them on a folder that is shared, and name that; or at a URL that all of "
                 "them can read.",
-                family=Family.USAGE,
             )
 
 
@@ -207,12 +204,11 @@ def _ray() -> Any:
     try:
         return importlib.import_module("ray")
     except ImportError:
-        raise SplatError(
+        raise UsageError(
             "cluster-not-installed",
             given="--cluster needs Ray, which is not installed.",
             wanted="The extra that brings it.",
             hint=f"{install_command('cluster')}; or leave --cluster away: the result is the same.",
-            family=Family.USAGE,
         ) from None
 
 
@@ -234,12 +230,11 @@ def _start(ray: Any, address: str) -> None:
 
 
 def _not_found(address: str, why: str) -> SplatError:
-    return SplatError(
+    return UsageError(
         "cluster-not-found",
         given=f"No cluster answers at {address}: {why.rstrip('.')}.",
         wanted="The address of a Ray cluster (HOST:PORT, ray://HOST:PORT, auto), or local:N.",
         hint="Start one with `ray start --head`, or use --cluster local:4 for this machine.",
-        family=Family.USAGE,
     )
 
 

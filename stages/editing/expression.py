@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import reported_blocks
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 from stages.scene import Splats, dc_to_rgb
 
 Column = Callable[[Splats], NDArray[np.floating]]
@@ -159,11 +159,10 @@ def _value(node: Any, splats: Splats) -> Any:
 
 
 def _wrong(text: str, why: str) -> SplatError:
-    return SplatError(
+    return UsageError(
         "edit-keep",
         given=f"--keep {text[:100]!r}: {why}.",
         wanted=f"A condition on {', '.join(VARIABLES)}, with numbers, + - * /, < <= > >= == !=, "
         "and, or, not.",
         hint="For example: --keep 'opacity > 0.1 and scale < 0.5'",
-        family=Family.USAGE,
     )

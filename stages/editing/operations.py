@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.atomic import partial_prefix
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 from stages.editing import expression, levels, regions, transform
 from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
 from stages.editing.scene import EditedScene
@@ -54,12 +54,11 @@ def apply_operations(
         before = len(scene.splats)
         scene = operation(scene)
         if before and not len(scene.splats):
-            raise SplatError(
+            raise UsageError(
                 "edit-nothing-left",
                 given=f"{parsed} removes all {before:,} splats.",
                 wanted="At least one splat that remains.",
                 hint="`splat info` prints the bounds, sizes and opacities of a file.",
-                family=Family.USAGE,
             )
         yield AppliedOperation(parsed, before, len(scene.splats), scene)
 
@@ -140,12 +139,11 @@ def join(first: Splats, second: Splats) -> Splats:
     """
     if first.draw_settings.antialias != second.draw_settings.antialias:
         which = "second" if second.draw_settings.antialias else "first"
-        raise SplatError(
+        raise UsageError(
             "edit-drawing-differs",
             given=f"Only the {which} of the two is for antialiased drawing.",
             wanted="Splats that are drawn in the same way: together, one half would look wrong.",
             hint="Export one of them again: splat export --drawing plain (or antialiased).",
-            family=Family.USAGE,
         )
     means = (second.means + (second.origin - first.origin)).astype(first.means.dtype)
     both = concatenate([first, replace(second, means=means)])
@@ -190,13 +188,12 @@ def _limiting_size(max_bytes: float, target: Path) -> Operation:
             scene = scene.with_splats(
                 decimate_scene(scene, int(_SAFETY * count * max_bytes / size))
             )
-        raise SplatError(
+        raise UsageError(
             "edit-too-small",
             given=f"--max-mb {max_bytes / 1e6:g} is less than {count:,} splats "
             f"need as .{row.ending}.",
             wanted=f"At least {np.ceil(size / 1e4) / 100:g}.",
             hint="Ask for more megabytes, or for another format.",
-            family=Family.USAGE,
         )
 
     return limited
@@ -236,10 +233,9 @@ def _number(parsed: ParsedOperation, low: float, high: float, whole: bool = Fals
 
 
 def _wrong(parsed: ParsedOperation, bounds: str = "") -> SplatError:
-    return SplatError(
+    return UsageError(
         f"edit-{parsed.name}",
         given=f"{parsed} has a value that is not understood.",
         wanted=f"--{parsed.name} {OPERATIONS[parsed.name].takes}{bounds}.",
         hint=OPERATIONS[parsed.name].help,
-        family=Family.USAGE,
     )

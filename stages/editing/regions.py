@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, FileKind, reading
 from stages.base.blocks import reported_blocks
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.base.text import reason_of
 from stages.scene import Splats
 
@@ -58,13 +58,12 @@ def parse_region(text: str) -> Region:
         view, corners = drawn[:_VIEW], drawn[_VIEW:]
         if len(corners) >= 6 and len(corners) % 2 == 0:
             return Region(_inside_lasso(view, corners.reshape(-1, 2)))
-    raise SplatError(
+    raise UsageError(
         "edit-region",
         given=f"{text[:100]!r} is no region of space.",
         wanted="box:x0,y0,z0,x1,y1,z1 with its lowest corner first, sphere:x,y,z,r, hull:FILE, or "
         "lasso: and its numbers.",
         hint="`splat info` prints the bounds; the page of `splat view` writes a lasso.",
-        family=Family.USAGE,
     )
 
 

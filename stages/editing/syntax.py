@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,9 @@ def _parse_line(line: str, where: str) -> ParsedOperation:
 
 
 def _invalid(given: str) -> SplatError:
-    return SplatError(
+    return UsageError(
         "edit-ops",
         given=given,
         wanted=f"Operations, one a line: {', '.join(OPERATIONS)}.",
         hint="For example: crop box:-1,-1,-1,1,1,1",
-        family=Family.USAGE,
     )

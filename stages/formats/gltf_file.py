@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.blocks import reported_blocks
 from stages.base.distribution import VERSION
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.formats.json_fields import location_fields
 from stages.scene import Splats
 from stages.scene.flip import flipped
@@ -185,12 +185,11 @@ def write_glb(path: Path, document: dict[str, Any], attributes: Sequence[Attribu
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + (8 + size if attributes else 0)
     if total > _GLB_LIMIT_BYTES:
-        raise SplatError(
+        raise UsageError(
             "export-glb-too-large",
             given=f"{path} would take {total / 2**30:.1f} GiB.",
             wanted="A .glb cannot be larger than 4 GiB.",
             hint="Export .gltf or .ply instead, or train with fewer splats.",
-            family=Family.USAGE,
         )
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, total))

@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 
 AUTO, PLAIN, ANTIALIASED = DRAWINGS = "auto", "plain", "antialiased"
 
@@ -216,20 +216,18 @@ def format_of(path: Path) -> Format:
     """
     name = Path(path).name.lower()
     if mesh := _MESH.search(name):
-        raise SplatError(
+        raise UsageError(
             "format-mesh",
             given=f"{path} is the name of a mesh: .mesh.{mesh[1]} holds triangles, no splats.",
             wanted="A file of splats: a mesh is made with the cameras of a run.",
             hint=f"In the run's folder: splat export --format mesh.{mesh[1]}",
-            family=Family.USAGE,
         )
     rows = [row for row in TABLE if row.matches(name)]
     if not rows:
-        raise SplatError(
+        raise UsageError(
             "format-unknown",
             given=f"{path} has the suffix {Path(path).suffix!r}.",
             wanted=f"One of {', '.join('.' + known for known in FORMATS)}.",
             hint="Choose a name with one of these suffixes.",
-            family=Family.USAGE,
         )
     return max(rows, key=lambda row: len(row.ending))

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError, SplatError
 from stages.base.text import counted, printable_name
 from stages.cameras import blender
 from stages.photos import masks
@@ -113,12 +113,11 @@ def _remove_masks(
 
 def _walk(folder: Path) -> Iterable[Path]:
     def refuse(error: OSError) -> None:
-        raise SplatError(
+        raise ResourceError(
             "ingest-folder-unreadable",
             given=f"{error.filename} cannot be listed: {error.strerror}.",
             wanted="A folder that may be read, with all its sub-folders.",
             hint="Change its permissions, or move the photographs elsewhere.",
-            family=Family.RESOURCES,
         ) from error
 
     for place, folders, files in os.walk(folder, onerror=refuse):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import RunFolderError, SplatError
 from stages.base.text import reason_of
 from stages.scene.capture import TRANSPARENT, View
 
@@ -77,10 +77,9 @@ def mask_of(folder: Path, view: View, width: int, height: int) -> NDArray[np.uin
 
 
 def _unreadable(path: Path, reason: str) -> SplatError:
-    return SplatError(
+    return RunFolderError(
         "photo-unreadable",
         given=f"{path} cannot be read: {reason}.",
         wanted="A picture as an earlier stage wrote it.",
         hint="Delete the folder of the stage that wrote it and run the command again.",
-        family=Family.RUN_FOLDER,
     )

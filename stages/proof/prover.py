@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
-from stages.base.errors import Family, SplatError
+from stages.base.errors import QualityError
 from stages.base.lazy import load_object
 from stages.base.text import counted, reason_of
 from stages.formats import BY_ENDING, Format, format_of
@@ -114,12 +114,11 @@ class Prover:
         """The proof of a file that was just written. Raises SplatError `code` if it is wrong."""
         proof = self.prove(path)
         if proof.fault:
-            raise SplatError(
+            raise QualityError(
                 code,
                 given=f"{path} came out wrong: {proof.fault}.",
                 wanted="A file that another program reads as the same splats.",
                 hint="Write another format, and report this with the file that was read.",
-                family=Family.QUALITY,
             )
         return proof
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 from stages.base.lazy import load_object
 from stages.base.settings import setting
 from stages.raster.torch_device import CPU, DEVICES
@@ -138,13 +138,12 @@ def qualified_name(backend: str, device: str = CPU) -> str:
     able = [each.name for each in BACKENDS if device in each.devices]
     if backend in able:
         return f"{backend}{_DEVICE_MARK}{device}"
-    raise SplatError(
+    raise UsageError(
         "option-device",
         given=f"--device {device} with --backend {backend}, which chooses its own device.",
         wanted=f"--device goes with --backend {' or '.join(able)}.",
         hint=f"Add --backend {able[0]}, or leave --device out (--device {CPU} if the run folder "
         "remembers another).",
-        family=Family.USAGE,
     )
 
 

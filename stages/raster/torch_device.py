@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError
 
 CPU = "cpu"
 DEVICES = (CPU, "cuda", "mps", "xpu")
@@ -23,13 +23,12 @@ def device_named(name: str) -> Any:
     import torch
 
     if not is_there(name):
-        raise SplatError(
+        raise ResourceError(
             "raster-no-device",
             given=f"--device {name}: torch {torch.__version__} finds no such device here.",
             wanted=f"A device that is available: {', '.join(filter(is_there, DEVICES))}.",
             hint="Choose that, or another backend. docs/guide/gpu.md says which build of torch "
             "brings which device.",
-            family=Family.RESOURCES,
         )
     return torch.device(name)
 

@@ -6,7 +6,7 @@ import errno
 from pathlib import Path
 
 from stages.base.disk import DISK_FULL, disk_full, is_full, not_permitted
-from stages.base.errors import Family, SplatError
+from stages.base.errors import Family, ResourceError, SplatError
 from stages.base.text import printable, printable_name, reason_of
 
 _DENIED = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -72,10 +72,9 @@ def _chain(error: BaseException) -> list[BaseException]:
 
 
 def out_of_memory(doing: str, error: BaseException) -> SplatError:
-    return SplatError(
+    return ResourceError(
         "out-of-memory",
         given=f"Memory ran out during {doing} ({reason_of(error)}).",
         wanted="Enough free memory for the settings.",
         hint="Close other programs, or ask for less: --max-splats, --train-side, --max-side.",
-        family=Family.RESOURCES,
     )

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import RunFolderError, SplatError
 
 LOCK = ".lock"
 HOLDER = ".lock-holder"  # process id of whoever holds it
@@ -57,10 +57,9 @@ def holder(folder: Path) -> int | None:
 def _busy(folder: Path) -> SplatError:
     pid = holder(folder)
     who = f"process {pid}" if pid else "another process"
-    return SplatError(
+    return RunFolderError(
         "run-folder-busy",
         given=f"{folder} is in use by {who}.",
         wanted="One process at a time in a run folder.",
         hint="Wait for it, stop it, or name another folder with --out.",
-        family=Family.RUN_FOLDER,
     )

@@ -18,7 +18,7 @@ from typing import Any
 
 from stages.base.atomic import sync_folder
 from stages.base.disk import not_permitted
-from stages.base.errors import Family, SplatError
+from stages.base.errors import RunFolderError, SplatError
 from stages.run.digests import FileRecords, records_from_data
 
 SCHEMA = 2  # of manifests and `run.json`; raised when their keys or settings are renamed
@@ -138,32 +138,29 @@ def read_sealed(path: Path) -> dict[str, Any] | None:
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:  # reported where the name is used
             raise
-        raise SplatError(
+        raise RunFolderError(
             "run-folder-unreadable",
             given=f"{path} cannot be read: {error.strerror}.",
             wanted="A run folder that you may read.",
             hint="Check the permissions of the folder.",
-            family=Family.RUN_FOLDER,
         ) from error
     except (ValueError, RecursionError) as error:
         raise edited(path) from error
     if not isinstance(data, dict) or not isinstance(data.get("schema"), int):
         raise edited(path)
     if data["schema"] < SCHEMA:
-        raise SplatError(
+        raise RunFolderError(
             "run-folder-older",
             given=f"{path} was written by an older version of splat (schema {data['schema']}).",
             wanted=f"A run folder of schema {SCHEMA}. Nothing in the folder was changed.",
             hint="Start a new run folder: splat process PHOTOS --out NEW_RUN",
-            family=Family.RUN_FOLDER,
         )
     if data["schema"] > SCHEMA:
-        raise SplatError(
+        raise RunFolderError(
             "run-folder-newer",
             given=f"{path} was written by a newer version of splat (schema {data['schema']}).",
             wanted=f"A run folder of schema {SCHEMA}.",
             hint="Upgrade splat, or start a new run folder with --out.",
-            family=Family.RUN_FOLDER,
         )
     digest = data.pop("digest", None)
     if digest != _seal(data):
@@ -180,10 +177,9 @@ def edited(path: Path) -> SplatError:
     """The error for a file of a run folder that is not as splat wrote it."""
     what = f"the folder {path.parent}" if path.name == MANIFEST else path
     again = "its stage runs again" if path.name == MANIFEST else "it is written again"
-    return SplatError(
+    return RunFolderError(
         EDITED,
         given=f"{path} was changed after it was written, or is damaged.",
         wanted="The file as splat wrote it: later stages depend on it.",
         hint=f"Restore the file, or delete {what}: then {again}. Nothing else is lost.",
-        family=Family.RUN_FOLDER,
     )

@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any
 
 from stages import STAGE_NAMES, load_stage
-from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.errors import Interrupted, RunFolderError, SplatError, UsageError
 from stages.base.interrupt import stop_on_signals
 from stages.base.settings import check_settings
 from stages.base.stage import Stage
@@ -98,13 +98,12 @@ class Pipeline:
                 damaged[folder] = found
         if damaged:
             what = (f"{folder.name}/{change}" for folder in damaged for change in damaged[folder])
-            raise SplatError(
+            raise RunFolderError(
                 "run-folder-damaged",
                 given=f"In {self.run_folder}, {', '.join(what)}.",
                 wanted="The files as the stages wrote them.",
                 hint=f"Check the disk. Delete {', '.join(map(str, damaged))}; then `splat process "
                 f"{self.run_folder}` makes this again, and what depends on it if it differs.",
-                family=Family.RUN_FOLDER,
             )
 
     def plan(self, settings: Mapping[str, Any] | None = None) -> list[Step]:
@@ -227,21 +226,19 @@ class Pipeline:
                 raise self._not_finished(step.stage.name, what)
 
     def _not_finished(self, name: str, what: str) -> SplatError:
-        return SplatError(
+        return UsageError(
             "stage-not-finished",
             given=f"In {self.run_folder}, {what}.",
             wanted="Every earlier stage finished and unchanged.",
             hint=f"Run `splat {name}` first, or `splat process` for everything that is missing.",
-            family=Family.USAGE,
         )
 
     def _unusable(self, error: OSError) -> SplatError:
-        return as_splat_error(error, "the run", self.run_folder) or SplatError(
+        return as_splat_error(error, "the run", self.run_folder) or RunFolderError(
             "run-folder-unusable",
             given=f"{error.filename or self.run_folder}: {error.strerror or error}.",
             wanted="A run folder that can be made and written to.",
             hint="Check the path, or name another folder with --out.",
-            family=Family.RUN_FOLDER,
         )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 
@@ -21,12 +21,11 @@ def newest_stage_with_splats(pipeline: Pipeline) -> str:
     for name in reversed(_STAGES_WITH_SPLATS):
         if pipeline.manifest(name) is not None:
             return name
-    raise SplatError(
+    raise UsageError(
         "no-splats-yet",
         given=f"No stage of {pipeline.run_folder} has made splats yet.",
         wanted="A run in which at least `seed` has finished.",
         hint="Run `splat process` to go on.",
-        family=Family.USAGE,
     )
 
 
@@ -63,12 +62,11 @@ def final_splats(pipeline: Pipeline) -> Splats:
             raise AssertionError(name)
         for source, digest in digests.items():
             if manifest.inputs.get(source, digest) != digest:
-                raise SplatError(
+                raise UsageError(
                     "run-half-anew",
                     given=f"In {pipeline.run_folder}, {source} was made again, and {name} was not.",
                     wanted="A run whose stages belong together.",
                     hint="Run `splat process` to finish it.",
-                    family=Family.USAGE,
                 )
         digests[name] = manifest.output_digest
     splats: Splats = pipeline.load("quantise").splats

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import RunFolderError, SplatError, UsageError
 from stages.run.digests import combined_digest, record_files
 from stages.run.lock import HOLDER, LOCK, locked
 from stages.run.manifest import MANIFEST, Manifest
@@ -41,12 +41,11 @@ def opened(folder: Path, photos: Path | None) -> Iterator[None]:
         if photos is None:
             raise missing(folder)
         if folder.exists() and any(path.name not in _WITHOUT_RUN_FILE for path in folder.iterdir()):
-            raise SplatError(
+            raise RunFolderError(
                 "run-folder-foreign",
                 given=f"{folder} exists and holds other things.",
                 wanted="A new folder, an empty one, or a run folder that splat made.",
                 hint="Name another folder with --out.",
-                family=Family.RUN_FOLDER,
             )
     RunFile.read(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -69,12 +68,11 @@ def recorded_for(folder: Path, photos: Path | None, first_stage_folder: Path) ->
     moved = recorded.photographs is not None and not recorded.photographs.exists()
     if has_finished_work(folder) and not moved and not _same(photos, first_stage_folder):
         before = recorded.photographs or "other photographs"
-        raise SplatError(
+        raise RunFolderError(
             "run-folder-other-photographs",
             given=f"{folder} was made from {before}, not from {photos}.",
             wanted="One run folder for one set of photographs.",
             hint="Name another run folder with --out.",
-            family=Family.RUN_FOLDER,
         )
     return RunFile(photos, recorded.settings)
 
@@ -98,29 +96,26 @@ def _check_photos(folder: Path, photos: Path) -> None:
     if stage_folder is not None or is_run_folder(photos):
         what = f"belongs to {stage_folder}, which splat made" if stage_folder else "is a run folder"
         run = stage_folder.parent if stage_folder else photos
-        raise SplatError(
+        raise UsageError(
             "photographs-run-folder",
             given=f"{photos} {what}.",
             wanted="A folder of photographs as they were taken.",
             hint=f"To continue the run: splat process {run}",
-            family=Family.USAGE,
         )
     if folder.resolve().is_relative_to(photos.resolve()):
-        raise SplatError(
+        raise UsageError(
             "run-folder-inside-photographs",
             given=f"The run folder {folder} would lie inside {photos}.",
             wanted="A run folder elsewhere: nothing is written among your photographs.",
             hint="Name one with --out, for example --out ../run",
-            family=Family.USAGE,
         )
 
 
 def missing(folder: Path) -> SplatError:
     """The error for a folder that is not a run folder."""
-    return SplatError(
+    return RunFolderError(
         "run-folder-missing",
         given=f"{folder} is not a run folder.",
         wanted="A folder that `splat process` made.",
         hint="Start one: splat process PHOTOS --out run/",
-        family=Family.RUN_FOLDER,
     )

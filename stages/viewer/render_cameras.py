@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.base.text import counted
 
 if TYPE_CHECKING:
@@ -70,12 +70,11 @@ def camera_of_view(splats: Splats, views: Sequence[View], name: str | None) -> C
     if name.isdigit() and int(name) < len(views):
         return views[int(name)].camera
     known = f"{views[0].name} ... {views[-1].name}" if views else "none: a file has no cameras"
-    raise SplatError(
+    raise UsageError(
         "render-camera",
         given=f"There is no camera {name}.",
         wanted=f"A photograph's name, or a number from 0 to {max(0, len(views) - 1)} ({known}).",
         hint="Leave --camera away, or name a run folder whose photographs you want to see.",
-        family=Family.USAGE,
     )
 
 
@@ -123,12 +122,11 @@ def _past_views(cameras: list[Camera], splats: Splats, duration: Duration) -> li
     from stages.viewer import camera_paths
 
     if not cameras:
-        raise SplatError(
+        raise UsageError(
             "render-no-capture",
             given="--path capture needs the photographs' cameras, and there are none.",
             wanted="A run folder in which `sfm` has finished, or a file in its 7-export.",
             hint="Name the run folder, or choose --path orbit.",
-            family=Family.USAGE,
         )
     cameras = [cameras[i] for i in camera_paths.tour(cameras, splats)]
     frames = _SMOOTHING_S * duration.frames_per_second
@@ -149,12 +147,11 @@ def _read_cameras(path: str) -> tuple[list[Camera], tuple[str, ...]]:
     from stages.cameras.table import read_cameras
 
     if not Path(path).exists():
-        raise SplatError(
+        raise UsageError(
             "render-path",
             given=f"--path {path} is neither a known path nor a file.",
             wanted="orbit, capture, a transforms.json or a folder with a COLMAP model.",
             hint="Leave --path away to go around the scene once.",
-            family=Family.USAGE,
         )
     found = read_cameras(Path(path))
     notes: tuple[str, ...] = ()

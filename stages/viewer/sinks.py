@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.atomic import make_folder, replacing
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError
 from stages.raster.definition import Rendering
 from stages.scene import Camera
 from stages.viewer.image_files import (
@@ -74,12 +74,11 @@ def film(path: Path, width: int, height: int, fps: float) -> Iterator[AddFrame]:
         except av.FFmpegError as error:
             if error.errno != errno.EINVAL and 0 < (error.errno or 0) < _FFMPEG_ERRORS:
                 raise OSError(error.errno, error.strerror) from error  # such as a full disk
-            raise SplatError(
+            raise ResourceError(
                 "film-encoder",
                 given=f"The film could not be encoded: {error}.",
                 wanted=f"An encoder that takes {width} x {height} pixels at {fps:g} a second.",
                 hint="Choose a smaller --width, or --out a folder to get pictures.",
-                family=Family.RESOURCES,
             ) from error
 
 

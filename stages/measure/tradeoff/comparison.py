@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.base.atomic import replacing
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.base.text import counted
 from stages.measure.bootstrap import Difference, paired_difference
 from stages.measure.evaluation import (
@@ -89,12 +89,11 @@ def compare_runs(first: Candidate, second: Candidate) -> Comparison:
     own run's camera. Raises SplatError (compare-nothing-in-common)."""
     names = sorted(first.held_out.keys() & second.held_out.keys())
     if not names:
-        raise SplatError(
+        raise UsageError(
             "compare-nothing-in-common",
             given=f"No photograph is held out of both {first.name} and {second.name}.",
             wanted="Photographs that neither run was trained on, to compare them by.",
             hint="Make both runs of the same photographs, four or more.",
-            family=Family.USAGE,
         )
     both = (first, second)
     side_px = min(one.side_px(name) for one in both for name in names)

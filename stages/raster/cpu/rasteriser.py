@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError, SplatError
 from stages.base.memory import MIB, available_mib
 from stages.raster.camera_row import camera_row
 from stages.raster.cpu import binning, blend, contributions
@@ -316,7 +316,7 @@ def _lists_too_large(
     """log_scales: of the visible splats."""
     given = f"The lists of {len(log_scales):,} splats for {camera.width} x {camera.height} pixels"
     linear = bool((log_scales >= 0).all())  # lengths are, and logarithms of small lengths are not
-    return SplatError(
+    return ResourceError(
         "raster-memory",
         given=f"{given} do not fit into memory ({error})."
         + (" No scale is negative: they look linear and were read as logarithms." * linear),
@@ -324,5 +324,4 @@ def _lists_too_large(
         hint="Write the natural logarithm of each scale into the file."
         if linear
         else "Ask for less: --width, --train-side or --max-splats; or close other programs.",
-        family=Family.RESOURCES,
     )

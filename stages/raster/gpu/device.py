@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError
 
 if TYPE_CHECKING:
     from stages.raster.definition import MemoryFull
@@ -81,12 +81,11 @@ def require() -> Any:
     """The torch device to run on. Raises SplatError if there is none."""
     fault = missing() if not interpreted() else _no_triton()
     if fault:
-        raise SplatError(
+        raise ResourceError(
             "raster-no-gpu",
             given=f"The backend gpu cannot run here: {fault}.",
             wanted="It takes Linux, an NVIDIA or AMD card, and a torch built for it.",
             hint=f"Choose --backend cpu. {INSTALL}",
-            family=Family.RESOURCES,
         )
     import torch
 
@@ -136,12 +135,11 @@ def gpu_errors_explained(splats: int) -> Iterator[None]:
     except RuntimeError as error:
         if "CUDA error" not in str(error) and "HIP error" not in str(error):
             raise
-        raise SplatError(
+        raise ResourceError(
             "raster-gpu-failed",
             given=f"The GPU stopped: {str(error).splitlines()[0]}.",
             wanted="A GPU that answers; another program may use it exclusively.",
             hint="Run `splat doctor`, see nvidia-smi or rocm-smi, or choose --backend cpu.",
-            family=Family.RESOURCES,
         ) from error
 
 
