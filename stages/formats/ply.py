@@ -144,8 +144,13 @@ def tables(file: BinaryIO, path: Path, header: Header) -> _Tables:
     if header.vertex.has_lists:
         raise BadFileError("its vertices hold lists")
     if header.encoding == "ascii":
-        _check_ascii_size(path, header)
-        return _ascii_tables(file, header)
+        ahead = header.before("vertex")
+        skipped = sum(element.count * len(element.properties) for element in ahead)
+        declared = header.vertex.count * len(header.vertex.properties)
+        # A number and its separator take at least two characters.
+        if 2 * (skipped + declared) > path.stat().st_size - header.data_starts + 1:
+            raise BadFileError("it is cut short: it cannot hold the numbers that it declares")
+        return _ascii_tables(file, header, skipped)
     return _binary_tables(binary_rows(path, header, "vertex"))
 
 
@@ -157,55 +162,18 @@ def _binary_tables(mapped: NDArray[Any]) -> _Tables:
         yield rows, block
 
 
-def _ascii_numbers(header: Header) -> tuple[int, int]:
-    """(the number of values before the vertices, the number of values of the vertices)."""
-    skipped = sum(element.count * len(element.properties) for element in header.before("vertex"))
-    return skipped, header.vertex.count * len(header.vertex.properties)
-
-
-def _check_ascii_size(path: Path, header: Header) -> None:
-    # A number and its separator take at least two characters.
-    if 2 * sum(_ascii_numbers(header)) > path.stat().st_size - header.data_starts + 1:
-        raise BadFileError("it is cut short: it cannot hold the numbers that it declares")
-
-
-def _ascii_tables(file: BinaryIO, header: Header) -> _Tables:
-    """The rows of a text file in blocks, all columns float64."""
-    skipped, declared = _ascii_numbers(header)
-    width = len(header.vertex.properties)
+def _ascii_tables(file: BinaryIO, header: Header, skipped: int) -> _Tables:
+    """The rows of a text file in blocks, all columns float64. skipped: how many numbers are before
+    the vertices. Raises BadFileError and ValueError."""
+    names = [name for name, _ in header.vertex.properties]
     file.seek(header.data_starts)
-    numbers = _numbers(file)
-    held = np.zeros(0)
-    while len(held) < skipped and (more := next(numbers, None)) is not None:
-        skipped -= len(held)
-        held = more
-    held = held[skipped:]
+    np.fromfile(file, count=skipped, sep=" ")
     for rows in reported_blocks(header.vertex.count, _ROWS_AT_ONCE):
-        wanted = (rows.stop - rows.start) * width
-        parts, there = [held], len(held)
-        while there < wanted:
-            more = next(numbers, None)
-            if more is None:
-                found = rows.start * width + there
-                raise BadFileError(f"it is cut short: {declared} numbers declared, {found} there")
-            parts.append(more)
-            there += len(more)
-        whole = np.concatenate(parts)
-        held = whole[wanted:]
-        yield rows, whole[:wanted].view([(name, "f8") for name, _ in header.vertex.properties])
-
-
-def _numbers(file: BinaryIO) -> Iterator[NDArray[np.float64]]:
-    """The numbers of the file in batches of some ten thousand."""
-    rest = b""
-    while block := file.read(1 << 18):
-        block = rest + block
-        cut = max(block.rfind(space) for space in (b" ", b"\n", b"\r", b"\t")) + 1
-        if cut == 0 and len(block) > 1 << 18:
-            raise BadFileError("it holds a word that is no number")
-        rest = block[cut:]
-        yield np.array(block[:cut].split(), dtype=np.float64)
-    yield np.array(rest.split(), dtype=np.float64)
+        wanted = (rows.stop - rows.start) * len(names)
+        numbers = np.fromfile(file, count=wanted, sep=" ")
+        if len(numbers) < wanted:
+            raise BadFileError("it is cut short: it holds fewer numbers than it declares")
+        yield rows, numbers.view([(name, "f8") for name in names])
 
 
 def columns(table: NDArray[Any], names: list[str]) -> NDArray[Any]:
