@@ -29,7 +29,6 @@ from stages.cameras.camera_file import (
 from stages.cameras.lens import Lens
 from stages.scene import View
 from stages.scene.place import GEOGRAPHIC, EarthPlace
-from stages.scene.rotations import matrices_of
 
 _NAME = "reconstruction.json"
 _PERSPECTIVE = ("perspective", "simple_radial", "radial", "brown")
@@ -136,6 +135,6 @@ def optics_of(camera: Mapping[str, Any]) -> tuple[list[float], Lens]:
 
 def rotations_of(turns: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 3] of axis-angle vectors [V, 3]."""
-    angles = np.linalg.norm(turns, axis=1, keepdims=True)
-    axes = turns / np.where(angles > 0, angles, 1.0)
-    return matrices_of(np.concatenate([np.cos(angles / 2), np.sin(angles / 2) * axes], axis=1))
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(turns).as_matrix())

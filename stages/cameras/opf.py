@@ -75,8 +75,7 @@ def read(path: Path) -> CameraFile:
         numbers = np.array([values for values, _ in mine], np.float64).reshape(-1, 6)
         angles = np.array([camera["orientation_deg"] for camera in cameras], np.float64)
         centres = np.array([camera["position"] for camera in cameras], np.float64).reshape(-1, 3)
-        rotations = np.array([_world_to_camera(*row) for row in np.radians(angles.reshape(-1, 3))])
-        poses = poses_of(rotations.reshape(-1, 3, 3), centres)
+        poses = poses_of(_world_to_camera(angles.reshape(-1, 3)), centres)
         views = make_views(names, numbers[:, :2], numbers[:, 2:], poses)
         frames = list(_parts(path, project, "scene_reference_frame"))
         ground = _georeference(frames[0]) if len(frames) == 1 else NO_GEOREFERENCE
@@ -149,13 +148,12 @@ def _optics(internals: dict[str, Any], size: Any) -> tuple[list[float], Lens]:
     return [*map(float, size), focal, focal, *centre], lens
 
 
-def _world_to_camera(omega: float, phi: float, kappa: float) -> NDArray[np.float64]:
-    """[3, 3], with our axes of the camera."""
-    (so, sp, sk), (co, cp, ck) = np.sin([omega, phi, kappa]), np.cos([omega, phi, kappa])
-    about_x = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
-    return np.asarray(OPENGL_FROM_OURS @ (about_x @ about_y @ about_z).T)
+def _world_to_camera(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, 3, 3], with our axes of the camera, of omega, phi and kappa [V, 3], degrees."""
+    from scipy.spatial.transform import Rotation
+
+    to_world = Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
+    return np.asarray(OPENGL_FROM_OURS @ to_world.transpose(0, 2, 1))
 
 
 def _georeference(frame: dict[str, Any]) -> Georeference:

@@ -45,8 +45,7 @@ def read(path: Path) -> CameraFile:
         scale = sizes.max(axis=1, keepdims=True) / _LONGER_SIDE
         centres = sizes / 2 + lens[:, :2] * scale
         focal = found[:, 6:] * scale
-        rotations = np.array([_world_to_camera(*row) for row in np.radians(found[:, 3:6])])
-        poses = poses_of(rotations, found[:, :3])
+        poses = poses_of(_world_to_camera(found[:, 3:6]), found[:, :3])
         views = make_views(names, sizes, np.hstack([focal, focal, centres]), poses)
         lenses = tuple(
             Lens(radial=tuple(row[2:6].tolist()), tangential=(float(row[6]), float(row[7])))
@@ -74,10 +73,9 @@ def _rows(path: Path) -> list[dict[str, str]]:
     return rows
 
 
-def _world_to_camera(heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """[3, 3], with our axes of the camera."""
-    (sh, sp, sr), (ch, cp, cr) = np.sin([-heading, pitch, roll]), np.cos([-heading, pitch, roll])
-    about_z = np.array([[ch, -sh, 0], [sh, ch, 0], [0, 0, 1]])
-    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
-    about_y = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
-    return np.asarray(OPENGL_FROM_OURS @ (about_z @ about_x @ about_y).T)
+def _world_to_camera(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[V, 3, 3], with our axes of the camera, of heading, pitch and roll [V, 3], degrees."""
+    from scipy.spatial.transform import Rotation
+
+    to_world = Rotation.from_euler("ZXY", angles * (-1, 1, 1), degrees=True).as_matrix()
+    return np.asarray(OPENGL_FROM_OURS @ to_world.transpose(0, 2, 1))

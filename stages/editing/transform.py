@@ -96,12 +96,11 @@ class Similarity:
 
 
 def rotation_about(axis: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
-    """[3, 3] the rotation about `axis` [3], right-handed (Rodrigues' formula)."""
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.deg2rad(degrees)
-    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return np.asarray(rotation)
+    """[3, 3] the rotation about `axis` [3], right-handed."""
+    from scipy.spatial.transform import Rotation
+
+    turn = np.deg2rad(degrees) * axis / np.linalg.norm(axis)
+    return np.asarray(Rotation.from_rotvec(turn).as_matrix())
 
 
 def rotation_to_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
