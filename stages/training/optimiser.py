@@ -8,7 +8,7 @@ of columns that starts by itself has a number of steps: the opacity, and each SH
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,27 +168,7 @@ def _move(i, shift, means, quaternions, log_scales, opacity_logits, sh, n_sh):
 
 @kernel
 def adam_step(
-    ticket,
-    chunk,
-    visible,
-    gradients,
-    means2d,
-    means,
-    quaternions,
-    log_scales,
-    opacity_logits,
-    sh,
-    sh_degrees,
-    moment1,
-    moment2,
-    steps,
-    counts,
-    corrections,
-    rates,
-    ndc_x,
-    ndc_y,
-    gradient_sum,
-    gradient_count,
+    ticket, chunk, visible, gradients, means2d, model, counts, corrections, rates, ndc_x, ndc_y
 ):
     """Update the visible splats; accumulate the norm of the gradient by their 2D positions.
 
@@ -196,13 +176,15 @@ def adam_step(
 
     Args:
         visible, gradients, means2d: see `raster.definition.Backward`.
-        sh: [N, 3 coefficients], 2-D; coefficients above a splat's degree do not change.
-        sh_degrees: [N].
-        steps: [N, STEP_COUNTS], of which the first `counts` are advanced.
+        model: the arrays of `Model`; sh is [N, 3 coefficients], 2-D. Coefficients above a splat's
+            degree do not change.
+        counts: how many columns of steps are advanced, from the first.
         corrections: [T, 2] 1 / (1 - beta^t) of both betas.
         rates: [columns of gradients] learning rates.
         ndc_x, ndc_y: factors from a gradient per pixel to the units of the densification threshold.
     """
+    means, quaternions, log_scales, opacity_logits, sh, sh_degrees = model[:6]
+    moment1, moment2, steps, gradient_sum, gradient_count = model[6:11]
     n = len(visible)
     columns = gradients.shape[1]
     row_width, n_sh = moment1.shape[1], min(columns - SH, sh.shape[1])
@@ -335,26 +317,10 @@ def apply_gradients(
     parameters = backward.parameters
     with np.errstate(over="ignore", invalid="ignore"):  # then the splat's step is skipped
         parameters[:, MEAN:ROTATION] *= np.float32(rates.extent)
+    flat = replace(model, sh=model.sh.reshape(len(model), 3 * model.sh.shape[1]))
     pool.share(
-        adam_step,
-        CHUNK,
-        backward.rows,
-        parameters,
-        backward.means2d,
-        model.means,
-        model.quaternions,
-        model.log_scales,
-        model.opacity_logits,
-        model.sh.reshape(len(model), 3 * model.sh.shape[1]),
-        model.sh_degrees,
-        model.moment1,
-        model.moment2,
-        model.steps,
-        active_counts(coefficients),
-        _CORRECTIONS,
+        *(adam_step, CHUNK, backward.rows, parameters, backward.means2d),
+        *(tuple(vars(flat).values()), active_counts(coefficients), _CORRECTIONS),
         rates.row(coefficients),
-        np.float32(0.5 * width / pixels),
-        np.float32(0.5 * height / pixels),
-        model.gradient_sum,
-        model.gradient_count,
+        *(np.float32(0.5 * width / pixels), np.float32(0.5 * height / pixels)),
     )

@@ -71,19 +71,19 @@ class Yardstick:
 
     def blend(self, pool: Pool, forward: Forward, image: NDArray[np.float32]) -> Job:
         """A job that draws the lists of `forward` into image [4, H, W], with the pool's threads."""
-        geometry = forward.geometry.copy()
+        tiles = forward.tiles
+        geometry = tiles.geometry.copy()
         # the opacity itself and the exponent to base e, as the kernel wants them
         geometry[:, GL] = np.exp2(geometry[:, GL])
         geometry[:, (GA, GB)] = geometry[:, (GA, GB)] ** 2 * np.log(2.0)
-        lists = forward.lists
-        spans = np.empty(len(lists), np.uint8)
-        row_spans(forward.width, lists.starts, lists.members, forward.geometry, spans)
+        spans = np.empty(len(tiles.members), np.uint8)
+        row_spans(tiles.width, tiles.starts, tiles.members, tiles.geometry, spans)
         arrays: list[NDArray[Any]] = [
-            *(lists.starts.copy(), lists.members.copy(), spans, geometry),
-            *(forward.paint.copy(), forward.background, image),
+            *(tiles.starts.copy(), tiles.members.copy(), spans, geometry),
+            *(tiles.paint.copy(), tiles.background, image),
         ]
         pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
-        width, height = forward.width, forward.height
+        width, height = tiles.width, tiles.height
 
         def job() -> None:
             self._blend(pool.n_threads, width, height, *pointers)

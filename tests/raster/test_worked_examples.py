@@ -157,4 +157,4 @@ def test_a_picture_of_1080p_has_8160_tiles_and_an_aligned_box_covers_ten():
     )
     forward = rasteriser.forward(splat_arrays(scene), view, RasterSettings(dilation_px2=1e-6))
     assert forward.n_intersections == 10
-    assert len(forward.lists.starts) - 1 == 120 * 68 == 8160
+    assert len(forward.tiles.starts) - 1 == 120 * 68 == 8160

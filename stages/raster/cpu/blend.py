@@ -204,27 +204,16 @@ def _finish_tile(background, depths, work):
 
 
 @kernel
-def blend_tiles(
-    ticket,
-    width,
-    height,
-    tile_starts,
-    members,
-    masks,
-    geometry,
-    paint,
-    background,
-    depths,
-    image,
-    transmittance,
-    last,
-):
+def blend_tiles(ticket, tiles, depths, image):
     """Draw every tile. image [4 or 6, H, W] float32: red, green, blue, alpha; if `depths`, then
     expected and median depth.
 
-    transmittance, last [tiles, 256] float32, block by block, for the backward pass: the final
-    transmittance, and the number of the last entry drawn (NEVER where a pixel was not finished).
+    tiles: see `DrawnTiles`. Its transmittance and last [tiles, 256] float32, block by block, are
+    filled for the backward pass: the final transmittance, and the number of the last entry drawn
+    (NEVER where a pixel was not finished).
     """
+    width, height, tile_starts, members, _, masks, geometry, paint = tiles[:8]
+    background, transmittance, last = tiles[8:]
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(8 * PIXELS, np.float32)
@@ -259,23 +248,10 @@ def _start_gradient(v_image, tile, tile_x, tile_y, background, transmittance, wo
 
 
 @kernel
-def blend_gradient_tiles(
-    ticket,
-    width,
-    height,
-    tile_starts,
-    members,
-    slots,
-    masks,
-    geometry,
-    paint,
-    background,
-    transmittance,
-    last,
-    v_image,
-    gradients,
-):
+def blend_gradient_tiles(ticket, tiles, v_image, gradients):
     """gradients [intersections, SUMS] at each entry's slot, from v_image [3, H, W]."""
+    width, height, tile_starts, members, slots, masks, geometry, paint = tiles[:8]
+    background, transmittance, last = tiles[8:]
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(5 * PIXELS, np.float32)

@@ -68,24 +68,11 @@ def _start(residual, tile, tile_x, tile_y, background, transmittance, work):
 
 
 @kernel
-def contribution_tiles(
-    ticket,
-    width,
-    height,
-    tile_starts,
-    members,
-    slots,
-    masks,
-    geometry,
-    paint,
-    background,
-    transmittance,
-    last,
-    residual,
-    out,
-):
+def contribution_tiles(ticket, tiles, residual, out):
     """out [intersections, CONTRIBUTIONS] at each entry's slot; residual [3, H, W]: render less
     photograph."""
+    width, height, tile_starts, members, slots, masks, geometry, paint = tiles[:8]
+    background, transmittance, last = tiles[8:]
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     work = np.empty(7 * PIXELS, np.float32)

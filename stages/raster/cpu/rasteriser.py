@@ -19,7 +19,7 @@ from stages.raster.cpu.splat_kernels import (
     project_splats,
     splat_gradients,
 )
-from stages.raster.cpu.tile import PIXELS
+from stages.raster.cpu.tile import PIXELS, DrawnTiles
 from stages.raster.definition import (
     CONTRIBUTIONS,
     NO_SMOOTHING,
@@ -70,51 +70,26 @@ class Buffers:
 
 
 @dataclass(frozen=True)
-class TileLists:
-    """The splats of each tile, nearest first: entries starts[t]..starts[t + 1] for tile t.
-
-    members [I]: row of the splat. slots [I]: where the entry's gradient goes; the slots of a splat
-    are contiguous. masks [I]: 4x4 blocks of the tile that the splat touches. places [V, 4]: row,
-    number of slots and first slot of each visible splat; see `binning`.
-    """
-
-    starts: NDArray[np.int64]
-    members: NDArray[np.int32]
-    slots: NDArray[np.int32]
-    masks: NDArray[np.uint16]
-    places: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        return len(self.members)
-
-
-@dataclass(frozen=True)
 class Forward:
     """The result of a forward pass, with what the backward pass needs.
 
     image [4 or 6, H, W]: RGB, alpha, and if requested expected and median depth. visible [V] int32:
-    rows of the splats that touch the picture, ascending. geometry, paint: of all rows, filled for
-    visible ones. transmittance, last: see `blend.blend_tiles`. The arrays are buffers of the
-    rasteriser, valid until its next forward pass.
+    rows of the splats that touch the picture, ascending. places [V, 4]: row, number of slots and
+    first slot of each visible splat; see `binning`. The arrays are buffers of the rasteriser, valid
+    until its next forward pass.
     """
 
     image: NDArray[np.float32]
     visible: NDArray[np.int32]
-    lists: TileLists
     culled: int
-    geometry: NDArray[np.float64]
-    paint: NDArray[np.float32]
-    transmittance: NDArray[np.float32]
-    last: NDArray[np.float32]
+    tiles: DrawnTiles
+    places: NDArray[np.int32]
     cam: NDArray[np.float64]
     degree: int
-    background: NDArray[np.float32]
-    width: int
-    height: int
 
     @property
     def n_intersections(self) -> int:
-        return len(self.lists)
+        return len(self.tiles.members)
 
 
 class CpuRasteriser:
@@ -141,48 +116,23 @@ class CpuRasteriser:
         paint = get("paint", (n, 4), np.float32)
         status = get("status", (n,), np.uint8)
         self.pool.share(
-            project_splats, CHUNK, cam, degree, *arrays, smoothing, geometry, paint, status
+            *(project_splats, CHUNK, cam, degree, (*arrays, smoothing), geometry, paint, status)
         )
         visible = np.flatnonzero(status == VISIBLE).astype(np.int32)
         try:
-            lists = self._lists(visible, arrays, geometry, paint, width, height)
+            lists, places = self._lists(visible, arrays, geometry, paint, width, height)
         except MemoryError as error:
             raise _lists_too_large(error, camera, arrays[2][visible]) from error
         background = np.asarray(settings.background, np.float32)
-        tiles = len(lists.starts) - 1
+        n_tiles = len(lists[0]) - 1
+        transmittance = get("light", (n_tiles, PIXELS), np.float32)
+        last = get("last", (n_tiles, PIXELS), np.float32)
+        drawn = (geometry, paint, background, transmittance, last)
+        tiles = DrawnTiles(width, height, *lists, *drawn)
         image = get("image", (6 if depths else 4, height, width), np.float32)
-        transmittance = get("light", (tiles, PIXELS), np.float32)
-        last = get("last", (tiles, PIXELS), np.float32)
-        self.pool.share(
-            blend.blend_tiles,
-            width,
-            height,
-            lists.starts,
-            lists.members,
-            lists.masks,
-            geometry,
-            paint,
-            background,
-            depths,
-            image,
-            transmittance,
-            last,
-        )
-        return Forward(
-            image,
-            visible,
-            lists,
-            int(np.count_nonzero(status == CULLED)),
-            geometry,
-            paint,
-            transmittance,
-            last,
-            cam,
-            degree,
-            background,
-            width,
-            height,
-        )
+        self.pool.share(blend.blend_tiles, tiles, depths, image)
+        culled = int(np.count_nonzero(status == CULLED))
+        return Forward(image, visible, culled, tiles, places, cam, degree)
 
     def backward(
         self,
@@ -192,26 +142,14 @@ class CpuRasteriser:
         smoothing: NDArray[np.float32] = NO_SMOOTHING,
     ) -> Backward:
         """See `definition.Rasteriser`."""
-        n = len(forward.visible)
-        get = self.buffers.get
+        n, get, tiles = len(forward.visible), self.buffers.get, forward.tiles
         (raw,) = self.buffers.carve(((forward.n_intersections, blend.SUMS), np.float32))
-        self._over_tiles(blend.blend_gradient_tiles, forward, v_image, raw)
+        self.pool.share(blend.blend_gradient_tiles, tiles, v_image, raw)
         out = get("out", (n, gradient_columns((forward.degree + 1) ** 2)), np.float32)
         means2d = get("means2d", (n, 2), np.float32)
         self.pool.share(
-            splat_gradients,
-            CHUNK,
-            forward.visible,
-            forward.cam,
-            forward.degree,
-            *arrays,
-            smoothing,
-            forward.geometry,
-            forward.paint,
-            forward.lists.places,
-            raw,
-            out,
-            means2d,
+            *(splat_gradients, CHUNK, forward.visible, forward.cam, forward.degree),
+            *((*arrays, smoothing), tiles, forward.places, raw, out, means2d),
         )
         return Backward(forward.visible, out, means2d)
 
@@ -219,35 +157,10 @@ class CpuRasteriser:
         """See `definition.Rasteriser`."""
         shape = (forward.n_intersections, CONTRIBUTIONS)
         (raw,) = self.buffers.carve((shape, np.float32))
-        self._over_tiles(contributions.contribution_tiles, forward, residual, raw)
+        self.pool.share(contributions.contribution_tiles, forward.tiles, residual, raw)
         out = np.empty((len(forward.visible), CONTRIBUTIONS))
-        contributions.gather_contributions(raw, forward.lists.places, out)
+        contributions.gather_contributions(raw, forward.places, out)
         return out
-
-    def _over_tiles(
-        self,
-        kernel: Any,
-        forward: Forward,
-        planes: NDArray[np.float32],
-        out: NDArray[np.float32],
-    ) -> None:
-        """Run a kernel from far to near over every tile's list; one row of `out` for each entry."""
-        self.pool.share(
-            kernel,
-            forward.width,
-            forward.height,
-            forward.lists.starts,
-            forward.lists.members,
-            forward.lists.slots,
-            forward.lists.masks,
-            forward.geometry,
-            forward.paint,
-            forward.background,
-            forward.transmittance,
-            forward.last,
-            planes,
-            out,
-        )
 
     def _lists(
         self,
@@ -257,7 +170,8 @@ class CpuRasteriser:
         paint: NDArray[np.float32],
         width: int,
         height: int,
-    ) -> TileLists:
+    ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.int32]]:
+        """(starts, members, slots and masks of `DrawnTiles`; `Forward.places`)."""
         n, get, share = len(visible), self.buffers.get, self.pool.share
         bounds = get("bounds", (n,), np.int32)
         share(binning.bound_tiles, visible, geometry, width, height, bounds)
@@ -283,19 +197,11 @@ class CpuRasteriser:
         binning.scan_counts(positions, starts)
         columns = (((total,), np.int32), ((total,), np.int32), ((total,), np.uint16))
         members, slots, masks_of = self.buffers.carve(*columns, name="lists")
-        lists = TileLists(starts, members, slots, masks_of, places)
         share(
-            binning.fill_tiles,
-            order,
-            places,
-            tiles,
-            masks,
-            positions,
-            lists.members,
-            lists.slots,
-            lists.masks,
+            *(binning.fill_tiles, order, places, tiles, masks, positions),
+            *(members, slots, masks_of),
         )
-        return lists
+        return (starts, members, slots, masks_of), places
 
 
 def _starts(counts: NDArray[np.int32], starts: NDArray[np.int32]) -> int:

@@ -88,25 +88,13 @@ def _block_of_colours_is_finite(start, sh):
 
 
 @kernel
-def project_splats(
-    ticket,
-    chunk,
-    cam,
-    degree,
-    means,
-    quaternions,
-    log_scales,
-    opacity_logits,
-    sh,
-    smoothing,
-    geometry,
-    paint,
-    status,
-):
+def project_splats(ticket, chunk, cam, degree, splats, geometry, paint, status):
     """Geometry record, paint and status (0 out of view, 1 visible, 2 not drawable) of each row.
 
-    geometry [N, 8], paint [N, 4] (colour and depth): filled for visible rows only.
+    splats: means, quaternions, log_scales, opacity_logits, sh, smoothing. geometry [N, 8],
+    paint [N, 4] (colour and depth): filled for visible rows only.
     """
+    means, quaternions, log_scales, opacity_logits, sh, smoothing = splats
     n = len(means)
     w = np.empty(WORK_ROW * LANES, np.float64)
     basis = np.empty(16 * LANES, np.float64)
@@ -210,29 +198,13 @@ def _sum_slots(raw, slot, end, lane, sums):
 
 
 @kernel
-def splat_gradients(
-    ticket,
-    chunk,
-    visible,
-    cam,
-    degree,
-    means,
-    quaternions,
-    log_scales,
-    opacity_logits,
-    sh,
-    smoothing,
-    geometry,
-    paint,
-    splats,
-    raw,
-    out,
-    means2d,
-):
+def splat_gradients(ticket, chunk, visible, cam, degree, splats, tiles, found, raw, out, means2d):
     """Sum each splat's (splat, tile) gradients in a fixed order, and continue to its parameters.
 
-    splats [V, 4]: `TileLists.places`.
+    splats: as in `project_splats`. tiles: see `DrawnTiles`. found [V, 4]: `Forward.places`.
     """
+    means, quaternions, log_scales, opacity_logits, sh, smoothing = splats
+    geometry, paint = tiles[6:8]
     n = len(visible)
     columns = out.shape[1]
     w = np.empty(WORK_ROW * LANES, np.float64)
@@ -254,8 +226,8 @@ def splat_gradients(
             for lane in range(LANES):
                 place = places[lane]
                 rows[lane] = visible[place]
-                slot = np.int64(splats[place, SLOT])
-                _sum_slots(raw, slot, slot + splats[place, COUNT], lane, by_lane)
+                slot = np.int64(found[place, SLOT])
+                _sum_slots(raw, slot, slot + found[place, COUNT], lane, by_lane)
                 vstore(out, place * columns + columns - 16, splat16(np.float32(0.0)))
             for k in range(SUMS):
                 put(sums, k, gather8(by_lane, lanes, 16, k))

@@ -5,7 +5,10 @@ Plane p of a tile's work holds block b (b % 4 across, b // 4 down) at p + 16 b, 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.raster.cpu.binning import BLOCK, TILE
 from stages.raster.kernels.simd import (
@@ -20,6 +23,29 @@ PIXELS = TILE * TILE
 BLOCKS = 16
 NEVER = np.float32(3e38)  # the last entry drawn in a pixel that was not finished
 _F = np.float32
+
+
+class DrawnTiles(NamedTuple):
+    """A picture's tiles as kernels take them: entries starts[t]..starts[t + 1] are the splats of
+    tile t, nearest first. Kernels unpack it before they loop: each access to an array of a tuple
+    changes a reference count, which threads would contend for.
+
+    members [I]: row of the splat. slots [I]: where the entry's gradient goes; the slots of a splat
+    are contiguous. masks [I]: 4x4 blocks of the tile that the splat touches. geometry, paint: of
+    all rows, filled for visible ones. transmittance, last: see `blend.blend_tiles`.
+    """
+
+    width: int
+    height: int
+    starts: NDArray[np.int64]
+    members: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    masks: NDArray[np.uint16]
+    geometry: NDArray[np.float64]
+    paint: NDArray[np.float32]
+    background: NDArray[np.float32]
+    transmittance: NDArray[np.float32]
+    last: NDArray[np.float32]
 
 
 @kernel
