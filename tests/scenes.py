@@ -11,7 +11,6 @@ from stages.raster import backends
 from stages.raster.definition import (
     LOG_SCALE,
     MEAN,
-    NO_SMOOTHING,
     OPACITY,
     ROTATION,
     SH,
@@ -95,13 +94,12 @@ def gradients(backend, scene, view, v_image, settings=None, smoothing=None):
     """{parameter: gradient of sum(image x v_image)}, each in the shape of its parameter, as the
     backend of that name gives them."""
     settings = settings or RasterSettings()
-    widths = NO_SMOOTHING if smoothing is None else smoothing
     rasteriser = backends.rasteriser_of(backend)
-    arrays = splat_arrays(scene)
-    forward = rasteriser.forward(arrays, view, settings, widths)
+    arrays = splat_arrays(scene) if smoothing is None else (*splat_arrays(scene), smoothing)
+    forward = rasteriser.forward(arrays, view, settings)
     poison(rasteriser)
     planar = np.ascontiguousarray(np.asarray(v_image, np.float32).transpose(2, 0, 1))
-    found = rasteriser.backward(arrays, forward, planar, widths)
+    found = rasteriser.backward(forward, planar)
     full = np.zeros((len(scene), found.parameters.shape[1]))
     full[found.rows] = found.parameters
     coefficients = (min(settings.sh_degree, scene.sh_degree) + 1) ** 2

@@ -111,7 +111,9 @@ class MemoryFull(SplatError):  # noqa: N818 - names a state, as `Interrupted` do
 
 
 NO_SMOOTHING = np.zeros(0, np.float32)
-Arrays = tuple[NDArray[np.float32], ...]  # means, quaternions, log_scales, opacity_logits, sh
+# means, quaternions, log_scales, opacity_logits, sh, C-contiguous; and where a smoothing filter is
+# used (see `raster.smoothing`), its widths [N] as a sixth.
+Arrays = tuple[NDArray[np.float32], ...]
 
 
 class Forward(Protocol):
@@ -143,6 +145,11 @@ class Backward:
     means2d: NDArray[np.float32]
 
 
+def with_smoothing(arrays: Arrays) -> Arrays:
+    """The six arrays; the last is NO_SMOOTHING where there are five."""
+    return (*arrays, NO_SMOOTHING)[:6]
+
+
 def splat_arrays(splats: Splats) -> Arrays:
     """The five parameter arrays, C-contiguous float32."""
     return tuple(np.ascontiguousarray(a, dtype=np.float32) for a in splats.arrays)
@@ -152,30 +159,18 @@ class Rasteriser(Protocol):
     """The interface of a backend. An instance must not be used by two threads at once."""
 
     def forward(
-        self,
-        arrays: Arrays,
-        camera: Camera,
-        settings: RasterSettings,
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-        depths: bool = False,
+        self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> Any:
         """Draw. Returns this backend's own kind of `Forward`.
 
         Args:
-            arrays: parameters of the splats, C-contiguous float32; see `Splats.arrays`.
+            arrays: parameters of the splats, which do not change before the backward pass.
             camera: in the frame of the means.
             settings: how to draw.
-            smoothing: [N] widths of the 3D smoothing filter, see `raster.smoothing`; [0] for none.
             depths: whether to draw the depth planes.
         """
 
-    def backward(
-        self,
-        arrays: Arrays,
-        forward: Any,
-        v_image: NDArray[np.float32],
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-    ) -> Backward:
+    def backward(self, forward: Any, v_image: NDArray[np.float32]) -> Backward:
         """Gradients of the visible splats from v_image [3, H, W], the gradient of the image."""
 
     def contributions(self, forward: Any, residual: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.raster.backends import AUTO, rasteriser_of
-from stages.raster.definition import NO_SMOOTHING, RasterSettings, Rendering, splat_arrays
+from stages.raster.definition import RasterSettings, Rendering, splat_arrays
 from stages.scene import Camera, Splats
 from stages.scene.draw_settings import near_plane_of
 
@@ -42,11 +42,12 @@ def renderer(
     """A function that draws the same splats from one camera after another and keeps its buffers.
     Its results are copies. Arguments as of `render`."""
     chosen = settings or raster_settings_of(splats)
-    widths = NO_SMOOTHING if smoothing is None else np.ascontiguousarray(smoothing, np.float32)
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
+    if smoothing is not None:
+        arrays = (*arrays, np.ascontiguousarray(smoothing, np.float32))
 
     def draw(camera: Camera) -> Rendering:
-        forward = rasteriser.forward(arrays, camera, chosen, widths, depths=True)
+        forward = rasteriser.forward(arrays, camera, chosen, depths=True)
         image = forward.image
         return Rendering(
             np.ascontiguousarray(image[:3].transpose(1, 2, 0)),

@@ -15,7 +15,6 @@ from stages.raster.definition import (
     CONTRIBUTIONS,
     ERROR_CHANGE,
     LARGEST_WEIGHT,
-    NO_SMOOTHING,
     SQUARED_WEIGHT,
     WEIGHT,
     WEIGHTED_RESIDUAL,
@@ -23,6 +22,7 @@ from stages.raster.definition import (
     Backward,
     RasterSettings,
     gradient_columns,
+    with_smoothing,
 )
 from stages.raster.gpu.device import gpu_errors_explained
 from stages.raster.reference import (
@@ -53,7 +53,6 @@ class ReferenceForward:
     arrays: Arrays
     camera: Camera
     settings: RasterSettings
-    smoothing: NDArray[np.float32]
 
 
 class ReferenceRasteriser:
@@ -66,16 +65,11 @@ class ReferenceRasteriser:
         self.dtype = widest(self.device)
 
     def forward(
-        self,
-        arrays: Arrays,
-        camera: Camera,
-        settings: RasterSettings,
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-        depths: bool = False,
+        self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> ReferenceForward:
         """See `definition.Rasteriser`."""
         with gpu_errors_explained(len(arrays[0])), torch.no_grad():
-            p, widths = self._parameters(arrays), self._widths(smoothing)
+            p, widths = self._parameters(arrays)
             projected = project(p, camera, settings, widths)
             image, *planes = render_projected(p, projected, camera, settings)
             culled = int((~drawable(p, widths)).sum())
@@ -83,22 +77,16 @@ class ReferenceRasteriser:
             picture = _host(torch.stack(every)).astype(np.float32)
             touching = projected.index[_touching(projected, camera)]
             visible = np.sort(_host(touching)).astype(np.int32)
-        return ReferenceForward(picture, visible, culled, arrays, camera, settings, smoothing)
+        return ReferenceForward(picture, visible, culled, arrays, camera, settings)
 
-    def backward(
-        self,
-        arrays: Arrays,
-        forward: ReferenceForward,
-        v_image: NDArray[np.float32],
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-    ) -> Backward:
+    def backward(self, forward: ReferenceForward, v_image: NDArray[np.float32]) -> Backward:
         """See `definition.Rasteriser`."""
-        rows, degree = forward.visible, forward.settings.sh_degree
+        rows, degree, arrays = forward.visible, forward.settings.sh_degree, forward.arrays
         with gpu_errors_explained(len(arrays[0])):
-            p = self._parameters(arrays)
+            p, widths = self._parameters(arrays)
             for tensor in p.tensors():
                 tensor.requires_grad_()
-            projected = project(p, forward.camera, forward.settings, self._widths(smoothing))
+            projected = project(p, forward.camera, forward.settings, widths)
             rgb = colours(p.rows(projected.index), self._tensor(forward.camera.centre), degree)
             shown, shades = _leaves(projected), rgb.detach().requires_grad_()
             self._blend_back(shown, shades, forward, self._tensor(v_image))
@@ -133,11 +121,11 @@ class ReferenceRasteriser:
         """See `definition.Rasteriser`. Colour is affine in each alpha: without the splat a pixel
         changes by -w c + b alpha / (1 - alpha), with b what is composited behind it."""
         camera, settings = forward.camera, forward.settings
-        p, planes = self._parameters(forward.arrays), self._tensor(residual)
+        (p, widths), planes = self._parameters(forward.arrays), self._tensor(residual)
         like: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
         found = torch.zeros(len(forward.arrays[0]), CONTRIBUTIONS, **like)
         with gpu_errors_explained(len(found)), torch.no_grad():
-            projected = project(p, camera, settings, self._widths(forward.smoothing))
+            projected = project(p, camera, settings, widths)
             rgb = colours(p.rows(projected.index), self._tensor(camera.centre), settings.sh_degree)
             for place, rows, pixels in picture_blocks(projected, camera):
                 if not len(rows):
@@ -162,11 +150,10 @@ class ReferenceRasteriser:
                 found[index, WEIGHTED_RESIDUAL:] += weights @ errors.T
         return _host(found).astype(np.float64)[forward.visible]
 
-    def _parameters(self, arrays: Arrays) -> Parameters:
-        return Parameters(*map(self._tensor, arrays))
-
-    def _widths(self, smoothing: NDArray[np.float32]) -> Tensor | None:
-        return self._tensor(smoothing) if len(smoothing) else None
+    def _parameters(self, arrays: Arrays) -> tuple[Parameters, Tensor | None]:
+        """(the parameters, the widths of the smoothing filter or None)."""
+        *parameters, widths = map(self._tensor, with_smoothing(arrays))
+        return Parameters(*parameters), widths if len(widths) else None
 
     def _tensor(self, values: Any) -> Tensor:
         return torch.tensor(values, dtype=self.dtype, device=self.device)

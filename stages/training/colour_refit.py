@@ -34,21 +34,21 @@ class ColourRefit:
         rasteriser: renders the pictures.
         settings: to render them with.
         levels: gives all training views each time it is called.
-        widths: [N] of the smoothing filter, or [0] for none.
+        smooth: whether to render with the model's smoothing widths.
     """
 
     rasteriser: Rasteriser
     settings: RasterSettings
     levels: Callable[[], Iterable[Level]]
-    widths: NDArray[np.float32]
+    smooth: bool = False
 
     def of(self, model: Model) -> Model:
         """`model` with refitted colours; `model` itself if they cannot be improved."""
         gradient, weight = np.zeros(model.sh.shape), np.zeros(model.sh.shape)
         for forward, error in self._errors(model):
             huber = _huber_weights(error)
-            self._add(model, forward, huber * error, gradient)
-            self._add(model, forward, huber, weight, absolute=True)
+            self._add(forward, huber * error, gradient)
+            self._add(forward, huber, weight, absolute=True)
         direction = np.where(_own_coefficients(model), gradient / (weight + DAMPING), 0.0)
         slope = float((gradient * direction).sum())
         moved = replace(model, sh=(model.sh + direction).astype(np.float32))
@@ -69,9 +69,9 @@ class ColourRefit:
 
     def _errors(self, model: Model) -> Iterator[tuple[object, NDArray[np.float32]]]:
         """(result of the forward pass, target less render [3, H, W]) of each view."""
-        arrays = model.arrays
+        arrays = model.drawn(self.smooth)
         for level in self.levels():
-            forward = self.rasteriser.forward(arrays, level.camera, self.settings, self.widths)
+            forward = self.rasteriser.forward(arrays, level.camera, self.settings)
             image = forward.image[:3]
             target = target_of(level, image, self.settings.background)
             scale = np.float32(1 / 255 if target.dtype == np.uint8 else 1)
@@ -81,7 +81,6 @@ class ColourRefit:
 
     def _add(
         self,
-        model: Model,
         forward: object,
         v_image: NDArray[np.float32],
         total: NDArray[np.float64],
@@ -89,7 +88,7 @@ class ColourRefit:
     ) -> None:
         """Add the gradient of each coefficient by `v_image`, or its absolute value, to `total`
         [N, coefficients, 3]."""
-        backward = self.rasteriser.backward(model.arrays, forward, v_image, self.widths)
+        backward = self.rasteriser.backward(forward, v_image)
         found = backward.parameters[:, SH : used_columns(total.shape[1])]
         found = found.reshape(len(found), *total.shape[1:])
         total[backward.rows] += np.abs(found) if absolute else found

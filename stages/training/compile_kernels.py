@@ -24,6 +24,7 @@ def compile_kernels() -> None:
     from stages.scene import Camera
     from stages.training.cpu_step import CpuStep
     from stages.training.optimiser import LearningRates, new_model
+    from stages.training.step import StepInput
     from stages.training.views import Level
 
     camera = Camera(_SIDE, _SIDE, _SIDE, _SIDE, _SIDE / 2, _SIDE / 2, np.eye(4))
@@ -36,7 +37,7 @@ def compile_kernels() -> None:
     rasteriser = CpuRasteriser()
     step = CpuStep(rasteriser)
     step.load(model)
-    step.step(level, settings, LearningRates(), smooth=False)
+    step.step(StepInput(level, settings, LearningRates()))
     forward = rasteriser.forward(model.arrays, camera, settings)
     rasteriser.contributions(forward, np.zeros((3, _SIDE, _SIDE), np.float32))
 

@@ -17,7 +17,7 @@ from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import rasteriser_of
-from stages.raster.definition import NO_SMOOTHING, RasterSettings
+from stages.raster.definition import RasterSettings
 from stages.raster.draw import raster_settings_of
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import IGNORE, Splats
@@ -25,7 +25,7 @@ from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.conversion import model_of
 from stages.training.dropout import Dropout
 from stages.training.optimiser import LearningRates, Model
-from stages.training.steps import step_of
+from stages.training.step import StepInput, step_of
 from stages.training.views import Level
 
 # Factors of the default learning rates: at the first step of a call, and at its last.
@@ -95,7 +95,8 @@ class FineTuner:
                 self.extent,
             )
             rates = replace(rates, **dict.fromkeys(frozen, 0.0))
-            self._stepper.step(self._next_level(), settings, rates, False, self._dropout())
+            given = StepInput(self._next_level(), settings, rates, dropout=self._dropout())
+            self._stepper.step(given)
         found = _with_frozen(self._to_splats(self._stepper.model(), splats), splats, frozen)
         if needs_colour_refit(self.dropout, len(self.views)) and "sh_dc" not in frozen:
             found = self._refit_colours(found, settings, "sh_rest" in frozen)
@@ -104,9 +105,7 @@ class FineTuner:
     def _refit_colours(self, splats: Splats, settings: RasterSettings, only_dc: bool) -> Splats:
         model = model_of(splats)
         model.sh_degrees[:] = 0 if only_dc else splats.sh_degrees
-        refit = ColourRefit(
-            self._rasteriser, settings, lambda: map(_level_of, self.views), NO_SMOOTHING
-        )
+        refit = ColourRefit(self._rasteriser, settings, lambda: map(_level_of, self.views))
         return replace(splats, sh=refit.of(model).sh)
 
     def _dropout(self) -> Dropout | None:

@@ -31,6 +31,7 @@ from stages.training.optimiser import (
     bias_corrections,
     empty_model,
 )
+from stages.training.step import StepInput
 from stages.training.views import Level
 
 LAG = 8  # steps after which the host reads the results of a step
@@ -109,20 +110,15 @@ class GpuStep:
             self._on_host = Model(*arrays)
         return self._on_host
 
-    def step(
-        self,
-        level: Level,
-        settings: RasterSettings,
-        rates: LearningRates,
-        smooth: bool,
-        dropout: Dropout | None = None,
-    ) -> float:
+    def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`; the loss is that of LAG steps ago."""
+        level, settings = given.level, given.settings
         with gpu_errors_explained(len(self)):
             known = id(level.means) in self._targets
             view_target = self._target(level)
             view = view_target.view(self.rasteriser, settings)
-            scene, room = self._drawn_scene(smooth, dropout), self._room if known else None
+            scene = self._drawn_scene(given.smooth, given.dropout)
+            room = self._room if known else None
             drawn = self.rasteriser.draw(scene, view, capacity=room)
             if room is None:  # the first step on this view waits for the device
                 room = len(drawn.lists.members)
@@ -133,7 +129,7 @@ class GpuStep:
             parameters, means2d = self.rasteriser.gradients(scene, view, drawn, v_image)
             if self._own is not None:
                 parameters *= self._own[:, : parameters.shape[1]]
-            self._adam(drawn, view, parameters, means2d, rates, room)
+            self._adam(drawn, view, parameters, means2d, given.rates, room)
             self._on_host = None
             self.skipped += drawn.lists.total > room
             self._arrivals.send(torch.stack([loss.double(), drawn.lists.total[0].double()]))

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from stages.base.errors import Interrupted
 from stages.measure.evaluation import EvaluationView, evaluate, evaluation_subset
 from stages.raster.backends import backend_of, rasteriser_of
-from stages.raster.definition import NO_SMOOTHING
 from stages.scene import Camera, Splats, morton
 from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.density import AdaptiveDensity, BoundedDensity
@@ -97,7 +96,7 @@ class FinalColourRefit:
             rasteriser_of(backend_of(trainer.backend).name),
             trainer.raster_settings(trainer.schedule.sh_degree),
             lambda: (view.levels[-1] for view in trainer.train),
-            model.smoothing if trainer.smooth else NO_SMOOTHING,
+            trainer.smooth,
         )
         trainer.stepper.load(refit.of(model))
 

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from stages.raster.definition import MemoryFull, RasterSettings
 from stages.scene import Camera
 from stages.training.cap import most_opaque
-from stages.training.dropout import Dropout
-from stages.training.optimiser import LearningRates, Model
-from stages.training.step import TrainingStep
-from stages.training.views import Level
+from stages.training.optimiser import Model
+from stages.training.step import StepInput, TrainingStep
 
 Made = TypeVar("Made")
 
@@ -48,16 +46,9 @@ class MemoryLimitedStep:
         """See `step.TrainingStep`."""
         return self.inner.model()
 
-    def step(
-        self,
-        level: Level,
-        settings: RasterSettings,
-        rates: LearningRates,
-        smooth: bool,
-        dropout: Dropout | None = None,
-    ) -> float:
+    def step(self, given: StepInput) -> float:
         """See `step.TrainingStep`."""
-        return self._done(lambda: self.inner.step(level, settings, rates, smooth, dropout))
+        return self._done(lambda: self.inner.step(given))
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         """See `step.TrainingStep`."""

@@ -248,6 +248,10 @@ class Model:
         """What the rasteriser takes."""
         return (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.sh)
 
+    def drawn(self, smooth: bool) -> Arrays:
+        """As `arrays`; with the widths of the smoothing filter if `smooth`."""
+        return (*self.arrays, self.smoothing) if smooth else self.arrays
+
     def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Model:
         """The rows of an index or a mask, with their moments."""
         return Model(*(np.ascontiguousarray(array[index]) for array in vars(self).values()))

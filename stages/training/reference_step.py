@@ -5,6 +5,8 @@ It is slow; the steps with kernels are tested against it.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 import torch.nn.functional as functional
@@ -17,13 +19,10 @@ from stages.raster.definition import (
     ROTATION,
     SH,
     Backward,
-    RasterSettings,
     used_columns,
 )
 from stages.scene import TRANSPARENT
 from stages.scene.light import BRIGHT, OFFSET, POWER
-from stages.training.dropout import Dropout
-from stages.training.host_step import HostStep
 from stages.training.loss import SSIM_WEIGHT
 from stages.training.optimiser import (
     BETA1,
@@ -35,6 +34,7 @@ from stages.training.optimiser import (
     Model,
     active_counts,
 )
+from stages.training.step import HostStep, StepInput
 from stages.training.target import Colour
 from stages.training.views import Level
 
@@ -45,25 +45,16 @@ _C1, _C2 = 0.01**2, 0.03**2
 class ReferenceStep(HostStep):
     """See `step.TrainingStep`."""
 
-    def step(
-        self,
-        level: Level,
-        settings: RasterSettings,
-        rates: LearningRates,
-        smooth: bool,
-        dropout: Dropout | None = None,
-    ) -> float:
-        camera, model, widths = level.camera, self._model, self.widths(smooth)
-        arrays = self.arrays(dropout)
-        forward = self.rasteriser.forward(arrays, camera, settings, widths)
+    def step(self, given: StepInput) -> float:
+        level, settings, size = given.level, given.settings, given.level.pixels.shape[:0:-1]
+        forward = self.rasteriser.forward(self.arrays(given), level.camera, settings)
         image = torch.tensor(forward.image[:3], dtype=torch.float64, requires_grad=True)
         value = reference_loss(*compared(level, image, settings.background))
-        torch.autograd.backward(camera.width * camera.height * value)
+        torch.autograd.backward(math.prod(size) * value)
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
-        backward = self.rasteriser.backward(arrays, forward, v_image, widths)
-        coefficients = (settings.sh_degree + 1) ** 2
-        adam(model, backward, coefficients, rates, camera.width, camera.height)
+        backward = self.rasteriser.backward(forward, v_image)
+        adam(self._model, backward, (settings.sh_degree + 1) ** 2, given.rates, *size)
         return float(value.detach())
 
 

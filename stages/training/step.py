@@ -1,17 +1,46 @@
-"""The interface between the trainer and a backend's training step."""
+"""A backend's training step: its interface, the choice of one, and what steps on the host share."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol, SupportsInt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.definition import Rasteriser, RasterSettings
+from stages.base.lazy import load_object
+from stages.raster.backends import backend_of
+from stages.raster.definition import Arrays, Rasteriser, RasterSettings
 from stages.scene import Camera
-from stages.training.dropout import Dropout
-from stages.training.optimiser import LearningRates, Model
+from stages.training.dropout import INVISIBLE, Dropout
+from stages.training.optimiser import LearningRates, Model, empty_model
 from stages.training.views import Level
+
+# A backend with training kernels of its own keeps parameters and moments where these are.
+_OWN_STEPS = {
+    "gpu": "stages.training.gpu_step:GpuStep",
+    "cpu": "stages.training.cpu_step:CpuStep",
+}
+_OTHER_BACKENDS = "stages.training.reference_step:ReferenceStep"
+
+
+@dataclass(frozen=True)
+class StepInput:
+    """What one step trains on.
+
+    Args:
+        level: the training view at one resolution; masks and light as in `training.views`.
+        settings: of the rasteriser; SH coefficients up to `settings.sh_degree` are trained.
+        rates: learning rates.
+        smooth: whether to render with the model's smoothing widths.
+        dropout: drops splats from this step; None for none.
+    """
+
+    level: Level
+    settings: RasterSettings
+    rates: LearningRates
+    smooth: bool = False
+    dropout: Dropout | None = None
 
 
 class TrainingStep(Protocol):
@@ -32,25 +61,52 @@ class TrainingStep(Protocol):
     def model(self) -> Model:
         """The current model, on the host; good until the next step."""
 
-    def step(
-        self,
-        level: Level,
-        settings: RasterSettings,
-        rates: LearningRates,
-        smooth: bool,
-        dropout: Dropout | None = None,
-    ) -> float:
+    def step(self, given: StepInput) -> float:
         """Forward pass, loss, backward pass and one step of Adam.
-
-        Args:
-            level: the training view at one resolution; masks and light as in `training.target`.
-            settings: of the rasteriser; SH coefficients up to `settings.sh_degree` are trained.
-            rates: learning rates.
-            smooth: whether to render with the model's smoothing widths.
-            dropout: drops splats from this step; None for none.
 
         Returns the loss before the step; a device may return that of a few steps earlier.
         """
 
     def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
         """[H, W, 3] of the current model, in an array that the caller may keep."""
+
+
+def step_of(backend: str) -> TrainingStep:
+    """A new training step of the backend `backend` or "auto". Raises ValueError for an unknown
+    name, SplatError if the hardware that it needs is absent."""
+    chosen = backend_of(backend)
+    step_class = load_object(_OWN_STEPS.get(chosen.name, _OTHER_BACKENDS))
+    step: TrainingStep = step_class(chosen.create())
+    return step
+
+
+class HostStep:
+    """A `TrainingStep` whose model is in NumPy arrays; subclasses add `step`."""
+
+    skipped = 0
+
+    def __init__(self, rasteriser: Rasteriser) -> None:
+        self.rasteriser = rasteriser
+        self._model = empty_model()
+
+    def __len__(self) -> int:
+        return len(self._model)
+
+    def load(self, model: Model) -> None:
+        self._model = model
+
+    def model(self) -> Model:
+        return self._model
+
+    def draw(self, camera: Camera, settings: RasterSettings, smooth: bool) -> NDArray[np.float32]:
+        forward = self.rasteriser.forward(self._model.drawn(smooth), camera, settings)
+        return np.ascontiguousarray(forward.image[:3].transpose(1, 2, 0))
+
+    def arrays(self, given: StepInput) -> Arrays:
+        """The model's arrays, with dropped splats made invisible."""
+        arrays = self._model.drawn(given.smooth)
+        if given.dropout is None:
+            return arrays
+        dropped = given.dropout.dropped(self._model.gradient_count)
+        logits = np.where(dropped, np.float32(INVISIBLE), self._model.opacity_logits)
+        return (*arrays[:3], logits, *arrays[4:])

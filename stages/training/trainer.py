@@ -35,8 +35,7 @@ from stages.training.hooks import step_hooks
 from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, Model
 from stages.training.schedule import Schedule
-from stages.training.step import TrainingStep
-from stages.training.steps import step_of
+from stages.training.step import StepInput, TrainingStep, step_of
 from stages.training.validation import EarlyStopping, uses_dropout
 from stages.training.views import TrainingView
 
@@ -124,7 +123,7 @@ class Trainer:
         dropout = None
         if self.dropout and not schedule.densifying(step):  # it would distort the mean gradients
             dropout = Dropout(len(self.train), schedule.dropout_key(step))
-        return self.stepper.step(level, settings, rates, self.smooth, dropout)
+        return self.stepper.step(StepInput(level, settings, rates, self.smooth, dropout))
 
     def _row(self, step: int) -> int:
         """Which training view `step` uses: no validation view while the model is densified."""

@@ -38,6 +38,7 @@ from stages.training.gpu_step import GpuStep
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.reference_step import reference_loss
+from stages.training.step import StepInput
 from stages.training.views import Level
 from tests.benchmarks.scenes import random_scene, view
 from tests.scenes import PARAMETERS, camera, cloud, exact_gradients, gradients, relative
@@ -110,7 +111,7 @@ def ours(splats: Splats, where: Camera, rounds: int) -> dict[str, float]:
     stepper, level = GpuStep(rasteriser), stripes(where)
     stepper.load(new_model(*(a.copy() for a in splat_arrays(splats))))
     rates = LearningRates().scaled(0.0, 0.0)  # so that the scene stays what it is
-    found |= _step(lambda: stepper.step(level, SETTINGS, rates, False), rounds, len(splats))
+    found |= _step(lambda: stepper.step(StepInput(level, SETTINGS, rates)), rounds, len(splats))
     moved = np.dot(STEP_BYTES, (len(splats), entries, where.width * where.height))
     found["floor_ms"] = 1e3 * float(moved) / H100_BYTES_A_SECOND
     found["floor_share"] = found["floor_ms"] / found["step_ms"]

@@ -23,7 +23,7 @@ from stages.raster.definition import RasterSettings
 from stages.scene import Camera, DrawSettings, View
 from stages.training import views as training_views
 from stages.training.optimiser import LearningRates, new_model
-from stages.training.steps import step_of
+from stages.training.step import StepInput, step_of
 from stages.training.views import load_views
 from tests.scenes import camera, cloud
 
@@ -74,9 +74,8 @@ def main() -> None:
             print(f"{len(train)} + {len(held_out)} photographs: {time.monotonic() - begun:.0f} s")
             order = np.random.default_rng(0).permutation(len(train))
             for number in order[:STEPS]:
-                stepper.step(
-                    train[number].levels[-1], RasterSettings(near=0.1), LearningRates(), False
-                )
+                level = train[number].levels[-1]
+                stepper.step(StepInput(level, RasterSettings(near=0.1), LearningRates()))
             touched = sum(int(view.levels[-1].pixels.max()) > 0 for view in train)
         print(f"{touched} photographs used; {memory.peak_mib - before:.0f} MiB beyond the splats")
 

@@ -46,7 +46,7 @@ def measure(name: str, splats: Splats, camera: Camera, yardstick: Yardstick) -> 
         rasteriser.forward(arrays, camera, settings)
 
     def both() -> None:
-        rasteriser.backward(arrays, rasteriser.forward(arrays, camera, settings), v)
+        rasteriser.backward(rasteriser.forward(arrays, camera, settings), v)
 
     drawn = rasteriser.forward(arrays, camera, settings)
     visible, intersections = len(drawn.visible), drawn.n_intersections
@@ -120,7 +120,7 @@ def equal_comparison() -> None:
         settings = RasterSettings(sh_degree=0)
 
         def both(r=rasteriser, a=arrays, c=camera, s=settings, v=v) -> None:
-            r.backward(a, r.forward(a, c, s), v)
+            r.backward(r.forward(a, c, s), v)
 
         seconds = interleaved({"both": both}, rounds_for(both))["both"]
         wanted = "" if target is None else f"{target:.0f}"

@@ -112,7 +112,7 @@ def _drawn(threads):
     rasteriser, arrays = CpuRasteriser(Pool(threads)), splat_arrays(scene)
     forward = rasteriser.forward(arrays, view, RasterSettings())
     image = forward.image.copy()
-    backward = rasteriser.backward(arrays, forward, v)
+    backward = rasteriser.backward(forward, v)
     return [image, backward.parameters.copy(), backward.means2d.copy()]
 
 

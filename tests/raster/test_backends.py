@@ -16,8 +16,8 @@ from tests.tolerances import FLOAT32_GRADIENT
 class Zeros(ReferenceRasteriser):
     """Draws, and says that nothing matters."""
 
-    def backward(self, arrays, forward, v_image, smoothing=None):
-        found = super().backward(arrays, forward, v_image)
+    def backward(self, forward, v_image):
+        found = super().backward(forward, v_image)
         none = np.zeros_like(found.parameters)
         return Backward(found.rows, none, np.zeros_like(found.means2d))
 
@@ -43,7 +43,7 @@ def test_a_backend_that_returns_zeros_is_found_out(monkeypatch: pytest.MonkeyPat
 
 def test_a_backend_takes_part_in_training_without_a_step_of_its_own(monkeypatch) -> None:
     from stages.training.reference_step import ReferenceStep
-    from stages.training.steps import step_of
+    from stages.training.step import step_of
 
     fake = Backend("another", "stages.raster.reference_rasteriser:ReferenceRasteriser", "a test")
     monkeypatch.setattr(backends, "BACKENDS", (*backends.BACKENDS, fake))

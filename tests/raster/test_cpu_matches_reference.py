@@ -81,7 +81,7 @@ def test_results_do_not_depend_on_the_number_of_threads_or_on_earlier_pictures()
         rasteriser.forward(arrays, camera(33, 17), RasterSettings())
         forward = rasteriser.forward(arrays, view, RasterSettings())
         picture = forward.image.copy()
-        results.append((picture, rasteriser.backward(arrays, forward, v).parameters.copy()))
+        results.append((picture, rasteriser.backward(forward, v).parameters.copy()))
     for picture, gradient in results[1:]:
         np.testing.assert_array_equal(picture, results[0][0])
         np.testing.assert_array_equal(gradient, results[0][1])

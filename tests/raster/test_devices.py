@@ -27,7 +27,7 @@ def drawn(scene, view) -> list[np.ndarray]:
     rasteriser, arrays = ReferenceRasteriser(), splat_arrays(scene)
     v = np.random.default_rng(1).normal(size=(3, view.height, view.width)).astype(np.float32)
     forward = rasteriser.forward(arrays, view, SETTINGS, depths=True)
-    backward = rasteriser.backward(arrays, forward, v)
+    backward = rasteriser.backward(forward, v)
     found = rasteriser.contributions(forward, v)
     return [forward.image, backward.parameters, backward.means2d, found]
 

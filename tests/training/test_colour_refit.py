@@ -35,7 +35,7 @@ def pictures_of(model: Model) -> list[Level]:
 
 
 def refitted(model: Model, levels: list[Level]) -> Model:
-    return ColourRefit(CpuRasteriser(), SETTINGS, lambda: levels, NO_WIDTHS).of(model)
+    return ColourRefit(CpuRasteriser(), SETTINGS, lambda: levels).of(model)
 
 
 def squared_error(model: Model, levels: list[Level]) -> float:

@@ -13,6 +13,7 @@ from stages.training.dropout import MAX_PROBABILITY, Dropout, noise
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.reference_step import ReferenceStep
+from stages.training.step import StepInput
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 
@@ -70,7 +71,7 @@ def test_dropped_splats_do_not_move_and_others_replace_them(step_class):
     dropout = Dropout(3, 5)
     dropped = dropout.dropped(model.gradient_count)
     assert 10 < dropped.sum() < 45
-    step.step(level, RasterSettings(sh_degree=0), LearningRates(1e-3), False, dropout)
+    step.step(StepInput(level, RasterSettings(sh_degree=0), LearningRates(1e-3), False, dropout))
     moved = (step.model().sh != before.sh).any((1, 2))
     assert not moved[dropped].any()
     assert moved[~dropped].mean() > 0.5

@@ -21,6 +21,7 @@ from stages.training.gpu_step import GpuStep, image_loss
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
 from stages.training.reference_step import ReferenceStep, reference_loss
+from stages.training.step import StepInput
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 from tests.tolerances import LOSS_GRADIENT
@@ -60,7 +61,7 @@ def test_two_steps_leave_what_the_definition_leaves(degree):
     plain.load(start())
     found = stepper()
     for _ in range(2):
-        losses = [s.step(level(), settings, RATES, smooth=False) for s in (found, plain)]
+        losses = [s.step(StepInput(level(), settings, RATES)) for s in (found, plain)]
         assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     for name, wanted in vars(plain.model()).items():
         here = getattr(found.model(), name)
@@ -78,7 +79,7 @@ def test_masks_and_light_ask_what_the_definition_asks(outside, light):
     plain, found = ReferenceStep(ReferenceRasteriser()), stepper()
     plain.load(start())
     photograph = masked(outside, light)
-    losses = [s.step(photograph, settings, RATES, smooth=False) for s in (found, plain)]
+    losses = [s.step(StepInput(photograph, settings, RATES)) for s in (found, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
     wanted = plain.model().moment1
     np.testing.assert_allclose(found.model().moment1, wanted, atol=2e-5 * np.abs(wanted).max())
@@ -111,7 +112,7 @@ def test_the_loss_and_its_gradient_are_those_of_the_definition(size):
 def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
     made = stepper(lag=2)
     for _ in range(4):
-        made.step(seen, SETTINGS, RATES, False, dropout)
+        made.step(StepInput(seen, SETTINGS, RATES, False, dropout))
     waits: Counter[str] = Counter()
 
     def counting(name, kept):
@@ -126,7 +127,7 @@ def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
     if made.device.type == "cuda":
         torch.cuda.set_sync_debug_mode("error")
     try:
-        made.step(seen, SETTINGS, RATES, False, dropout)
+        made.step(StepInput(seen, SETTINGS, RATES, False, dropout))
     finally:
         if made.device.type == "cuda":
             torch.cuda.set_sync_debug_mode("default")
@@ -138,10 +139,11 @@ def test_a_steady_step_never_waits_for_the_device(seen, dropout, monkeypatch):
 @pytest.mark.slow
 def test_a_photograph_that_is_read_anew_is_sent_once(monkeypatch):
     made, seen = stepper(), level()
-    made.step(seen, SETTINGS, RATES, smooth=False)
+    made.step(StepInput(seen, SETTINGS, RATES))
     sent = []
     monkeypatch.setattr(gpu_step, "gpu_target_of", lambda *given: sent.append(given))
-    made.step(replace(seen, pixels=seen.pixels.copy()), SETTINGS, RATES, smooth=False)
+    again = replace(seen, pixels=seen.pixels.copy())
+    made.step(StepInput(again, SETTINGS, RATES))
     assert not sent
 
 
@@ -149,15 +151,17 @@ def test_a_photograph_that_is_read_anew_is_sent_once(monkeypatch):
 def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
     made, seen = stepper(lag=1), level()
     for _ in range(2):
-        made.step(seen, SETTINGS, RATES, smooth=False)
+        made.step(StepInput(seen, SETTINGS, RATES))
     before, made._room = made.model(), 1
-    made.step(seen, SETTINGS, RATES, smooth=False)  # has no room, which arrives one step later
+    made.step(
+        StepInput(seen, SETTINGS, RATES, smooth=False)
+    )  # has no room, which arrives one step later
     for name, kept in vars(made.model()).items():
         np.testing.assert_array_equal(kept, getattr(before, name))
-    made.step(seen, SETTINGS, RATES, smooth=False)
+    made.step(StepInput(seen, SETTINGS, RATES))
     assert int(made.skipped) == 1
     assert made._room > 1
-    made.step(seen, SETTINGS, RATES, smooth=False)
+    made.step(StepInput(seen, SETTINGS, RATES))
     assert (made.model().steps > before.steps).any()
 
 
@@ -165,7 +169,7 @@ def test_lists_without_room_leave_the_model_as_it_was_and_get_room():
 def test_a_model_moves_between_backends_whole():
     """As a checkpoint of one backend that another goes on with."""
     made = stepper()
-    made.step(level(), SETTINGS, RATES, smooth=False)
+    made.step(StepInput(level(), SETTINGS, RATES))
     model = made.model()
     other = GpuStep(GpuRasteriser())
     other.load(model)
@@ -174,5 +178,5 @@ def test_a_model_moves_between_backends_whole():
         np.testing.assert_array_equal(getattr(other.model(), name), kept)
     plain = ReferenceStep(ReferenceRasteriser())
     plain.load(other.model())
-    losses = [s.step(level(), SETTINGS, RATES, smooth=False) for s in (made, plain)]
+    losses = [s.step(StepInput(level(), SETTINGS, RATES)) for s in (made, plain)]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)

@@ -21,6 +21,7 @@ from stages.training.cpu_step import CpuStep
 from stages.training.loss import channel_means
 from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, new_model
+from stages.training.step import StepInput
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 from tests.small_scene import small_scene
@@ -136,7 +137,9 @@ def test_kernels_that_run_out_of_memory_go_on_with_half(monkeypatch: pytest.Monk
     level = Level(camera(20, 15), pixels, channel_means(pixels))
     start = new_model(*(a.copy() for a in splat_arrays(cloud(12, 20, 15, degree=0))))
     made.load(start)
-    made.step(level, RasterSettings(near=0.1, sh_degree=0), LearningRates(), smooth=False)
+    made.step(
+        StepInput(level, RasterSettings(near=0.1, sh_degree=0), LearningRates(), smooth=False)
+    )
     assert reported == [6]
     kept = most_opaque(start, 6)
     assert np.abs(made.model().means - kept.means).max() < 1e-2

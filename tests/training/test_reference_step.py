@@ -13,7 +13,7 @@ from stages.scene import IGNORE, TRANSPARENT, Splats
 from stages.scene.light import Light
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, Model, new_model
-from stages.training.steps import step_of
+from stages.training.step import StepInput, step_of
 from stages.training.views import Level
 from tests.scenes import camera, cloud
 
@@ -49,7 +49,7 @@ def stepped(
     stepper = step_of(backend)
     stepper.load(new_model(*(array.copy() for array in splat_arrays(start))))
     settings = RasterSettings(near=0.1, sh_degree=degree, background=(0.9, 0.2, 0.6))
-    losses = [stepper.step(level, settings, RATES, smooth=False) for _ in range(steps)]
+    losses = [stepper.step(StepInput(level, settings, RATES)) for _ in range(steps)]
     return stepper.model(), losses
 
 
@@ -92,7 +92,7 @@ def test_coefficients_above_a_splats_own_degree_are_not_trained(backend: str) ->
     stepper = step_of(backend)
     stepper.load(model)
     for _ in range(3):
-        stepper.step(level, RasterSettings(near=0.1, sh_degree=1), RATES, smooth=False)
+        stepper.step(StepInput(level, RasterSettings(near=0.1, sh_degree=1), RATES))
     after = stepper.model().sh
     assert np.array_equal(after[poor, 1:], start.sh[poor, 1:])
     assert (after[~poor, 1:] != start.sh[~poor, 1:]).any()

@@ -15,7 +15,7 @@ from stages.scene import IGNORE, TRANSPARENT, DrawSettings, Splats
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.schedule import RESOLUTIONS, Schedule
-from stages.training.steps import step_of
+from stages.training.step import StepInput, step_of
 from stages.training.trainer import Trainer
 from stages.training.views import Level, TrainingView
 from tests.scenes import BACKENDS, camera, cloud, join, splats
@@ -33,7 +33,7 @@ def after_one_step(backend: str, picture: np.ndarray, start: Splats) -> np.ndarr
     stepper = step_of(backend)
     stepper.load(new_model(*(array.copy() for array in splat_arrays(start))))
     settings = RasterSettings(near=0.1, sh_degree=0)
-    stepper.step(level(picture, IGNORE), settings, LearningRates(), smooth=False)
+    stepper.step(StepInput(level(picture, IGNORE), settings, LearningRates()))
     return stepper.model().sh
 
 

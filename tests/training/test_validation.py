@@ -53,10 +53,11 @@ def recorded(made):
     """(row of the view, whether splats were dropped) of each step, as training goes on."""
     steps, step = [], made.stepper.step
 
-    def stepping(level, settings, rates, smooth, dropout):
-        (row,) = (k for k, v in enumerate(made.train) if any(level is one for one in v.levels))
-        steps.append((row, dropout is not None))
-        return step(level, settings, rates, smooth, dropout)
+    def stepping(given):
+        levels = enumerate(view.levels for view in made.train)
+        (row,) = (k for k, own in levels if any(given.level is one for one in own))
+        steps.append((row, given.dropout is not None))
+        return step(given)
 
     made.stepper.step = stepping
     return steps

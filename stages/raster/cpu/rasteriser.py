@@ -22,11 +22,11 @@ from stages.raster.cpu.splat_kernels import (
 from stages.raster.cpu.tile import PIXELS, DrawnTiles
 from stages.raster.definition import (
     CONTRIBUTIONS,
-    NO_SMOOTHING,
     Arrays,
     Backward,
     RasterSettings,
     gradient_columns,
+    with_smoothing,
 )
 from stages.raster.kernels.pool import Pool, default_pool
 from stages.scene import Camera
@@ -74,7 +74,8 @@ class Forward:
     """The result of a forward pass, with what the backward pass needs.
 
     image [4 or 6, H, W]: RGB, alpha, and if requested expected and median depth. visible [V] int32:
-    rows of the splats that touch the picture, ascending. places [V, 4]: row, number of slots and
+    rows of the splats that touch the picture, ascending. splats: what was drawn, with smoothing;
+    see `definition.with_smoothing`. places [V, 4]: row, number of slots and
     first slot of each visible splat; see `binning`. The arrays are buffers of the rasteriser, valid
     until its next forward pass.
     """
@@ -82,6 +83,7 @@ class Forward:
     image: NDArray[np.float32]
     visible: NDArray[np.int32]
     culled: int
+    splats: Arrays
     tiles: DrawnTiles
     places: NDArray[np.int32]
     cam: NDArray[np.float64]
@@ -100,47 +102,34 @@ class CpuRasteriser:
         self.buffers = Buffers()
 
     def forward(
-        self,
-        arrays: Arrays,
-        camera: Camera,
-        settings: RasterSettings,
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-        depths: bool = False,
+        self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> Forward:
         """See `definition.Rasteriser`."""
-        cam = camera_row(camera, settings)
+        splats, cam = with_smoothing(arrays), camera_row(camera, settings)
         degree = min(settings.sh_degree, int(arrays[4].shape[1] ** 0.5) - 1)
         width, height = camera.width, camera.height
         n, get = len(arrays[0]), self.buffers.get
         geometry = get("geometry", (n, GEOMETRY_ROW), np.float64)
         paint = get("paint", (n, 4), np.float32)
         status = get("status", (n,), np.uint8)
-        self.pool.share(
-            *(project_splats, CHUNK, cam, degree, (*arrays, smoothing), geometry, paint, status)
-        )
+        self.pool.share(project_splats, CHUNK, cam, degree, splats, geometry, paint, status)
         visible = np.flatnonzero(status == VISIBLE).astype(np.int32)
         try:
-            lists, places = self._lists(visible, arrays, geometry, paint, width, height)
+            lists, places = self._lists(visible, splats[:5], geometry, paint, width, height)
         except MemoryError as error:
             raise _lists_too_large(error, camera, arrays[2][visible]) from error
         background = np.asarray(settings.background, np.float32)
         n_tiles = len(lists[0]) - 1
         transmittance = get("light", (n_tiles, PIXELS), np.float32)
         last = get("last", (n_tiles, PIXELS), np.float32)
-        drawn = (geometry, paint, background, transmittance, last)
-        tiles = DrawnTiles(width, height, *lists, *drawn)
+        rest = (geometry, paint, background, transmittance, last)
+        tiles = DrawnTiles._make((width, height, *lists, *rest))
         image = get("image", (6 if depths else 4, height, width), np.float32)
         self.pool.share(blend.blend_tiles, tiles, depths, image)
         culled = int(np.count_nonzero(status == CULLED))
-        return Forward(image, visible, culled, tiles, places, cam, degree)
+        return Forward(image, visible, culled, splats, tiles, places, cam, degree)
 
-    def backward(
-        self,
-        arrays: Arrays,
-        forward: Forward,
-        v_image: NDArray[np.float32],
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-    ) -> Backward:
+    def backward(self, forward: Forward, v_image: NDArray[np.float32]) -> Backward:
         """See `definition.Rasteriser`."""
         n, get, tiles = len(forward.visible), self.buffers.get, forward.tiles
         (raw,) = self.buffers.carve(((forward.n_intersections, blend.SUMS), np.float32))
@@ -149,7 +138,7 @@ class CpuRasteriser:
         means2d = get("means2d", (n, 2), np.float32)
         self.pool.share(
             *(splat_gradients, CHUNK, forward.visible, forward.cam, forward.degree),
-            *((*arrays, smoothing), tiles, forward.places, raw, out, means2d),
+            *(forward.splats, tiles, forward.places, raw, out, means2d),
         )
         return Backward(forward.visible, out, means2d)
 

@@ -15,12 +15,12 @@ from stages.raster.camera_row import camera_row
 from stages.raster.definition import (
     CONTRIBUTIONS,
     LARGEST_WEIGHT,
-    NO_SMOOTHING,
     SH,
     Arrays,
     Backward,
     RasterSettings,
     gradient_columns,
+    with_smoothing,
 )
 from stages.raster.gpu import blend, gradients, lists, project
 from stages.raster.gpu.device import gpu_errors_explained, interpreted, require
@@ -113,16 +113,11 @@ class GpuRasteriser:
         self.real = real
 
     def forward(
-        self,
-        arrays: Arrays,
-        camera: Camera,
-        settings: RasterSettings,
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-        depths: bool = False,
+        self, arrays: Arrays, camera: Camera, settings: RasterSettings, depths: bool = False
     ) -> Forward:
         """See `definition.Rasteriser`."""
         with gpu_errors_explained(len(arrays[0])):
-            scene, view = self.scene(arrays, smoothing), self.view(camera, settings)
+            scene, view = self.scene(arrays), self.view(camera, settings)
             drawn = self.draw(scene, view, depths)
             status, image = drawn.status.cpu().numpy(), drawn.image.cpu().numpy()
         return Forward(
@@ -134,13 +129,7 @@ class GpuRasteriser:
             drawn,
         )
 
-    def backward(
-        self,
-        arrays: Arrays,
-        forward: Forward,
-        v_image: NDArray[np.float32],
-        smoothing: NDArray[np.float32] = NO_SMOOTHING,
-    ) -> Backward:
+    def backward(self, forward: Forward, v_image: NDArray[np.float32]) -> Backward:
         """See `definition.Rasteriser`."""
         v = torch.from_numpy(np.ascontiguousarray(v_image)).to(self.device)
         parameters, means2d = self.gradients(forward.scene, forward.view, forward.drawn, v)
@@ -163,9 +152,9 @@ class GpuRasteriser:
         found[:, LARGEST_WEIGHT] = largest.cpu().numpy()[forward.visible]
         return found
 
-    def scene(self, arrays: Arrays, smoothing: NDArray[np.float32] = NO_SMOOTHING) -> Scene:
+    def scene(self, arrays: Arrays) -> Scene:
         """Rows on the device from arrays on the host."""
-        means, quaternions, log_scales, opacity_logits, sh = arrays
+        means, quaternions, log_scales, opacity_logits, sh, smoothing = with_smoothing(arrays)
         n, coefficients = len(means), sh.shape[1]
         parts = (
             means,
