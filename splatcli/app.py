@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from inspect import Parameter
+from itertools import chain
 from typing import Annotated, Any
 
 import typer
 
 from splatcli import run_settings
+from splatcli.arguments import AS_JSON, QUIET, VERBOSE
 from splatcli.command_group import CommandGroup
 from splatcli.commands import (
     batch,
@@ -80,40 +84,47 @@ def _options(
     pass
 
 
-def _add(name: str, command: Any, example: str, **more: Any) -> None:
-    app.command(name, epilog=f"Example: {example}", **more)(guarded(command))
+def _add(name: str, command: Any, example: str, *added: Iterable[Parameter], **more: Any) -> None:
+    """Add a command with the parameters of `added` besides its own."""
+    found = with_parameters(command, chain(*added))
+    app.command(name, epilog=f"Example: {example}", **more)(guarded(found))
 
 
+_RESULT = (QUIET, AS_JSON)
+_RUN = (*_RESULT, VERBOSE)
 _add(
     "process",
-    with_parameters(process.process, run_settings.process_parameters()),
+    process.process,
     "splat process photos/ --preset preview --out run/",
+    *(run_settings.process_parameters(), _RUN),
 )
 _add(
     "batch",
-    with_parameters(batch.batch, run_settings.batch_parameters()),
+    batch.batch,
     "splat batch captures/* --out runs/",
+    *(run_settings.batch_parameters(), _RUN),
 )
 for _name in STAGE_NAMES:
     _help, _example = _STAGES[_name]
-    _command = with_parameters(process.stage_command(_name), run_settings.stage_parameters(_name))
-    _add(_name, _command, _example, help=_help)
+    _options_of = (run_settings.stage_parameters(_name), _RUN)
+    _add(_name, process.stage_command(_name), _example, *_options_of, help=_help)
 _add(
     "edit",
-    with_parameters(edit.edit, operation_parameters()),
+    edit.edit,
     "splat edit scene.ply chair.sog --crop box:-1,-1,-1,1,1,1 --decimate 50%",
+    *(operation_parameters(), _RESULT),
     cls=OrderedCommand,
 )
-_add("status", status.status, "splat status run/")
-_add("render", render.render, "splat render run/ --path orbit --out film.mp4")
+_add("status", status.status, "splat status run/", [AS_JSON])
+_add("render", render.render, "splat render run/ --path orbit --out film.mp4", _RESULT)
 _add("view", view.view, "splat view run/")
-_add("info", info.info, "splat info run/7-export/scene.ply")
-_add("tradeoff", tradeoff.tradeoff, "splat tradeoff run/")
-_add("compare", compare.compare, "splat compare run/ other-run/")
-_add("convert", convert.convert, "splat convert scene.ply scene.sog")
-_add("verify", verify.verify, "splat verify run/7-export/scene.glb")
-_add("cameras", cameras.cameras, "splat cameras run/ transforms.json")
-_add("doctor", doctor.doctor, "splat doctor")
+_add("info", info.info, "splat info run/7-export/scene.ply", [AS_JSON])
+_add("tradeoff", tradeoff.tradeoff, "splat tradeoff run/", _RESULT)
+_add("compare", compare.compare, "splat compare run/ other-run/", _RESULT)
+_add("convert", convert.convert, "splat convert scene.ply scene.sog", _RESULT)
+_add("verify", verify.verify, "splat verify run/7-export/scene.glb", _RESULT)
+_add("cameras", cameras.cameras, "splat cameras run/ transforms.json", [AS_JSON])
+_add("doctor", doctor.doctor, "splat doctor", [AS_JSON])
 
 
 def main() -> None:

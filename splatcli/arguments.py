@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from inspect import Parameter
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from splatcli.options import option
+from splatcli.options import keyword, option
 from stages.base.distribution import install_command
 from stages.base.settings import Setting
 from stages.formats import FORMATS
@@ -38,26 +39,6 @@ Out = Annotated[
         rich_help_panel="Output",
     ),
 ]
-Quiet = Annotated[
-    bool,
-    typer.Option(
-        "--quiet", "-q", help="Print only warnings and results.", rich_help_panel="Output"
-    ),
-]
-AsJson = Annotated[
-    bool,
-    typer.Option(
-        "--json", help="Print events and results as lines of JSON.", rich_help_panel="Output"
-    ),
-]
-Verbose = Annotated[
-    bool,
-    typer.Option(
-        "--verbose",
-        help="Write a log for a bug report: versions, machine, settings, warnings, tracebacks.",
-        rich_help_panel="Output",
-    ),
-]
 Cluster = Annotated[
     str | None,
     typer.Option(
@@ -85,3 +66,17 @@ Backend = Annotated[
 Device = Annotated[
     str | None, _chosen("device", DEVICES, "Torch device for --backend reference: {}.")
 ]
+
+
+def _switch(name: str, help: str, *flags: str) -> Parameter:
+    """A switch that `console.guarded` reads; see `console.Mode`."""
+    return keyword(name, bool, typer.Option(*flags, help=help, rich_help_panel="Output"), False)
+
+
+QUIET = _switch("quiet", "Print only warnings and results.", "--quiet", "-q")
+AS_JSON = _switch("as_json", "Print events and results as lines of JSON.", "--json")
+VERBOSE = _switch(
+    "verbose",
+    "Write a log for a bug report: versions, machine, settings, warnings, tracebacks.",
+    "--verbose",
+)

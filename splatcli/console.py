@@ -8,6 +8,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,22 @@ err = _Screen(stderr=True, highlight=False, soft_wrap=True)
 LOSSLESS_DB = 99.0  # the PSNR that is recorded for equal pictures
 
 
+@dataclass
+class Mode:
+    """How the command that runs prints: --quiet, and --json."""
+
+    quiet: bool = False
+    as_json: bool = False
+
+    @property
+    def has_notes(self) -> bool:
+        """Whether lines for a reader are wanted."""
+        return not self.quiet and not self.as_json
+
+
+mode = Mode()  # of this process, which runs one command
+
+
 def emit(event: str, **values: Any) -> None:
     """One line of JSON on standard output."""
     sys.stdout.write(json.dumps({"event": event, **values}) + "\n")
@@ -51,7 +68,8 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def call(**values: Any) -> None:
-        as_json = bool(values.get("as_json"))
+        mode.quiet, mode.as_json = (values.pop(name, False) for name in ("quiet", "as_json"))
+        as_json = mode.as_json
         try:
             if values.pop("verbose", False):
                 _start_log(as_json)
@@ -154,11 +172,19 @@ def warn(text: str) -> None:
     note(text, "yellow")
 
 
+def step(label: str, **counts: int) -> None:
+    """Say that a step of the command begins. counts: of an event."""
+    if mode.as_json:
+        emit("progress", label=label, **counts)
+    elif not mode.quiet:
+        note(label)
+
+
 def note_compiling() -> None:
     """Explain the delay if the kernels are not compiled yet."""
     from stages.raster.kernels import cache
 
-    if not cache.are_compiled():
+    if mode.has_notes and not cache.are_compiled():
         note("Compiling the kernels; this is done once and takes about half a minute.")
 
 

@@ -30,11 +30,11 @@ _COUNTED = ("photographs", "pairs")
 STOPPING = "Stopping at the next safe place (Ctrl-C again stops at once)."
 
 
-def listener_for(quiet: bool, as_json: bool) -> Listener:
+def listener_for(mode: console.Mode) -> Listener:
     """The listener that suits the options and the output."""
-    if as_json:
+    if mode.as_json:
         return Events()
-    if quiet:
+    if mode.quiet:
         return Quiet()
     return Bars(console.err) if console.err.is_terminal else Lines()
 
@@ -232,10 +232,11 @@ class Bars(Listener):
 
 
 @contextmanager
-def counting(what: str, total: int, quiet: bool, as_json: bool) -> Iterator[Callable[[], None]]:
+def counting(what: str, total: int) -> Iterator[Callable[[], None]]:
     """Yield a function to call after each of `total` items; shows the count, the rate and the
-    remaining time."""
-    done, last, timer = 0, time.monotonic(), _PhaseTimer()
+    remaining time. One item is not worth a count, but for machines."""
+    done, last, timer, mode = 0, time.monotonic(), _PhaseTimer(), console.mode
+    shown = mode.has_notes and total > 1
     bar = Progress(
         TextColumn(what),
         BarColumn(bar_width=24),
@@ -244,7 +245,7 @@ def counting(what: str, total: int, quiet: bool, as_json: bool) -> Iterator[Call
         TimeRemainingColumn(compact=True),
         console=console.err,
         transient=True,
-        disable=quiet or as_json or not console.err.is_terminal,
+        disable=not (shown and console.err.is_terminal),
     )
     task = bar.add_task(what, total=total)
     timer.new_phase(0, total)
@@ -254,13 +255,13 @@ def counting(what: str, total: int, quiet: bool, as_json: bool) -> Iterator[Call
         done += 1
         bar.advance(task)
         timer.new_phase(done, total)
-        every = _EVENT_EVERY_S if as_json else _LINE_EVERY_S
-        if (done < total or not as_json) and time.monotonic() - last < every:
+        every = _EVENT_EVERY_S if mode.as_json else _LINE_EVERY_S
+        if (done < total or not mode.as_json) and time.monotonic() - last < every:
             return
         last = time.monotonic()
-        if as_json:
+        if mode.as_json:
             console.emit("progress", label=what, done=done, total=total)
-        elif bar.disable and not quiet:
+        elif bar.disable and shown:
             console.note(f"{what}: {done}/{total}, {timer.text()}")
 
     with bar:

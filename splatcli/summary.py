@@ -29,16 +29,16 @@ _HEADLINES = {
 }
 
 
-def show(pipeline: Pipeline, until: str | None, *, quiet: bool, as_json: bool) -> None:
+def show(pipeline: Pipeline, until: str | None) -> None:
     """Print a table of the stages up to `until`, the exported files, and after all stages their
     warnings again."""
     reached = [stage.name for stage in pipeline.layout.up_to(until)]
     manifests = [m for m in map(pipeline.manifest, reached) if m is not None]
     assets = _assets(pipeline) if "export" in reached else []
-    if as_json:
+    if console.mode.as_json:
         console.emit("result", **_as_data(pipeline, manifests, assets))
         return
-    if quiet:
+    if console.mode.quiet:
         for path, _, _ in assets:
             console.out.print(path, markup=False)
         return

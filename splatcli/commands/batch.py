@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from splatcli import console, log, options, run_settings
-from splatcli.arguments import AsJson, Cluster, Quiet, Verbose
+from splatcli.arguments import Cluster
 from stages.distributed.batch import WAITING, BatchTable, Row, run_names, running_stage
 from stages.distributed.cluster import open_executor
 from stages.distributed.tasks import TaskResult, resources_of
@@ -37,9 +37,6 @@ def batch(
         ),
     ] = "runs",
     cluster: Cluster = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-    verbose: Verbose = False,
     **given: Any,
 ) -> None:
     """Many captures: `splat process` for each, into a run folder of its name.
@@ -61,31 +58,31 @@ def batch(
         open_executor(cluster, runs, photos.values()) as executor,
     ):
         table = BatchTable(local_folder, runs, list(photos))
-        with _live_table(table, quiet, as_json):
+        with _live_table(table):
             for number, result in executor.results(tasks, resources_of(settings["train"])):
                 table.ended(number, result)
-                _report(table.rows[number], result, quiet, as_json)
+                _report(table.rows[number], result)
         table.write()
-    _print(table, quiet, as_json)
+    _print(table)
     if table.worst_status:
         raise typer.Exit(table.worst_status)
 
 
-def _report(row: Row, result: TaskResult, quiet: bool, as_json: bool) -> None:
+def _report(row: Row, result: TaskResult) -> None:
     """Print a line, or an event, for a run that ended."""
-    if as_json:
+    if console.mode.as_json:
         console.emit("ended", **vars(row), exit_status=result.status, message=result.message)
     elif result.status:
         console.note(f"{row.capture}: {result.message} ({result.code})", "red")
-    elif not quiet and not console.err.is_terminal:
+    elif not console.mode.quiet and not console.err.is_terminal:
         seconds = console.duration(float(row.seconds or 0))
         console.note(f"{row.capture}: done in {seconds}, {_db(row)}")
 
 
 @contextmanager
-def _live_table(table: BatchTable, quiet: bool, as_json: bool) -> Iterator[None]:
+def _live_table(table: BatchTable) -> Iterator[None]:
     """On a terminal, show the running stages until all runs have ended."""
-    if quiet or as_json or not console.err.is_terminal:
+    if not (console.mode.has_notes and console.err.is_terminal):
         yield
         return
     live = Live(
@@ -110,12 +107,12 @@ def _running(table: BatchTable) -> Table:
     return drawn
 
 
-def _print(table: BatchTable, quiet: bool, as_json: bool) -> None:
+def _print(table: BatchTable) -> None:
     """The whole table, once all runs have ended."""
-    if as_json:
+    if console.mode.as_json:
         console.emit("result", folder=str(table.runs), rows=[vars(row) for row in table.rows])
         return
-    if not quiet:
+    if not console.mode.quiet:
         console.table(
             ("capture", "status", "time", "held out", "size", "splats", "warnings"),
             [

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import AsJson
 from stages.base.atomic import make_folder
 from stages.base.errors import SplatError, UsageError
 from stages.run import runfolder
@@ -27,7 +26,6 @@ def cameras(
     out: Annotated[
         Path, typer.Argument(help="A .json name for nerfstudio, or a folder for COLMAP.")
     ],
-    as_json: AsJson = False,
 ) -> None:
     """Write cameras for other programs: those of a run, of nerfstudio or of COLMAP.
 
@@ -61,11 +59,11 @@ def cameras(
         "pictures": str(pictures),
         "pictures_found": (found.folder / found.views[0].image).is_file(),
     }
-    _print(facts, as_json)
+    _print(facts)
 
 
-def _print(facts: dict[str, Any], as_json: bool) -> None:
-    if as_json:
+def _print(facts: dict[str, Any]) -> None:
+    if console.mode.as_json:
         console.emit("cameras", **facts)
         return
     points = f", {facts['points']:,} points" if facts["points"] else ""

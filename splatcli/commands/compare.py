@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from splatcli import console
-from splatcli.arguments import AsJson, Quiet
 from splatcli.folders import find_run_folder
 from stages.base.errors import UsageError
 from stages.run import results
@@ -25,8 +24,6 @@ def compare(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the report.")] = Path(
         "comparison"
     ),
-    quiet: Quiet = False,
-    as_json: AsJson = False,
 ) -> None:
     """Compare two runs: better, worse, or inconclusive.
 
@@ -47,12 +44,11 @@ def compare(
         for run, other in zip(runs, reversed(runs), strict=True)
     ]
     _check_photographs(*runs)
-    if not quiet and not as_json:
-        console.note_compiling()
+    console.note_compiling()
     comparison = compare_runs(sides[0], sides[1])
     make_folder(out)
     files = write_comparison(out, comparison)
-    if as_json:
+    if console.mode.as_json:
         change = comparison.psnr
         console.emit(
             "compared",
@@ -64,7 +60,7 @@ def compare(
             files=[str(file) for file in files],
         )
         return
-    if not quiet:
+    if not console.mode.quiet:
         console.table(("", sides[0].name, sides[1].name), fact_rows(comparison))
     for line in verdict_lines(comparison):
         console.out.print(line, markup=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import ENDINGS, AsJson, Quiet
+from splatcli.arguments import ENDINGS
 from stages.run import results
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ _STEPS = 3
 def convert(
     source: Annotated[Path, typer.Argument(help="Splat file to read; its name says the format.")],
     target: Annotated[Path, typer.Argument(help=f"Splat file to write: {ENDINGS}.")],
-    quiet: Quiet = False,
-    as_json: AsJson = False,
 ) -> None:
     """Write a splat file in another format.
 
@@ -39,7 +37,7 @@ def convert(
     rows = formats.format_of(source), formats.format_of(target)  # before any work is done
     begun = time.monotonic()
     make_folder(target.parent)
-    with _progress(quiet, as_json) as begin, scratch.scratch_in(target.parent, spare=True):
+    with _progress() as begin, scratch.scratch_in(target.parent, spare=True):
         begin(f"reading {source}")
         splats = formats.read(source)
         begin(f"writing {target}")
@@ -63,22 +61,22 @@ def convert(
         **found,
         "warnings": warnings,
     }
-    if as_json:
+    if console.mode.as_json:
         console.emit("converted", **facts)
         return
     if dropped:
         console.warn(f"Warning: {dropped} splats that no viewer can draw were left out.")
     for warning in warnings:
         console.warn(f"Warning: {warning}")
-    _show(facts, found, quiet)
+    _show(facts, found)
 
 
-def _show(facts: dict[str, Any], found: dict[str, Any], quiet: bool) -> None:
+def _show(facts: dict[str, Any], found: dict[str, Any]) -> None:
     size = f"{facts['splats']:,} splats, {console.size(facts['size_bytes'])}"
     quality = console.fidelity(found["verify_db"])
     console.note(f"{facts['target']}: {size}, {facts['bytes_per_splat']:.1f} bytes each, {quality}")
     worst = {name: found[name] for name in found if name.startswith("max_") and found[name] > 0}
-    if worst and not quiet:
+    if worst and not console.mode.quiet:
         console.note(f"Largest differences: {console.figures(worst)}", "dim")
 
 
@@ -99,18 +97,15 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
 
 
 @contextlib.contextmanager
-def _progress(quiet: bool, as_json: bool) -> Iterator[Callable[[str], None]]:
+def _progress() -> Iterator[Callable[[str], None]]:
     """Yield a function to call at the beginning of each step. It prints a line or an event; on a
     terminal it shows a bar with the progress of the step."""
     done = 0
-    if as_json or quiet or not console.err.is_terminal:
+    if not (console.mode.has_notes and console.err.is_terminal):
 
         def begin(label: str) -> None:
             nonlocal done
-            if as_json:
-                console.emit("progress", label=label, done=done, total=_STEPS)
-            elif not quiet:
-                console.note(label)
+            console.step(label, done=done, total=_STEPS)
             done += 1
 
         yield begin

@@ -13,7 +13,6 @@ from pathlib import Path
 import typer
 
 from splatcli import console
-from splatcli.arguments import AsJson
 from stages.base import threads
 from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family
@@ -39,11 +38,11 @@ class Check:
     advice: str = ""
 
 
-def doctor(as_json: AsJson = False) -> None:
+def doctor() -> None:
     """Check what this machine has, and what is missing."""
     found = list(checks())
     missing = [check for check in found if not check.ok]
-    if as_json:
+    if console.mode.as_json:
         console.emit("doctor", ok=not missing, checks=[asdict(check) for check in found])
     else:
         marks = {True: "ok", False: "MISSING"}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import ENDINGS, AsJson, Quiet
+from splatcli.arguments import ENDINGS
 from splatcli.folders import load_target
 from splatcli.operation_options import parsed_operations
 from stages.base.errors import UsageError
@@ -33,8 +33,6 @@ def edit(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the effect of the operations; write nothing.")
     ] = False,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
     **operation_options: Any,
 ) -> None:
     """Select, move, join and thin out splats: operations in the order in which they are typed.
@@ -51,20 +49,15 @@ def edit(
             hint=f"splat edit {source} edited.ply --keep 'opacity > 0.1'",
         )
     parsed = parsed_operations(ctx)
-    facts = _edit(source, target or Path("scene.ply"), parsed, dry_run, quiet, as_json)
-    if as_json:
+    facts = _edit(source, target or Path("scene.ply"), parsed, dry_run)
+    if console.mode.as_json:
         console.emit("edited", **facts)
     else:
         _show(facts)
 
 
 def _edit(
-    source: Path,
-    target: Path,
-    parsed: Sequence[ParsedOperation],
-    dry_run: bool,
-    quiet: bool,
-    as_json: bool,
+    source: Path, target: Path, parsed: Sequence[ParsedOperation], dry_run: bool
 ) -> dict[str, Any]:
     """Apply the operations and write `target`. Returns figures: splats, steps, PSNR, bytes."""
     from stages import formats
@@ -84,7 +77,7 @@ def _edit(
         steps = []
         for step in operations.apply_operations(scene, prepared):
             scene = step.scene
-            steps.append(_report(step, as_json, quiet))
+            steps.append(_report(step))
         facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
         if start_db is not None:
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
@@ -140,7 +133,7 @@ def _db(scene: EditedScene) -> float | None:
     return None if found is None else round(found, 3)
 
 
-def _report(step: AppliedOperation, as_json: bool, quiet: bool) -> dict[str, Any]:
+def _report(step: AppliedOperation) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "operation": str(step.parsed),
         "splats_before": step.before,
@@ -149,9 +142,9 @@ def _report(step: AppliedOperation, as_json: bool, quiet: bool) -> dict[str, Any
     psnr = _db(step.scene)
     if psnr is not None:
         facts["psnr_db"] = psnr
-    if as_json:
+    if console.mode.as_json:
         console.emit("operation", **facts)
-    elif not quiet:
+    elif not console.mode.quiet:
         cost = f", {console.figure('psnr_db', psnr)}" if psnr is not None else ""
         console.note(f"{step.parsed}: {step.before:,} -> {step.after:,} splats{cost}")
     return facts

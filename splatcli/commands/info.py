@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import AsJson, RunOrFile
+from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from stages.raster.backends import backend_of
 from stages.run import results
@@ -35,7 +35,6 @@ def info(
     speed: Annotated[
         bool, typer.Option("--speed", help="Draw some pictures too: frames a second, here.")
     ] = False,
-    as_json: AsJson = False,
 ) -> None:
     """Print statistics of a file or a run: splats, SH degrees, bounds, bytes, and warnings."""
     from stages.base import scratch
@@ -52,7 +51,7 @@ def info(
     if speed and statistics.count:
         facts |= _speed(splats, pipeline or results.run_around(target))
     warnings = warnings_of(statistics)
-    if as_json:
+    if console.mode.as_json:
         console.emit("info", **facts, warnings=dict(warnings))
         return
     rows = [(console.label(name), _text(name, value)) for name, value in facts.items()]

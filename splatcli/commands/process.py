@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatcli import console, log, options, progress, run_settings, summary
-from splatcli.arguments import AsJson, Cluster, Out, Photos, Quiet, Run, Verbose
+from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES
 from stages.base.errors import UsageError
@@ -26,9 +26,6 @@ def process(
     *,
     out: Out = None,
     cluster: Cluster = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-    verbose: Verbose = False,
     **given: Any,
 ) -> None:
     """Photographs in, assets out: all seven stages.
@@ -43,35 +40,20 @@ def process(
     settings = run_settings.combined(base, given, preset)
     if "cameras" in given:
         _check_cameras(given["cameras"])
-    if photos is None and not (quiet or as_json):
+    if photos is None and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
-    _run(pipeline, settings, quiet=quiet, as_json=as_json, view=view)
+    _run(pipeline, settings, view=view)
 
 
 def stage_command(name: str) -> Callable[..., None]:
     """The command that runs the stage `name`."""
 
-    def ingest(
-        photos: Photos = None,
-        *,
-        out: Out = None,
-        quiet: Quiet = False,
-        as_json: AsJson = False,
-        verbose: Verbose = False,
-        **given: Any,
-    ) -> None:
+    def ingest(photos: Photos = None, *, out: Out = None, **given: Any) -> None:
         pipeline = Pipeline(*_run_folder_and_photos(photos, out))
-        _run_stage("ingest", pipeline, given, quiet, as_json)
+        _run_stage("ingest", pipeline, given)
 
-    def later(
-        run: Run = None,
-        *,
-        quiet: Quiet = False,
-        as_json: AsJson = False,
-        verbose: Verbose = False,
-        **given: Any,
-    ) -> None:
-        _run_stage(name, Pipeline(find_run_folder(run)), given, quiet, as_json)
+    def later(run: Run = None, **given: Any) -> None:
+        _run_stage(name, Pipeline(find_run_folder(run)), given)
 
     return ingest if name == "ingest" else later
 
@@ -103,9 +85,7 @@ def _check_cameras(path: Path) -> None:
     read_cameras(path)
 
 
-def _run_stage(
-    name: str, pipeline: Pipeline, given: Mapping[str, Any], quiet: bool, as_json: bool
-) -> None:
+def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
     """One stage, with the recorded settings and the given options. The stages after training take
     little time: those that are missing in between run too."""
     is_known = runfolder.is_run_folder(pipeline.run_folder)
@@ -124,7 +104,7 @@ def _run_stage(
         settings["quantise"] = options.changed(base["quantise"], changes)
     if not is_known:
         settings = {**base, **settings}
-    if name == "train" and not (quiet or as_json):
+    if name == "train" and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     after_training = STAGE_NAMES[STAGE_NAMES.index("train") + 1 :]
     _run(
@@ -132,8 +112,6 @@ def _run_stage(
         settings,
         until=name,
         may_run=after_training if name in after_training else (name,),
-        quiet=quiet,
-        as_json=as_json,
         view=view,
     )
 
@@ -164,8 +142,6 @@ def _run(
     *,
     until: str | None = None,
     may_run: Collection[str] | None = None,
-    quiet: bool = False,
-    as_json: bool = False,
     view: bool = False,
 ) -> None:
     """Run the pipeline and print the result. view: show the training on a page, too."""
@@ -176,21 +152,21 @@ def _run(
             f"run.json of {pipeline.run_folder} is missing or damaged. It is rebuilt from the "
             "folders of the stages; settings of stages that never began are the defaults."
         )
-    listeners: list[Listener] = [log.LogListener(), progress.listener_for(quiet, as_json)]
+    listeners: list[Listener] = [log.LogListener(), progress.listener_for(console.mode)]
     if until is None:
         listeners.insert(0, PrecompileListener(settings["train"].backend))
     if view:
-        listeners.insert(0, _live_training(pipeline, as_json))
+        listeners.insert(0, _live_training(pipeline))
     pipeline.run(settings, until=until, may_run=may_run, listener=Listeners(*listeners))
-    summary.show(pipeline, until, quiet=quiet, as_json=as_json)
+    summary.show(pipeline, until)
 
 
-def _live_training(pipeline: Pipeline, as_json: bool) -> Listener:
+def _live_training(pipeline: Pipeline) -> Listener:
     from stages.viewer.live_training import LiveTraining
     from stages.viewer.server import open_in_browser
 
     def announce(address: str) -> None:
-        if as_json:
+        if console.mode.as_json:
             console.emit("view", address=address)
         else:
             console.note(f"Watch the training at {address}", "bold")

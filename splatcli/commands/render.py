@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import AsJson, Backend, Device, Quiet, RunOrFile
+from splatcli.arguments import Backend, Device, RunOrFile
 from splatcli.folders import load_target
 from splatcli.options import number
 from splatcli.progress import counting
@@ -110,8 +110,6 @@ def render(
     ] = False,
     backend: Backend = None,
     device: Device = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
 ) -> None:
     """Draw the splats: from a photograph's camera, or as a film along a path.
 
@@ -120,23 +118,17 @@ def render(
     """
     options = _Options(out, camera, path, frames, seconds, fps, width, depth)
     kind = options.kind()
-    facts = _render(target, options, kind, backend, device, quiet, as_json)
-    if kind == "folder" and not quiet:
+    facts = _render(target, options, kind, backend, device)
+    if kind == "folder" and not console.mode.quiet:
         _warn_of_other_frames(out, facts["frames"])
-    if as_json:
+    if console.mode.as_json:
         console.emit("rendered", out=str(out), kind=kind, **facts)
     else:
         _print(out, kind, facts)
 
 
 def _render(
-    target: Path | None,
-    options: _Options,
-    kind: str,
-    backend: str | None,
-    device: str | None,
-    quiet: bool,
-    as_json: bool,
+    target: Path | None, options: _Options, kind: str, backend: str | None, device: str | None
 ) -> dict[str, Any]:
     """Draw and write the pictures. Returns figures: frames, size, depth range, times."""
     from stages.raster.backends import AUTO, qualified_name
@@ -156,8 +148,7 @@ def _render(
     )
     draw = renderer(splats, backend=backend)
     sink, facts = _sink(options, kind, draw, cameras)
-    with_bar = not quiet and (len(cameras) > 1 or as_json)
-    rate = _draw_all(draw, cameras, sink, not with_bar, as_json)
+    rate = _draw_all(draw, cameras, sink)
     facts |= {"frames": len(cameras), "width": cameras[0].width, "height": cameras[0].height}
     if rate is not None:
         facts["frames_a_second"] = round(rate, 2)
@@ -221,13 +212,11 @@ def _draw_all(
     draw: Callable[[Camera], Rendering],
     cameras: list[Camera],
     sink: AbstractContextManager[Callable[[Rendering], None]],
-    quiet: bool,
-    as_json: bool,
 ) -> float | None:
     """Draw and write all frames. Returns frames a second without the writing, from the second frame
     on, because the first also compiles kernels and makes buffers; None for a single frame."""
     seconds = []
-    with counting("frames", len(cameras), quiet, as_json) as tick, sink as put:
+    with counting("frames", len(cameras)) as tick, sink as put:
         for camera in cameras:
             begun = time.perf_counter()
             drawn = draw(camera)

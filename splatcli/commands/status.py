@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from splatcli import console, summary
-from splatcli.arguments import AsJson, Run
+from splatcli.arguments import Run
 from splatcli.folders import find_run_folder
 from stages.run.pipeline import Pipeline, Step
 
@@ -17,20 +17,19 @@ def status(
     verify: Annotated[
         bool, typer.Option("--verify", help="Read all files of finished stages: damage is named.")
     ] = False,
-    as_json: AsJson = False,
 ) -> None:
     """Say what is finished, what would run again, and why."""
     pipeline = Pipeline(find_run_folder(run))
     steps, busy = pipeline.status(), pipeline.busy()
-    _print(pipeline, steps, busy, as_json)
+    _print(pipeline, steps, busy)
     if verify:
         pipeline.check_outputs()
-        if not as_json:
+        if not console.mode.as_json:
             console.note("All files of finished stages are as they were written.")
 
 
-def _print(pipeline: Pipeline, steps: list[Step], busy: int | None, as_json: bool) -> None:
-    if as_json:
+def _print(pipeline: Pipeline, steps: list[Step], busy: int | None) -> None:
+    if console.mode.as_json:
         rows = [
             {
                 "stage": s.stage.name,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from splatcli import console
-from splatcli.arguments import AsJson, Quiet, Run
+from splatcli.arguments import Run
 from splatcli.folders import find_run_folder
 from stages.base.errors import UsageError
 from stages.run import results
@@ -24,8 +24,6 @@ def tradeoff(
         Path | None,
         typer.Option("--out", "-o", help="Folder for the report.", show_default="RUN/tradeoff"),
     ] = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
 ) -> None:
     """Measure quality against time, bytes and number of splats: a report with plots.
 
@@ -41,23 +39,15 @@ def tradeoff(
     inputs = _inputs(pipeline)
     folder = out or pipeline.run_folder / "tradeoff"
     make_folder(folder)
-    if not quiet:
-        console.note_compiling()
-
-    def report_step(label: str) -> None:
-        if as_json:
-            console.emit("progress", label=label)
-        elif not quiet:
-            console.note(label)
-
-    found = measure_tradeoff(inputs, report_step)
+    console.note_compiling()
+    found = measure_tradeoff(inputs, console.step)
     files = write_report(folder, pipeline.run_folder.absolute().name, found, inputs)
-    if as_json:
+    if console.mode.as_json:
         console.emit(
             "tradeoff", folder=str(folder), files=[str(f) for f in files], summary=summarise(found)
         )
         return
-    if not quiet:
+    if not console.mode.quiet:
         for title, lines in summarise(found).items():
             for number, line in enumerate(lines):
                 console.out.print(f"{title if not number else '':<12} {line}", markup=False)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from splatcli import console
-from splatcli.arguments import AsJson, Quiet
 from splatcli.folders import find_run_folder
 from stages.base.errors import QualityError, UsageError
 from stages.run import results, runfolder
@@ -72,8 +71,6 @@ def verify(
             help="Run folder or splat file that it must equal; by default the run around it."
         ),
     ] = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
 ) -> None:
     """Verify a file: read it with a second parser, draw it, compare it with what was trained.
 
@@ -86,12 +83,10 @@ def verify(
     files = _files(target)
     for file in files:
         formats.format_of(file)  # raises before any work is done
-    quiet = quiet or as_json
-    if not quiet:
-        console.note_compiling()
+    console.note_compiling()
     original, prover_of, found = None, None, []
     for number, file in enumerate(files):
-        _report_step(f"verifying {file}", number, len(files), quiet, as_json)
+        console.step(f"verifying {file}", done=number, total=len(files))
         # Our own reader first: it reports damage that makes other parsers crash.
         read = formats.read(file)
         if original is None or prover_of is None:
@@ -109,11 +104,11 @@ def verify(
             if not proof.fault:
                 break
         found.append((file, proof))
-        if as_json:
+        if console.mode.as_json:
             console.emit("verified", **_facts(file, proof, original))
     assert original is not None
-    if not as_json:
-        _print(found, original, quiet)
+    if not console.mode.as_json:
+        _print(found, original)
     _raise_if_wrong(found, original)
 
 
@@ -161,13 +156,6 @@ def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     return _Original(splats, views, name, backend=backend, quantised=quantised)
 
 
-def _report_step(label: str, done: int, total: int, quiet: bool, as_json: bool) -> None:
-    if as_json:
-        console.emit("progress", label=label, done=done, total=total)
-    elif not quiet:
-        console.note(label)
-
-
 def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
     from stages.formats import format_of
 
@@ -186,9 +174,9 @@ def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:
     }
 
 
-def _print(found: list[tuple[Path, Proof]], original: _Original, quiet: bool) -> None:
+def _print(found: list[tuple[Path, Proof]], original: _Original) -> None:
     facts = [_facts(file, proof, original) for file, proof in found]
-    if quiet:
+    if console.mode.quiet:
         for each in facts:
             what = each["fault"] or console.fidelity(each["verify_db"])
             console.out.print(f"{each['file']}: {what}", markup=False)
