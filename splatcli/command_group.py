@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -48,34 +47,9 @@ class CommandGroup(TyperGroup):
 
 def _as_splat_error(error: Any) -> SplatError:
     command = error.ctx.command_path if error.ctx is not None else "splat"
-    hint = f"`{command} --help` lists what there is."
-    kind = type(error).__name__
-    if kind == "NoSuchOption":
-        given = f"{command} has no option {error.option_name}."
-        if error.possibilities:
-            hint = f"Did you mean {' or '.join(error.possibilities)}? {hint}"
-    elif kind == "BadOptionUsage":
-        given = f"{error.option_name} needs a value."
-    elif kind == "MissingParameter":
-        given = f"{command} needs a {error.param.name}, and none is named."
-    else:
-        given, hint = _reworded(command, error.format_message(), hint)
     return UsageError(
         "command-line",
-        given=given,
+        given=f"{command}: {error.format_message().rstrip('.')}.",
         wanted="A command with the options and arguments that it knows.",
-        hint=hint,
+        hint=f"`{command} --help` lists what there is; put quotes around a path with spaces.",
     )
-
-
-def _reworded(command: str, message: str, hint: str) -> tuple[str, str]:
-    """(given, hint) for a parser's message; the message itself if it is not a known one."""
-    if found := re.fullmatch(r"No such command '(.+?)'\.(?: Did you mean (.+)\?)?", message):
-        likely = f"Did you mean {found[2].replace(chr(39), '')}? " if found[2] else ""
-        return f"{command} has no command {found[1]}.", likely + hint
-    if found := re.fullmatch(r"Got unexpected extra argument(?:s|\(s\))? \((.+)\)", message):
-        return (
-            f"{command} does not accept {found[1]}.",
-            f"Put quotes around a path with spaces, and give each option all of its values. {hint}",
-        )
-    return message, hint

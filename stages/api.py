@@ -38,7 +38,7 @@ class Scene:
     def draw(self, camera: Camera) -> NDArray[np.uint8]:
         """sRGB picture [H, W, 3] from a camera in the world of `reconstruction`."""
         from stages.raster.draw import render
-        from stages.viewer.image_files import eight_bits
+        from stages.viewer.sinks import eight_bits
 
         return eight_bits(render(self.splats, camera, backend=self.backend).image)
 

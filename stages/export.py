@@ -141,8 +141,8 @@ def _write_meshes(
     if not rows:
         return []
     from stages.scene import ExportedFile
-    from stages.surface.checks import write_checked
     from stages.surface.collision_mesh import make_collision_mesh
+    from stages.surface.files import write_checked
 
     made = make_collision_mesh(
         splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report

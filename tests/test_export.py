@@ -18,7 +18,7 @@ from stages.formats import FORMATS
 from stages.proof import checks
 from stages.proof.content import FileContent
 from stages.scene import ExportedAssets, QuantisedSplats, Splats
-from stages.surface import fuse, ply
+from stages.surface import files, fuse
 from tests.small_scene import SmallScene, small_scene
 
 
@@ -247,7 +247,7 @@ def test_a_wrong_mesh_does_not_pass(
     scene: SmallScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fuse, "VOXELS", 48**3)
-    monkeypatch.setattr(ply, "write", lambda path, mesh, units: path.write_bytes(b"ply\n"))
+    monkeypatch.setattr(files, "write_ply", lambda path, mesh, units: path.write_bytes(b"ply\n"))
     with pytest.raises(SplatError, match=r"scene\.mesh\.ply came out wrong") as caught:
         exported(scene, tmp_path, formats=("mesh.ply",))
     assert (caught.value.code, caught.value.family) == ("export-verify-failed", Family.QUALITY)

@@ -2,7 +2,7 @@
 
 This table lists what `stages.formats` itself reads and writes. How a file is checked by a parser
 that did not write it is listed in `stages.proof.checks`; the formats of meshes are listed in
-`stages.surface.checks`. Both know their formats by the same endings.
+`stages.surface.files`. Both know their formats by the same endings.
 """
 
 from __future__ import annotations

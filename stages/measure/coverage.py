@@ -122,12 +122,8 @@ def weighted_quantile(
     points: NDArray[np.float64], weights: NDArray[np.floating], share: float
 ) -> NDArray[np.float64]:
     """[3] for each coordinate."""
-    found = []
-    for column in points.T:
-        order = np.argsort(column)
-        running = np.cumsum(weights[order], dtype=np.float64)
-        found.append(column[order[np.searchsorted(running, share * running[-1])]])
-    return np.array(found)
+    found = np.quantile(points, share, axis=0, weights=weights, method="inverted_cdf")
+    return np.asarray(found)
 
 
 def _normalised(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """The table of mesh formats: one row for each. Reading it imports nothing.
 
-To add a format, write `write(path, mesh, units)` in a module here and an independent reader in
+To add a format, put a function (path, mesh, units) that writes it and an independent reader into
 `files`, name both in a row of `MESHES`, and extend the pattern of mesh names in
 `stages.formats.table`.
 """
@@ -31,6 +31,8 @@ class MeshFormat:
     keeps: str = "no splats: triangles for collision"
 
 
-_GLB = MeshFormat("mesh.glb", "stages.surface.gltf:write", "stages.surface.checks:read_glb", True)
-_PLY = MeshFormat("mesh.ply", "stages.surface.ply:write", "stages.surface.checks:read_ply")
+_GLB = MeshFormat(
+    "mesh.glb", "stages.surface.files:write_glb_mesh", "stages.surface.files:read_glb", True
+)
+_PLY = MeshFormat("mesh.ply", "stages.surface.files:write_ply", "stages.surface.files:read_ply")
 MESHES = {row.ending: row for row in (_GLB, _PLY)}

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from stages.raster.definition import SH, Rasteriser, RasterSettings, used_columns
 from stages.training.optimiser import Model
-from stages.training.target import ignore_masked, target_of
-from stages.training.views import Level
+from stages.training.views import Level, ignore_masked, target_of
 
 DAMPING = 1.0  # pixels; a splat that covers so many takes half of its step
 # With more views each adds little, and each costs as much as two training steps.

@@ -8,7 +8,7 @@ from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.training.loss import image_loss
 from stages.training.optimiser import apply_gradients
 from stages.training.step import HostStep, StepInput
-from stages.training.target import ignore_masked, target_of
+from stages.training.views import ignore_masked, target_of
 
 
 class CpuStep(HostStep):

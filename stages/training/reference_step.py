@@ -35,8 +35,7 @@ from stages.training.optimiser import (
     active_counts,
 )
 from stages.training.step import HostStep, StepInput
-from stages.training.target import Colour
-from stages.training.views import Level
+from stages.training.views import Colour, Level
 
 _RADIUS, _SIGMA = 5, 1.5  # of SSIM's window
 _C1, _C2 = 0.01**2, 0.03**2
@@ -59,7 +58,7 @@ class ReferenceStep(HostStep):
 
 
 def compared(level: Level, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
-    """(render, target) that the loss compares; see `training.target`."""
+    """(render, target) that the loss compares; see `training.views`."""
     target = torch.tensor(level.pixels, dtype=torch.float64) / 255
     drawn, inside = image.detach(), torch.ones_like(target[0])
     if level.mask is not None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from stages.measure.image_metrics import psnr
 from stages.training.schedule import Schedule
-from stages.training.target import target_of
+from stages.training.views import target_of
 
 if TYPE_CHECKING:
     from stages.training.trainer import Trainer

@@ -1,4 +1,11 @@
-"""The training views, at every resolution of the schedule."""
+"""The training views at every resolution of the schedule, and the image that a render of one is
+compared with, where the view is masked or its light is corrected:
+
+- Cut-out views: the photograph over the background of the render.
+- Views with an ignored region: there the target equals the render, so it has no gradient.
+- Corrected light: the photograph in the median exposure and white balance. A channel that was
+  overexposed has a target of at least its corrected value, and a brighter render is no error.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +19,12 @@ from numpy.typing import NDArray
 
 from stages.measure.evaluation import load_evaluation_view
 from stages.photos.album import Album
-from stages.scene import Camera, View
-from stages.scene.light import Light
+from stages.scene import IGNORE, TRANSPARENT, Camera, View
+from stages.scene.light import BRIGHT, Light, gains_and_offsets
 from stages.training.loss import channel_means
 from stages.training.schedule import RESOLUTIONS
+
+Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -26,7 +35,7 @@ class Level:
         camera: of that size.
         pixels: [3, H, W].
         means: [3] the mean of each channel, in 0..1.
-        mask: [H, W], as in `scene.Photo`; None if all pixels count. See `training.target`.
+        mask: [H, W], as in `scene.Photo`; None if all pixels count. See `training.views`.
         outside: what the mask means, as in `scene.Photo`.
         light: exposure and white balance to correct; None for none.
     """
@@ -126,3 +135,29 @@ def load_views(
                 levels.add(Level.from_pixels(camera, photograph.pixels, *masked, kept_light))
             loaded.append(TrainingView(view.name, levels))
     return loaded
+
+
+def target_of(
+    level: Level, image: NDArray[np.float32], background: Colour
+) -> NDArray[np.uint8] | NDArray[np.float32]:
+    """[3, H, W] the target for `image` [>= 3, H, W], which was rendered over `background`: the
+    photograph's bytes where nothing has to be done, else float32, mostly in 0..1."""
+    if level.plain:
+        return level.pixels
+    pixels = level.pixels * np.float32(1 / 255)
+    cut_out = level.mask if level.outside == TRANSPARENT else None
+    solid = np.float32(1) if cut_out is None else cut_out * np.float32(1 / 255)
+    if level.light is not None:
+        gains, offsets = (row[:, None, None] for row in gains_and_offsets(level.light))
+        overexposed = pixels >= BRIGHT
+        pixels = (pixels - offsets * solid) / gains
+        pixels = np.where(overexposed, np.maximum(pixels, image[:3]), pixels)
+    if cut_out is not None:
+        return pixels + (1 - solid) * np.array(background, np.float32)[:, None, None]
+    return pixels if level.mask is None else np.where(level.mask > 0, pixels, image[:3])
+
+
+def ignore_masked(level: Level, v_image: NDArray[np.float32]) -> None:
+    """Set the gradient [3, H, W] to 0 in the view's ignored region."""
+    if level.mask is not None and level.outside == IGNORE:
+        v_image[:, level.mask == 0] = 0.0

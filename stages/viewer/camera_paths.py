@@ -63,8 +63,7 @@ def smoothed(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
     reach = min(int(np.ceil(3 * frames)), len(keys) - 1)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
     # Point reflection at the ends keeps them in place.
-    before, after = 2 * keys[0] - keys[reach:0:-1], 2 * keys[-1] - keys[-2 : -2 - reach : -1]
-    padded = np.vstack([before, keys, after])
+    padded = np.pad(keys, ((reach, reach), (0, 0)), "reflect", reflect_type="odd")
     rows = [np.convolve(column, weights / weights.sum(), "valid") for column in padded.T]
     steady = zip(cameras, np.stack(rows, axis=1), strict=True)
     return tuple(_posed(camera, pose) for camera, pose in steady)
@@ -122,20 +121,16 @@ def _lengths(a: NDArray[np.float64], b: NDArray[np.float64], reach: float) -> ND
 def _spline(keys: NDArray[np.float64], spans: NDArray[np.float64]) -> NDArray[np.float64]:
     """[M, 7] dense samples of the Catmull-Rom spline through keys [K, 7] with knots `spans` [K - 1]
     apart, quaternions of length 1."""
+    from scipy.interpolate import CubicHermiteSpline
+
     slopes = np.diff(keys, axis=0) / spans[:, None]
     tangents = np.concatenate([slopes[:1], np.empty_like(keys[1:-1]), slopes[-1:]])
     both = (keys[2:] - keys[:-2]) / (spans[:-1] + spans[1:])[:, None]
     tangents[1:-1] = slopes[:-1] - both + slopes[1:]
-    s = np.linspace(0.0, 1.0, _SAMPLES, endpoint=False)[:, None, None]
-    start, end = keys[:-1], keys[1:]
-    out, into = tangents[:-1] * spans[:, None], tangents[1:] * spans[:, None]
-    stretches = (
-        (1 + 2 * s) * (1 - s) ** 2 * start
-        + s * (1 - s) ** 2 * out
-        + s**2 * (3 - 2 * s) * end
-        + s**2 * (s - 1) * into
-    )
-    curve = np.vstack([stretches.transpose(1, 0, 2).reshape(-1, 7), keys[-1:]])
+    ends = np.concatenate([[0.0], np.cumsum(spans)])
+    shares = np.linspace(0.0, 1.0, _SAMPLES, endpoint=False)
+    at = np.append((ends[:-1, None] + spans[:, None] * shares).ravel(), ends[-1])
+    curve: NDArray[np.float64] = CubicHermiteSpline(ends, keys, tangents)(at)
     curve[:, 3:] /= np.linalg.norm(curve[:, 3:], axis=1, keepdims=True)
     return curve
 

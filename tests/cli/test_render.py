@@ -18,7 +18,7 @@ from stages.cameras import nerfstudio
 from stages.raster.draw import render
 from stages.run import results
 from stages.scene import Camera, View, look_at
-from stages.viewer.image_files import eight_bits
+from stages.viewer.sinks import eight_bits
 from tests import processes, scenes
 from tests.processes import line_of, running
 from tests.tolerances import FILM_LEVELS

@@ -15,7 +15,7 @@ from pygltflib import GLTF2
 from stages import formats
 from stages.base.errors import SplatError
 from stages.base.lazy import load_object
-from stages.surface.checks import fault_of
+from stages.surface.files import fault_of
 from stages.surface.mesh import Mesh
 from stages.surface.table import MESHES
 

@@ -7,7 +7,7 @@ import torch
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import RasterSettings, splat_arrays
 from stages.scene import rgb_to_dc
-from stages.training import gpu_dropout
+from stages.training import gpu_step
 from stages.training.cpu_step import CpuStep
 from stages.training.dropout import MAX_PROBABILITY, Dropout, noise
 from stages.training.loss import channel_means
@@ -52,9 +52,9 @@ def test_a_device_drops_the_same_splats():
     seen = np.random.default_rng(2).integers(0, 40, 5000).astype(np.int32)
     for key in (0, 1, 0xFFFFFFFF):
         wanted = Dropout(VIEWS, key).dropped(seen)
-        found = gpu_dropout.dropped(Dropout(VIEWS, key), torch.tensor(seen))
+        found = gpu_step.dropped(Dropout(VIEWS, key), torch.tensor(seen))
         np.testing.assert_array_equal(found.numpy(), wanted)
-    assert len(gpu_dropout.dropped(Dropout(VIEWS, 1), torch.zeros(0, dtype=torch.int32))) == 0
+    assert len(gpu_step.dropped(Dropout(VIEWS, 1), torch.zeros(0, dtype=torch.int32))) == 0
 
 
 @pytest.mark.parametrize("step_class", [CpuStep, ReferenceStep])

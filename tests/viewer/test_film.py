@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from stages.base.errors import SplatError
-from stages.viewer.image_files import (
+from stages.viewer.sinks import (
     depth_colours,
     depth_range,
     eight_bits,
+    film,
     save_depth,
     save_picture,
 )
-from stages.viewer.sinks import film
 from tests.tolerances import FILM_LEVELS
 
 COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128), (200, 100, 50), (10, 200, 150)]
