@@ -21,8 +21,8 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     Georeference,
+    cameras_of,
     content_of,
-    make_views,
     poses_of,
     stored_size,
 )
@@ -36,7 +36,7 @@ _CENTRE = 0.5  # ARKit counts pixels from the centre of the first one, we from i
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # ahead stands for north
 _SESSION = Georeference(1.0, _UP, "ARKit's tracking")
 
-Optics = tuple[list[float], NDArray[np.float64]]  # w, h, fx, fy, cx, cy; [3, 4] camera to world
+Posed = tuple[list[float], NDArray[np.float64]]  # w, h, fx, fy, cx, cy; [3, 4] camera to world
 
 
 def locate(path: Path) -> Path | None:
@@ -60,23 +60,22 @@ def read(path: Path) -> CameraFile:
     pictures = path.parent / images if images else path
     found = {file: _picture(pictures, file.stem) for file in files}
     with_picture = [file for file in files if found[file] is not None] or files
-    optics = []
+    posed = []
     for file in with_picture:
         with reading(file, CAMERAS):
             frame = json.loads(content_of(file).decode("utf-8-sig"))
             if not isinstance(frame, dict):
                 raise BadFileError("it is not an object")
-            parse: Callable[..., Optics] = _polycam if images else _scanner_app
-            optics.append(parse(frame, found[file]))
+            parse: Callable[..., Posed] = _polycam if images else _scanner_app
+            posed.append(parse(frame, found[file]))
     with reading(with_picture[0], CAMERAS):
         names = [getattr(found[file], "name", file.stem) for file in with_picture]
-        numbers = np.array([values for values, _ in optics], np.float64)
-        to_world = np.array([pose for _, pose in optics])
+        to_world = np.array([pose for _, pose in posed])
         with np.errstate(all="ignore"):  # `make_views` checks the result
             rotations = OPENGL_FROM_OURS @ to_world[:, :, :3].transpose(0, 2, 1)
         poses = poses_of(rotations, to_world[:, :, 3])
-        views = make_views(names, numbers[:, :2], numbers[:, 2:], poses)
-        return CameraFile(views, pictures, (PINHOLE,) * len(views), _SESSION)
+        views, lenses = cameras_of(names, [(values, PINHOLE) for values, _ in posed], poses)
+        return CameraFile(views, pictures, lenses, _SESSION)
 
 
 def _picture(folder: Path, stem: str) -> Path | None:
@@ -84,7 +83,7 @@ def _picture(folder: Path, stem: str) -> Path | None:
     return next((path for path in near if path.is_file()), None)
 
 
-def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Optics:
+def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Posed:
     intrinsics = np.array(_required(frame, "intrinsics"), np.float64)
     pose = np.array(_required(frame, "cameraPoseARFrame"), np.float64)
     if intrinsics.size != 9 or pose.size != 16:
@@ -96,7 +95,7 @@ def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Optics:
     return [*map(float, stored_size(picture)), fx, fy, *centre], pose.reshape(4, 4)[:3]
 
 
-def _polycam(frame: dict[str, Any], _: Path | None) -> Optics:
+def _polycam(frame: dict[str, Any], _: Path | None) -> Posed:
     names = ("width", "height", "fx", "fy", "cx", "cy")
     pose = [[float(_required(frame, f"t_{i}{j}")) for j in range(4)] for i in range(3)]
     return [float(_required(frame, name)) for name in names], np.array(pose)

@@ -45,6 +45,7 @@ class Georeference:
 
 
 NO_GEOREFERENCE = Georeference()
+Optics = tuple[Sequence[float], Lens]  # (width, height, fx, fy, cx, cy, pixels), the distortion
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,15 @@ def make_views(
         View(name, name, Camera(int(size[0]), int(size[1]), *lens.tolist(), matrix))  # type: ignore[call-arg]
         for name, size, lens, matrix in zip(names, sizes, intrinsics, matrices, strict=True)
     )
+
+
+def cameras_of(
+    names: Sequence[str], optics: Sequence[Optics], world_to_camera: NDArray[np.float64]
+) -> tuple[tuple[View, ...], tuple[Lens, ...]]:
+    """(views, lenses) of cameras, checked as by `make_views`."""
+    numbers = np.array([values for values, _ in optics], np.float64).reshape(-1, 6)
+    views = make_views(names, numbers[:, :2], numbers[:, 2:], world_to_camera)
+    return views, tuple(lens for _, lens in optics)
 
 
 def poses_of(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
+from stages.cameras.camera_file import Optics
 from stages.cameras.lens import Lens
 
 _MODELS = {  # by number: name and how many parameters
@@ -55,20 +56,12 @@ class Image:
     seen: NDArray[np.void]
 
 
-@dataclass(frozen=True)
-class Optics:
-    """numbers: width, height, fx, fy, cx, cy, pixels."""
-
-    numbers: tuple[float, ...]
-    lens: Lens
-
-
 def _optics(model: str, width: int, height: int, params: tuple[float, ...]) -> Optics:
     if not np.isfinite(params).all():
         raise BadFileError("a camera has a parameter that is not a number")
     if model in _ONE_FOCAL:
         params = params[:1] + params
-    return Optics((width, height, *params[:4]), _lens(model, params[4:]))
+    return (width, height, *params[:4]), _lens(model, params[4:])
 
 
 def _lens(model: str, k: tuple[float, ...]) -> Lens:

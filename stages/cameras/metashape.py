@@ -22,7 +22,7 @@ from stages.cameras.camera_file import (
     ROTATION_TOLERANCE,
     CameraFile,
     Georeference,
-    make_views,
+    cameras_of,
     poses_of,
 )
 from stages.cameras.lens import Lens
@@ -56,14 +56,9 @@ def read(path: Path) -> CameraFile:
         texts = [(camera.findtext("transform") or "").split() for camera in aligned]
         poses = np.array(texts, np.float64).reshape(-1, 4, 4)
         rotations = poses[:, :3, :3].transpose(0, 2, 1)
-        numbers = np.array([values for values, _ in mine], np.float64).reshape(-1, 6)
-        views = make_views(
-            [camera.get("label", "") for camera in aligned],
-            numbers[:, :2],
-            numbers[:, 2:],
-            poses_of(rotations, poses[:, :3, 3]),
-        )
-        return CameraFile(views, path.parent, tuple(lens for _, lens in mine), _georeference(root))
+        names = [camera.get("label", "") for camera in aligned]
+        views, lenses = cameras_of(names, mine, poses_of(rotations, poses[:, :3, 3]))
+        return CameraFile(views, path.parent, lenses, _georeference(root))
 
 
 def _georeference(root: Element) -> Georeference:

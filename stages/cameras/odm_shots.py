@@ -21,8 +21,8 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     Georeference,
+    cameras_of,
     content_of,
-    make_views,
     poses_of,
 )
 from stages.cameras.lens import PINHOLE, Lens
@@ -54,7 +54,6 @@ def read(path: Path) -> CameraFile:
         about = [shot["properties"] for shot in shots]
         optics = [_optics(shot, lenses) for shot in about]
         names = [str(shot["filename"]) for shot in about]
-        numbers = np.array([values for values, _ in optics], np.float64).reshape(-1, 6)
         turns = np.array([shot["rotation"] for shot in about], np.float64).reshape(-1, 3)
         centres = np.array([shot["translation"] for shot in about], np.float64).reshape(-1, 3)
         where = np.array([shot["geometry"]["coordinates"][:2] for shot in shots], np.float64)
@@ -64,10 +63,10 @@ def read(path: Path) -> CameraFile:
             rotations = rotations_of(turns)
         place = _place(where.reshape(-1, 2), centres)
         poses = poses_of(rotations, centres - place.offset if place else centres)
-        views = make_views(names, numbers[:, :2], numbers[:, 2:], poses)
+        views, shot_lenses = cameras_of(names, optics, poses)
         georeference = Georeference(1.0, np.eye(3), _SOURCE, place)
         root = path.parent.parent if path.parent.name == "odm_report" else path.parent
-        return CameraFile(views, root / "images", tuple(lens for _, lens in optics), georeference)
+        return CameraFile(views, root / "images", shot_lenses, georeference)
 
 
 def files(path: Path) -> list[Path]:

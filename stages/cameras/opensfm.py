@@ -22,9 +22,9 @@ from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
     Georeference,
+    cameras_of,
     content_of,
     file_points,
-    make_views,
 )
 from stages.cameras.lens import Lens
 from stages.scene import View
@@ -59,14 +59,13 @@ def read(path: Path) -> CameraFile:
         missing = {str(shot["camera"]) for shot in shots.values()} - optics.keys()
         if missing:
             raise BadFileError(f"there is no camera {min(missing)[:80]!r}")
-        numbers = np.array([optics[shot["camera"]][0] for shot in shots.values()]).reshape(-1, 6)
         turns = np.array([shot["rotation"] for shot in shots.values()], np.float64).reshape(-1, 3)
         shifts = np.array([shot["translation"] for shot in shots.values()], np.float64)
         with np.errstate(all="ignore"):  # `make_views` checks the result
             rotations = rotations_of(turns)
         poses = np.concatenate([rotations, shifts.reshape(-1, 3, 1)], axis=2)
-        views = make_views(list(shots), numbers[:, :2], numbers[:, 2:], poses)
-        lenses = tuple(optics[shot["camera"]][1] for shot in shots.values())
+        own = [optics[shot["camera"]] for shot in shots.values()]
+        views, lenses = cameras_of(list(shots), own, poses)
         return CameraFile(views, path.parent / "images", lenses, _georeference(data, views))
 
 

@@ -24,9 +24,9 @@ from stages.cameras.camera_file import (
     NO_GEOREFERENCE,
     CameraFile,
     Georeference,
+    cameras_of,
     check_inside,
     content_of,
-    make_views,
     poses_of,
 )
 from stages.cameras.lens import Lens
@@ -72,14 +72,13 @@ def read(path: Path) -> CameraFile:
         }
         mine = [optics[_known(optics, camera["sensor_id"], "sensor")] for camera in cameras]
         names = [pictures[_known(pictures, camera["id"], "picture")] for camera in cameras]
-        numbers = np.array([values for values, _ in mine], np.float64).reshape(-1, 6)
         angles = np.array([camera["orientation_deg"] for camera in cameras], np.float64)
         centres = np.array([camera["position"] for camera in cameras], np.float64).reshape(-1, 3)
         poses = poses_of(_world_to_camera(angles.reshape(-1, 3)), centres)
-        views = make_views(names, numbers[:, :2], numbers[:, 2:], poses)
+        views, lenses = cameras_of(names, mine, poses)
         frames = list(_parts(path, project, "scene_reference_frame"))
         ground = _georeference(frames[0]) if len(frames) == 1 else NO_GEOREFERENCE
-        return CameraFile(views, path.parent, tuple(lens for _, lens in mine), ground)
+        return CameraFile(views, path.parent, lenses, ground)
 
 
 def files(path: Path) -> list[Path]:

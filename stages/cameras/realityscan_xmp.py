@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, make_views, poses_of, stored_size
+from stages.cameras.camera_file import CameraFile, cameras_of, poses_of, stored_size
 from stages.cameras.lens import PINHOLE, Lens
 from stages.cameras.xml_file import parsed
 
@@ -39,7 +39,7 @@ def locate(path: Path) -> Path | None:
 def read(path: Path) -> CameraFile:
     """The cameras that have a pose; their pictures are beside the files. Raises SplatError
     "cameras-unreadable"."""
-    names, numbers, lenses, poses = [], [], [], []
+    names, optics, poses = [], [], []
     for file in sorted(path.glob("*.xmp")):
         with reading(file, CAMERAS):
             about = _description(file)
@@ -50,13 +50,11 @@ def read(path: Path) -> CameraFile:
                 raise BadFileError("its pose is not 9 and 3 numbers")
             picture = _picture(file)
             names.append(picture.name)
-            numbers.append(_intrinsics(about, *stored_size(picture)))
-            lenses.append(_lens(about))
+            optics.append((_intrinsics(about, *stored_size(picture)), _lens(about)))
             poses.append(poses_of(rotation.reshape(1, 3, 3), position.reshape(1, 3))[0])
     with reading(next(iter(sorted(path.glob("*.xmp")))), CAMERAS):
-        found = np.array(numbers, np.float64).reshape(-1, 6)
-        views = make_views(names, found[:, :2], found[:, 2:], np.array(poses).reshape(-1, 3, 4))
-        return CameraFile(views, path, tuple(lenses))
+        views, lenses = cameras_of(names, optics, np.array(poses).reshape(-1, 3, 4))
+        return CameraFile(views, path, lenses)
 
 
 def _description(path: Path) -> Element:

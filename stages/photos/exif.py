@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from stages.photos.gps import Gps, read_gps
+from stages.photos.gps import Gps, number_of, read_gps, text_of
 from stages.photos.panorama import projection_of
 
 FULL_FRAME_WIDTH_MM = 36.0
@@ -162,18 +162,11 @@ def _number(value: Any) -> float | None:
     """A positive finite number, or None."""
     if isinstance(value, tuple | list):
         value = value[0] if value else None
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
+    number = number_of(value)
+    return number if number is not None and number > 0 else None
 
 
 def _text(value: Any) -> str:
     """Printable text on one line, at most 80 characters."""
-    if isinstance(value, bytes):
-        value = value.decode("ascii", "ignore")
-    if not isinstance(value, str):
-        return ""
-    kept = "".join(c if c.isprintable() else " " for c in value.split("\0")[0])
+    kept = "".join(c if c.isprintable() else " " for c in text_of(value).split("\0")[0])
     return " ".join(kept.split())[:80]

@@ -60,7 +60,7 @@ def _from_exif(tags: dict[int, Any]) -> Gps:
     """None also at 0, 0, which receivers without a fix write."""
     found = []
     for reference, number in ((1, 2), (3, 4)):
-        sign = {"N": 1, "E": 1, "S": -1, "W": -1}.get(_text(tags.get(reference)).upper()[:1])
+        sign = {"N": 1, "E": 1, "S": -1, "W": -1}.get(text_of(tags.get(reference)).upper()[:1])
         try:
             degrees, minutes, seconds = (float(part) for part in tags[number])
         except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -70,8 +70,8 @@ def _from_exif(tags: dict[int, Any]) -> Gps:
             return Gps()
         found.append(sign * value)
     side = tags.get(5)  # a byte, which some programs write as text
-    below = side in (1, 3) or _text(side) in ("\1", "\3", "1", "3")
-    height = _number(tags.get(6))
+    below = side in (1, 3) or text_of(side) in ("\1", "\3", "1", "3")
+    height = number_of(tags.get(6))
     return _checked(found[0], found[1], -height if height is not None and below else height)
 
 
@@ -79,7 +79,7 @@ def _from_dji(xmp: bytes) -> Gps:
     """The corrected position; none for a fix without correction, which Exif holds as well."""
     values: dict[str, float | None] = {}
     for name, text in _DJI.findall(xmp):
-        values.setdefault(name.decode(), _number(text.decode("ascii", "replace")))
+        values.setdefault(name.decode(), number_of(text.decode("ascii", "replace")))
     if values.get("RtkFlag") not in _CORRECTED:
         return Gps()
     latitude = values.get("GpsLatitude")
@@ -98,20 +98,22 @@ def _checked(
 ) -> Gps:
     if not (abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)):
         return Gps()
-    if height is not None and abs(height) > _HIGHEST_M:
-        height = None
+    height = round(height, 9) if height is not None and abs(height) <= _HIGHEST_M else None
+    error_m = None if error_m is None else round(error_m, 9)
     return Gps((round(latitude, 9), round(longitude, 9)), height, error_m)
 
 
-def _number(value: Any) -> float | None:
+def number_of(value: Any) -> float | None:
+    """A finite number, or None."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
-    return round(number, 9) if math.isfinite(number) else None
+    return number if math.isfinite(number) else None
 
 
-def _text(value: Any) -> str:
+def text_of(value: Any) -> str:
+    """Text, or the ASCII in bytes; "" for anything else."""
     if isinstance(value, bytes):
         value = value.decode("ascii", "ignore")
     return value.strip() if isinstance(value, str) else ""

@@ -24,12 +24,11 @@ def test_a_lens_shows_directions_where_colmap_does_and_can_be_undone(model: str)
     camera.params = params
     uv = random.uniform(-0.5, 0.5, (200, 2))
     wanted = camera.img_from_cam(np.hstack([uv, np.ones((200, 1))]))
-    optics = _optics(model, 640, 480, tuple(params))
-    _, _, fx, fy, cx, cy = optics.numbers
-    seen = optics.lens.distort(uv)
+    (_, _, fx, fy, cx, cy), lens = _optics(model, 640, 480, tuple(params))
+    seen = lens.distort(uv)
     np.testing.assert_allclose(seen * (fx, fy) + (cx, cy), wanted, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(optics.lens.undistort(seen), uv, rtol=0, atol=1e-9)
-    assert optics.lens.distorts == (model not in ("SIMPLE_PINHOLE", "PINHOLE"))
+    np.testing.assert_allclose(lens.undistort(seen), uv, rtol=0, atol=1e-9)
+    assert lens.distorts == (model not in ("SIMPLE_PINHOLE", "PINHOLE"))
 
 
 def test_a_skewed_lens_can_be_undone() -> None:
