@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import QualityError, SplatError
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.capacity.output_formats import drawing_setting
 from stages.formats.table import PLAIN
@@ -29,107 +30,81 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    steps: int = field(
-        default=7000,
-        metadata={
-            "panel": "Quality and time",
-            "help": "Training steps, with one photograph each.",
-            "min": 1,
-            "max": 1_000_000,
-        },
+    steps: int = setting(
+        7000,
+        "Training steps, with one photograph each.",
+        panel="Quality and time",
+        min=1,
+        max=1_000_000,
     )
-    train_side: int = field(
-        default=800,
-        metadata={
-            "panel": "Quality and time",
-            "help": "Longer side of the photographs in training (pixels).",
-            "min": 16,
-            "max": 8192,
-        },
+    train_side: int = setting(
+        800,
+        "Longer side of the photographs in training (pixels).",
+        panel="Quality and time",
+        min=16,
+        max=8192,
     )
-    sh_degree: int = field(
-        default=2,
-        metadata={"help": "Degree of view-dependent colour, 0 (none) to 3.", "min": 0, "max": 3},
+    sh_degree: int = setting(2, "Degree of view-dependent colour, 0 (none) to 3.", min=0, max=3)
+    max_splats: int = setting(
+        0,
+        "Largest number of splats. 0: what free memory allows, with no more "
+        "parameters than the photographs have pixel values.",
+        panel="Size",
+        min=0,
+        max=100_000_000,
     )
-    max_splats: int = field(
-        default=0,
-        metadata={
-            "panel": "Size",
-            "help": "Largest number of splats. 0: what free memory allows, with no more "
-            "parameters than the photographs have pixel values.",
-            "min": 0,
-            "max": 100_000_000,
-        },
+    seconds: float = setting(
+        0.0,
+        "Time limit in seconds, of the whole command: training makes as many steps as "
+        "fit, whatever --steps says, and pruning as many rounds. 0: no limit.",
+        panel="Quality and time",
+        min=0,
+        max=1e7,
     )
-    seconds: float = field(
-        default=0.0,
-        metadata={
-            "panel": "Quality and time",
-            "help": "Time limit in seconds, of the whole command: training makes as many steps as "
-            "fit, whatever --steps says, and pruning as many rounds. 0: no limit.",
-            "min": 0,
-            "max": 1e7,
-        },
+    patience: float = setting(
+        0.0,
+        "Stop densifying when it no longer improves any validation view by this many dB. 0: never.",
+        panel="Advanced",
+        min=0,
+        max=10,
     )
-    patience: float = field(
-        default=0.0,
-        metadata={
-            "panel": "Advanced",
-            "help": "Stop densifying when it no longer improves any validation view by this "
-            "many dB. 0: never.",
-            "min": 0,
-            "max": 10,
-        },
+    smooth: bool = setting(
+        False,
+        "Train under a 3D smoothing filter, so that no detail is finer than the "
+        "photographs show: softer from close by, without needles and specks.",
     )
-    smooth: bool = field(
-        default=False,
-        metadata={
-            "help": "Train under a 3D smoothing filter, so that no detail is finer than the "
-            "photographs show: softer from close by, without needles and specks."
-        },
+    seed: int = setting(0, "Seed of all random numbers.", min=0, max=2**31 - 1)
+    background: str = setting(
+        "black",
+        "Background in training: black, as in viewers, or any, a random colour at "
+        "each step, for scenes that are drawn over others. Cut-out objects always use any.",
+        panel="Light and masks",
+        choices=("black", "any"),
     )
-    seed: int = field(
-        default=0, metadata={"help": "Seed of all random numbers.", "min": 0, "max": 2**31 - 1}
-    )
-    background: str = field(
-        default="black",
-        metadata={
-            "panel": "Light and masks",
-            "help": "Background in training: black, as in viewers, or any, a random colour at "
-            "each step, for scenes that are drawn over others. Cut-out objects always use any.",
-            "choices": ("black", "any"),
-        },
-    )
-    light: str = field(
-        default="auto",
-        metadata={
-            "panel": "Light and masks",
-            "help": "Bring all photographs to the median exposure and white balance before "
-            "training: auto (if they differ by more than a camera's noise and points agree), on or "
-            "off.",
-            "choices": ("auto", "on", "off"),
-        },
+    light: str = setting(
+        "auto",
+        "Bring all photographs to the median exposure and white balance before "
+        "training: auto (if they differ by more than a camera's noise and points agree), on or "
+        "off.",
+        panel="Light and masks",
+        choices=("auto", "on", "off"),
     )
     drawing: str = drawing_setting()
-    blocks: str = field(
-        default="1",
-        metadata={
-            "panel": "Advanced",
-            "help": "Divide the scene into this many blocks, train each on the photographs that "
-            "show it, and merge them; auto: one block for about every 250 photographs.",
-            "pattern": r"auto|[1-9]\d{0,3}",
-            "wanted": "A whole number of blocks, or auto.",
-        },
+    blocks: str = setting(
+        "1",
+        "Divide the scene into this many blocks, train each on the photographs that "
+        "show it, and merge them; auto: one block for about every 250 photographs.",
+        panel="Advanced",
+        pattern=r"auto|[1-9]\d{0,3}",
+        wanted="A whole number of blocks, or auto.",
     )
-    within: tuple[float, ...] = field(
-        default=(),
-        metadata={
-            "help": "Densify only inside this rectangle of the ground plane (world units); the "
-            "rest stays as coarse as it is.",
-            "together": "X0 Z0 X1 Z1",
-            "min": -1e30,
-            "max": 1e30,
-        },
+    within: tuple[float, ...] = setting(
+        (),
+        "Densify only inside this rectangle of the ground plane (world units); the "
+        "rest stays as coarse as it is.",
+        together="X0 Z0 X1 Z1",
+        min=-1e30,
+        max=1e30,
     )
     backend: str = backend_setting()
     device: str = device_setting()

@@ -73,9 +73,9 @@ class Stage:
     name: also the name of its command and the end of its folder's name.
     version: raised when equal inputs and settings give different bytes.
     reads: names of the earlier stages whose outputs `run` receives.
-    settings_type: one flat frozen dataclass, torch-free; each field has a default and carries
-        `metadata={"help": ...}` with its unit. Fields with `metadata={"affects_output": False}`
-        (number of threads, say) do not make a stage run again.
+    settings_type: one flat frozen dataclass, torch-free; each field is a `settings.setting` with a
+        default and a help that names the unit. Fields with `affects_output=False` (number of
+        threads, say) do not make a stage run again.
     run(inputs, settings, folder, report): writes everything under `folder` and returns the output.
         `folder` may hold what an interrupted run of the same inputs and settings left there.
     load(folder): the output again, from a finished folder. Cheap: arrays may be loaded, images not.

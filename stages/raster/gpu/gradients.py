@@ -184,24 +184,11 @@ def exponent_gradient(cam, record, sums, mask, x, y, a, b, c, det, REAL: tl.cons
 
 
 @inner
-def covariance_gradient(
-    cam,
-    a,
-    b,
-    c,
-    det,
-    minors,
-    kept,
-    g_a,
-    g_b,
-    g_k,
-    g_drawn,
-    ANTIALIAS: tl.constexpr,
-    REAL: tl.constexpr,
-):
+def covariance_gradient(cam, shape, g_shape, g_drawn, ANTIALIAS: tl.constexpr, REAL: tl.constexpr):
     """(gradients of both variances, of the covariance and of the minors; what antialiasing adds to
     the gradient of ln(1 / z)) from those of the exponent and of the logarithm of the drawn
-    opacity."""
+    opacity. shape: see `covariance`. g_shape: of the exponent's A, B and K."""
+    (a, b, c, det, minors, kept), (g_a, g_b, g_k) = shape, g_shape
     e, major, wide = number(cam, DILATION, REAL), tl.maximum(a, c), a >= c
     g_major = 0.5 * g_b / det - (0.5 * g_a + g_k * b) / (major * major)
     g_cov, g_det = g_k / major, -0.5 * g_b * major / (det * det)
@@ -219,31 +206,13 @@ def covariance_gradient(
 
 @inner
 def shape_gradient(
-    cam,
-    rows,
-    at,
-    mask,
-    out,
-    width,
-    x0,
-    x1,
-    x2,
-    y0,
-    y1,
-    y2,
-    g_var_x,
-    g_var_y,
-    g_cov,
-    g_minors,
-    j00,
-    j02,
-    j11,
-    j12,
-    g_drawn,
-    SMOOTH: tl.constexpr,
+    cam, rows, at, mask, out, width, v0, v1, g, jacobian, g_drawn, SMOOTH: tl.constexpr,
     REAL: tl.constexpr,
-):
-    """Gradients of scales and rotation into `out`; returns those of the Jacobian's last column."""
+):  # fmt: skip
+    """Gradients of scales and rotation into `out`; returns those of the Jacobian's last column.
+    v0, v1: rows of V, as `footprint_rows` gives them. g: as `covariance_gradient` gives it."""
+    (x0, x1, x2), (y0, y1, y2), (j00, j02, j11, j12) = v0, v1, jacobian
+    g_var_x, g_var_y, g_cov, g_minors = g
     m0, m1, m2 = cross(x0, x1, x2, y0, y1, y2)
     d0, d1, d2 = cross(y0, y1, y2, m0, m1, m2)
     e0, e1, e2 = cross(m0, m1, m2, x0, x1, x2)
@@ -313,15 +282,16 @@ def splat_gradient_kernel(
     g_drawn = -s_1  # gradient of the logarithm of the drawn opacity
     store_gradient(out, OPACITY, mask, g_drawn * (1.0 - opacity_of(rows, at, mask, REAL)))
     g_var_x, g_var_y, g_cov, g_minors, nearer = covariance_gradient(
-        cam, a, b, c, det, minors, kept, g_a, g_b, g_k, g_drawn, ANTIALIAS, REAL
+        cam, (a, b, c, det, minors, kept), (g_a, g_b, g_k), g_drawn, ANTIALIAS, REAL
     )
     g_near += nearer
     u, v, in_u, in_v = slopes(cam, x, y, z, REAL)
     j00, j02, j11, j12 = fx / z, -fx * u / z, fy / z, -fy * v / z
+    v0, v1, g = (x0, x1, x2), (y0, y1, y2), (g_var_x, g_var_y, g_cov, g_minors)
+    jacobian = (j00, j02, j11, j12)
     g02, g12 = shape_gradient(
-        cam, rows, at, mask, out, width, x0, x1, x2, y0, y1, y2, g_var_x, g_var_y, g_cov, g_minors,
-        j00, j02, j11, j12, g_drawn, SMOOTH, REAL,
-    )  # fmt: skip
+        cam, rows, at, mask, out, width, v0, v1, g, jacobian, g_drawn, SMOOTH, REAL
+    )
     # a slope inside its limits moves with the mean; a clamped one does not
     g_u, g_v = tl.where(in_u, -g02 * fx / z, 0.0), tl.where(in_v, -g12 * fy / z, 0.0)
     by_x, by_y = (g_x * fx + g_u) / z, (g_y * fy + g_v) / z
