@@ -137,7 +137,6 @@ def run(
     from stages.structure.crs import check_crs
 
     capture: Capture = inputs["ingest"]
-    _check_count(capture)
     if settings.crs:
         check_crs(settings.crs)
     if settings.scale:
@@ -235,16 +234,6 @@ def load(folder: Path) -> Reconstruction:
     from stages.structure.reconstruction_files import load_reconstruction
 
     return load_reconstruction(folder)
-
-
-def _check_count(capture: Capture) -> None:
-    if len(capture.photos) < _FEWEST_PHOTOGRAPHS:
-        raise SplatError(
-            "sfm-too-few-photographs",
-            given=f"The capture holds {counted(len(capture.photos), 'usable photograph')}.",
-            wanted=f"At least {_FEWEST_PHOTOGRAPHS}; 20 to 50 do an object or a room well.",
-            hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
-        )
 
 
 def _check_duplicates(capture: Capture) -> None:

@@ -310,7 +310,8 @@ def test_two_scenes_are_separated_and_one_may_be_used(
 
 
 def test_two_photographs_are_too_few(tmp_path: Path) -> None:
-    assert failure(bad_captures.sample(2), tmp_path).code == "sfm-too-few-photographs"
+    """Ingest refuses them first; pairs of near-duplicates are refused here."""
+    assert failure(bad_captures.sample(2), tmp_path).code == "sfm-no-parallax"
 
 
 def test_a_time_limit_is_an_error(tmp_path: Path) -> None:
