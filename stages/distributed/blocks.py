@@ -92,7 +92,7 @@ class _BlockTraining:
 
     def train(self, blocks: int, seeds: Splats, folder: Path) -> TrainedSplats:
         """The merged splats, written to `folder` as training writes them."""
-        from stages.distributed import block_views, partition
+        from stages.distributed import partition
         from stages.scene import draw_settings_of, split_held_out
         from stages.train import save
         from stages.training.build import corrects_light
@@ -106,14 +106,14 @@ class _BlockTraining:
         cells = partition.partition(points, weights, blocks)
         cameras = [view.camera for view in self.whole.views]
         backend = backend_of_settings(self.settings)
-        fractions = block_views.block_fractions(coarse, cells, cameras, backend)
-        assigned = block_views.assign_views(fractions)
+        fractions = partition.block_fractions(coarse, cells, cameras, backend)
+        assigned = partition.assign_views(fractions)
         folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
         parts = self._parts(folders, cells, assigned)
         draw_settings = draw_settings_of(
             self.whole.views, self.settings.train_side, light, self.settings.antialias
         )
-        crosses = block_views.crosses_blocks(assigned)
+        crosses = partition.crosses_blocks(assigned)
         crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]
         seam_views = [view for view in crossing if view in training]
         trained = self._merge(parts, cells, seam_views, draw_settings, len(training))

@@ -3,20 +3,25 @@
 The partition depends on what the views show, not on where the cameras are, so that no block lies
 where no view looks, and a ring of cameras around an object is cut through the object. Each view
 has a weight of one, which is spread over the points that it shows; all cells have about the same
-total weight.
+total weight. Which views show which block is measured by rendering the coarse model of the whole
+scene.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.scene import Reconstruction
+from stages.measure.contribution import blend_weights
+from stages.scene import Camera, Reconstruction, Splats
 
 UNBOUNDED = 1e30  # world units: the outer sides of the outer cells (JSON has no infinity)
 MARGIN = 0.05  # of the scene's extent: how far beyond its own cell a block densifies
+SIDE = 160  # longer side of the renderings of the coarse model, pixels
+SMALLEST_FRACTION = 0.1  # of a picture that must show a block for the view to train it
 _GROUND = [0, 2]  # the axes of the ground plane
 _POINTS = 20_000  # about, of the sparse cloud
 _EXTENT_PERCENTILES = (5, 95)
@@ -115,3 +120,31 @@ def _extent(places: NDArray[np.float64]) -> NDArray[np.float64]:
 def margin(places: NDArray[np.float64]) -> float:
     """`MARGIN` in world units, for the places [P, 2] that the views show."""
     return MARGIN * float(_extent(places).max())
+
+
+def block_fractions(
+    splats: Splats, cells: Sequence[Cell], cameras: Iterable[Camera], backend: str
+) -> NDArray[np.float64]:
+    """[blocks, cameras] the fraction of each picture that comes from splats in each cell, 0 to 1;
+    occluded splats do not count. All 0 for a camera that sees nothing."""
+    inside = [cell.holds(splats.means) for cell in cells]
+    found = []
+    small = (camera.fitted(SIDE) for camera in cameras)
+    for rows, weight in blend_weights(splats, small, backend):
+        total = float(weight.sum())
+        found.append([float(weight[own[rows]].sum()) / total if total else 0.0 for own in inside])
+    return np.array(found).T.reshape(len(cells), -1)
+
+
+def assign_views(fractions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[blocks, views] which views train which block, from `block_fractions`: each view trains the
+    block that it shows most of, and all blocks that it shows enough of."""
+    assigned = fractions >= SMALLEST_FRACTION
+    most = fractions.argmax(axis=0)
+    assigned[most, np.arange(fractions.shape[1])] |= fractions.max(axis=0) > 0
+    return assigned
+
+
+def crosses_blocks(assigned: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[views] which views show more than one block."""
+    return np.asarray(assigned.sum(axis=0) > 1)

@@ -19,15 +19,16 @@ To add a format, in six steps:
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.atomic import remove_abandoned_files
+from stages.base.bad_files import reading
 from stages.base.lazy import load_object
 from stages.formats.table import BY_ENDING, FORMATS, Format, format_of
-from stages.formats.units import units_of
 
 if TYPE_CHECKING:
     from stages.scene import Splats, View
@@ -41,6 +42,8 @@ __all__ = [
     "units_of",
     "write",
 ]
+_START_BYTES = 1 << 16
+_METRES = re.compile(rb"\bunits\"?\s*[:=]\s*\"?metres\b")
 
 
 def write(
@@ -87,7 +90,6 @@ def read(path: Path, *, strict: bool = True) -> Splats:
     strict: whether a value that is not finite makes the file unreadable. Raises SplatError as
     `format_of`, or "splats-unreadable".
     """
-    from stages.base.bad_files import reading
     from stages.formats.offset import offset_path, read_offset
     from stages.formats.values import check_finite, nonfinite_allowed
 
@@ -98,3 +100,11 @@ def read(path: Path, *, strict: bool = True) -> Splats:
         return splats
     with reading(offset_path(path)):
         return read_offset(path, row, splats)
+
+
+def units_of(path: Path) -> str:
+    """ "metres" where the start of the file declares it, as our .ply, glTF and .sog do; else
+    "arbitrary". Raises SplatError "splats-unreadable"."""
+    with reading(Path(path)), Path(path).open("rb") as file:
+        start = file.read(_START_BYTES)
+    return "metres" if _METRES.search(start) else "arbitrary"

@@ -13,7 +13,7 @@ import pytest
 from splatcli.commands import process
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import Interrupted, SplatError
-from stages.distributed import block_views, blocks
+from stages.distributed import blocks, partition
 from stages.distributed.tasks import SerialExecutor, TaskResult
 from stages.run.pipeline import Listener, Pipeline
 from stages.scene import save_splats, split_held_out
@@ -160,7 +160,7 @@ def test_a_block_that_no_photograph_shows_is_the_coarse_model_s(
     tmp_path, photos, monkeypatch
 ) -> None:
     monkeypatch.setattr(
-        block_views, "assign_views", lambda share: np.array([[True], [False]]) & (share >= 0)
+        partition, "assign_views", lambda share: np.array([[True], [False]]) & (share >= 0)
     )
     manifest = trained(tmp_path / "run", photos, blocks="2", steps=20).manifest("train")
     assert manifest is not None

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.distributed import block_views, merge, partition
+from stages.distributed import merge, partition
 from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import AUTO
 from stages.scene import Camera, look_at
@@ -66,16 +66,16 @@ def test_a_photograph_teaches_what_it_shows_and_not_what_is_hidden(tmp_path) -> 
     both, _ = merge.merge_blocks([wall, behind], halves, wall.draw_settings)
     cells = partition.partition(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.ones(2), 2)
     eye = Camera(72, 54, 160.0, 160.0, 36.0, 27.0, look_at(np.array([-4.0, 0, 0]), np.zeros(3)))
-    share = block_views.block_fractions(both, cells, [eye], AUTO)
+    share = partition.block_fractions(both, cells, [eye], AUTO)
     assert share[0, 0] > 0.9
-    assert block_views.assign_views(share)[:, 0].tolist() == [True, False]
+    assert partition.assign_views(share)[:, 0].tolist() == [True, False]
 
 
 def test_each_photograph_teaches_one_block_at_least() -> None:
     share = np.array([[0.06, 0.5, 0.0], [0.04, 0.5, 0.0]])
-    member = block_views.assign_views(share)
+    member = partition.assign_views(share)
     assert member.tolist() == [[True, True, False], [False, True, False]]
-    assert block_views.crosses_blocks(member).tolist() == [False, True, False]
+    assert partition.crosses_blocks(member).tolist() == [False, True, False]
 
 
 def test_merged_blocks_give_each_place_once_and_in_order(tmp_path) -> None:
