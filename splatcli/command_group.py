@@ -47,9 +47,10 @@ class CommandGroup(TyperGroup):
 
 def _as_splat_error(error: Any) -> SplatError:
     command = error.ctx.command_path if error.ctx is not None else "splat"
+    message = error.format_message()
     return UsageError(
         "command-line",
-        given=f"{command}: {error.format_message().rstrip('.')}.",
+        given=f"{command}: {message}" + "." * (message[-1:] not in (".", "?")),
         wanted="A command with the options and arguments that it knows.",
         hint=f"`{command} --help` lists what there is; put quotes around a path with spaces.",
     )

@@ -108,21 +108,10 @@ def _read(source: Path) -> tuple[CameraFile, ColmapModel | None]:
 
 def _without_points(found: CameraFile) -> tuple[ColmapModel, Path]:
     """(a model without points, the innermost folder that holds all pictures)."""
-    import numpy as np
-
     from stages.cameras.colmap import ColmapModel
 
     paths = [os.path.normpath(found.folder / view.image) for view in found.views]
     root = os.path.commonpath([os.path.dirname(path) for path in paths])
-    none = np.zeros(0)
-    model = ColmapModel(
-        names=tuple(Path(path).relative_to(root).as_posix() for path in paths),
-        cameras=tuple(view.camera for view in found.views),
-        points=np.zeros((0, 3)),
-        colours=np.zeros((0, 3), np.uint8),
-        errors_px=none,
-        observed_points=none.astype(np.int32),
-        observing_views=none.astype(np.int32),
-        observed_px=np.zeros((0, 2)),
-    )
+    names = tuple(Path(path).relative_to(root).as_posix() for path in paths)
+    model = ColmapModel(names, tuple(view.camera for view in found.views))
     return model, Path(root)

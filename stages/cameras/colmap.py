@@ -8,7 +8,7 @@ the same as ours, and the world is not transformed.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ _PINHOLE = 1
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Pinhole views and points. Ids in the files that we write are positions + 1.
+    """Pinhole views, and points or none. Ids in the files that we write are positions + 1.
 
     Args:
         names: V picture paths, relative to the folder of pictures.
@@ -42,12 +42,12 @@ class ColmapModel:
 
     names: tuple[str, ...]
     cameras: tuple[Camera, ...]
-    points: NDArray[np.float64]
-    colours: NDArray[np.uint8]
-    errors_px: NDArray[np.float64]
-    observed_points: NDArray[np.int32]
-    observing_views: NDArray[np.int32]
-    observed_px: NDArray[np.float64]
+    points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    errors_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    observed_points: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    observing_views: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    observed_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def write_colmap_model(folder: Path, model: ColmapModel) -> None:

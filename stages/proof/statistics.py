@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from stages.base.blocks import blocks
 from stages.raster.definition import ALPHA_MIN, LOG_SCALE_MAX, QUATERNION_MIN
-from stages.scene import ROW_FIELDS, Splats
+from stages.scene import ROW_FIELDS, Splats, parameters_per_splat
 from stages.scene.quantiles import quantiles
 
 NEEDLE_ASPECT = 100.0
@@ -157,7 +157,7 @@ DEGREES = (0, 1, 2, 3)
 def floats_of(degree: int) -> int:
     """Parameters of one splat: position 3, rotation 4, scale 3, opacity 1, and 3 colours for each
     of (degree + 1)^2 spherical harmonics."""
-    return 3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2
+    return int(parameters_per_splat(np.array(degree)))
 
 
 def memory_of(degree: int, count: int = 1) -> dict[str, int]:
