@@ -7,7 +7,6 @@ stages.scene.storage) or prints the reason why it cannot.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
-from stages.base.parent import how_it_ended
+from stages.base.parent import end_child, how_it_ended, python_module, start_child
 from stages.base.text import reason_of
 from stages.base.usd_path import accepted_path
 from stages.formats.json_fields import place_of
@@ -54,28 +53,19 @@ def read(path: Path) -> Splats:
     """
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "splats.bin"
-        command = [
-            sys.executable,
-            "-m",
-            "stages.formats.usd_read",
-            str(path.resolve()),
-            str(output),
-            *(["allow-nonfinite"] if allows_nonfinite() else []),
-        ]
+        flags = ["allow-nonfinite"] if allows_nonfinite() else []
+        command = python_module("stages.formats.usd_read", str(path.resolve()), str(output), *flags)
+        # The library writes crash reports to TMPDIR; they are deleted with the folder.
+        environment = {"TMPDIR": folder, "PXR_WORK_THREAD_LIMIT": _THREADS}
+        child = start_child(command, subprocess.PIPE, environment)
         try:
-            child = subprocess.run(
-                command,
-                capture_output=True,
-                # The library writes crash reports there; they are deleted with the folder.
-                env={**os.environ, "TMPDIR": folder, "PXR_WORK_THREAD_LIMIT": _THREADS},
-                cwd=Path(__file__).resolve().parents[2],
-                timeout=_TIMEOUT_SECONDS,
-                check=False,
-            )
+            said, _ = child.communicate(timeout=_TIMEOUT_SECONDS)
         except subprocess.TimeoutExpired as error:
             raise BadFileError(f"it was not read within {_TIMEOUT_SECONDS} s") from error
+        finally:
+            end_child(child)
         if child.returncode == _REFUSED:
-            raise BadFileError(child.stdout.decode("utf-8", "replace").strip()[:300])
+            raise BadFileError(said.decode("utf-8", "replace").strip()[:300])
         if child.returncode != 0:
             how = how_it_ended(child.returncode)
             raise BadFileError(f"it is damaged: the USD library ended with {how} on it")
