@@ -188,7 +188,8 @@ def covariance_gradient(cam, shape, g_shape, g_drawn, ANTIALIAS: tl.constexpr, R
     """(gradients of both variances, of the covariance and of the minors; what antialiasing adds to
     the gradient of ln(1 / z)) from those of the exponent and of the logarithm of the drawn
     opacity. shape: see `covariance`. g_shape: of the exponent's A, B and K."""
-    (a, b, c, det, minors, kept), (g_a, g_b, g_k) = shape, g_shape
+    a, b, c, det, minors, kept = shape
+    g_a, g_b, g_k = g_shape
     e, major, wide = number(cam, DILATION, REAL), tl.maximum(a, c), a >= c
     g_major = 0.5 * g_b / det - (0.5 * g_a + g_k * b) / (major * major)
     g_cov, g_det = g_k / major, -0.5 * g_b * major / (det * det)
@@ -211,7 +212,9 @@ def shape_gradient(
 ):  # fmt: skip
     """Gradients of scales and rotation into `out`; returns those of the Jacobian's last column.
     v0, v1: rows of V, as `footprint_rows` gives them. g: as `covariance_gradient` gives it."""
-    (x0, x1, x2), (y0, y1, y2), (j00, j02, j11, j12) = v0, v1, jacobian
+    x0, x1, x2 = v0
+    y0, y1, y2 = v1
+    j00, j02, j11, j12 = jacobian
     g_var_x, g_var_y, g_cov, g_minors = g
     m0, m1, m2 = cross(x0, x1, x2, y0, y1, y2)
     d0, d1, d2 = cross(y0, y1, y2, m0, m1, m2)
