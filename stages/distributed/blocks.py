@@ -13,7 +13,6 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,37 +41,27 @@ COARSE_STEPS, COARSE_SIDE, COARSE_SPLATS = 3, 2, 4
 def in_blocks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
     """The pipeline, which trains in blocks if its settings ask for it."""
     stage = pipeline.layout.stage("train")
-    return pipeline.with_run("train", partial(_train, pipeline, stage, open_executor))
+
+    def train(inputs: Mapping[str, Any], settings: Any, folder: Path, report: Report) -> Any:
+        single = replace(settings, blocks="1")
+        views = 0 if settings == single else len(inputs["sfm"].views)
+        blocks = count_blocks(settings.blocks, views)
+        if blocks == 1:
+            return stage.run(inputs, single, folder, report)
+        _check(settings)
+        root = pipeline.run_folder.absolute() / FOLDER
+        root.mkdir(exist_ok=True)
+        whole = _with_roles(inputs["sfm"])
+        with open_executor(root, _BlockProgress(report)) as executor:
+            training = _BlockTraining(pipeline, whole, single, root, executor, report)
+            return training.train(blocks, inputs["seed"], folder)
+
+    return pipeline.with_run("train", train)
 
 
 def count_blocks(setting: str, views: int) -> int:
     """The number of blocks for `TrainSettings.blocks` and this many views."""
     return max(1, round(views / VIEWS_PER_BLOCK)) if setting == "auto" else int(setting)
-
-
-def _train(
-    pipeline: Pipeline,
-    stage: Stage,
-    open_executor: OpenExecutor,
-    inputs: Mapping[str, Any],
-    settings: Any,
-    folder: Path,
-    report: Report,
-) -> Any:
-    """The stage `train` for any number of blocks."""
-    single = replace(settings, blocks="1")
-    views = 0 if settings == single else len(inputs["sfm"].views)
-    blocks = count_blocks(settings.blocks, views)
-    if blocks == 1:
-        return stage.run(inputs, single, folder, report)
-    _check(settings)
-    root = pipeline.run_folder.absolute() / FOLDER
-    root.mkdir(exist_ok=True)
-    with open_executor(root, _BlockProgress(report)) as executor:
-        training = _BlockTraining(
-            *(pipeline, _with_roles(inputs["sfm"]), single, root, executor, report)
-        )
-        return training.train(blocks, inputs["seed"], folder)
 
 
 @dataclass

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.stage import Report, Stage
+from stages.base.stage import Report
 from stages.distributed.tasks import ChunkTask, Executor, OpenExecutor, Resources, run_all
 from stages.run.pipeline import Listener, Pipeline
 
@@ -17,24 +17,16 @@ if TYPE_CHECKING:
 
 def with_chunks(pipeline: Pipeline, open_executor: OpenExecutor) -> Pipeline:
     """The pipeline with the stage `sfm` in chunks."""
-    stage = pipeline.layout.stage("sfm")
-    return pipeline.with_run("sfm", partial(_sfm, pipeline, stage, open_executor))
+    run: Callable[..., Any] = pipeline.layout.stage("sfm").run
 
+    def sfm(inputs: Mapping[str, Any], settings: Any, folder: Path, report: Report) -> Any:
+        if settings.cameras is not None:  # known cameras have few pairs to match
+            return run(inputs, settings, folder, report)
+        with open_executor(pipeline.run_folder, Listener()) as executor:
+            execute = partial(_execute, executor, report)
+            return run(inputs, settings, folder, report, executor=execute)
 
-def _sfm(
-    pipeline: Pipeline,
-    stage: Stage,
-    open_executor: OpenExecutor,
-    inputs: Mapping[str, Any],
-    settings: Any,
-    folder: Path,
-    report: Report,
-) -> Any:
-    if settings.cameras is not None:  # known cameras have few pairs to match
-        return stage.run(inputs, settings, folder, report)
-    run: Callable[..., Any] = stage.run
-    with open_executor(pipeline.run_folder, Listener()) as executor:
-        return run(inputs, settings, folder, report, executor=partial(_execute, executor, report))
+    return pipeline.with_run("sfm", sfm)
 
 
 def _execute(
