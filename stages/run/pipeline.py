@@ -114,7 +114,7 @@ class Pipeline:
         wanted = {**self.recorded_settings(), **(settings or {})}
         photos = self.photos or self.recorded_photos()
         try:
-            return Planner(self.layout, photos).plan(wanted)
+            return Planner(self.layout, photos, wanted).plan()
         except OSError as error:
             raise self._unusable(error) from error
 
@@ -154,30 +154,25 @@ class Pipeline:
                 wanted = run_file.settings_of(self.layout.stages)
                 for recorded in wanted.values():
                     check_settings(recorded)
-                planner = Planner(self.layout, run_file.photographs)
-                self._check_allowed(planner.photos, wanted, until, may_run)
+                planner = Planner(self.layout, run_file.photographs, wanted)
+                self._check_allowed(planner, until, may_run)
                 run_file.write(self.run_folder)
-                return self._run_all(planner, wanted, until, stop, listener)
+                return self._run_all(planner, until, stop, listener)
         except OSError as error:
             raise self._unusable(error) from error
         finally:
             listener.ended()
 
     def _run_all(
-        self,
-        planner: Planner,
-        wanted: Mapping[str, Any],
-        until: str | None,
-        stop: Event,
-        listener: Listener,
+        self, planner: Planner, until: str | None, stop: Event, listener: Listener
     ) -> list[Manifest]:
         manifests, began = [], time.monotonic() if until is None else None
         for stage in self.layout.up_to(until):
-            step = planner.assess(stage, wanted[stage.name])
+            step = planner.assess(stage)
             if step.will_run or step.manifest is None:
                 if stop.is_set():
                     raise Interrupted(stage.name)
-                manifest = self._run_one(planner, step, wanted[stage.name], stop, listener, began)
+                manifest = self._run_one(planner, step, stop, listener, began)
                 listener.finished(stage, step.number, manifest)
             else:
                 manifest = step.manifest
@@ -187,17 +182,11 @@ class Pipeline:
         return manifests
 
     def _run_one(
-        self,
-        planner: Planner,
-        step: Step,
-        settings: Any,
-        stop: Event,
-        listener: Listener,
-        began: float | None,
+        self, planner: Planner, step: Step, stop: Event, listener: Listener, began: float | None
     ) -> Manifest:
-        stage = step.stage
+        stage, settings = step.stage, planner.wanted[step.stage.name]
         space = self.layout.workspace(stage)
-        request = planner.request(stage, settings)
+        request = planner.request(stage)
         resumed = space.begin(request, stage.settings_type)
         listener.started(stage, step.number, step.reason, resumed)
         inputs = {name: self.load(name) for name in stage.reads} or {
@@ -208,18 +197,14 @@ class Pipeline:
         return attempt(stage, settings, request, inputs, space, stop, listener)
 
     def _check_allowed(
-        self,
-        photos: Path | None,
-        wanted: Mapping[str, Any],
-        until: str | None,
-        may_run: Collection[str] | None,
+        self, planner: Planner, until: str | None, may_run: Collection[str] | None
     ) -> None:
         """Raises SplatError (stage-not-finished) for the first stage that has to run and may not.
         It uses a planner of its own, because that of the run learns the real outputs."""
         if may_run is None:
             return
         reached = self.layout.up_to(until)
-        for step in Planner(self.layout, photos).plan(wanted):
+        for step in Planner(self.layout, planner.photos, planner.wanted).plan():
             if step.stage in reached and step.will_run and step.stage.name not in may_run:
                 again = "" if step.manifest is None else "would run again: "
                 what = f"{step.stage.name} {again}{step.reason}"

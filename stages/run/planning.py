@@ -42,18 +42,18 @@ class Planner:
     photos: the photographs, or None if the run folder does not record them.
     """
 
-    def __init__(self, layout: Layout, photos: Path | None) -> None:
-        self.layout = layout
-        self.photos = photos
+    def __init__(self, layout: Layout, photos: Path | None, wanted: Mapping[str, Any]) -> None:
+        """wanted: settings by stage name."""
+        self.layout, self.photos, self.wanted = layout, photos, wanted
         self._digests: dict[str, str] = {}
         self._pending: dict[str, bool] = {}  # name -> has finished before
         self._photo_records: FileRecords | None = None
 
-    def plan(self, wanted: Mapping[str, Any]) -> list[Step]:
-        """One step for each stage. wanted: settings by stage name. Raises SplatError, OSError."""
+    def plan(self) -> list[Step]:
+        """One step for each stage. Raises SplatError, OSError."""
         steps = []
         for stage in self.layout.stages:
-            step = self.assess(stage, wanted[stage.name])
+            step = self.assess(stage)
             if step.will_run:
                 self._pending[stage.name] = step.manifest is not None
             elif step.manifest is not None:
@@ -65,7 +65,7 @@ class Planner:
         """Keep the digest of the stage's final output."""
         self._digests[stage.name] = manifest.output_digest
 
-    def assess(self, stage: Stage, settings: Any) -> Step:
+    def assess(self, stage: Stage) -> Step:
         """Whether `stage` has to run, given the outputs of the stages before it."""
         space = self.layout.workspace(stage)
         number = self.layout.number(stage)
@@ -81,7 +81,7 @@ class Planner:
             first = "was interrupted" if interrupted else "has not run yet"
             return Step(stage, number, True, failure or first, None, interrupted, bool(failure))
         reasons = why_again(
-            self._request_if_known(stage, settings, manifest, bool(waiting)),
+            self._request_if_known(stage, manifest, bool(waiting)),
             manifest,
             stage.settings_type,
         )
@@ -93,8 +93,9 @@ class Planner:
         why = ", ".join(reasons)
         return Step(stage, number, runs, why, manifest, interrupted, runs and bool(failure))
 
-    def request(self, stage: Stage, settings: Any) -> Request:
+    def request(self, stage: Stage) -> Request:
         """The request for `stage`. Raises SplatError (photographs-missing), OSError."""
+        settings = self.wanted[stage.name]
         files = self._files(stage, settings)
         inputs = {name: self._digests[name] for name in stage.reads}
         inputs |= {name: combined_digest(records) for name, records in files.items()}
@@ -140,13 +141,11 @@ class Planner:
             )
         return self.photos
 
-    def _request_if_known(
-        self, stage: Stage, settings: Any, done: Manifest, waiting: bool
-    ) -> Request:
+    def _request_if_known(self, stage: Stage, done: Manifest, waiting: bool) -> Request:
         """The request with the inputs of the finished run where the present ones are unknown.
         Outputs of stages that have to run first are a reason of their own, and photographs that
         were moved away after ingest are none."""
         gone = not stage.reads and (self.photos is None or not self.photos.exists())
         if waiting or gone:
-            return request_for(stage, settings, done.inputs, done.input_files)
-        return self.request(stage, settings)
+            return request_for(stage, self.wanted[stage.name], done.inputs, done.input_files)
+        return self.request(stage)
