@@ -53,15 +53,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same view on another pixel grid (both axes scaled separately)."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-        )
+        lens = self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+        return Camera(width, height, *lens, self.world_to_camera)
 
     def fitted(self, long_side: int) -> Camera:
         """The same view with its longer side at most `long_side` pixels; never enlarged."""
@@ -73,15 +66,9 @@ class Camera:
         scale = min(width / self.width, height / self.height)
         if abs(scale * self.width - width) < 1.5 and abs(scale * self.height - height) < 1.5:
             return self.resized(width, height)  # the same aspect ratio, to within a pixel
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * scale,
-            fy=self.fy * scale,
-            cx=width / 2 + (self.cx - self.width / 2) * scale,
-            cy=height / 2 + (self.cy - self.height / 2) * scale,
-        )
+        cx = width / 2 + (self.cx - self.width / 2) * scale
+        cy = height / 2 + (self.cy - self.height / 2) * scale
+        return Camera(width, height, self.fx * scale, self.fy * scale, cx, cy, self.world_to_camera)
 
     def moved(self, world_from_new: NDArray[np.float64]) -> Camera:
         """The same camera in a new world frame (x_world = world_from_new x_new), [4, 4]."""
