@@ -89,16 +89,12 @@ def test_stopping_is_heeded_before_the_next_view(scene, tmp_path, monkeypatch, d
     assert len(scored) == drawn
 
 
-@pytest.mark.parametrize(
-    ("view", "counted_as"),
-    [(4, "floaters_removed"), (1, "unneeded_removed")],  # seen from afar by 1 and by 3 others
-)
-def test_a_splat_close_to_one_camera_is_removed(scene, tmp_path, view, counted_as) -> None:
-    floater = floater_before(scene, view)
+def test_a_splat_close_to_one_camera_is_removed(scene, tmp_path) -> None:
+    floater = floater_before(scene, 4)  # which one other view sees from afar
     _, reference = run(scene, scene.splats, tmp_path, max_loss_db=0)
     result, report = run(scene, join(scene.splats, floater), tmp_path, max_loss_db=0)
     assert not rows_of(floater, result).any()
-    assert report.metrics[counted_as] > reference.metrics[counted_as]
+    assert report.metrics["floaters_removed"] > reference.metrics["floaters_removed"]
     assert report.metrics["psnr_change_db"] >= -0.05
 
 
@@ -152,26 +148,16 @@ def test_the_loss_stays_below_what_the_strength_allows(scene, tmp_path) -> None:
     assert sizes[1] < sizes[0]
 
 
-def test_validation_views_halve_what_held_out_views_lose(scene, tmp_path, monkeypatch) -> None:
-    """Where nothing is overfitted, and nothing is fine-tuned."""
-    found, report = run(scene, scene.splats, tmp_path)
-    assert len(found) < len(scene.splats)
-    monkeypatch.setattr(pruning, "VALIDATION_FROM", len(scene.reconstruction.views))
-    _, without = run(scene, scene.splats, tmp_path)
-    assert 0 < -report.metrics["psnr_change_db"] < -0.5 * without.metrics["psnr_change_db"]
-
-
-def test_what_costs_a_validation_view_too_much_stays(scene, tmp_path) -> None:
-    """The fifth training view shows a splat that harms the others, which choose."""
-    trained = join(scene.splats, floater_before(scene, 1))
-    validation = split_held_out(scene.reconstruction.views)[0][4]
-    moved = showing(scene, trained, [validation], tmp_path / "photographs")
+def test_what_costs_one_view_too_much_stays(scene, tmp_path) -> None:
+    """One photograph shows a splat that counts as a floater by the others."""
+    views = scene.reconstruction.views
+    shown = split_held_out(views)[0][4]
+    trained = join(scene.splats, floater_before(scene, views.index(shown)))
+    moved = showing(scene, trained, [shown], tmp_path / "photographs")
     result, _ = run(moved, trained, tmp_path)
-    photographs = load_evaluation_views(
-        moved.reconstruction.folder, [validation], trained.draw_settings
-    )
+    photographs = load_evaluation_views(moved.reconstruction.folder, [shown], trained.draw_settings)
     before, after = (mean_psnr_db(s, photographs, "cpu") for s in (trained, result))
-    assert after >= before - 0.1
+    assert after >= before - 0.3
 
 
 def test_held_out_views_that_lose_more_are_in_a_warning(scene, tmp_path) -> None:

@@ -50,12 +50,10 @@ class Removal:
 def select_removal(
     splats: Splats,
     contributions: Contributions,
-    validation: Contributions,
     cameras: Sequence[Camera],
     sse_per_parameter: float,
     most: int,
     share: float = ROUND_SHARE,
-    by_error: bool = False,
 ) -> Removal | None:
     """The splats and SH coefficients that contribute less than `sse_per_parameter` for each of
     their parameters, least first; None if there are none.
@@ -71,26 +69,17 @@ def select_removal(
 
     Args:
         splats: N splats.
-        contributions: of them to the views that choose.
-        validation: of them to views that do not choose. Floaters are what few views of either need.
-        cameras: of both, in the same order.
+        contributions: of them to the views.
+        cameras: of these views, in the same order.
         sse_per_parameter: the Lagrange multiplier of the rate-distortion cost.
         most: splats to remove.
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
-        by_error: measure contributions by the change of the error instead.
     """
     seen, near = contributions.view_counts > 0, near_view_frusta(splats, list(cameras))
-    every = replace(
-        contributions,
-        weight=contributions.weight + validation.weight,
-        kept_weight=contributions.kept_weight + validation.kept_weight,
-        view_counts=contributions.view_counts + validation.view_counts,
-        scene_depth=np.append(contributions.scene_depth, validation.scene_depth),
-    )
-    floaters = near_camera_floaters(splats, every, list(cameras)) | splats_in_masks(every)
+    floaters = near_camera_floaters(splats, contributions, list(cameras))
+    floaters |= splats_in_masks(contributions)
     free = floaters | (~seen & ~near)
-    change = contributions.sse_change if by_error else contributions.picture_change
-    ratio = change / parameters_per_splat(splats.sh_degrees)
+    ratio = contributions.picture_change / parameters_per_splat(splats.sh_degrees)
     ratio[~seen & near] = np.finfo(np.float64).max
     ratio[free] = -np.inf
     order = np.argsort(ratio, kind="stable")
@@ -100,7 +89,7 @@ def select_removal(
     removed[chosen] = True
     # SH coefficients that contribute more than the last removed splat stay
     limit = float(ratio[chosen[-1]]) if 0 < len(chosen) == most else sse_per_parameter
-    degrees, colour, sh_sse = _select_sh(splats, contributions, removed, limit, share, by_error)
+    degrees, colour, sh_sse = _select_sh(splats, contributions, removed, limit, share)
     if not len(chosen) and np.array_equal(degrees, splats.sh_degrees):
         return None
     predicted = float(contributions.sse_change[chosen].sum()) + sh_sse
@@ -123,14 +112,11 @@ def _select_sh(
     removed: NDArray[np.bool_],
     sse_per_parameter: float,
     share: float,
-    by_error: bool,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
     """(degrees, colour, predicted change of the error) of the splats that stay; see `Removal`."""
     degrees, colour = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     best, to = np.full(len(splats), np.inf), np.zeros(len(splats), np.int64)
     change = contributions.truncated_picture_change
-    if by_error:
-        change = contributions.truncated_sse_change
     for degree in range(splats.sh_degree):
         saved = parameters_per_splat(degrees) - parameters_per_splat(np.full(1, degree))
         ratio = np.where(saved > 0, change[:, degree] / np.maximum(saved, 1), np.inf)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +46,12 @@ class Targets:
             allowed = min(allowed, int(count * self.max_bytes / size))
         return count - max(1, min(allowed, count))
 
-    def allows(self, psnr_db: Sequence[Psnr], best_db: Sequence[Psnr]) -> bool:
-        """Whether groups of training views may have `psnr_db` where they had `best_db`, with
-        `MARGIN` for views that are not trained on."""
+    def allows(self, psnr_db: Psnr, best_db: Psnr) -> bool:
+        """Whether training views may have `psnr_db` where they had `best_db`, with `MARGIN` for
+        views that are not trained on."""
         if self.min_psnr_db:
-            return float(np.concatenate(psnr_db).mean()) >= self.min_psnr_db
-        pairs = zip(best_db, psnr_db, strict=True)
-        return not any(self.broken_by((best - now) / MARGIN) for best, now in pairs)
+            return float(psnr_db.mean()) >= self.min_psnr_db
+        return not self.broken_by((best_db - psnr_db) / MARGIN)
 
     def broken_by(self, loss_db: Psnr) -> bool:
         """Whether views lose more than the strength allows. loss_db: [V]."""
