@@ -167,7 +167,7 @@ class Pruner:
             share, found.stopped_by = share / 2, LOSS
             if share < ROUND_SHARE / 2**HALVINGS:
                 break
-        found.end_db = float(state.psnr_db.mean())
+        found.end_db = float(np.mean(state.psnr_db))
         self.targets.check_end(found.splats, found.end_db)
         return found
 
