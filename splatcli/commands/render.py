@@ -114,7 +114,8 @@ def render(
     """Draw the splats: from a photograph's camera, or as a film along a path.
 
     Frames that are in the folder already are written again. Depth is z in world units, 0 where
-    there is nothing; in films near is light and far is dark.
+    there is nothing; in films near is light and far is dark. Pictures smaller than those of
+    training are drawn larger and averaged.
     """
     options = _Options(out, camera, path, frames, seconds, fps, width, depth)
     kind = options.kind()
@@ -132,7 +133,7 @@ def _render(
 ) -> dict[str, Any]:
     """Draw and write the pictures. Returns figures: frames, size, depth range, times."""
     from stages.raster.backends import AUTO, qualified_name
-    from stages.raster.draw import renderer
+    from stages.raster.draw import renderer, supersampled
     from stages.raster.torch_device import CPU
 
     begun = time.monotonic()
@@ -146,7 +147,7 @@ def _render(
         if backend or device
         else results.backend_of_run(run)
     )
-    draw = renderer(splats, backend=backend)
+    draw = supersampled(renderer(splats, backend=backend), splats.draw_settings.side)
     sink, facts = _sink(options, kind, draw, cameras)
     rate = _draw_all(draw, cameras, sink)
     facts |= {"frames": len(cameras), "width": cameras[0].width, "height": cameras[0].height}

@@ -60,6 +60,38 @@ def renderer(
     return draw
 
 
+def supersampled(draw: Callable[[Camera], Rendering], side: int) -> Callable[[Camera], Rendering]:
+    """A function that draws as `draw` does, but pictures whose longer side is below `side` pixels
+    a whole number of times as large, and averages colour and alpha over each pixel's area.
+
+    A splat of a fraction of a pixel is too faint and too wide in a direct drawing: the low-pass
+    filter widens it, and compensation treats it alone, not with the neighbours that fill the pixel.
+    Depths are those of one sample in each pixel, because a mean over an edge is on no surface.
+
+    Args:
+        draw: draws one camera's picture.
+        side: longer side of the pictures that the splats were trained at; 0 for unknown.
+    """
+
+    def draw_larger(camera: Camera) -> Rendering:
+        factor = -(-side // max(camera.width, camera.height))
+        if factor <= 1:
+            return draw(camera)
+        height, width = camera.height, camera.width
+        drawn = draw(camera.resized(width * factor, height * factor))
+        blocks = height, factor, width, factor
+        middle = slice(factor // 2, None, factor)
+        return Rendering(
+            drawn.image.reshape(*blocks, 3).mean((1, 3)),
+            drawn.alpha.reshape(blocks).mean((1, 3)),
+            np.ascontiguousarray(drawn.depth[middle, middle]),
+            np.ascontiguousarray(drawn.median_depth[middle, middle]),
+            drawn.culled,
+        )
+
+    return draw_larger
+
+
 def raster_settings_of(splats: Splats) -> RasterSettings:
     """By the draw settings of `splats`; without a near plane there, by the extent of the splats."""
     drawn = splats.draw_settings

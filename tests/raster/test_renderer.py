@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from stages.raster.draw import render, renderer
+from stages.raster.draw import render, renderer, supersampled
+from stages.scene.draw_settings import DrawSettings
 from tests import scenes
 
 
@@ -24,3 +27,21 @@ def test_frames_do_not_disturb_each_other(backend: str) -> None:
 def test_an_unknown_backend_is_named() -> None:
     with pytest.raises(ValueError, match="magic"):
         renderer(scenes.cloud(3), backend="magic")
+
+
+def test_a_small_picture_is_the_mean_of_one_as_large_as_those_of_training() -> None:
+    """A wall of splats of a fifth of a pixel, which is dense in the larger picture."""
+    x, y = np.meshgrid(np.linspace(-2, 2, 40), np.linspace(-2, 2, 40))
+    wall = np.stack([x, y, np.full_like(x, 3.0)], -1).reshape(-1, 3)
+    scene = replace(
+        scenes.splats(wall, scales=0.08, opacities=0.95, rgb=(1.0, 1.0, 1.0)),
+        draw_settings=DrawSettings(antialias=True),
+    )
+    small = scenes.camera(8, 6, focal=7.5)
+    draw = renderer(scene, backend="cpu")
+    found, large = supersampled(draw, 64)(small), draw(small.resized(64, 48))
+    wanted = large.image.reshape(6, 8, 8, 8, 3).mean((1, 3))
+    np.testing.assert_allclose(found.image, wanted, atol=1e-6)
+    assert found.median_depth.shape == found.alpha.shape == (6, 8)
+    assert found.alpha.min() > 0.99 > draw(small).alpha.max()
+    assert supersampled(draw, 8)(small).image.tolist() == draw(small).image.tolist()
