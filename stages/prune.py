@@ -72,7 +72,7 @@ class PruneSettings:
     )
     finetune_steps: int = setting(
         90,
-        "Steps of fine-tuning after each round; 0 for none.",
+        "Steps of fine-tuning after a round that costs too much; 0 for none.",
         panel="Advanced",
         min=0,
         max=100_000,
@@ -200,7 +200,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=14,
+    version=15,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

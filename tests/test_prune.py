@@ -14,6 +14,7 @@ from stages import formats, prune
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.capacity import pruning
+from stages.capacity.selection import select_removal
 from stages.measure import contribution, evaluation
 from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
@@ -335,3 +336,17 @@ def test_near_a_frustum_is_a_quarter_of_the_longer_side_beyond_the_edge() -> Non
     """A camera of 64 x 48 pixels and focal length 60 sees x of -0.53 to 0.53 at depth 1."""
     scene = splats([[0, 0, 1], [0.75, 0, 1], [0.85, 0, 1], [0, 0, -1]])
     assert near_view_frusta(scene, [camera()]).tolist() == [True, True, False, False]
+
+
+def test_what_few_views_show_is_removed_last() -> None:
+    """Of five splats, three are seen by one or two views; the two others contribute more."""
+    seen_by, change = [1, 2, 3, 5, 2], [1e-6, 1e-5, 0.1, 0.2, 1e-6]
+    scene = splats([[0.1 * i, 0.0, 3.0] for i in range(5)])
+    contributions = contributions_of(seen_by, change)
+    removal = select_removal(scene, contributions, [camera()], 1.0, most=5)
+    assert removal is not None
+    assert not removal.removed[[0, 1, 4]].any()
+    assert removal.removed[[2, 3]].any()
+    forced = select_removal(scene, contributions, [camera()], np.inf, most=5)
+    assert forced is not None
+    assert forced.removed.sum() > removal.removed.sum()

@@ -67,8 +67,8 @@ def select_removal(
     residual asks for in any case. The predicted change of the error is measured by the error.
 
     Floaters, and splats outside the region around the views, are removed at any multiplier. Splats
-    just outside all pictures, which no view speaks against, are removed last, and only if
-    `sse_per_parameter` is infinite.
+    that fewer than `FEW_VIEWS` views see, or that lie just outside all pictures, are removed last,
+    and only if `sse_per_parameter` is infinite: the views say little about them.
 
     Args:
         splats: N splats.
