@@ -49,6 +49,13 @@ class SfmSettings:
         "(neighbours in order of name) or auto (those with similar features).",
         choices=("auto", "exhaustive", "sequential"),
     )
+    features: str = setting(
+        "auto",
+        "sift; auto (SIFT, and learned features where it leaves photographs out, if they are "
+        "installed); or learned (both from the start).",
+        panel="Advanced",
+        choices=("auto", "sift", "learned"),
+    )
     allow_partial: bool = setting(
         False,
         "Use the best reconstruction found even if it fails the quality gates.",
@@ -171,6 +178,7 @@ def _from_photographs(
     from stages.structure.job import job_of, prepare_work_folder
 
     _check_duplicates(capture)
+    features = _features(settings.features, report)
     work = folder / _WORK
     job = job_of(capture, work, settings.seed, settings.max_features, settings.matching)
     prepare_work_folder(work, job)
@@ -180,22 +188,26 @@ def _from_photographs(
         report=report,
         deadline=time.monotonic() + 60.0 * settings.max_minutes,
         allow_partial=settings.allow_partial,
+        join_all=features == "learned",
         executor=executor,
     )
     attempts = fallbacks.try_configurations(
         runner.run_configuration,
         already_exhaustive=job.matching == "exhaustive",
         out_of_time=runner.out_of_time,
+        features=features,
     )
     report.metric("attempts", [acceptance.attempt_metrics(attempt) for attempt in attempts])
-    model = acceptance.accepted_model(attempts, capture, settings.allow_partial)
-    acceptance.report_warnings(attempts, capture, report)
+    model = acceptance.accepted_model(attempts, capture, settings.allow_partial, settings.features)
+    acceptance.report_warnings(attempts, capture, report, settings.features)
     known_scale = metric_scale.KnownScale(settings.scale, settings.marker, crs=settings.crs)
     found = finish.finish(model, capture, folder, report, known_scale)
     best = fallbacks.best_attempt(attempts)
     _report_model(found, best.statistics.mean_reprojection_error_px, capture, report)
     acceptance.report_metrics(best, model, report)
+    acceptance.report_joined(attempts, capture, report)
     report.metric("pairs_compared", runner.pairs_compared())
+    report.metric("pairs_matched_by_learned_features", runner.learned_pairs())
     return found, runner.seconds_by_step()
 
 
@@ -253,6 +265,21 @@ def _check_duplicates(capture: Capture) -> None:
         )
 
 
+def _features(wanted: str, report: Report) -> str:
+    """The features to use: "sift" where learned ones are not installed."""
+    from stages.structure.learned_weights import INSTALL, installed
+
+    if wanted == "sift" or installed():
+        return wanted
+    if wanted == "learned":
+        report.warn(
+            "sfm-learned-not-installed",
+            f"Learned features are not installed ({INSTALL} installs them); the run goes on with "
+            "SIFT alone.",
+        )
+    return "sift"
+
+
 def _report_model(
     found: Reconstruction, mean_error_px: float, capture: Capture, report: Report
 ) -> None:
@@ -284,5 +311,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=16, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=17, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

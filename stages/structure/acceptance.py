@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.base.text import listed
 from stages.scene import Capture
-from stages.structure.fallbacks import Attempt, best_attempt
+from stages.structure.fallbacks import LEARNED, Attempt, best_attempt
 from stages.structure.gates import THRESHOLDS, borderline_failures, failure
+from stages.structure.learned_weights import INSTALL, installed
 from stages.structure.sparse_model import SparseModel
 
 _FEWEST_PARTIAL_POINTS = 50
@@ -19,16 +21,18 @@ _REPORTED = (
 )
 
 
-def accepted_model(attempts: list[Attempt], capture: Capture, allow_partial: bool) -> SparseModel:
+def accepted_model(
+    attempts: list[Attempt], capture: Capture, allow_partial: bool, features: str = "sift"
+) -> SparseModel:
     """The model of the best attempt. Raises SplatError if it failed a gate, unless `allow_partial`
-    and the model has enough photographs and points."""
+    and the model has enough photographs and points. features: the setting."""
     best = best_attempt(attempts)
     model = best.result.model if best.result is not None else None
     if model is not None and len(model.names) >= THRESHOLDS.fewest_views:
         enough = len(model.points) >= _FEWEST_PARTIAL_POINTS
         if best.passed or (enough and allow_partial):
             return model
-    worst = best.failures[0]
+    worst = _with_hint(best.failures[0], features)
     groups = best.result.groups if best.result is not None else ()
     if worst.code == "sfm-too-few-registered" and len(groups) > 1:
         names = {photo.image: photo.name for photo in capture.photos}
@@ -41,8 +45,10 @@ def accepted_model(attempts: list[Attempt], capture: Capture, allow_partial: boo
     raise worst
 
 
-def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -> None:
-    """Warnings about the model of the best attempt."""
+def report_warnings(
+    attempts: list[Attempt], capture: Capture, report: Report, features: str = "sift"
+) -> None:
+    """Warnings about the model of the best attempt. features: the setting."""
     best = best_attempt(attempts)
     assert best.result is not None
     assert best.result.model is not None
@@ -53,7 +59,7 @@ def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -
             "sfm-photographs-left-out",
             f"{len(missing)} of {len(capture.photos)} photographs could not be registered and "
             f"{'is' if len(missing) == 1 else 'are'} not used: {listed(missing)}. More overlap "
-            "with the others would help.",
+            f"with the others would help.{_learned_hint(features)}",
         )
     if len(best.result.groups) > 1:
         sizes = ", ".join(str(len(group)) for group in best.result.groups)
@@ -61,7 +67,7 @@ def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -
             "sfm-several-models",
             f"The photographs were registered in separate models of {sizes}; the largest is used.",
         )
-    if best.passed and best is not attempts[0]:
+    if best.passed and attempts[0].failures:
         report.warn(
             "sfm-second-try",
             f"The standard configuration failed ({attempts[0].failures[0].given}) but another one "
@@ -75,6 +81,36 @@ def report_warnings(attempts: list[Attempt], capture: Capture, report: Report) -
         report.warn(
             found.code, f"Accepted because of --allow-partial: {found.given} {found.wanted}"
         )
+
+
+def report_joined(attempts: list[Attempt], capture: Capture, report: Report) -> None:
+    """The metric `registered_by`: how many photographs of the used model SIFT registered, and the
+    names of those that learned features joined."""
+    best = best_attempt(attempts)
+    assert best.result is not None
+    assert best.result.model is not None
+    used = set(best.result.model.names)
+    joined: set[str] = set()
+    if best.configuration.learned:
+        by_sift = (a for a in attempts if not a.configuration.learned and a.result is not None)
+        models = (attempt.result.model for attempt in by_sift if attempt.result is not None)
+        joined = used - {name for model in models if model is not None for name in model.names}
+    names = [photo.name for photo in capture.photos if photo.image in joined]
+    report.metric("registered_by", {"sift": len(used) - len(names), "learned": names})
+
+
+def _learned_hint(features: str) -> str:
+    """How learned features may help, where they could have been tried and were not."""
+    if features != "auto" or installed():
+        return ""
+    return f" Learned features may join them: {INSTALL}, then --features learned."
+
+
+def _with_hint(found: SplatError, features: str) -> SplatError:
+    """The failure with `_learned_hint`, if learned features may fix it."""
+    if found.code not in LEARNED.fixes:
+        return found
+    return failure(found.code, found.given, found.wanted, found.hint + _learned_hint(features))
 
 
 def report_metrics(best: Attempt, model: SparseModel, report: Report) -> None:

@@ -22,14 +22,15 @@ from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.structure import database as sqlite
 from stages.structure.chunks import ChunkExecutor, extract_features_in_chunks, match_pairs_in_chunks
-from stages.structure.fallbacks import CONFIGURATIONS, Attempt, Configuration
+from stages.structure.fallbacks import CONFIGURATIONS, LEARNED, Attempt, Configuration
 from stages.structure.gates import (
     ModelStatistics,
     check_keypoints,
     check_model,
     check_pairs,
+    connected_groups,
 )
-from stages.structure.job import Job, compared_pairs_path
+from stages.structure.job import Job, compared_pairs_path, selected_pairs_path
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, run_step
 from stages.structure.sparse_model import load_result, model_statistics, without_implausible_views
 
@@ -48,6 +49,7 @@ class AttemptRunner:
         report: receives progress, and says when to stop.
         deadline: of all configurations together, in seconds of `time.monotonic`.
         allow_partial: go on to mapping although the gates before it failed.
+        join_all: match learned features for all photographs, also for those that SIFT registers.
         executor: runs chunks of features and matching; None: one worker process does it all.
     """
 
@@ -56,6 +58,7 @@ class AttemptRunner:
     report: Report
     deadline: float
     allow_partial: bool = False
+    join_all: bool = False
     executor: ChunkExecutor | None = None
 
     def out_of_time(self) -> bool:
@@ -74,13 +77,19 @@ class AttemptRunner:
         job = self._job(configuration)
         try:
             self._extract_features(job)
+            if configuration.learned:
+                try:
+                    job = self._match_learned(self._match(job, configuration))
+                except WorkerCrashed as crash:  # SIFT's model may do
+                    return Attempt(configuration, (crash,), empty)
             counts = sqlite.keypoint_counts(Path(job.database), photographs)
             attempt = Attempt(configuration, (), empty, keypoints_median=float(median(counts)))
             failures = check_keypoints(counts)
             # A partial model may come of few features, but more features are tried before that.
             if failures and not (self.allow_partial and configuration.more_features):
                 return replace(attempt, failures=tuple(failures))
-            job = self._match(job, configuration)
+            if not configuration.learned:
+                job = self._match(job, configuration)
             verified = sqlite.verified_pairs(Path(job.database))
             attempt = replace(
                 attempt,
@@ -161,6 +170,31 @@ class AttemptRunner:
         marker.touch()
         return job
 
+    def _match_learned(self, job: Job) -> Job:
+        """Add learned features and matches to those of the matched `job`; returns the job with the
+        database of both."""
+        source = Path(job.database)
+        learned = replace(job, database=str(_learned(source)))
+        if not Path(learned.database).exists():  # it appears when it is complete
+            photographs = self._unregistered(source)
+            step = "learned matching"
+            self._run(replace(learned, step=step, source=job.database, photographs=photographs))
+        return learned
+
+    def _unregistered(self, database: Path) -> tuple[int, ...]:
+        """Positions of the photographs that SIFT left out: of its model, or where it came to none,
+        of the largest group that its matches link."""
+        everyone = range(len(self.base.names))
+        if self.join_all:
+            return tuple(everyone)
+        model_folder = Path(self._job(CONFIGURATIONS[0]).out)
+        model = load_result(model_folder).model if _is_mapped(model_folder) else None
+        if model is not None:
+            registered = set(without_implausible_views(model).names)
+            return tuple(i for i in everyone if self.base.names[i] not in registered)
+        group = connected_groups(sqlite.verified_pairs(database), len(everyone))[0]
+        return tuple(i for i in everyone if i not in group)
+
     def _match_in_chunks(self, job: Job, executor: ChunkExecutor) -> None:
         """Match until no pair is left to select; the selection depends on earlier matches."""
         left = 1
@@ -205,6 +239,12 @@ class AttemptRunner:
         except (OSError, ValueError):
             return {}
 
+    def learned_pairs(self) -> int:
+        """Pairs that were matched by learned features."""
+        database = Path(self._job(LEARNED).database)
+        path = selected_pairs_path(replace(self.base, database=str(_learned(database))))
+        return len(json.loads(path.read_text())) if path.exists() else 0
+
     def pairs_compared(self) -> int:
         """Pairs that pair selection compared by their largest features."""
         path = compared_pairs_path(self._job(CONFIGURATIONS[0]))
@@ -215,6 +255,11 @@ def mapping_seconds(photographs: int) -> float:
     """Time limit of one mapping: several times what good captures need on two slow cores. Captures
     that cannot be mapped would otherwise go on without end."""
     return 240.0 + 10.0 * photographs
+
+
+def _learned(database: Path) -> Path:
+    """The copy of a database that learned features are added to."""
+    return database.with_name(f"{database.stem}-learned.db")
 
 
 def _is_mapped(out: Path) -> bool:

@@ -22,6 +22,7 @@ class Configuration:
         name: for messages and metrics.
         more_features: lower SIFT's peak threshold and allow more features.
         exhaustive: match every pair, whatever the settings say.
+        learned: add learned features and their matches to SIFT's.
         drop_stationary, loose, other_pair, mapper: as in `job.Job`.
         fixes: codes of the failures after which this configuration is tried.
     """
@@ -29,6 +30,7 @@ class Configuration:
     name: str
     more_features: bool = False
     exhaustive: bool = False
+    learned: bool = False
     drop_stationary: bool = False
     loose: bool = False
     other_pair: bool = False
@@ -41,7 +43,12 @@ _SPARSE = frozenset({"sfm-too-few-points", "sfm-too-few-features"})
 _UNCONNECTED = frozenset({"sfm-separate-groups", "sfm-no-matches"})
 _CAMERA = frozenset({"sfm-implausible-distortion", "sfm-implausible-focal"})
 
-CONFIGURATIONS = (
+LEARNED = Configuration(
+    "learned features",
+    learned=True,
+    fixes=_UNREGISTERED | _UNCONNECTED | _SPARSE | {"sfm-weak-link"},
+)
+CONFIGURATIONS = (  # by SIFT alone
     Configuration("standard"),
     Configuration("without stationary matches", drop_stationary=True, fixes=_CAMERA),
     Configuration("looser registration", loose=True, fixes=_UNREGISTERED),
@@ -104,11 +111,22 @@ class Attempt:
 
 
 def best_attempt(attempts: list[Attempt]) -> Attempt:
-    """The first attempt that passed, else the one of the highest rank."""
-    for attempt in attempts:
-        if attempt.passed:
-            return attempt
+    """The attempt that passed with most registered photographs, the first of them; if none passed,
+    the one of the highest rank."""
+    passed = [attempt for attempt in attempts if attempt.passed]
+    if passed:
+        return max(passed, key=lambda attempt: attempt.statistics.registered)
     return max(attempts, key=lambda attempt: attempt.rank)
+
+
+def configurations(features: str) -> tuple[Configuration, ...]:
+    """The configurations in order. features: "sift", "auto" (learned features second) or "learned"
+    (first)."""
+    if features == "sift":
+        return CONFIGURATIONS
+    if features == "learned":
+        return (LEARNED, *CONFIGURATIONS)
+    return (CONFIGURATIONS[0], LEARNED, *CONFIGURATIONS[1:])
 
 
 def try_configurations(
@@ -116,32 +134,40 @@ def try_configurations(
     *,
     already_exhaustive: bool,
     out_of_time: Callable[[], bool],
+    features: str = "sift",
 ) -> list[Attempt]:
     """The attempts, in order, until one passes, no configuration left may help, or time is up.
+
+    If the first passes and leaves photographs out, learned features are tried all the same.
 
     Args:
         run: runs one configuration.
         already_exhaustive: the settings match every pair anyway, so a configuration that adds
             nothing else is skipped.
         out_of_time: whether to stop; the first configuration is run all the same.
+        features: as in `configurations`.
     """
     attempts: list[Attempt] = []
-    for configuration in CONFIGURATIONS:
+    for configuration in configurations(features):
         if attempts:
-            failures = {failure.code for failure in attempts[-1].failures}
-            if not _may_help(configuration, failures, already_exhaustive):
+            if not _may_help(configuration, attempts, already_exhaustive):
                 continue
             if out_of_time():
                 break
         attempts.append(run(configuration))
-        if attempts[-1].passed:
-            break
     return attempts
 
 
-def _may_help(configuration: Configuration, failures: set[str], already_exhaustive: bool) -> bool:
+def _may_help(
+    configuration: Configuration, attempts: list[Attempt], already_exhaustive: bool
+) -> bool:
+    if any(attempt.passed for attempt in attempts):
+        return configuration.learned and attempts[0].statistics.left_out > 0
+    failures = {failure.code for failure in attempts[-1].failures}
     if "sfm-no-parallax" in failures:
         return False
+    if configuration is CONFIGURATIONS[0]:
+        return True
     only_adds_pairs = configuration == Configuration(
         configuration.name, exhaustive=True, fixes=configuration.fixes
     )

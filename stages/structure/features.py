@@ -101,14 +101,14 @@ def sift_features(
 
     Raises ValueError if a picture cannot be read.
     """
-    picture = _grey(photograph)
+    picture = read_grey(photograph)
     height, width = picture.shape
     reduced = _reduced(width, height)
     if reduced != (width, height):
         picture = np.asarray(cv2.resize(picture, reduced, interpolation=cv2.INTER_AREA), np.uint8)
     inside = None
     if mask is not None:
-        small = cv2.resize(_grey(mask), reduced, interpolation=cv2.INTER_NEAREST)
+        small = cv2.resize(read_grey(mask), reduced, interpolation=cv2.INTER_NEAREST)
         inside = np.where(small > 127, np.uint8(255), np.uint8(0))
     sift = cv2.SIFT.create(
         nfeatures=most,
@@ -128,7 +128,8 @@ def sift_features(
     return rows[order], _root(descriptors[order])
 
 
-def _grey(path: Path) -> NDArray[np.uint8]:
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """[H, W] a picture file. Raises ValueError if it cannot be read."""
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = cv2.imdecode(np.fromfile(path, np.uint8), flags)
     if picture is None:

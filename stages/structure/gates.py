@@ -72,6 +72,11 @@ class ModelStatistics:
     cut_points: int = 0
     cut_views: int = 0
 
+    @property
+    def left_out(self) -> int:
+        """Photographs that are not in the largest model."""
+        return self.photographs - self.registered
+
 
 @dataclass(frozen=True)
 class Thresholds:

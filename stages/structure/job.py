@@ -23,6 +23,7 @@ STEPS = (
     *("features", "matching", "mapping"),
     *("neighbours", "triangulation"),  # with known cameras
     *("pair selection", "features chunk", "matching chunk"),  # with an executor
+    "learned matching",
 )
 
 
@@ -59,8 +60,9 @@ class Job:
         other_pair: start from another initial pair than COLMAP would.
         refine: refine the poses of known cameras.
         max_seconds: time limit of mapping.
-        source: of a chunk: the database of the whole job.
-        photographs, pairs: of a chunk: the positions to process.
+        source: of a chunk: the database of the whole job; of learned matching: that of SIFT.
+        photographs, pairs: of a chunk: the positions to process; of learned matching: the
+            photographs to join.
     """
 
     step: str

@@ -178,18 +178,8 @@ class _Matcher:
         matches = known
         if matches is None:
             matches = match_descriptors(self.features.index(first), self.features.index(second))
-        geometry = pycolmap.TwoViewGeometry()
-        if len(matches) >= FEWEST_INLIERS:
-            found = pycolmap.estimate_two_view_geometry(
-                self._cameras[first],
-                self.features.points(first),
-                self._cameras[second],
-                self.features.points(second),
-                matches,
-                _verification(self._job),
-            )
-            if len(found.inlier_matches) >= FEWEST_INLIERS:
-                geometry = found
+        sides = [(self._cameras[position], self.features.points(position)) for position in pair]
+        geometry = two_view_geometry(sides[0], sides[1], matches, self._job)
         return (matches if known is None else None), geometry
 
 
@@ -227,10 +217,26 @@ def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
     return similarity
 
 
-def _verification(job: Job) -> pycolmap.TwoViewGeometryOptions:
+def two_view_geometry(
+    first: tuple[pycolmap.Camera, NDArray[np.float64]],
+    second: tuple[pycolmap.Camera, NDArray[np.float64]],
+    matches: NDArray[np.uint32],
+    job: Job,
+) -> pycolmap.TwoViewGeometry:
+    """The two-view geometry of two photographs; without inliers if it has too few.
+
+    Args:
+        first, second: the camera of a photograph and its keypoints [N, 2].
+        matches: [M, 2] indices of keypoints.
+        job: its seed, and whether stationary matches are dropped.
+    """
+    nothing = pycolmap.TwoViewGeometry()
+    if len(matches) < FEWEST_INLIERS:
+        return nothing
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = job.seed
     options.ransac.max_num_trials = MOST_TRIALS
     options.compute_relative_pose = True  # also tells a pure rotation from a planar scene
     options.filter_stationary_matches = job.drop_stationary
-    return options
+    found = pycolmap.estimate_two_view_geometry(*first, *second, matches, options)
+    return found if len(found.inlier_matches) >= FEWEST_INLIERS else nothing

@@ -18,6 +18,11 @@ FEWEST_SIMILAR = 4  # matches of the largest features; unrelated pairs have fewe
 LINK_INLIERS = 30
 FEWEST_LINKS = 3
 MOST_LINKING_PAIRS = 20  # for each photograph of the capture
+# Pairs for learned features: for each photograph that is to be joined, those that look most alike;
+# and for each photograph of these pairs those with most inliers, whose common points the others are
+# registered by.
+JOINING = 10
+SUPPORTING = 4
 
 
 def exhaustive_pairs(photographs: int) -> list[Pair]:
@@ -70,6 +75,33 @@ def linking_pairs(
     order = np.lexsort((second, first, -similarity[first, second]))
     order = order[: MOST_LINKING_PAIRS * photographs]
     return sorted(zip(first[order].tolist(), second[order].tolist(), strict=True))
+
+
+def joining_pairs(
+    likeness: NDArray[np.int32], inliers: dict[Pair, int], wanted: Iterable[int]
+) -> list[Pair]:
+    """The pairs to match by learned features so that photographs are joined to the others.
+
+    Args:
+        likeness: [P, P] symmetric: how alike two photographs look.
+        inliers: of the pairs that SIFT matched; enough of them make a link.
+        wanted: positions of the photographs to join.
+    """
+    photographs = len(likeness)
+    linked = np.zeros((photographs, photographs), np.int64)
+    for (i, j), count in inliers.items():
+        if count >= LINK_INLIERS:
+            linked[i, j] = linked[j, i] = count
+    pairs = set()
+    for i in wanted:
+        row = np.where(linked[i] > 0, -1, likeness[i])
+        row[i] = -1
+        best = np.lexsort((np.abs(np.arange(photographs) - i), -row))[:JOINING]
+        pairs |= {_pair(i, int(j)) for j in best if row[j] > 0}
+    for i in {position for pair in pairs for position in pair}:
+        best = np.argsort(-linked[i], kind="stable")[:SUPPORTING]
+        pairs |= {_pair(i, int(j)) for j in best if linked[i, j]}
+    return sorted(pairs)
 
 
 def _pair(i: int, j: int) -> Pair:

@@ -28,9 +28,16 @@ def main(arguments: list[str]) -> int:
         "pair selection": matching.select_pairs,
         "features chunk": features.extract_chunk,
         "matching chunk": matching.match_chunk,
+        "learned matching": _match_learned,
     }
     steps[job.step](job)
     return 0
+
+
+def _match_learned(job: Job) -> None:
+    from stages.structure import learned  # imports torch, which takes seconds
+
+    learned.match_learned(job)
 
 
 if __name__ == "__main__":

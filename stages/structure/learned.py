@@ -1,0 +1,140 @@
+"""Joins photographs by learned features, in the worker process (imports pycolmap and torch).
+
+The step copies the database of SIFT's matches, adds learned keypoints after SIFT's, and matches
+pairs that may join photographs to the others. SIFT's keypoints and matches stay as they are, so
+mapping continues from both.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+
+from stages.structure import database as sqlite
+from stages.structure.features import read_grey
+from stages.structure.job import Job, ProgressWriter, selected_pairs_path
+from stages.structure.learned_features import SIDE, LearnedFeatures, XFeat, mutual_nearest
+from stages.structure.learned_matching import LighterGlue
+from stages.structure.matching import two_view_geometry
+from stages.structure.pairs import Pair, joining_pairs
+
+COMPARED = 512  # features of a photograph, the best, for the choice of pairs
+LEAST_COSINE = 0.82  # as XFeat's authors have it for matches without LighterGlue
+FEWEST_INLIERS = 30  # of a pair that SIFT does not verify: the transformer finds likely matches
+_SCALE = 4.0  # of a keypoint, pixels of the reduced picture; COLMAP does not use it
+
+
+def match_learned(job: Job) -> None:
+    """Write `job.database`: a copy of `job.source` with learned keypoints, and matches that may
+    join `job.photographs` to the others. The pairs are written to `selected_pairs_path`."""
+    torch.set_num_threads(1)  # photographs and pairs run side by side
+    partial = Path(job.database).with_suffix(".partial.db")
+    sqlite.copy(Path(job.source), partial)
+    features = _features(job)
+    inliers = sqlite.inliers_of_pairs(partial)
+    wanted = joining_pairs(_likeness(job, features), inliers, job.photographs)
+    with (
+        closing(sqlite.Features(Path(job.source), immutable=True)) as stored,
+        pycolmap.Database.open(partial) as database,
+    ):
+        _write_keypoints(job, database, features)
+        _write_matches(job, database, stored, features, wanted)
+    selected_pairs_path(job).write_text(json.dumps(wanted))
+    os.replace(partial, job.database)
+
+
+def _features(job: Job) -> list[LearnedFeatures]:
+    """The learned features of each photograph, by position."""
+    network, root, progress = XFeat(), Path(job.images_root), ProgressWriter(Path(job.progress))
+
+    def of_photograph(position: int) -> LearnedFeatures:
+        mask = job.masks[position] if job.masks else ""
+        picture = read_grey(root / job.names[position])
+        return network.features(picture, read_grey(root / mask) if mask else None)
+
+    found = []
+    with ThreadPoolExecutor(job.threads) as pool:
+        for each in pool.map(of_photograph, range(len(job.names))):
+            found.append(each)
+            progress.write("learned features", len(found), len(job.names))
+    return found
+
+
+def _likeness(job: Job, features: list[LearnedFeatures]) -> NDArray[np.int32]:
+    """[P, P] mutual nearest neighbours of the best features of `job.photographs` and all others; 0
+    for pairs without one of them."""
+    photographs, progress = len(features), ProgressWriter(Path(job.progress))
+    likeness = np.zeros((photographs, photographs), np.int32)
+    for done, i in enumerate(job.photographs, 1):
+        for j in range(photographs):
+            if j != i and not likeness[i, j]:
+                count = mutual_nearest(features[i], features[j], COMPARED, LEAST_COSINE)
+                likeness[i, j] = likeness[j, i] = count
+        progress.write("selecting pairs", done, len(job.photographs))
+    return likeness
+
+
+def _write_keypoints(
+    job: Job, database: pycolmap.Database, features: Iterable[LearnedFeatures]
+) -> None:
+    """Add the learned keypoints after SIFT's."""
+    for position, each in enumerate(features):
+        camera = job.cameras[job.camera_of[position]]
+        scale = _SCALE * max(1.0, max(camera.width, camera.height) / SIDE)
+        rows = np.zeros((len(each.points), 4), np.float32)
+        rows[:, :2], rows[:, 2] = each.points, scale
+        sift = np.asarray(database.read_keypoints(position + 1), np.float32).reshape(-1, 4)
+        database.update_keypoints(position + 1, np.concatenate((sift, rows)))
+
+
+def _write_matches(
+    job: Job,
+    database: pycolmap.Database,
+    stored: sqlite.Features,
+    features: list[LearnedFeatures],
+    wanted: list[Pair],
+) -> None:
+    """Match the `wanted` pairs, add SIFT's matches, verify both together and write them."""
+    network, progress = LighterGlue(), ProgressWriter(Path(job.progress))
+    cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
+    sift_points = functools.cache(stored.points)
+
+    def match(pair: Pair) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]:
+        sift = stored.matches(*pair)
+        sift = np.empty((0, 2), np.uint32) if sift is None else sift
+        first = np.array([len(sift_points(position)) for position in pair], np.uint32)
+        learned = network.matches(*(features[position] for position in pair)) + first
+        matches = np.concatenate((sift, learned))
+        sides = [
+            (cameras[position], np.concatenate((sift_points(position), features[position].points)))
+            for position in pair
+        ]
+        geometry = two_view_geometry(sides[0], sides[1], matches, job)
+        found = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+        by_sift = int((found[:, 0] < first[0]).sum())
+        if len(found) < FEWEST_INLIERS and 2 * by_sift < len(found):
+            geometry = pycolmap.TwoViewGeometry()
+        return matches, geometry
+
+    with ThreadPoolExecutor(job.threads) as pool:
+        for done, (pair, (matches, geometry)) in enumerate(
+            zip(wanted, pool.map(match, wanted), strict=True), 1
+        ):
+            ids = pair[0] + 1, pair[1] + 1
+            if database.exists_matches(*ids):
+                database.delete_matches(*ids)
+            if database.exists_two_view_geometry(*ids):
+                database.delete_two_view_geometry(*ids)
+            database.write_matches(*ids, matches)
+            database.write_two_view_geometry(*ids, geometry)
+            progress.write("learned matching", done, len(wanted))
