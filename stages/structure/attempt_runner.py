@@ -174,11 +174,11 @@ class AttemptRunner:
         """Add learned features and matches to those of the matched `job`; returns the job with the
         database of both."""
         source = Path(job.database)
-        learned = replace(job, database=str(_learned(source)))
+        learned = replace(job, database=str(_learned(source)), source=job.database)
         if not Path(learned.database).exists():  # it appears when it is complete
             photographs = self._unregistered(source)
             step = "learned matching"
-            self._run(replace(learned, step=step, source=job.database, photographs=photographs))
+            self._run(replace(learned, step=step, photographs=photographs))
         return learned
 
     def _unregistered(self, database: Path) -> tuple[int, ...]:

@@ -98,9 +98,9 @@ class LighterGlue:
 
 
 def _attention(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-    # With one head; the fast kernel needs four dimensions.
-    batch = (x[None, None] for x in (query, key, value))
-    message: Tensor = functional.scaled_dot_product_attention(*batch)[0, 0]
+    # The fast kernel wants batches and heads, of which there is one.
+    query, key, value = query[None, None], key[None, None], value[None, None]
+    message: Tensor = functional.scaled_dot_product_attention(query, key, value)[0, 0]
     return message
 
 
