@@ -178,7 +178,7 @@ def _from_photographs(
     from stages.structure.job import job_of, prepare_work_folder
 
     _check_duplicates(capture)
-    features = _features(settings.features, report)
+    features = usable_features(settings.features, report)
     work = folder / _WORK
     job = job_of(capture, work, settings.seed, settings.max_features, settings.matching)
     prepare_work_folder(work, job)
@@ -265,7 +265,7 @@ def _check_duplicates(capture: Capture) -> None:
         )
 
 
-def _features(wanted: str, report: Report) -> str:
+def usable_features(wanted: str, report: Report) -> str:
     """The features to use: "sift" where learned ones are not installed."""
     from stages.structure.learned_weights import INSTALL, installed
 

@@ -32,7 +32,7 @@ def accepted_model(
         enough = len(model.points) >= _FEWEST_PARTIAL_POINTS
         if best.passed or (enough and allow_partial):
             return model
-    worst = _with_hint(best.failures[0], features)
+    worst = with_hint(best.failures[0], features)
     groups = best.result.groups if best.result is not None else ()
     if worst.code == "sfm-too-few-registered" and len(groups) > 1:
         names = {photo.image: photo.name for photo in capture.photos}
@@ -106,7 +106,7 @@ def _learned_hint(features: str) -> str:
     return f" Learned features may join them: {INSTALL}, then --features learned."
 
 
-def _with_hint(found: SplatError, features: str) -> SplatError:
+def with_hint(found: SplatError, features: str) -> SplatError:
     """The failure with `_learned_hint`, if learned features may fix it."""
     if found.code not in LEARNED.fixes:
         return found

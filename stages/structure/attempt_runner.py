@@ -177,23 +177,24 @@ class AttemptRunner:
         learned = replace(job, database=str(_learned(source)), source=job.database)
         if not Path(learned.database).exists():  # it appears when it is complete
             photographs = self._unregistered(source)
-            step = "learned matching"
-            self._run(replace(learned, step=step, photographs=photographs))
+            self._run(replace(learned, step="learned", photographs=photographs))
         return learned
 
     def _unregistered(self, database: Path) -> tuple[int, ...]:
-        """Positions of the photographs that SIFT left out: of its model, or where it came to none,
-        of the largest group that its matches link."""
+        """Positions of the photographs that SIFT left out: of its model, or where mapping was not
+        reached, of the largest group that its matches link."""
         everyone = range(len(self.base.names))
-        if self.join_all:
-            return tuple(everyone)
         model_folder = Path(self._job(CONFIGURATIONS[0]).out)
-        model = load_result(model_folder).model if _is_mapped(model_folder) else None
-        if model is not None:
-            registered = set(without_implausible_views(model).names)
-            return tuple(i for i in everyone if self.base.names[i] not in registered)
-        group = connected_groups(sqlite.verified_pairs(database), len(everyone))[0]
-        return tuple(i for i in everyone if i not in group)
+        registered: set[int] = set()
+        if self.join_all:
+            pass
+        elif _is_mapped(model_folder):
+            model = load_result(model_folder).model
+            names = () if model is None else without_implausible_views(model).names
+            registered = {self.base.names.index(name) for name in names}
+        else:
+            registered = set(connected_groups(sqlite.verified_pairs(database), len(everyone))[0])
+        return tuple(i for i in everyone if i not in registered)
 
     def _match_in_chunks(self, job: Job, executor: ChunkExecutor) -> None:
         """Match until no pair is left to select; the selection depends on earlier matches."""

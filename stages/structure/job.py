@@ -23,7 +23,7 @@ STEPS = (
     *("features", "matching", "mapping"),
     *("neighbours", "triangulation"),  # with known cameras
     *("pair selection", "features chunk", "matching chunk"),  # with an executor
-    "learned matching",
+    "learned",
 )
 
 
@@ -60,8 +60,8 @@ class Job:
         other_pair: start from another initial pair than COLMAP would.
         refine: refine the poses of known cameras.
         max_seconds: time limit of mapping.
-        source: of a chunk: the database of the whole job; of learned matching: that of SIFT.
-        photographs, pairs: of a chunk: the positions to process; of learned matching: the
+        source: of a chunk: the database of the whole job; of "learned": that of SIFT.
+        photographs, pairs: of a chunk: the positions to process; of "learned": the
             photographs to join.
     """
 

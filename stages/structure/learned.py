@@ -7,7 +7,6 @@ mapping continues from both.
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 from collections.abc import Iterable
@@ -26,11 +25,11 @@ from stages.structure.job import Job, ProgressWriter, selected_pairs_path
 from stages.structure.learned_features import SIDE, LearnedFeatures, XFeat, mutual_nearest
 from stages.structure.learned_matching import LighterGlue
 from stages.structure.matching import two_view_geometry
-from stages.structure.pairs import Pair, joining_pairs
+from stages.structure.pairs import Pair, joining_pairs, without_weaker
 
 COMPARED = 512  # features of a photograph, the best, for the choice of pairs
 LEAST_COSINE = 0.82  # as XFeat's authors have it for matches without LighterGlue
-FEWEST_INLIERS = 30  # of a pair that SIFT does not verify: the transformer finds likely matches
+FEWEST_INLIERS = 30  # of a pair; of SIFT's, for a pair that SIFT verifies
 _SCALE = 4.0  # of a keypoint, pixels of the reduced picture; COLMAP does not use it
 
 
@@ -104,37 +103,55 @@ def _write_matches(
     features: list[LearnedFeatures],
     wanted: list[Pair],
 ) -> None:
-    """Match the `wanted` pairs, add SIFT's matches, verify both together and write them."""
-    network, progress = LighterGlue(), ProgressWriter(Path(job.progress))
-    cameras = [database.read_camera(camera + 1) for camera in job.camera_of]
-    sift_points = functools.cache(stored.points)
+    """Match the `wanted` pairs, add SIFT's matches, verify both together and write them, but for
+    pairs that only learned features verify and that stronger ones make redundant."""
+    progress = ProgressWriter(Path(job.progress))
+    matcher = _Matcher(job, [database.read_camera(camera + 1) for camera in job.camera_of])
+    inliers = sqlite.inliers_of_pairs(Path(job.source))
+    inliers = {pair: count for pair, count in inliers.items() if count}
+    found: dict[Pair, tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]] = {}
+    uncertain = []
+    with ThreadPoolExecutor(job.threads) as pool:
+        results = pool.map(lambda pair: matcher.match(pair, stored, features), wanted)
+        for pair, (matches, geometry, by_sift) in zip(wanted, results, strict=True):
+            found[pair] = matches, geometry
+            inliers[pair] = len(geometry.inlier_matches)
+            if by_sift < FEWEST_INLIERS:
+                uncertain.append(pair)
+            progress.write("learned matching", len(found), len(wanted))
+    dropped = without_weaker(inliers, uncertain)
+    for pair, (matches, geometry) in found.items():
+        ids = pair[0] + 1, pair[1] + 1
+        if database.exists_matches(*ids):
+            database.delete_matches(*ids)
+        if database.exists_two_view_geometry(*ids):
+            database.delete_two_view_geometry(*ids)
+        enough = inliers[pair] >= FEWEST_INLIERS and pair not in dropped
+        database.write_matches(*ids, matches)
+        database.write_two_view_geometry(*ids, geometry if enough else pycolmap.TwoViewGeometry())
 
-    def match(pair: Pair) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]:
+
+class _Matcher:
+    """Matches and verifies pairs; several threads may use it at once."""
+
+    def __init__(self, job: Job, cameras: list[pycolmap.Camera]) -> None:
+        self._job, self._cameras, self._network = job, cameras, LighterGlue()
+
+    def match(
+        self, pair: Pair, stored: sqlite.Features, features: list[LearnedFeatures]
+    ) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry, int]:
+        """(matches by SIFT and learned features, two-view geometry, how many of its inliers are
+        SIFT's)."""
         sift = stored.matches(*pair)
         sift = np.empty((0, 2), np.uint32) if sift is None else sift
-        first = np.array([len(sift_points(position)) for position in pair], np.uint32)
-        learned = network.matches(*(features[position] for position in pair)) + first
+        points = [stored.points(position) for position in pair]
+        starts = np.array([len(each) for each in points], np.uint32)
+        learned = self._network.matches(*(features[position] for position in pair)) + starts
         matches = np.concatenate((sift, learned))
-        sides = [
-            (cameras[position], np.concatenate((sift_points(position), features[position].points)))
-            for position in pair
-        ]
-        geometry = two_view_geometry(sides[0], sides[1], matches, job)
-        found = np.asarray(geometry.inlier_matches).reshape(-1, 2)
-        by_sift = int((found[:, 0] < first[0]).sum())
-        if len(found) < FEWEST_INLIERS and 2 * by_sift < len(found):
-            geometry = pycolmap.TwoViewGeometry()
-        return matches, geometry
-
-    with ThreadPoolExecutor(job.threads) as pool:
-        for done, (pair, (matches, geometry)) in enumerate(
-            zip(wanted, pool.map(match, wanted), strict=True), 1
-        ):
-            ids = pair[0] + 1, pair[1] + 1
-            if database.exists_matches(*ids):
-                database.delete_matches(*ids)
-            if database.exists_two_view_geometry(*ids):
-                database.delete_two_view_geometry(*ids)
-            database.write_matches(*ids, matches)
-            database.write_two_view_geometry(*ids, geometry)
-            progress.write("learned matching", done, len(wanted))
+        first, second = (
+            (self._cameras[position], np.concatenate((each, features[position].points)))
+            for position, each in zip(pair, points, strict=True)
+        )
+        geometry = two_view_geometry(first, second, matches, self._job)
+        inliers = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+        return matches, geometry, int((inliers[:, 0] < starts[0]).sum())

@@ -22,9 +22,6 @@ LEAST_SCORE = 0.05  # of a keypoint, as XFeat's authors have it
 _CELL = 8  # pixels of the picture, each way, to one of the feature map
 _MULTIPLE = 32  # that the network needs of both sides
 _WINDOW = 5  # keypoints are the largest scores among this many pixels each way
-_CORNER_HALF_WINDOW = (4, 4)
-_CORNER_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.01)
-_LONGEST_MOVE = 2.0  # pixels of the reduced picture
 
 # (block, step of each of its convolutions); batch normalisation and ReLU follow each.
 _ENCODER = (
@@ -90,8 +87,8 @@ class XFeat:
         score = scores[0, 0, y, x] * _sample(reliability, grid, "bilinear")[:, 0]
         order = torch.argsort(-score, stable=True)[:MOST]
         found = _sample(descriptors, grid[:, :, order], "bicubic")
-        corners = _refined(small, torch.stack((x, y), 1)[order].numpy())
-        points = (corners + 0.5) * (width / columns, height / rows)
+        whole = torch.stack((x, y), 1)[order].numpy()
+        points = (whole + 0.5) * (width / columns, height / rows)
         half = np.array((width, height)) / 2
         normalised = torch.from_numpy(((points - half) / half.max()).astype(np.float32))
         return LearnedFeatures(points, normalised, functional.normalize(found, dim=1))
@@ -165,15 +162,3 @@ def _keypoints(scores: Tensor) -> tuple[Tensor, Tensor]:
 def _sample(channels: Tensor, grid: Tensor, mode: str) -> Tensor:
     """[N, C] values of [1, C, H, W] at positions [1, 1, N, 2]."""
     return functional.grid_sample(channels, grid, mode, align_corners=False)[0, :, 0].T
-
-
-def _refined(picture: NDArray[np.uint8], points: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[N, 2] the corners next to whole pixels (Foerstner 1987); those without a corner stay."""
-    if not len(points):
-        return np.empty((0, 2))
-    start = points.astype(np.float32)
-    found = cv2.cornerSubPix(
-        picture, start[:, None].copy(), _CORNER_HALF_WINDOW, (-1, -1), _CORNER_STEPS
-    )[:, 0]
-    moved = np.abs(found - start).max(axis=1)
-    return np.where(moved[:, None] <= _LONGEST_MOVE, found, start).astype(np.float64)

@@ -93,7 +93,7 @@ class LighterGlue:
         seen_a, seen_b = (
             functional.logsigmoid(self._linear(f"{name}.matchability", x)) for x in (a, b)
         )
-        both = similarity.log_softmax(1) + similarity.log_softmax(0)
+        both: Tensor = similarity.log_softmax(1) + similarity.log_softmax(0)
         return both + seen_a + seen_b.T
 
 

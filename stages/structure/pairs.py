@@ -104,5 +104,23 @@ def joining_pairs(
     return sorted(pairs)
 
 
+def without_weaker(inliers: dict[Pair, int], uncertain: Iterable[Pair]) -> set[Pair]:
+    """The `uncertain` pairs to drop: those whose photographs are linked by a chain of pairs that
+    each have more inliers. Learned features also match what only looks alike, such as both sides of
+    an object; where they are wrong, a chain around it mostly has more matches.
+
+    inliers: of all pairs with a two-view geometry.
+    """
+    photographs = 1 + max((pair[1] for pair in inliers), default=0)
+    group = np.arange(photographs)  # of those that stronger pairs link
+    uncertain, dropped = set(uncertain), set()
+    for pair in sorted(inliers, key=lambda pair: (-inliers[pair], pair)):
+        first, second = group[list(pair)]
+        if first == second and pair in uncertain:
+            dropped.add(pair)
+        group[group == second] = first
+    return dropped
+
+
 def _pair(i: int, j: int) -> Pair:
     return (min(i, j), max(i, j))

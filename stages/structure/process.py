@@ -95,7 +95,7 @@ def run_worker(
 def run_step(job: Job, folder: Path, report: Report, max_seconds: float, suffix: str = "") -> None:
     """`run_worker`, with the worker's progress passed to `report`. suffix: added to its phases."""
     path = Path(job.progress)
-    unit = "pairs" if job.step in ("matching", "neighbours") else "photographs"
+    unit = "pairs" if job.step in ("matching", "neighbours", "learned") else "photographs"
     path.unlink(missing_ok=True)
 
     def tick() -> None:

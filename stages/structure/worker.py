@@ -28,7 +28,7 @@ def main(arguments: list[str]) -> int:
         "pair selection": matching.select_pairs,
         "features chunk": features.extract_chunk,
         "matching chunk": matching.match_chunk,
-        "learned matching": _match_learned,
+        "learned": _match_learned,
     }
     steps[job.step](job)
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from stages.base.errors import SplatError
 from stages.structure.fallbacks import (
     CONFIGURATIONS,
+    LEARNED,
     Attempt,
     Configuration,
     best_attempt,
@@ -107,3 +108,47 @@ def test_every_fallback_lists_what_it_may_fix() -> None:
     assert not CONFIGURATIONS[0].fixes
     assert all(configuration.fixes for configuration in CONFIGURATIONS[1:])
     assert len({configuration.name for configuration in CONFIGURATIONS}) == len(CONFIGURATIONS)
+
+
+def passed(registered: int, learned: bool = False) -> Attempt:
+    configuration = LEARNED if learned else CONFIGURATIONS[0]
+    return Attempt(configuration, (), ModelStatistics(photographs=10, registered=registered))
+
+
+def tried(first: Attempt, features: str) -> list[str]:
+    """The configurations that follow `first` if learned features pass with all photographs."""
+
+    def run(configuration: Configuration) -> Attempt:
+        names.append(configuration.name)
+        return passed(10, learned=True) if configuration.learned else first
+
+    names: list[str] = []
+    try_configurations(run, already_exhaustive=True, out_of_time=lambda: False, features=features)
+    return names
+
+
+def test_learned_features_follow_sift_only_where_photographs_are_left_out() -> None:
+    assert tried(passed(10), "auto") == ["standard"]
+    assert tried(passed(9), "auto") == ["standard", "learned features"]
+    assert tried(passed(9), "sift") == ["standard"]
+    assert tried(passed(9), "learned") == ["learned features"]
+
+
+def test_learned_features_do_not_help_against_a_lack_of_parallax() -> None:
+    failed = Attempt(CONFIGURATIONS[0], failing("sfm-no-parallax"), ModelStatistics(photographs=10))
+    assert tried(failed, "auto") == ["standard"]
+
+
+def test_the_attempt_with_most_photographs_is_used_and_sift_where_they_are_as_many() -> None:
+    sift, learned = passed(9), passed(10, learned=True)
+    assert best_attempt([sift, learned]) is learned
+    assert best_attempt([sift, passed(9, learned=True)]) is sift
+
+
+def test_sift_follows_where_learned_features_fail_first() -> None:
+    script = Script("sfm-high-error", standard=())
+    attempts = try_configurations(
+        script, already_exhaustive=True, out_of_time=lambda: False, features="learned"
+    )
+    assert script.tried == ["learned features", "standard"]
+    assert best_attempt(attempts).configuration.name == "standard"
