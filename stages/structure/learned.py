@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from stages.structure import database as sqlite
 from stages.structure.features import read_grey
 from stages.structure.job import Job, ProgressWriter, selected_pairs_path
-from stages.structure.learned_features import SIDE, LearnedFeatures, XFeat, mutual_nearest
+from stages.structure.learned_features import LearnedFeatures, XFeat, mutual_nearest
 from stages.structure.learned_matching import LighterGlue
 from stages.structure.matching import two_view_geometry
 from stages.structure.pairs import Pair, joining_pairs, without_weaker
@@ -30,7 +30,7 @@ from stages.structure.pairs import Pair, joining_pairs, without_weaker
 COMPARED = 512  # features of a photograph, the best, for the choice of pairs
 LEAST_COSINE = 0.82  # as XFeat's authors have it for matches without LighterGlue
 FEWEST_INLIERS = 30  # of a pair; of SIFT's, for a pair that SIFT verifies
-_SCALE = 4.0  # of a keypoint, pixels of the reduced picture; COLMAP does not use it
+_SCALE = 4.0  # of a keypoint, pixels; COLMAP does not use it
 
 
 def match_learned(job: Job) -> None:
@@ -46,7 +46,7 @@ def match_learned(job: Job) -> None:
         closing(sqlite.Features(Path(job.source), immutable=True)) as stored,
         pycolmap.Database.open(partial) as database,
     ):
-        _write_keypoints(job, database, features)
+        _write_keypoints(database, features)
         _write_matches(job, database, stored, features, wanted)
     selected_pairs_path(job).write_text(json.dumps(wanted))
     os.replace(partial, job.database)
@@ -83,15 +83,11 @@ def _likeness(job: Job, features: list[LearnedFeatures]) -> NDArray[np.int32]:
     return likeness
 
 
-def _write_keypoints(
-    job: Job, database: pycolmap.Database, features: Iterable[LearnedFeatures]
-) -> None:
+def _write_keypoints(database: pycolmap.Database, features: Iterable[LearnedFeatures]) -> None:
     """Add the learned keypoints after SIFT's."""
     for position, each in enumerate(features):
-        camera = job.cameras[job.camera_of[position]]
-        scale = _SCALE * max(1.0, max(camera.width, camera.height) / SIDE)
         rows = np.zeros((len(each.points), 4), np.float32)
-        rows[:, :2], rows[:, 2] = each.points, scale
+        rows[:, :2], rows[:, 2] = each.points, _SCALE
         sift = np.asarray(database.read_keypoints(position + 1), np.float32).reshape(-1, 4)
         database.update_keypoints(position + 1, np.concatenate((sift, rows)))
 

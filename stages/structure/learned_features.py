@@ -16,7 +16,8 @@ from torch.nn import functional
 
 from stages.structure.learned_weights import XFEAT, weights_path
 
-SIDE = 1024  # pixels; larger photographs are reduced to it
+SIDE = 1024  # pixels: the longer side at which features are found
+MOST_ENLARGED = 2.0  # of small photographs; keypoints are whole pixels of the resized picture
 MOST = 2048  # keypoints of a photograph
 LEAST_SCORE = 0.05  # of a keypoint, as XFeat's authors have it
 _CELL = 8  # pixels of the picture, each way, to one of the feature map
@@ -68,10 +69,9 @@ class XFeat:
         """The features of a grey picture [H, W]. mask [H, W]: features where it is below half are
         left out."""
         height, width = picture.shape
-        reduction = min(1.0, SIDE / max(width, height))
+        resize = min(MOST_ENLARGED, SIDE / max(width, height))
         columns, rows = (
-            max(_MULTIPLE, int(side * reduction) // _MULTIPLE * _MULTIPLE)
-            for side in (width, height)
+            max(_MULTIPLE, int(side * resize) // _MULTIPLE * _MULTIPLE) for side in (width, height)
         )
         resized = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
         small = np.asarray(resized, np.uint8)
