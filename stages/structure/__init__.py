@@ -5,6 +5,8 @@ Without known cameras (`stages.sfm`):
   (`job`) in worker processes (`process`, `worker`), or in `chunks`;
 - in the worker: `features` (SIFT), then pairs by `retrieval` over a `vocabulary` of visual words
   and `pairs`, `matching` with `descriptor_matching` and two-view geometry, then `mapping`;
+- where SIFT leaves photographs out: `learned` adds `learned_features` and `learned_matching`, whose
+  weights `learned_weights` finds;
 - `sparse_model` holds the result with its statistics (`view_graph`, `epipolar`), `gates` check
   them, and `acceptance` decides which model is used.
 

@@ -163,7 +163,8 @@ def _may_help(
 ) -> bool:
     if any(attempt.passed for attempt in attempts):
         return configuration.learned and attempts[0].statistics.left_out > 0
-    failures = {failure.code for failure in attempts[-1].failures}
+    by_sift = [attempt for attempt in attempts if not attempt.configuration.learned]
+    failures = {failure.code for failure in (by_sift or attempts)[-1].failures}
     if "sfm-no-parallax" in failures:
         return False
     if configuration is CONFIGURATIONS[0]:
