@@ -117,6 +117,7 @@ class AttemptRunner:
         if result.model is not None:
             result = replace(result, model=without_implausible_views(result.model))
         statistics = model_statistics(result, len(self.base.names), attempt.configuration.mapper)
+        statistics = replace(statistics, learned=attempt.configuration.learned)
         failures = tuple(before) + tuple(check_model(statistics))
         return replace(attempt, statistics=statistics, failures=failures, result=result)
 

@@ -43,6 +43,8 @@ _SPARSE = frozenset({"sfm-too-few-points", "sfm-too-few-features"})
 _UNCONNECTED = frozenset({"sfm-separate-groups", "sfm-no-matches"})
 _CAMERA = frozenset({"sfm-implausible-distortion", "sfm-implausible-focal"})
 
+_FALSE_JOIN = frozenset({"sfm-weak-link", "sfm-contradictions"})
+
 LEARNED = Configuration(
     "learned features",
     learned=True,
@@ -103,11 +105,14 @@ class Attempt:
 
     @property
     def rank(self) -> tuple[bool, int, int, int]:
-        """Orders attempts that failed: any incremental model before the global mapper's, then by
-        registered photographs, points, and the size of any model found."""
+        """Orders attempts that failed: any incremental model before the global mapper's and those
+        that learned features may have joined falsely, then by registered photographs, points, and
+        the size of any model found."""
         largest = max(self.statistics.models, default=0)
-        incremental = self.statistics.mapper != "global"
-        return (incremental, self.statistics.registered, self.statistics.points, largest)
+        failures = {failure.code for failure in self.failures}
+        false = self.configuration.learned and bool(failures & _FALSE_JOIN)
+        trusted = self.statistics.mapper != "global" and not false
+        return (trusted, self.statistics.registered, self.statistics.points, largest)
 
 
 def best_attempt(attempts: list[Attempt]) -> Attempt:

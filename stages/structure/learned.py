@@ -25,7 +25,7 @@ from stages.structure.job import Job, ProgressWriter, selected_pairs_path
 from stages.structure.learned_features import LearnedFeatures, XFeat, mutual_nearest
 from stages.structure.learned_matching import LighterGlue
 from stages.structure.matching import two_view_geometry
-from stages.structure.pairs import Pair, joining_pairs, unconfirmed, without_weaker
+from stages.structure.pairs import Pair, joining_pairs, without_weaker
 
 COMPARED = 512  # features of a photograph, the best, for the choice of pairs
 LEAST_COSINE = 0.82  # as XFeat's authors have it for matches without LighterGlue
@@ -115,7 +115,7 @@ def _write_matches(
             if by_sift < FEWEST_INLIERS:
                 uncertain.append(pair)
             progress.write("learned matching", len(found), len(wanted))
-    dropped = without_weaker(inliers, uncertain) | unconfirmed(inliers, uncertain)
+    dropped = without_weaker(inliers, uncertain)
     for pair, (matches, geometry) in found.items():
         ids = pair[0] + 1, pair[1] + 1
         if database.exists_matches(*ids):

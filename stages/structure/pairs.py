@@ -122,36 +122,5 @@ def without_weaker(inliers: dict[Pair, int], uncertain: Iterable[Pair]) -> set[P
     return dropped
 
 
-def unconfirmed(inliers: dict[Pair, int], uncertain: Iterable[Pair]) -> set[Pair]:
-    """The `uncertain` pairs to drop because each alone would join two groups, of which at least one
-    has several photographs: where groups show the same, more than one pair says so.
-
-    Args:
-        inliers: of all pairs with a two-view geometry; the certain ones make the groups.
-        uncertain: pairs that only learned features verify.
-    """
-    uncertain = set(uncertain)
-    photographs = 1 + max((pair[1] for pair in inliers), default=0)
-    certain = [
-        (*pair, 0, 0)
-        for pair, count in inliers.items()
-        if pair not in uncertain and count >= LINK_INLIERS
-    ]
-    groups = connected_groups(certain, photographs)
-    group = {position: number for number, members in enumerate(groups) for position in members}
-    joins: dict[tuple[int, ...], list[Pair]] = {}
-    for pair in sorted(uncertain):
-        if inliers.get(pair, 0) >= LINK_INLIERS:
-            both = tuple(sorted(group[position] for position in pair))
-            joins.setdefault(both, []).append(pair)
-    return {
-        pairs[0]
-        for both, pairs in joins.items()
-        if len(pairs) == 1
-        and max(len(groups[number]) for number in both) > 1
-        and len(set(both)) > 1
-    }
-
-
 def _pair(i: int, j: int) -> Pair:
     return (min(i, j), max(i, j))

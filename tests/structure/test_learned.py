@@ -14,7 +14,7 @@ from stages import ingest, sfm
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.structure import acceptance, learned_weights
-from stages.structure.pairs import joining_pairs, unconfirmed, without_weaker
+from stages.structure.pairs import joining_pairs, without_weaker
 from tests.structure import bad_captures
 from tests.structure.truth import TRUTH, centres, similarity
 
@@ -51,14 +51,6 @@ def test_a_pair_of_learned_features_is_dropped_where_stronger_pairs_link_its_pho
     assert without_weaker(inliers, []) == set()
     assert without_weaker(inliers | {(0, 2): 55}, [(0, 2), (1, 2)]) == {(1, 2)}
     assert without_weaker({}, []) == set()
-
-
-def test_groups_are_joined_by_two_pairs_at_least() -> None:
-    inliers = {(0, 1): 90, (2, 3): 90, (1, 2): 244}
-    assert unconfirmed(inliers, [(1, 2)]) == {(1, 2)}
-    assert unconfirmed(inliers | {(0, 3): 31}, [(1, 2), (0, 3)]) == set()
-    assert unconfirmed({(0, 1): 90, (1, 2): 40}, [(0, 1), (1, 2)]) == set()  # no group to join
-    assert unconfirmed({}, []) == set()
 
 
 def test_without_the_extra_a_request_is_a_warning_and_sift_goes_on(
