@@ -57,7 +57,7 @@ def test_dependencies_are_read_less_extras_and_versions(monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("name", "module"),
     [
-        ("opencv-contrib-python-headless", "cv2"),
+        ("opencv-python-headless", "cv2"),
         ("pillow", "PIL"),
         ("usd-core", "pxr"),
         ("plyfile", "plyfile"),
