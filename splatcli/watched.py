@@ -24,14 +24,19 @@ def watched(command: Callable[[], None]) -> None:
     processes cannot fork, `command` runs in this one."""
     if not hasattr(os, "fork"):
         return command()
+    forwarded = {getattr(signal, name) for name in _FORWARDED}
+    # A signal that arrives before it can be passed on waits until then.
+    signal.pthread_sigmask(signal.SIG_BLOCK, forwarded)
     child = os.fork()
     if child == 0:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, forwarded)
         # In a group of its own, so that a terminal's Ctrl-C reaches it once, from the parent.
         os.setpgid(0, 0)
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # it may write to the terminal all the same
         die_with_parent(watch_input=False)
         return command()
     _forward_signals(child)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, forwarded)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if status < 0 and -status not in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         status = console.show_error(_crashed(status), "--json" in sys.argv)
