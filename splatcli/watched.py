@@ -25,7 +25,7 @@ def watched(command: Callable[[], None]) -> None:
     if not hasattr(os, "fork"):
         return command()
     forwarded = {getattr(signal, name) for name in _FORWARDED}
-    # A signal that arrives before it can be passed on waits until then.
+    # A signal that arrives before it can be forwarded waits until then.
     signal.pthread_sigmask(signal.SIG_BLOCK, forwarded)
     child = os.fork()
     if child == 0:
