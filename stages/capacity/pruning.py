@@ -25,8 +25,8 @@ from stages.training.finetune import FineTuner
 
 HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
 MAX_VIEWS = 48  # measured in a round; what the others showed at first goes on counting
-# Fine-tuning leaves a quarter of a loss at least: 90 steps left 0.2 to 0.7 of what validation views
-# lost by a tenth of the splats, on five captures.
+# The part of a loss that fine-tuning is taken to leave at least. 90 steps left 0.2 to 0.7 of the
+# mean loss by a tenth of the splats in most rounds, on five captures.
 LEAST_LEFT = 0.25
 TINY = float(np.finfo(np.float64).tiny)
 # why pruning stopped
@@ -167,7 +167,7 @@ class Pruner:
             share, found.stopped_by = share / 2, LOSS
             if share < ROUND_SHARE / 2**HALVINGS:
                 break
-        found.end_db = float(np.mean(state.psnr_db))
+        found.end_db = float(state.psnr_db.mean())
         self.targets.check_end(found.splats, found.end_db)
         return found
 

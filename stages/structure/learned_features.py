@@ -122,7 +122,7 @@ class XFeat:
         for number, step in enumerate(steps):
             layer = f"{block}.{number}.layer"
             weight = self._weights[f"{layer}.0.weight"]
-            x = functional.conv2d(x, weight, stride=step, padding=weight.shape[-1] // 2)
+            x = functional.conv2d(x, weight, None, step, weight.shape[-1] // 2)
             mean, variance = (
                 self._weights[f"{layer}.1.running_{name}"] for name in ("mean", "var")
             )
