@@ -20,6 +20,7 @@ from stages.base.text import counted
 
 if TYPE_CHECKING:
     from stages.photos.decode import Decoded, PixelBudget, Unusable
+    from stages.photos.masking import MaskedPhoto
     from stages.photos.quality import Measures
     from stages.photos.sources import Findings, Source
     from stages.scene import Capture, Photo
@@ -59,6 +60,13 @@ class IngestSettings:
         panel="Light and masks",
         choices=("auto", "ignore", "transparent"),
     )
+    rig_mask: Path | None = setting(
+        None,
+        "Picture twice as wide as high, black where every 360-degree picture shows the camera's "
+        "stand, the person who holds it, or a bad seam.",
+        panel="Light and masks",
+        affects_output=False,  # its content does, which is an input
+    )
     frames: int = setting(
         0,
         "Frames to take from each video, at most; 0 chooses by how far the camera moves.",
@@ -74,15 +82,15 @@ class _Ingested:
 
     Args:
         name: of the file, or of the frame.
-        photo: None for a file that cannot be used.
-        measures: of the photograph.
+        photos: the photograph, or the faces of a panorama; () for a file that cannot be used.
+        measures: of the picture.
         error: why the file cannot be used.
-        inside: share of the photograph that its mask keeps.
+        inside: share of the picture that its mask keeps.
         remarks: codes of `advice.TEXTS` that apply to it.
     """
 
     name: str
-    photo: Photo | None = None
+    photos: tuple[Photo, ...] = ()
     measures: Measures | None = None
     error: Unusable | None = None
     inside: float = 1.0
@@ -120,26 +128,30 @@ def run(
         ingested += _ingest_video(source, settings, folder, report)
     unusable = [(one.name, str(one.error), one.error.hint) for one in ingested if one.error]
     advice.about_left_out(unusable, report.warn)
-    photos = tuple(one.photo for one in ingested if one.photo is not None)
-    if len(photos) < FEWEST_PHOTOGRAPHS:
-        raise _too_few(root, len(photos), unusable)
-    inside = [one.inside for one in ingested if one.photo is not None]
-    masking.check_shares(photos, inside, bool(found.masks))
-    bare = [photo.name for photo in photos if not photo.mask]
+    usable = [one for one in ingested if one.photos]
+    if len(usable) < FEWEST_PHOTOGRAPHS:
+        raise _too_few(root, len(usable), unusable)
+    pictures = tuple(replace(one.photos[0], name=one.name) for one in usable)
+    photos = tuple(photo for one in usable for photo in one.photos)
+    files = bool(found.masks or settings.rig_mask)
+    masking.check_shares(pictures, [one.inside for one in usable], files)
+    bare = [picture.name for picture in pictures if not picture.mask]
     remarks: dict[str, Sequence[str]] = {
         code: [o.name for o in ingested if code in o.remarks] for code in advice.TEXTS
     }
     remarks |= {
         "ingest-raw-not-read": found.raws,
         "ingest-format-not-read": found.other_pictures,
-        "ingest-masks-cut-out": [photo.name for photo in photos] if cut_out else (),
+        "ingest-masks-cut-out": [picture.name for picture in pictures] if cut_out else (),
         "ingest-mask-unused": found.stray_masks,
-        "ingest-mask-missing": bare if len(bare) < len(photos) else (),
+        "ingest-mask-missing": bare if len(bare) < len(pictures) else (),
+        "ingest-rig-mask-unused": _rig_mask_unused(photos, settings),
     }
     advice.about_names(remarks, report.warn)
-    duplicates = near_duplicates([one.measures.thumbnail for one in ingested if one.measures])
-    photos = _with_duplicates(photos, duplicates)
-    _report_capture(photos, duplicates, report)
+    duplicates = near_duplicates([one.measures.thumbnail for one in usable if one.measures])
+    first = {usable[i].name: usable[group[0]].name for group in duplicates for i in group}
+    photos = tuple(replace(photo, duplicate_of=first.get(photo.source, "")) for photo in photos)
+    _report_capture(pictures, duplicates, report)
     report.metric("left_out", len(unusable))
     report.metric("files_ignored", found.others)
     capture = Capture(folder, photos)
@@ -201,11 +213,18 @@ def _ingest_photographs(
 def _ingest_photograph(
     source: Source, mask: Path | None, settings: IngestSettings, folder: Path, budget: PixelBudget
 ) -> _Ingested:
+    from stages.photos import faces
     from stages.photos.decode import Unusable, decode
+    from stages.photos.panorama import SPHERE, hint_for, kind_of
 
     try:
         decoded = decode(source.path, settings.max_side, budget)
-        return _write(source.name, source.image, decoded, settings, folder, mask)
+        kind = kind_of(decoded)
+        if kind == SPHERE:
+            decoded = decode(source.path, int(faces.WIDTHS * settings.max_side), budget)
+        elif kind:
+            raise Unusable(f"it is {kind}", hint_for(kind))
+        return _write(source.name, source.image, decoded, settings, folder, mask, kind=kind)
     except Unusable as error:
         return _Ingested(source.name, error=error)
 
@@ -218,7 +237,7 @@ def _ingest_video(
     from stages.photos.decode import Unusable
 
     try:
-        chosen = video_frames.photographs(source, settings.frames, settings.max_side, report)
+        kind, chosen = video_frames.photographs(source, settings.frames, settings.max_side, report)
         return [
             _write(
                 f"{source.name}/{number}",
@@ -227,6 +246,7 @@ def _ingest_video(
                 settings,
                 folder,
                 video=source.name,
+                kind=kind,
             )
             for number, decoded in chosen
         ]
@@ -242,30 +262,58 @@ def _write(
     folder: Path,
     mask: Path | None = None,
     video: str = "",
+    kind: str = "",
 ) -> _Ingested:
-    """Write a normalised picture and its mask, and measure it. video: that it is a frame of. Raises
-    Unusable for a panorama."""
-    from stages.photos.decode import Unusable
-    from stages.photos.masking import MaskedPhoto
-    from stages.photos.panorama import CUT, panorama
-    from stages.photos.quality import measure
-    from stages.photos.write import write_mask, write_picture
-    from stages.scene import TRANSPARENT, Photo
+    """Write a normalised picture and its mask, or the faces of a panorama, and measure it. Raises
+    Unusable if a mask leaves no face.
 
-    if kind := panorama(decoded.pixels, decoded.stored, decoded.exif.projection):
-        raise Unusable(f"it is {kind}", CUT)
+    Args:
+        name: of the file, or of the frame.
+        image: as in `Photo`.
+        decoded: the picture.
+        settings: of the stage.
+        folder: of the stage's output.
+        mask: file of its mask.
+        video: that it is a frame of.
+        kind: `panorama.SPHERE` or "".
+    """
+    from stages.photos.decode import Unusable
+    from stages.photos.faces import face_photos
+    from stages.photos.masking import MaskedPhoto
+    from stages.photos.panorama import SPHERE
+    from stages.photos.quality import measure
+    from stages.photos.write import write_photo
+    from stages.scene import TRANSPARENT
+
     masked = MaskedPhoto.of(decoded, name, mask, settings.invert_masks, settings.mask_means)
+    if kind == SPHERE and settings.rig_mask is not None:
+        masked = masked.without(settings.rig_mask, name)
     decoded = masked.decoded
-    target = folder / image
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_picture(target, decoded)
-    if masked.mask is not None:
-        write_mask(folder / masked.file(image), masked.mask)
     measures = measure(decoded.pixels, masked.mask)
+    photo = _photo(name, image, masked, measures, video)
+    parts = face_photos(photo, masked) if kind == SPHERE else ((photo, masked),)
+    photos = tuple(write_photo(part, picture, folder) for part, picture in parts)
+    if not photos:
+        raise Unusable("masks leave nothing of it", "Check the masks")
+    remarks = {
+        "ingest-transparency": decoded.alpha is not None and masked.outside == TRANSPARENT,
+        "ingest-mask-scaled": masked.scaled,
+        "ingest-hdr": decoded.hdr,
+        "ingest-colour-profile": decoded.bad_profile,
+        "ingest-gps-contradicts": decoded.exif.gps.contradicts,
+    }
+    codes = tuple(code for code, applies in remarks.items() if applies)
+    return _Ingested(name, photos, measures, inside=masked.share, remarks=codes)
+
+
+def _photo(name: str, image: str, masked: MaskedPhoto, measures: Measures, video: str) -> Photo:
+    """What is known of a picture. Arguments as of `_write`."""
+    from stages.scene import Photo
+
+    decoded, exif = masked.decoded, masked.decoded.exif
     height, width = decoded.pixels.shape[:2]
-    exif = decoded.exif
     focal = exif.focal_px(decoded.stored, width, height)
-    photo = Photo(
+    return Photo(
         name=name,
         image=image,
         width=width,
@@ -281,15 +329,6 @@ def _write(
         mask=masked.file(image),
         outside=masked.outside,
     )
-    remarks = {
-        "ingest-transparency": decoded.alpha is not None and masked.outside == TRANSPARENT,
-        "ingest-mask-scaled": masked.scaled,
-        "ingest-hdr": decoded.hdr,
-        "ingest-colour-profile": decoded.bad_profile,
-        "ingest-gps-contradicts": exif.gps.contradicts,
-    }
-    codes = tuple(code for code, applies in remarks.items() if applies)
-    return _Ingested(name, photo, measures, inside=masked.share, remarks=codes)
 
 
 def _video_key(video: str, width: int, height: int) -> str:
@@ -297,10 +336,9 @@ def _video_key(video: str, width: int, height: int) -> str:
     return f"video, {width}x{height} {video.replace(',', ' ')}"
 
 
-def _with_duplicates(photos: tuple[Photo, ...], groups: list[tuple[int, ...]]) -> tuple[Photo, ...]:
-    """The photographs, with `duplicate_of` set to the first of each group of near-duplicates."""
-    first = {index: photos[group[0]].name for group in groups for index in group}
-    return tuple(replace(photo, duplicate_of=first.get(i, "")) for i, photo in enumerate(photos))
+def _rig_mask_unused(photos: Sequence[Photo], settings: IngestSettings) -> Sequence[str]:
+    unused = settings.rig_mask is not None and not any(photo.face for photo in photos)
+    return (str(settings.rig_mask),) if unused else ()
 
 
 def _report_capture(
@@ -313,6 +351,7 @@ def _report_capture(
     blurred = advice.about_capture(photos, duplicates, report.warn)
     known = [photo.exposure_ev for photo in photos if photo.exposure_ev is not None]
     report.metric("photographs", len(photos))
+    report.metric("panoramas", sum(photo.face is not None for photo in photos))
     report.metric("with_focal_length", sum(photo.focal_px is not None for photo in photos))
     report.metric("masked", sum(bool(photo.mask) for photo in photos))
     report.metric("cameras", len({photo.camera for photo in photos}))
@@ -345,4 +384,4 @@ def _too_few(root: Path, usable: int, unusable: list[tuple[str, str, str]]) -> S
     )
 
 
-STAGE = Stage(name="ingest", version=8, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=9, reads=(), settings_type=IngestSettings, run=run, load=load)

@@ -252,7 +252,7 @@ def _check_duplicates(capture: Capture) -> None:
     """Refuse a capture of near-duplicates at once; matching would take minutes to find the same."""
     from stages.structure.gates import MOVE
 
-    different = len({photo.duplicate_of or photo.name for photo in capture.photos})
+    different = len({photo.duplicate_of or photo.source for photo in capture.photos})
     if different < _FEWEST_PHOTOGRAPHS:
         raise SplatError(
             "sfm-no-parallax",
@@ -286,7 +286,8 @@ def _report_model(
     names = {view.name for view in found.views}
     report.metric("photographs", len(capture.photos))
     report.metric("registered_images", len(found.views))
-    report.metric("unregistered_images", [p.name for p in capture.photos if p.name not in names])
+    lost = dict.fromkeys(photo.source for photo in capture.photos if photo.name not in names)
+    report.metric("unregistered_images", list(lost))
     report.metric("points", len(found.points))
     report.metric("mean_reprojection_error_px", round(mean_error_px, 4))
 

@@ -42,6 +42,8 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "ingest-mask-unused": "Masks that belong to no photograph by their names are not used: "
     "{names}.",
     "ingest-mask-missing": "Some photographs have no mask: {names}. There everything counts.",
+    "ingest-rig-mask-unused": "The capture has no 360-degree pictures, so this mask is not used: "
+    "{names}.",
     "ingest-blurred": "Blurred, compared with the others: {names}. "
     "Take these again or remove them; more light or a shorter exposure helps.",
     "ingest-small": f"Smaller than {SMALL_BELOW_PX} pixels: {{names}}. "

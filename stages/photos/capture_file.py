@@ -9,7 +9,7 @@ from typing import Any
 
 from stages.base.atomic import replacing
 from stages.base.bad_files import BadFileError, reading, stage_output
-from stages.scene import Capture, Photo
+from stages.scene import Capture, Face, Photo
 
 FILE = "capture.json"
 _SCHEMA = 5
@@ -17,7 +17,7 @@ _SCHEMA = 5
 
 def save_capture(capture: Capture) -> None:
     """Write capture.json into the capture's folder. Raises SplatError if it cannot be written."""
-    data = {"schema": _SCHEMA, "photos": [asdict(photo) for photo in capture.photos]}
+    data = {"schema": _SCHEMA, "photos": [_row(photo) for photo in capture.photos]}
     text = json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False)
     with replacing(capture.folder / FILE) as path:
         path.write_text(text + "\n", encoding="utf-8", newline="\n")
@@ -39,6 +39,16 @@ def load_capture(folder: Path) -> Capture:
         return Capture(folder, photos)
 
 
+def _row(photo: Photo) -> dict[str, Any]:
+    row = asdict(photo)
+    if photo.face is None:
+        del row["face"]
+    return row
+
+
 def _photo(row: dict[str, Any]) -> Photo:
-    gps = row.pop("gps")
-    return Photo(**row, gps=None if gps is None else (float(gps[0]), float(gps[1])))
+    gps, face = row.pop("gps"), row.pop("face", None)
+    if face is not None:
+        w, x, y, z = (float(value) for value in face["turn"])
+        face = Face(str(face["rig"]), str(face["frame"]), (w, x, y, z))
+    return Photo(**row, gps=None if gps is None else (float(gps[0]), float(gps[1])), face=face)

@@ -77,6 +77,13 @@ class MaskedPhoto:
             decoded = replace(decoded, pixels=black, unchanged_jpeg=None)
         return cls(decoded, mask, outside, scaled, float(np.mean(mask > 127)))
 
+    def without(self, file: Path, name: str) -> MaskedPhoto:
+        """Without what the mask in `file` is black at. Raises SplatError "mask-unfit"."""
+        kept, scaled = _read(file, name, False, self.decoded)
+        mask = np.where(kept, np.uint8(255) if self.mask is None else self.mask, np.uint8(0))
+        share = float(np.mean(mask > 127))
+        return MaskedPhoto(self.decoded, mask, IGNORE, self.scaled or scaled, share)
+
     def file(self, image: str) -> str:
         """Where the mask of the normalised picture `image` goes; "" without one."""
         return f"{FOLDER}/{image.removeprefix(PHOTOS_FOLDER)}.png" if self.outside else ""

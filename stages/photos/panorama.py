@@ -9,11 +9,17 @@ nothing: phones take such photographs.
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-_PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w{1,40})")
+if TYPE_CHECKING:
+    from stages.photos.decode import Decoded
+
+_TAG = rb"GPano:%s\s*(?:=\s*[\"']|>)\s*(\w{1,40})"
+_WIDTHS = (b"FullPanoWidthPixels", b"CroppedAreaImageWidthPixels")
+_RATIO = 0.01  # by which a picture that its metadata call a panorama may differ from 2:1
 _COLUMNS = 256  # of the reduced picture
 _FEWEST = 64  # columns; smaller pictures are not examined
 _SEAM = 2.5  # times the median difference of neighbouring columns
@@ -22,34 +28,57 @@ _POLE = 0.3  # of the variation along a row in the middle
 _CONTRAST = 4.0  # of 255: below, edges and rows say nothing
 _DARK = 12.0  # of 255: what is outside the circles of two fisheyes
 _SHARE = 0.95  # of the pixels outside the circles that are dark, and just inside that are not
-CUT = (
-    "Cut it into perspective pictures that overlap by half (ns-process-data of nerfstudio does, "
-    "with --camera-type equirectangular), or photograph with a plain lens"
+EQUIRECTANGULAR = "equirectangular"
+SPHERE = "a 360-degree panorama (equirectangular)"
+_FISHEYES = "a pair of fisheye pictures side by side"
+WHOLE = "Export the whole sphere, twice as wide as high, or photograph with a plain lens"
+STITCH = (
+    "Stitch it in the program of the camera's maker, and export it equirectangular: twice as wide "
+    "as high"
 )
 
 
 def projection_of(xmp: bytes) -> str:
-    """GPano's ProjectionType in lower case ("equirectangular"); "" if there is none."""
-    found = _PROJECTION.search(xmp)
-    return found[1].decode("ascii").lower() if found else ""
+    """GPano's ProjectionType in lower case ("equirectangular"), with "partial" before it if the
+    picture shows a part of the circle; "" if there is none."""
+    found = re.search(_TAG % b"ProjectionType", xmp)
+    if not found:
+        return ""
+    whole, cropped = (re.search(_TAG % name, xmp) for name in _WIDTHS)
+    part = "partial " if whole and cropped and whole[1] != cropped[1] else ""
+    return part + found[1].decode("ascii").lower()
 
 
 def panorama(pixels: NDArray[np.uint8], stored: tuple[int, int], projection: str) -> str:
-    """What kind of panorama a picture is, as the end of "it is ..."; "" for an ordinary one.
+    """What kind of panorama a picture is, as the end of "it is ...": `SPHERE` for one that can be
+    cut into faces, "" for an ordinary picture.
 
     Args:
-        pixels: [H, W, 3] upright.
+        pixels: [H, W, C] upright.
         stored: (width, height) in the file.
         projection: see `projection_of`.
     """
     if projection:
-        return f"a panorama ({projection}, as its metadata say)"
+        width, height = stored
+        if projection == EQUIRECTANGULAR and abs(width / (2 * height) - 1) <= _RATIO:
+            return SPHERE
+        return f"a panorama ({projection}, {width} x {height}, as its metadata say)"
     if max(stored) != 2 * min(stored) or pixels.shape[1] < _FEWEST:
         return ""
     small = _reduced(pixels)
     if _two_fisheyes(small):
-        return "a pair of fisheye pictures side by side"
-    return "a 360-degree panorama (equirectangular)" if _wraps(small) else ""
+        return _FISHEYES
+    return SPHERE if _wraps(small) else ""
+
+
+def kind_of(decoded: Decoded) -> str:
+    """See `panorama`."""
+    return panorama(decoded.pixels, decoded.stored, decoded.exif.projection)
+
+
+def hint_for(kind: str) -> str:
+    """What to do about a kind of `panorama` that cannot be cut."""
+    return STITCH if kind == _FISHEYES else WHOLE
 
 
 def _reduced(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.base.text import counted
-from stages.photos.decode import Decoded
+from stages.photos import faces
+from stages.photos.decode import Decoded, Unusable
 from stages.photos.exif import Exif
 from stages.photos.frame_selection import (
     BLURRED_BELOW,
@@ -21,42 +23,56 @@ from stages.photos.frame_selection import (
     SelectedFrame,
     select_frames,
 )
+from stages.photos.panorama import SPHERE, hint_for, panorama
 from stages.photos.sources import Source
 from stages.photos.video import Video
+
+_EXAMINED = 15  # every such frame is examined for being a panorama
 
 
 def photographs(
     source: Source, wanted: int, max_side: int, report: Report
-) -> Iterator[tuple[str, Decoded]]:
-    """(name within the video, picture) of the selected frames, at most `wanted`; 0 selects by
-    motion. The report's metric "videos" says which frames were selected and why.
+) -> tuple[str, Iterator[tuple[str, Decoded]]]:
+    """(`panorama.SPHERE` or "", (name within the video, picture) of the selected frames, at most
+    `wanted`; 0 selects by motion). The report's metric "videos" says which were selected and why.
 
-    Raises Unusable for a file without frames that decode, and Interrupted.
+    Raises Unusable for a file without frames that decode, and of fisheye pictures, and Interrupted.
     """
     video = Video(source.path)
-    seen, colours = _measured(video, source.name, report)
+    seen, colours, kind = _measured(video, source.name, report)
+    if kind not in ("", SPHERE):
+        raise Unusable(f"it is {kind}", hint_for(kind))
     chosen = select_frames(seen, wanted)
     facts = _facts(source.name, video, seen, chosen, colours)
     report.metric("videos", [*report.metrics.get("videos", []), facts])
     _warn(source.name, video, seen, chosen, colours, wanted == 0, report)
-    numbers = {one.number for one in chosen}
-    for frame in video.frames():
-        if frame.number in numbers:
-            _tick(report, frame.number, len(seen), f"taking frames of {source.name}")
-            yield f"{frame.number:06d}.jpg", Decoded(frame.srgb(max_side), frame.size, Exif())
-        if frame.number >= chosen[-1].number:
-            return
+    numbers = [one.number for one in chosen]
+    side = int(faces.WIDTHS * max_side) if kind else max_side
+
+    def taken() -> Iterator[tuple[str, Decoded]]:
+        for frame in video.frames():
+            if frame.number in numbers:
+                _tick(report, frame.number, len(seen), f"taking frames of {source.name}")
+                yield f"{frame.number:06d}.jpg", Decoded(frame.srgb(side), frame.size, Exif())
+            if frame.number >= numbers[-1]:
+                return
+
+    return kind, taken()
 
 
-def _measured(video: Video, name: str, report: Report) -> tuple[list[MeasuredFrame], str]:
-    """(measurements of every frame, how its colours are converted to sRGB)."""
-    meter, seen, colours = FrameMeter(), [], ""
+def _measured(video: Video, name: str, report: Report) -> tuple[list[MeasuredFrame], str, str]:
+    """(measurements of every frame, how its colours are converted to sRGB, which kind of panorama
+    most frames are)."""
+    meter, seen, colours, kinds = FrameMeter(), [], "", Counter[str]()
     total = video.about_frames()
     for frame in video.frames():
         _tick(report, frame.number, max(total, frame.number + 1), f"measuring frames of {name}")
         colours = frame.colours.conversion
-        seen.append(meter.measure(frame.grey(MEASURED_SIDE_PX), frame.seconds))
-    return seen, colours
+        grey = frame.grey(MEASURED_SIDE_PX)
+        seen.append(meter.measure(grey, frame.seconds))
+        if frame.number % _EXAMINED == 0:
+            kinds[panorama(grey[..., None], frame.size, "")] += 1
+    return seen, colours, kinds.most_common(1)[0][0]
 
 
 def _tick(report: Report, done: int, total: int, label: str) -> None:

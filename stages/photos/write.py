@@ -11,8 +11,21 @@ from PIL import Image
 
 from stages.base.atomic import replacing
 from stages.photos.decode import Decoded
+from stages.photos.masking import MaskedPhoto
+from stages.scene import Photo
 
 _JPEG_QUALITY = 95
+
+
+def write_photo(photo: Photo, masked: MaskedPhoto, folder: Path) -> Photo:
+    """Write the picture and the mask of `photo`, relative to `folder`; returns `photo`. Raises
+    SplatError if they cannot be written."""
+    target = folder / photo.image
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(target, masked.decoded)
+    if masked.mask is not None:
+        write_mask(folder / photo.mask, masked.mask)
+    return photo
 
 
 def write_picture(path: Path, decoded: Decoded) -> None:

@@ -15,7 +15,7 @@ from stages.run.request import Request, request_for, why_again
 from stages.run.workspace import Layout
 
 PHOTOS = "photos"  # the input of a stage that reads no other
-MASKS = "masks"
+MASKS, RIG_MASK = "masks", "rig_mask"
 _NAMED_AT_MOST = 3
 
 
@@ -118,12 +118,13 @@ class Planner:
                 self._photo_records = record_files(photos, known.get(PHOTOS), users=True)
             found[PHOTOS] = self._photo_records
             masks = mask_folder(photos, named.get(MASKS))
-            named = {MASKS: masks} if masks is not None else {}
+            named.pop(MASKS, None)
+            named |= {MASKS: masks} if masks is not None else {}
         for name, path in named.items():
             if name in known and not path.exists():
                 found[name] = known[name]
                 continue
-            files = [path] if name == MASKS else files_of(path)
+            files = [path] if name in (MASKS, RIG_MASK) else files_of(path)
             records = (record_files(file, known.get(name), users=True) for file in files)
             found[name] = {key: record for part in records for key, record in part.items()}
         return found

@@ -21,11 +21,28 @@ IGNORE, TRANSPARENT = "ignore", "transparent"  # meaning of pixels outside a mas
 
 
 @dataclass(frozen=True)
-class Photo:
-    """One usable photograph, as ingest wrote it.
+class Face:
+    """Where a pinhole picture was cut out of a panorama.
 
     Args:
-        name: the user's own relative path in posix style ("day 1/IMG_01.HEIC").
+        rig: a key that is equal for panoramas of the same camera and size: one COLMAP rig.
+        frame: the name of the panorama: one COLMAP frame of that rig.
+        turn: unit quaternion (w, x, y, z) of the rotation from the panorama's axes (x right, y
+            down, z towards its middle) to those of the pinhole camera.
+    """
+
+    rig: str
+    frame: str
+    turn: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One usable photograph, or one face of a panorama, as ingest wrote it.
+
+    Args:
+        name: the user's own relative path in posix style ("day 1/IMG_01.HEIC"); of a
+            face, with its direction ("pano.jpg/060+00").
         image: the normalised picture (upright, sRGB, 8 bit), relative to the capture's folder.
         width, height: of the normalised picture, pixels.
         focal_px: focal length from EXIF in pixels of the normalised picture, or None.
@@ -41,6 +58,7 @@ class Photo:
         gps: latitude and longitude in degrees from EXIF or XMP, or None.
         gps_height: metres, above sea level or the ellipsoid as the receiver has it, or None.
         gps_error_m: standard deviation of `gps` as the receiver states it, metres, or None.
+        face: of a panorama; None for a photograph. The intrinsics of faces are exact.
     """
 
     name: str
@@ -58,6 +76,12 @@ class Photo:
     gps: tuple[float, float] | None = None
     gps_height: float | None = None
     gps_error_m: float | None = None
+    face: Face | None = None
+
+    @property
+    def source(self) -> str:
+        """The name of the user's picture: of the panorama, if this is a face."""
+        return self.face.frame if self.face else self.name
 
     @property
     def picture(self) -> str:
@@ -84,6 +108,7 @@ class View:
         camera: pose and intrinsics.
         role: "train" or "test" where a benchmark defines the split; "" elsewhere.
         light: exposure and white balance, see `scene.light`; None if they could not be measured.
+        frame: the name of the panorama that this is a face of; "" for a photograph.
     """
 
     name: str
@@ -94,6 +119,7 @@ class View:
     mask: str = ""
     outside: str = ""
     light: Light | None = None
+    frame: str = ""
 
 
 @dataclass(frozen=True)
@@ -134,18 +160,23 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
 
     A near-duplicate of another view would measure how well that other view was learnt, so the first
     of the eight that is no near-duplicate is held out instead. With fewer than 4 views nothing is.
+    The faces of a panorama count as one, and are held out together.
     """
     ordered = tuple(sorted(views, key=lambda view: view.name))
     if any(view.role for view in ordered):
         test = tuple(view for view in ordered if view.role == "test")
         return tuple(view for view in ordered if view.role != "test"), test
-    if len(ordered) < 4:
+    frames = {view.frame or view.name: view for view in ordered}
+    if len(frames) < 4:
         return ordered, ()
-    eights = (ordered[i : i + HELD_OUT_EVERY] for i in range(0, len(ordered), HELD_OUT_EVERY))
-    distinct = ([view for view in eight if not view.duplicate_of] for eight in eights)
-    held = tuple(eight[0] for eight in distinct if eight)
-    names = {view.name for view in held}
-    return tuple(view for view in ordered if view.name not in names), held
+    names = tuple(frames)
+    eights = (names[i : i + HELD_OUT_EVERY] for i in range(0, len(names), HELD_OUT_EVERY))
+    distinct = ([name for name in eight if not frames[name].duplicate_of] for eight in eights)
+    held = {eight[0] for eight in distinct if eight}
+    return (
+        tuple(view for view in ordered if (view.frame or view.name) not in held),
+        tuple(view for view in ordered if (view.frame or view.name) in held),
+    )
 
 
 def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:

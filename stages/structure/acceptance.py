@@ -35,7 +35,7 @@ def accepted_model(
     worst = with_hint(best.failures[0], features)
     groups = best.result.groups if best.result is not None else ()
     if worst.code == "sfm-too-few-registered" and len(groups) > 1:
-        names = {photo.image: photo.name for photo in capture.photos}
+        names = {photo.image: photo.source for photo in capture.photos}
         described = "; ".join(
             f"{len(group)} ({listed(sorted(names[image] for image in group), 3)})"
             for group in groups[:4]
@@ -53,11 +53,13 @@ def report_warnings(
     assert best.result is not None
     assert best.result.model is not None
     registered = set(best.result.model.names)
-    missing = [photo.name for photo in capture.photos if photo.image not in registered]
+    lost = (photo.source for photo in capture.photos if photo.image not in registered)
+    missing = list(dict.fromkeys(lost))
     if missing:
+        given = len({photo.source for photo in capture.photos})
         report.warn(
             "sfm-photographs-left-out",
-            f"{len(missing)} of {len(capture.photos)} photographs could not be registered and "
+            f"{len(missing)} of {given} photographs could not be registered and "
             f"{'is' if len(missing) == 1 else 'are'} not used: {listed(missing)}. More overlap "
             f"with the others would help.{_learned_hint(features)}",
         )

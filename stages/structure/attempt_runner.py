@@ -17,6 +17,8 @@ from pathlib import Path
 from statistics import median
 from zipfile import BadZipFile
 
+import numpy as np
+
 from stages.base.atomic import replacing
 from stages.base.errors import SplatError
 from stages.base.stage import Report
@@ -72,7 +74,8 @@ class AttemptRunner:
 
         Raises SplatError for crashes of extraction and matching, and Interrupted.
         """
-        photographs = len(self.base.names)
+        frames = self.base.frames
+        photographs = int(frames.max()) + 1
         empty = ModelStatistics(photographs=photographs, mapper=configuration.mapper)
         job = self._job(configuration)
         try:
@@ -82,7 +85,8 @@ class AttemptRunner:
                     job = self._match_learned(self._match(job, configuration))
                 except WorkerCrashed as crash:  # SIFT's model may do
                     return Attempt(configuration, (crash,), empty)
-            counts = sqlite.keypoint_counts(Path(job.database), photographs)
+            found = sqlite.keypoint_counts(Path(job.database), len(frames))
+            counts = np.bincount(frames, found).astype(int).tolist()
             attempt = Attempt(configuration, (), empty, keypoints_median=float(median(counts)))
             failures = check_keypoints(counts)
             # A partial model may come of few features, but more features are tried before that.
@@ -90,7 +94,7 @@ class AttemptRunner:
                 return replace(attempt, failures=tuple(failures))
             if not configuration.learned:
                 job = self._match(job, configuration)
-            verified = sqlite.verified_pairs(Path(job.database))
+            verified = self._verified_pairs(Path(job.database))
             attempt = replace(
                 attempt,
                 pairs_matched=len(sqlite.inliers_of_pairs(Path(job.database))),
@@ -116,10 +120,17 @@ class AttemptRunner:
         result = load_result(Path(job.out))
         if result.model is not None:
             result = replace(result, model=without_implausible_views(result.model))
-        statistics = model_statistics(result, len(self.base.names), attempt.configuration.mapper)
+        photographs = attempt.statistics.photographs
+        statistics = model_statistics(result, photographs, attempt.configuration.mapper)
         statistics = replace(statistics, learned=attempt.configuration.learned)
         failures = tuple(before) + tuple(check_model(statistics))
         return replace(attempt, statistics=statistics, failures=failures, result=result)
+
+    def _verified_pairs(self, database: Path) -> list[tuple[int, int, int, int]]:
+        """`database.verified_pairs` with numbers of frames for positions."""
+        frames = self.base.frames.tolist()
+        pairs = sqlite.verified_pairs(database)
+        return [(frames[first], frames[second], *rest) for first, second, *rest in pairs]
 
     def _job(self, configuration: Configuration) -> Job:
         base, more = self.base, configuration.more_features
@@ -194,7 +205,9 @@ class AttemptRunner:
             names = () if model is None else without_implausible_views(model).names
             registered = {self.base.names.index(name) for name in names}
         else:
-            registered = set(connected_groups(sqlite.verified_pairs(database), len(everyone))[0])
+            frames = self.base.frames
+            linked = connected_groups(self._verified_pairs(database), int(frames.max()) + 1)[0]
+            registered = set(np.flatnonzero(np.isin(frames, linked)).tolist())
         return tuple(i for i in everyone if i not in registered)
 
     def _match_in_chunks(self, job: Job, executor: ChunkExecutor) -> None:

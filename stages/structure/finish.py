@@ -136,6 +136,7 @@ def write_reconstruction(
             role,
             mask_file(photo),
             photo.outside,
+            frame=photo.face.frame if photo.face else "",
         )
         for photo, camera, role in zip(photos, cameras, roles or [""] * len(photos), strict=True)
     )

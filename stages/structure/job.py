@@ -13,6 +13,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stages.base import threads
 
 if TYPE_CHECKING:
@@ -29,11 +32,19 @@ STEPS = (
 
 @dataclass(frozen=True)
 class CameraGuess:
-    """Intrinsics as known before structure from motion. focal_px: from EXIF, or None."""
+    """Intrinsics as known before structure from motion.
+
+    Args:
+        width, height: of the photographs, pixels.
+        focal_px: from EXIF, or None; of a face of a panorama it is exact.
+        rig, turn: of a face, as in `scene.Face`; "" and () of other cameras.
+    """
 
     width: int
     height: int
     focal_px: float | None
+    rig: str = ""
+    turn: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -48,6 +59,8 @@ class Job:
         progress: file for the worker's progress (`ProgressWriter`).
         names: [P] in the capture's order, which fixes the image ids (position + 1).
         camera_of: [P] index into `cameras`.
+        frame_of: [P] number of each photograph's frame: the faces of a panorama share one; () if
+            there are no panoramas.
         cameras: known intrinsics.
         masks: [P] mask files, "" for none; () if no photograph has one.
         seed: of RANSAC and the mapper.
@@ -74,6 +87,7 @@ class Job:
     camera_of: tuple[int, ...]
     cameras: tuple[CameraGuess, ...]
     masks: tuple[str, ...] = ()
+    frame_of: tuple[int, ...] = ()
     seed: int = 0
     threads: int = 1
     max_features: int = 12288
@@ -89,6 +103,11 @@ class Job:
     photographs: tuple[int, ...] = ()
     pairs: tuple[tuple[int, int], ...] = ()
 
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """[P] number of each photograph's frame, from 0."""
+        return np.array(self.frame_of or range(len(self.names)), np.int64)
+
     def write(self, path: Path) -> Path:
         path.write_text(json.dumps(asdict(self)), encoding="utf-8")
         return path
@@ -99,9 +118,11 @@ class Job:
         data["names"] = tuple(data["names"])
         data["camera_of"] = tuple(data["camera_of"])
         data["masks"] = tuple(data["masks"])
+        data["frame_of"] = tuple(data["frame_of"])
         data["photographs"] = tuple(data["photographs"])
         data["pairs"] = tuple((first, second) for first, second in data["pairs"])
-        data["cameras"] = tuple(CameraGuess(**camera) for camera in data["cameras"])
+        cameras = (camera | {"turn": tuple(camera["turn"])} for camera in data["cameras"])
+        data["cameras"] = tuple(CameraGuess(**camera) for camera in cameras)
         return cls(**data)
 
 
@@ -117,8 +138,12 @@ def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching:
         key = (photo.camera, photo.width, photo.height)
         if key not in positions:
             positions[key] = len(guesses)
-            guesses.append(CameraGuess(photo.width, photo.height, photo.focal_px))
+            rig = (photo.face.rig, photo.face.turn) if photo.face else ("", ())
+            guesses.append(CameraGuess(photo.width, photo.height, photo.focal_px, *rig))
         camera_of.append(positions[key])
+    sources = list(dict.fromkeys(photo.source for photo in capture.photos))
+    frame = {source: number for number, source in enumerate(sources)}
+    panoramas = any(photo.face for photo in capture.photos)
     return Job(
         step="",
         images_root=str(capture.folder.resolve()),
@@ -128,6 +153,7 @@ def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching:
         names=tuple(photo.image for photo in capture.photos),
         masks=tuple(photo.mask for photo in capture.photos),
         camera_of=tuple(camera_of),
+        frame_of=tuple(frame[photo.source] for photo in capture.photos) if panoramas else (),
         cameras=tuple(guesses),
         seed=seed,
         threads=threads.count(),

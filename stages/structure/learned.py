@@ -72,11 +72,12 @@ def _features(job: Job) -> list[LearnedFeatures]:
 def _likeness(job: Job, features: list[LearnedFeatures]) -> NDArray[np.int32]:
     """[P, P] mutual nearest neighbours of the best features of `job.photographs` and all others; 0
     for pairs without one of them."""
+    frames = job.frames
     photographs, progress = len(features), ProgressWriter(Path(job.progress))
     likeness = np.zeros((photographs, photographs), np.int32)
     for done, i in enumerate(job.photographs, 1):
         for j in range(photographs):
-            if j != i and not likeness[i, j]:
+            if frames[j] != frames[i] and not likeness[i, j]:
                 count = mutual_nearest(features[i], features[j], COMPARED, LEAST_COSINE)
                 likeness[i, j] = likeness[j, i] = count
         progress.write("selecting pairs", done, len(job.photographs))

@@ -47,15 +47,21 @@ def map_photographs(job: Job) -> None:
     models = _global(job, scratch) if job.mapper == "global" else _incremental(job, scratch)
     timed_out = job.mapper != "global" and time.monotonic() - started >= job.max_seconds
     ordered = sorted(
-        (m for m in models.values() if m.num_reg_images() > 0),
-        key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
+        (m for m in models.values() if m.num_reg_frames() > 0),
+        key=lambda m: (-m.num_reg_frames(), -m.num_points3D(), min(m.reg_image_ids())),
     )
     if ordered:
         _robust_bundle_adjustment(ordered[0])
-    groups = [sorted(m.images[i].name for i in m.reg_image_ids()) for m in ordered]
+    groups = [_one_name_a_frame(m, job) for m in ordered]
     model = _sparse_model(ordered[0], ordered[1:], job) if ordered else None
     save_model(out, model, groups=groups, timed_out=timed_out)
     shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _one_name_a_frame(model: pycolmap.Reconstruction, job: Job) -> list[str]:
+    """Names of registered photographs; of each panorama, that of one face."""
+    ids = sorted(model.reg_image_ids(), reverse=True)
+    return sorted({int(job.frames[i - 1]): model.images[i].name for i in ids}.values())
 
 
 def _robust_bundle_adjustment(model: pycolmap.Reconstruction) -> None:
@@ -67,6 +73,7 @@ def _robust_bundle_adjustment(model: pycolmap.Reconstruction) -> None:
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = False
+    options.refine_sensor_from_rig = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     model.update_point_3d_errors()
     mean_error_px = model.compute_mean_reprojection_error()
@@ -94,6 +101,9 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
     # COLMAP waits for gradients to vanish, and those grow with the model.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.2
     options.ba_global_function_tolerance = 1e-4
+    options.ba_refine_sensor_from_rig = False  # the faces of a panorama lie exactly
+    exact = [number for number, camera in enumerate(job.cameras, 1) if camera.rig]
+    options.constant_cameras = options.mapper.constant_cameras = set(exact)
     if job.loose:
         options.mapper.abs_pose_min_num_inliers = LOOSE_INLIERS
         options.mapper.abs_pose_min_inlier_ratio = 0.15
@@ -182,6 +192,7 @@ def _sparse_model(
         view_cameras=np.array(
             [camera_position[model.images[i].camera_id] for i in image_ids], np.int32
         ),
+        view_frames=job.frames[np.array(image_ids) - 1].astype(np.int32),
         world_to_camera=np.array([_matrix(model.images[i].cam_from_world()) for i in image_ids]),
         camera_sizes=np.array([(c.width, c.height) for c in cameras], np.int32).reshape(-1, 2),
         camera_params=np.array([c.params for c in cameras], np.float64).reshape(-1, 4),
@@ -196,8 +207,8 @@ def _sparse_model(
 
 def _credible(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> bool:
     """Whether a smaller model is more than a few photographs that fit by chance."""
-    views = other.num_reg_images()
-    enough = max(CREDIBLE_VIEWS, CREDIBLE_SHARE * model.num_reg_images())
+    views = other.num_reg_frames()
+    enough = max(CREDIBLE_VIEWS, CREDIBLE_SHARE * model.num_reg_frames())
     return views >= enough and other.num_points3D() >= CREDIBLE_POINTS * views
 
 

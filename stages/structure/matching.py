@@ -96,16 +96,17 @@ def _rounds(
 ) -> Iterator[list[Pair]]:
     """Lists of pairs to match, each selected when the one before is matched. inliers: of the pairs
     that are matched."""
-    photographs = len(job.names)
+    frames = job.frames
     if job.matching == "exhaustive":
-        yield pairs.exhaustive_pairs(photographs)
+        yield pairs.pairs_of_faces(pairs.exhaustive_pairs(int(frames.max()) + 1), frames)
     elif job.matching == "sequential":
-        yield pairs.sequential_pairs(photographs)
+        yield pairs.pairs_of_faces(pairs.sequential_pairs(int(frames.max()) + 1), frames)
     else:
         similarity = _similarity(job, features)
-        first = pairs.initial_pairs(similarity)
+        first = [(i, j) for i, j in pairs.initial_pairs(similarity) if frames[i] != frames[j]]
         yield first
-        yield pairs.linking_pairs(similarity, first, {pair: inliers[pair] for pair in first})
+        known = {pair: inliers[pair] for pair in first}
+        yield pairs.linking_pairs(similarity, first, known, frames)
 
 
 class _IndexedFeatures:
@@ -202,6 +203,7 @@ def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
         wanted = retrieval.candidate_pairs(
             words_of, lambda done: progress.write("retrieving pairs", done, photographs)
         )
+        wanted = [(i, j) for i, j in wanted if job.frames[i] != job.frames[j]]
 
         def count_matches(pair: Pair) -> int:
             return len(match_descriptors(indices[pair[0]], indices[pair[1]]))

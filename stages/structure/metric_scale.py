@@ -110,7 +110,7 @@ def check_distance(distance: Sequence[str], photos: Sequence[Photo]) -> float:
     if not (math.isfinite(metres) and metres > 0):
         raise _unusable(f"{text} is not a distance in metres")
     for name in ends:
-        if name not in {photo.name for photo in photos}:
+        if name not in {photo.source for photo in photos}:
             raise _unusable(f"{name} is not a photograph of the capture or was not registered")
     return metres
 
@@ -120,7 +120,7 @@ def _from_distance(
 ) -> MetricScale:
     metres = check_distance(distance, photos)
     first, second, _ = distance
-    names = [photo.name for photo in photos]
+    names = [photo.source for photo in photos]
     a, b = (centres[names.index(name)] for name in (first, second))
     units = float(np.linalg.norm(a - b))
     spread = float(np.linalg.norm(centres - np.median(centres, axis=0), axis=1).max())

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
+from stages.scene.rotations import matrices_of
 from stages.structure import database as sqlite
 from stages.structure.job import CameraGuess, Job
 
@@ -23,13 +25,8 @@ def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
     partial = path.with_name(path.name + ".partial")
     sqlite.delete(partial)
     database = pycolmap.Database.open(partial)
-    for camera_id, guess in enumerate(job.cameras, 1):
-        camera = _camera(camera_id, guess)
-        database.write_camera(camera, use_camera_id=True)
-        rig = pycolmap.Rig()
-        rig.rig_id = camera_id
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
+    rig_of = _write_rigs(database, job.cameras)
+    frames: dict[int, pycolmap.Frame] = {}
     for image_id, (name, position) in enumerate(zip(job.names, job.camera_of, strict=True), 1):
         if only is not None and image_id - 1 not in only:
             continue
@@ -38,13 +35,43 @@ def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
         image.name = name
         image.camera_id = position + 1
         database.write_image(image, use_image_id=True)
-        frame = pycolmap.Frame()
-        frame.frame_id = image_id
-        frame.rig_id = position + 1
+        frame_id = int(job.frames[image_id - 1]) + 1
+        frame = frames.setdefault(frame_id, pycolmap.Frame())
+        frame.frame_id = frame_id
+        frame.rig_id = rig_of[position]
         frame.add_data_id(image.data_id)
+    for frame in frames.values():
         database.write_frame(frame, use_frame_id=True)
     database.close()
     os.replace(partial, path)
+
+
+def rig_numbers(cameras: Sequence[CameraGuess]) -> list[int]:
+    """[C] the id of each camera's rig: its own id, or that of the first camera of a panorama's
+    rig, which is the rig's reference."""
+    first: dict[str, int] = {}
+    numbers = enumerate(cameras, 1)
+    return [first.setdefault(c.rig, number) if c.rig else number for number, c in numbers]
+
+
+def _write_rigs(database: pycolmap.Database, cameras: Sequence[CameraGuess]) -> list[int]:
+    """Write cameras and rigs; returns the id of each camera's rig."""
+    rig_of = rig_numbers(cameras)
+    rigs: dict[int, pycolmap.Rig] = {}
+    for camera_id, (guess, rig_id) in enumerate(zip(cameras, rig_of, strict=True), 1):
+        camera = _camera(camera_id, guess)
+        database.write_camera(camera, use_camera_id=True)
+        rig = rigs.setdefault(rig_id, pycolmap.Rig())
+        if rig_id == camera_id:
+            rig.rig_id = rig_id
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            turn, reference = (matrices_of(np.array(c.turn)) for c in (guess, cameras[rig_id - 1]))
+            relative = pycolmap.Rotation3d(turn @ reference.T)
+            rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(relative, np.zeros(3)))
+    for rig in rigs.values():
+        database.write_rig(rig, use_rig_id=True)
+    return rig_of
 
 
 def _camera(camera_id: int, guess: CameraGuess) -> pycolmap.Camera:

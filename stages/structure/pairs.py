@@ -36,6 +36,14 @@ def sequential_pairs(photographs: int) -> list[Pair]:
     return sorted((i, i + step) for step in steps for i in range(photographs - step))
 
 
+def pairs_of_faces(frame_pairs: Iterable[Pair], frames: NDArray[np.int64]) -> list[Pair]:
+    """All pairs of photographs of these pairs of frames. frames [P]: number of each photograph's
+    frame: the faces of a panorama share one."""
+    members = [np.flatnonzero(frames == frame).tolist() for frame in range(int(frames.max()) + 1)]
+    both = (itertools.product(members[a], members[b]) for a, b in frame_pairs)
+    return sorted((min(pair), max(pair)) for product in both for pair in product)
+
+
 def initial_pairs(similarity: NDArray[np.int32]) -> list[Pair]:
     """The pairs to match first: the most similar of each photograph, and the next in order.
 
@@ -50,7 +58,10 @@ def initial_pairs(similarity: NDArray[np.int32]) -> list[Pair]:
 
 
 def linking_pairs(
-    similarity: NDArray[np.int32], matched: Iterable[Pair], inliers: dict[Pair, int]
+    similarity: NDArray[np.int32],
+    matched: Iterable[Pair],
+    inliers: dict[Pair, int],
+    frames: NDArray[np.int64] | None = None,
 ) -> list[Pair]:
     """More pairs to match so that the view graph is connected: all others of photographs with few
     links, and all between components; if these are too many, the most similar ones.
@@ -59,17 +70,24 @@ def linking_pairs(
         similarity: [P, P] as in `initial_pairs`.
         matched: pairs that were matched.
         inliers: of those that were verified; enough of them make a link.
+        frames: [P] as in `pairs_of_faces`; None: there are no panoramas. The faces of a panorama
+            are linked together.
     """
     photographs = len(similarity)
-    links = [pair for pair, count in inliers.items() if count >= LINK_INLIERS]
-    degree = np.bincount(np.array(links, np.int64).reshape(-1), minlength=photographs)
-    group = np.zeros(photographs, np.int64)
+    frames = np.arange(photographs) if frames is None else frames
+    most = int(frames.max()) + 1
+    linked = (pair for pair, count in inliers.items() if count >= LINK_INLIERS)
+    links = frames[np.array(list(linked), np.int64).reshape(-1, 2)]
+    degree = np.bincount(links.reshape(-1), minlength=most)[frames]
+    group = np.zeros(most, np.int64)
     for number, members in enumerate(
-        connected_groups([(*pair, 0, 0) for pair in links], photographs)
+        connected_groups([(*pair, 0, 0) for pair in links.tolist()], most)
     ):
         group[members] = number
+    group = group[frames]
     few = degree < FEWEST_LINKS
     wanted = few[:, None] | few[None, :] | (group[:, None] != group[None, :])
+    wanted &= frames[:, None] != frames[None, :]
     wanted[tuple(np.array(list(matched), np.int64).reshape(-1, 2).T)] = False
     first, second = np.nonzero(np.triu(wanted, 1))
     order = np.lexsort((second, first, -similarity[first, second]))

@@ -79,6 +79,7 @@ def _view_to_dict(view: View) -> dict[str, Any]:
         **({"role": view.role} if view.role else {}),
         **({"mask": view.mask, "outside": view.outside} if view.mask else {}),
         **({"light": list(view.light)} if view.light else {}),
+        **({"frame": view.frame} if view.frame else {}),
         "width": camera.width,
         "height": camera.height,
         **{name: float(getattr(camera, name)) for name in _INTRINSICS},

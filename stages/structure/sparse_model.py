@@ -91,6 +91,7 @@ class SparseModel:
     Args:
         names: [V].
         view_cameras: [V] index of each photograph's camera.
+        view_frames: [V] number of each photograph's frame: the faces of a panorama share one.
         world_to_camera: [V, 4, 4].
         camera_sizes: [C, 2] width, height.
         camera_params: [C, 4] f, cx, cy, k of COLMAP's SIMPLE_RADIAL: x = f (1 + k r^2) u + cx with
@@ -107,6 +108,7 @@ class SparseModel:
 
     names: tuple[str, ...]
     view_cameras: NDArray[np.int32]
+    view_frames: NDArray[np.int32]
     world_to_camera: NDArray[np.float64]
     camera_sizes: NDArray[np.int32]
     camera_params: NDArray[np.float64]
@@ -179,8 +181,9 @@ def without_implausible_views(model: SparseModel) -> SparseModel:
     """The model without photographs whose poses are unreliable: those that observe fewer than 15
     points, and those with implausible intrinsics. The latter stay if they are more than a tenth:
     then the whole model is implausible, and the gates must refuse it."""
-    seen = np.bincount(model.observing_views, minlength=len(model.names))
-    keep = seen >= FEWEST_OBSERVATIONS
+    frames = model.view_frames
+    seen = np.bincount(frames[model.observing_views], minlength=int(frames.max()) + 1)
+    keep = seen[frames] >= FEWEST_OBSERVATIONS
     with np.errstate(invalid="ignore"):
         zoom = np.abs(np.log(model.camera_params[:, 0] / model.focal_priors_px))
         implausible = (np.abs(model.camera_params[:, 3]) > THRESHOLDS.distortion) | (
@@ -212,6 +215,7 @@ def _with_views(model: SparseModel, keep_view: NDArray[np.bool_]) -> SparseModel
         camera_sizes=model.camera_sizes[keep_camera],
         camera_params=model.camera_params[keep_camera],
         focal_priors_px=model.focal_priors_px[keep_camera],
+        view_frames=model.view_frames[keep_view],
         world_to_camera=model.world_to_camera[keep_view],
         points=model.points[keep_point],
         colours=model.colours[keep_point],
@@ -293,7 +297,8 @@ def sideways_share(model: SparseModel) -> float:
 
 
 def model_statistics(result: MappingResult, photographs: int, mapper: str) -> ModelStatistics:
-    """The statistics that the gates check. photographs: how many were given."""
+    """The statistics that the gates check. photographs: how many were given. The faces of a
+    panorama count as one."""
     model = result.model
     sizes = tuple(len(group) for group in result.groups)
     if model is None or not model.names:
@@ -304,10 +309,11 @@ def model_statistics(result: MappingResult, photographs: int, mapper: str) -> Mo
     angles = triangulation_angles(model, sample)
     errors = point_errors(model)
     inconsistent = np.flatnonzero(model.pair_inlier_ratios < CONSISTENT_RATIO)
-    cut = weakest_cut(model.observed_points, model.observing_views, len(model.names))
+    registered, frames = np.unique(model.view_frames, return_inverse=True)
+    cut = weakest_cut(model.observed_points, frames[model.observing_views], len(registered))
     return ModelStatistics(
         photographs=photographs,
-        registered=len(model.names),
+        registered=len(registered),
         models=sizes,
         mapper=mapper,
         timed_out=result.timed_out,

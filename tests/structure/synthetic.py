@@ -37,6 +37,7 @@ def orbit_model(views: int, points: int, seed: int = 0, radius: float = 4.0) -> 
     return SparseModel(
         names=tuple(f"{i:02d}.jpg" for i in range(views)),
         view_cameras=np.zeros(views, np.int32),
+        view_frames=np.arange(views, dtype=np.int32),
         world_to_camera=poses,
         camera_sizes=np.array([SIZE], np.int32),
         camera_params=np.array([[FOCAL, SIZE[0] / 2, SIZE[1] / 2, K]]),

@@ -1,0 +1,125 @@
+"""Cuts equirectangular pictures of the whole sphere into pinhole pictures: the faces of a rig.
+
+Columns of an equirectangular picture are longitudes, rows latitudes. Its middle is +z of the
+panorama, x is right and y down, as of a camera. All faces of a panorama have one position and known
+turns, so that structure from motion places them as a rig of COLMAP's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.photos.masking import MaskedPhoto
+from stages.scene import Face, Photo
+from stages.scene.rotations import quaternions_of
+
+FIELD_DEG = 90.0  # of view of a face, both ways
+# Longitude (to the right) and latitude (up) of each face's middle, degrees.
+DIRECTIONS = (*((yaw, 0) for yaw in range(0, 360, 60)), (0, 90), (0, -90))
+# Panoramas are read at this many times the longest side of a face: there the middle of a face has
+# as many pixels a degree as the panorama.
+WIDTHS = math.pi / math.tan(math.radians(FIELD_DEG / 2))
+_MARGIN = 4  # pixels that the picture is continued by on all sides, for interpolation
+
+
+@dataclass(frozen=True)
+class CutFace:
+    """A face that was cut out.
+
+    Args:
+        name: its direction: longitude and latitude of its middle ("060+00").
+        pixels: [S, S, 3] uint8.
+        mask: [S, S] uint8, 0 outside; None where everything counts.
+        focal_px: of its pinhole camera, whose principal point is its middle.
+        turn: as in `scene.Face`.
+    """
+
+    name: str
+    pixels: NDArray[np.uint8]
+    mask: NDArray[np.uint8] | None
+    focal_px: float
+    turn: tuple[float, float, float, float]
+
+
+def faces(pixels: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> Iterator[CutFace]:
+    """The faces of a panorama [H, W, 3], with as many pixels a degree as its horizon has; those
+    that `mask` [H, W] leaves nothing of are left out."""
+    height, width = pixels.shape[:2]
+    side = max(16, int(width / WIDTHS))
+    focal = 0.5 * side / math.tan(math.radians(FIELD_DEG / 2))
+    around = _continued(pixels)
+    kept = None if mask is None else _continued(mask)
+    for yaw, pitch in DIRECTIONS:
+        rotation = face_rotation(yaw, pitch)
+        tables = _tables(rotation, side, focal, width, height)
+        cut = None if kept is None else cv2.remap(kept, *tables, cv2.INTER_NEAREST)
+        if cut is not None and not cut.any():
+            continue
+        w, x, y, z = quaternions_of(rotation).tolist()
+        yield CutFace(
+            f"{yaw:03d}{pitch:+03d}",
+            np.asarray(cv2.remap(around, *tables, cv2.INTER_CUBIC), np.uint8),
+            None if cut is None else np.asarray(cut, np.uint8),
+            focal,
+            (w, x, y, z),
+        )
+
+
+def face_photos(photo: Photo, masked: MaskedPhoto) -> Iterator[tuple[Photo, MaskedPhoto]]:
+    """The faces of a panorama as photographs, with their pictures and masks; `photo` and `masked`
+    are of the whole."""
+    image = PurePosixPath(photo.image)
+    for face in faces(masked.decoded.pixels, masked.mask):
+        cut = replace(masked.decoded, pixels=face.pixels, unchanged_jpeg=None)
+        part = replace(masked, decoded=cut, mask=face.mask)
+        file, side = f"{image}/{face.name}{image.suffix}", len(face.pixels)
+        described = replace(
+            photo,
+            name=f"{photo.name}/{face.name}",
+            image=file,
+            width=side,
+            height=side,
+            focal_px=face.focal_px,
+            camera=f"{photo.camera} {face.name}",
+            mask=part.file(file),
+            face=Face(photo.camera, photo.name, face.turn),
+        )
+        yield described, part
+
+
+def face_rotation(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:
+    """[3, 3] from the panorama's axes to those of the face in this direction: first the yaw, then
+    the pitch, so that the face's x axis stays level."""
+    yaw, pitch = np.radians([yaw_deg, pitch_deg])
+    x = np.array([np.cos(yaw), 0.0, -np.sin(yaw)])
+    z = np.array([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _continued(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """With a margin: over the seam goes on the other side; beyond a pole, the last row is close."""
+    sides = (0, 0, _MARGIN, _MARGIN)
+    wrapped = cv2.copyMakeBorder(picture, *sides, cv2.BORDER_WRAP)
+    sides = (_MARGIN, _MARGIN, 0, 0)
+    return np.asarray(cv2.copyMakeBorder(wrapped, *sides, cv2.BORDER_REPLICATE), np.uint8)
+
+
+def _tables(
+    rotation: NDArray[np.float64], side: int, focal: float, width: int, height: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """x and y [S, S]: where each pixel of a face lies in the `_continued` picture, for cv2.remap
+    (whose pixel centres are whole numbers)."""
+    at = (np.arange(side) + 0.5 - side / 2) / focal
+    u, v = np.meshgrid(at, at)
+    x, y, z = np.einsum("ki,kvu->ivu", rotation, np.stack([u, v, np.ones_like(u)]))
+    column = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width
+    row = (np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height
+    shift = _MARGIN - 0.5
+    return (column + shift).astype(np.float32), (row + shift).astype(np.float32)
