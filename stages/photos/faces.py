@@ -20,9 +20,15 @@ from stages.photos.masking import MaskedPhoto
 from stages.scene import Face, Photo
 from stages.scene.rotations import quaternions_of
 
-FIELD_DEG = 90.0  # of view of a face, both ways
-# Longitude (to the right) and latitude (up) of each face's middle, degrees.
-DIRECTIONS = (*((yaw, 0) for yaw in range(0, 360, 60)), (0, 90), (0, -90))
+# Longitude (to the right) and latitude (up) of each face's middle, degrees: the faces of a
+# dodecahedron, nearly. Fields of view of 71.6 degrees are the least that show the whole sphere. Six
+# faces of a cube, of 90 degrees, would have three quarters of the pixels a degree at the same size.
+DIRECTIONS = (
+    *((yaw, 25) for yaw in range(0, 360, 72)),
+    *((yaw, -25) for yaw in range(36, 360, 72)),
+    *((0, 90), (0, -90)),
+)
+FIELD_DEG = 72.0  # both ways
 # Panoramas are read at this many times the longest side of a face: there the middle of a face has
 # as many pixels a degree as the panorama.
 WIDTHS = math.pi / math.tan(math.radians(FIELD_DEG / 2))
@@ -34,7 +40,7 @@ class CutFace:
     """A face that was cut out.
 
     Args:
-        name: its direction: longitude and latitude of its middle ("060+00").
+        name: its direction: longitude and latitude of its middle ("072+25").
         pixels: [S, S, 3] uint8.
         mask: [S, S] uint8, 0 outside; None where everything counts.
         focal_px: of its pinhole camera, whose principal point is its middle.

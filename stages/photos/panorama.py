@@ -33,7 +33,7 @@ SPHERE = "a 360-degree panorama (equirectangular)"
 _FISHEYES = "a pair of fisheye pictures side by side"
 WHOLE = "Export the whole sphere, twice as wide as high, or photograph with a plain lens"
 STITCH = (
-    "Stitch it in the program of the camera's maker, and export it equirectangular: twice as wide "
+    "Stitch it in the camera manufacturer's program, and export it equirectangular: twice as wide "
     "as high"
 )
 

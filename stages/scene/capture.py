@@ -42,7 +42,7 @@ class Photo:
 
     Args:
         name: the user's own relative path in posix style ("day 1/IMG_01.HEIC"); of a
-            face, with its direction ("pano.jpg/060+00").
+            face, with its direction ("pano.jpg/072+25").
         image: the normalised picture (upright, sRGB, 8 bit), relative to the capture's folder.
         width, height: of the normalised picture, pixels.
         focal_px: focal length from EXIF in pixels of the normalised picture, or None.

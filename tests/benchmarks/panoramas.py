@@ -1,8 +1,8 @@
 """Equirectangular pictures of the sample's scene: `python -m tests.benchmarks.panoramas FOLDER`.
 
 Draws 12 of them along the sample's walk, as a 360-degree camera on a stick would take them: level
-to a few degrees, turned anyhow. With `--run RUN` it compares a finished run of them with the truth:
-how far the cameras are off, and how well the splats show views that no picture was taken from.
+to a few degrees, turned anyhow. With `--run RUN` it compares a finished run with the truth: how far
+the cameras are off, and how well the splats show the sample's test views, drawn into FOLDER.
 """
 
 from __future__ import annotations
@@ -21,7 +21,12 @@ from PIL import Image
 
 from sample_captures import make, render
 from sample_captures.render import Array, Light, Shape
+from stages import sfm
+from stages.measure.evaluation import evaluate_at_sizes, image_renderer
 from stages.raster.kernels.simd import kernel
+from stages.scene import View, load_splats
+from tests.benchmarks.sample_test_views import evaluation_views
+from tests.structure.truth import centres, similarity
 
 PANORAMAS = 12
 WIDTH = 3840  # 611 pixels a radian; the sample's photographs have 600
@@ -85,7 +90,7 @@ def picture(pose: NDArray[np.float64], width: int) -> NDArray[np.uint8]:
 
 def draw(number: int, folder: Path, width: int) -> None:
     """Draw one, unless it is in `folder`."""
-    path = folder / f"pano_{number:02d}.jpg"
+    path = folder / name(number)
     if not path.exists():
         partial_path = path.with_suffix(".partial")
         Image.fromarray(picture(poses()[number], width)).save(
@@ -150,12 +155,49 @@ def _block(kinds, matrices, centres, radii, origins, directions, reach, blocked)
                 break
 
 
+def name(number: int) -> str:
+    return f"pano_{number:02d}.jpg"
+
+
+def errors_mm(views: Sequence[View]) -> NDArray[np.float64]:
+    """[F, 3] of the placed panoramas' positions, millimetres."""
+    found = {view.frame: view.camera.world_to_camera for view in views}
+    true = dict(zip(map(name, range(PANORAMAS)), poses(), strict=True))
+    have, there = centres(np.array([*found.values()])), centres(np.array([true[f] for f in found]))
+    turn, scale, shift = similarity(have, there)
+    return np.asarray(1000 * (scale * have @ turn.T + shift - there))
+
+
+def compare(run: Path, drawn: Path) -> str:
+    """The figures of a finished run; also of one of the sample's photographs. drawn: folder of the
+    sample's test views."""
+    reconstruction = sfm.load(run / "2-sfm")
+    panoramas = bool(reconstruction.views[0].frame)
+    truth = dict(zip(map(name, range(PANORAMAS)), poses(), strict=True)) if panoramas else None
+    text = f"{len(reconstruction.views)} views"
+    if panoramas:
+        away = np.linalg.norm(errors_mm(reconstruction.views), axis=1)
+        text += f", {len(away)} placed, {away.mean():.3f} ({away.max():.3f}) mm off"
+    for stage in (s for s in ("4-train", "5-prune") if (run / s / "splats.bin").is_file()):
+        splats = load_splats(run / stage / "splats.bin")
+        views = evaluation_views(drawn, reconstruction, splats.draw_settings, truth)
+        scores = evaluate_at_sizes(image_renderer(splats, "auto"), views)["full"]
+        found = [score.psnr_db for score in scores]
+        text += f"\n{stage}: {len(splats)} splats, test views {np.mean(found):.2f} dB"
+        text += f", worst {min(found):.2f}"
+    return text
+
+
 def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--width", type=int, default=WIDTH, help="of a picture (pixels)")
+    parser.add_argument("--run", type=Path, help="a finished run to compare with the truth")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args(words)
+    if options.run:
+        print(compare(options.run, options.folder))
+        return
     options.folder.mkdir(parents=True, exist_ok=True)
     one = partial(draw, folder=options.folder, width=options.width)
     with ProcessPoolExecutor(options.jobs) as pool:

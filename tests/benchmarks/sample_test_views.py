@@ -8,7 +8,7 @@ reconstruction by the similarity that fits the cameras of the photographs best.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ PLACES = (
     *((5.0, -0.55, 1.02), (12.0, -0.50, 1.00), (18.0, -0.60, 1.02)),
     *((7.0, -1.12, 1.08), (15.0, -1.12, 1.08)),
 )
+Poses = Mapping[str, NDArray[np.float64]]
 _SHAKE_M = 0.04  # of the point looked at
 
 
@@ -56,21 +57,25 @@ def render_test_views(folder: Path) -> None:
 
 
 def evaluation_views(
-    folder: Path, reconstruction: Reconstruction, settings: DrawSettings
+    folder: Path, reconstruction: Reconstruction, settings: DrawSettings, truth: Poses | None = None
 ) -> Sequence[EvaluationView]:
-    """The test views, drawn into `folder` if they are not there, in the world of the sample's
-    `reconstruction`."""
+    """The test views, drawn into `folder` if they are not there, in the world of the
+    `reconstruction`. truth: world_to_camera [4, 4] by name of photograph or panorama; None: of the
+    sample."""
     render_test_views(folder)
-    return load_evaluation_views(folder, held_out_views_in(reconstruction), settings)
+    return load_evaluation_views(folder, held_out_views_in(reconstruction, truth), settings)
 
 
-def held_out_views_in(reconstruction: Reconstruction) -> tuple[View, ...]:
-    """The test views in the world of this reconstruction."""
-    truth = {
+def held_out_views_in(
+    reconstruction: Reconstruction, truth: Poses | None = None
+) -> tuple[View, ...]:
+    """The test views in the world of this reconstruction. truth: as of `evaluation_views`."""
+    truth = truth or {
         photo["name"]: np.array(photo["world_to_camera"])
         for photo in json.loads(TRUTH.read_text(encoding="utf-8"))["photos"]
     }
-    theirs = np.array([_centre(truth[view.name]) for view in reconstruction.views])
+    seen = [view.frame or view.name for view in reconstruction.views]
+    theirs = np.array([_centre(truth[name]) for name in seen])
     ours = np.array([view.camera.centre for view in reconstruction.views])
     scale, rotation, offset = similarity(theirs, ours)
     views = []

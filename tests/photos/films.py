@@ -49,13 +49,15 @@ def film(
     sound: bool = False,
     container_options: dict[str, str] | None = None,
     crf: int = 12,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
 ) -> Path:
     """Encode `pictures` [H, W, 3] at 30 a second, or shown at `seconds`. colours: H.273's numbers
-    of the codec context. sound: a track of silence as well."""
+    of the codec context. sound: a track of silence as well. size: of the
+    pictures."""
     times = iter(seconds) if seconds is not None else (i / 30 for i in range(10**9))
     with av.open(str(path), "w", options=container_options or {}) as container:
         stream: Any = container.add_stream(codec, rate=30)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixel_format
+        (stream.width, stream.height), stream.pix_fmt = size, pixel_format
         stream.codec_context.time_base = Fraction(1, 90_000)
         if codec == "libx264":
             stream.options = {"crf": str(crf)}

@@ -9,33 +9,10 @@ import pytest
 from PIL import Image
 
 from stages import ingest
-from stages.base.errors import SplatError
 from stages.base.stage import Report
-from stages.photos.panorama import panorama, projection_of
+from stages.photos.panorama import SPHERE, panorama, projection_of
+from tests.photos.spheres import sphere, two_fisheyes
 from tests.structure.bad_captures import SAMPLE
-
-WIDTH = 512
-
-
-def sphere(seed: int = 0, width: int = WIDTH) -> np.ndarray:
-    """[W / 2, W, 3] uint8 of a made scene: waves over the directions of the whole sphere."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[: width // 2, :width] + 0.5
-    longitude, latitude = 2 * np.pi * x / width, np.pi * (0.5 - 2 * y / width)
-    direction = np.stack(
-        [
-            np.cos(latitude) * np.cos(longitude),
-            np.cos(latitude) * np.sin(longitude),
-            np.sin(latitude),
-        ],
-        axis=-1,
-    )
-    waves = [
-        np.sin(direction @ rng.normal(0, 6, 3) + rng.uniform(0, 6))[..., None]
-        * rng.uniform(0, 1, 3)
-        for _ in range(12)
-    ]
-    return np.clip(128 + 30 * np.sum(waves, axis=0), 0, 255).astype(np.uint8)
 
 
 def size(pixels: np.ndarray) -> tuple[int, int]:
@@ -77,9 +54,7 @@ def test_a_wall_without_contrast_is_none() -> None:
 
 
 def test_two_fisheyes_side_by_side_are_named() -> None:
-    y, x = np.mgrid[:256, :512] + 0.5
-    away = np.minimum(np.hypot(x - 128, y - 128), np.hypot(x - 384, y - 128))
-    pixels = np.where((away < 128)[..., None], sphere(3), 0).astype(np.uint8)
+    pixels = two_fisheyes(3)
     assert panorama(pixels, size(pixels), "") == "a pair of fisheye pictures side by side"
 
 
@@ -92,31 +67,33 @@ def test_two_fisheyes_side_by_side_are_named() -> None:
 )
 def test_metadata_of_a_photo_sphere_are_enough(packet: bytes) -> None:
     assert projection_of(packet) == "equirectangular"
-    assert "as its metadata say" in panorama(
-        np.zeros((90, 120, 3), np.uint8), (120, 90), "equirectangular"
-    )
+    black = np.zeros((60, 120, 3), np.uint8)
+    assert panorama(black, (120, 60), "equirectangular") == SPHERE
     assert projection_of(b"<GPano:Nothing/>") == ""
 
 
-def test_a_capture_of_panoramas_is_refused_and_says_what_to_do(tmp_path: Path) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for number in range(4):
-        Image.fromarray(sphere(number)).save(folder / f"{number}.png")
-    with pytest.raises(SplatError) as raised:
-        ingest.run({"photos": folder}, ingest.IngestSettings(), tmp_path / "out", Report())
-    assert "0.png: it is a 360-degree panorama (equirectangular)" in raised.value.given
+def test_panoramas_of_another_ratio_and_parts_of_one_are_named() -> None:
+    black = np.zeros((90, 120, 3), np.uint8)
+    found = panorama(black, (120, 90), "equirectangular")
+    assert found == "a panorama (equirectangular, 120 x 90, as its metadata say)"
+    part = (
+        b'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="8000" '
+        b'GPano:CroppedAreaImageWidthPixels="4000"'
+    )
+    assert projection_of(part) == "partial equirectangular"
+    assert projection_of(part.replace(b"4000", b"8000")) == "equirectangular"
+    assert "(partial equirectangular" in panorama(black[:60], (120, 60), projection_of(part))
 
 
-def test_a_panorama_among_photographs_is_left_out_by_name(tmp_path: Path) -> None:
+def test_two_fisheyes_among_photographs_are_left_out_by_name(tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
     for number in range(3):
         Image.fromarray(sphere(number)[:, :300]).save(folder / f"{number}.png")
-    Image.fromarray(sphere(7)).save(folder / "round.png")
+    Image.fromarray(two_fisheyes(3)).save(folder / "two.png")
     report = Report()
     capture = ingest.run({"photos": folder}, ingest.IngestSettings(), tmp_path / "out", report)
     assert [photo.name for photo in capture.photos] == ["0.png", "1.png", "2.png"]
     (message,) = [text for code, text in report.warnings if code == "ingest-left-out"]
-    assert "round.png is left out: it is a 360-degree panorama (equirectangular)" in message
-    assert "Cut it into perspective pictures" in message
+    assert "two.png is left out: it is a pair of fisheye pictures side by side" in message
+    assert "Stitch it" in message
