@@ -24,7 +24,7 @@ from stages.raster.backends import (
 )
 
 if TYPE_CHECKING:
-    from stages.capacity.pruning import PruningResult
+    from stages.capacity.pruning import Pruner, PruningResult
     from stages.measure.evaluation import EvaluationView
     from stages.scene import Reconstruction, Splats, TrainedSplats
 
@@ -92,13 +92,10 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     """
     import numpy as np
 
-    from stages.capacity.pruning import Pruner
     from stages.capacity.summary import advise_more_splats, describe_loss, summarise
-    from stages.capacity.targets import Targets
     from stages.measure.evaluation import load_evaluation_views, psnr_of_views_db
-    from stages.scene import split_held_out, training_extent
+    from stages.scene import split_held_out
     from stages.scene.storage import save_splats
-    from stages.training.finetune import FineTuner
 
     deadline = time.monotonic() + (settings.seconds or math.inf)
     reconstruction: Reconstruction = inputs["sfm"]
@@ -112,18 +109,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     )
     evaluated = held_out or training
     before_db = psnr_of_views_db(splats, evaluated, backend)
-    extent = training_extent(reconstruction)
-    finetuner = FineTuner(training, extent, backend, report, trained.dropout)
-    targets = Targets(
-        strength=settings.strength,
-        max_loss_db=settings.max_loss_db,
-        max_splats=settings.max_splats,
-        max_bytes=settings.max_mb * 1e6,
-        min_psnr_db=settings.min_psnr,
-        size_bytes=_size_measure(settings, splats, training, reconstruction),
-    )
-    limits = settings.rounds, settings.finetune_steps
-    pruner = Pruner(training, targets, backend, finetuner, *limits, report, deadline)
+    pruner = pruner_of(settings, inputs, training, backend, report, deadline)
     found = pruner.prune(splats)
     loss_db = before_db - psnr_of_views_db(found.splats, evaluated, backend)
     report_backend(report, backend)
@@ -133,17 +119,56 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report.metric("psnr_db", round(mean_db - lost_db, 3))
     report.metric("psnr_change_db", round(-lost_db, 3))
     report.metric("psnr_change_worst_view_db", round(-float(loss_db.max()), 3))
-    report.metric("finetune_steps", finetuner.steps)
+    report.metric("finetune_steps", pruner.finetuner.steps)
     _report_result(splats, found, report)
-    report.metric("summary", summarise(trained, found, settings.strength, finetuner.steps))
+    report.metric("summary", summarise(trained, found, settings.strength, pruner.finetuner.steps))
     overridden = settings.max_splats or settings.max_mb or settings.min_psnr
-    if targets.broken_by(loss_db) and not overridden:
-        report.warn("prune-loss-above-limit", describe_loss(loss_db, targets))
+    if pruner.targets.broken_by(loss_db) and not overridden:
+        report.warn("prune-loss-above-limit", describe_loss(loss_db, pruner.targets))
     if advice := advise_more_splats(found, settings.strength):
         report.warn("prune-more-would-pay", advice)
     assert np.isfinite(found.splats.means).all()
     save_splats(folder, found.splats)
     return found.splats
+
+
+def pruner_of(
+    settings: PruneSettings,
+    inputs: Mapping[str, Any],
+    training: Sequence[EvaluationView],
+    backend: str,
+    report: Report,
+    deadline: float = math.inf,
+) -> Pruner:
+    """What prunes the splats of inputs["train"].
+
+    Args:
+        settings: of the stage.
+        inputs: of the stage.
+        training: the training views.
+        backend: name of the rasteriser.
+        report: for progress.
+        deadline: after which no round begins, as `time.monotonic`.
+    """
+    from stages.capacity.pruning import Pruner
+    from stages.capacity.targets import Targets
+    from stages.scene import training_extent
+    from stages.training.finetune import FineTuner
+
+    reconstruction: Reconstruction = inputs["sfm"]
+    trained: TrainedSplats = inputs["train"]
+    extent = training_extent(reconstruction)
+    finetuner = FineTuner(training, extent, backend, report, trained.dropout)
+    targets = Targets(
+        strength=settings.strength,
+        max_loss_db=settings.max_loss_db,
+        max_splats=settings.max_splats,
+        max_bytes=settings.max_mb * 1e6,
+        min_psnr_db=settings.min_psnr,
+        size_bytes=_size_measure(settings, trained.splats, training, reconstruction),
+    )
+    limits = settings.rounds, settings.finetune_steps
+    return Pruner(training, targets, backend, finetuner, *limits, report, deadline)
 
 
 def _size_measure(

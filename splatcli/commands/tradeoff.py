@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
     from stages.measure.tradeoff.measurement import TradeoffInputs
+    from stages.scene import Splats
 
 
 def tradeoff(
@@ -28,8 +30,8 @@ def tradeoff(
     """Measure quality against time, bytes and number of splats: a report with plots.
 
     The quality is measured on held-out views. The course of training comes from its log, files are
-    really written and read, splats are removed in the order of what they contribute and the rest
-    fine-tuned, as `splat prune` does.
+    really written and read, and the trained splats are pruned to several numbers, as `splat prune
+    --max-splats` does.
     """
     from stages.base.atomic import make_folder
     from stages.measure.tradeoff.measurement import measure_tradeoff
@@ -59,9 +61,9 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     (stage-not-finished, run-half-anew, nothing-held-out)."""
     from stages.base.stage import Report
     from stages.measure.evaluation import load_evaluation_views
-    from stages.measure.tradeoff.measurement import SHARES, TradeoffInputs, deciding_views
-    from stages.scene import split_held_out, training_extent
-    from stages.training.finetune import FineTuner
+    from stages.measure.tradeoff.measurement import TradeoffInputs, floater_views
+    from stages.prune import pruner_of
+    from stages.scene import split_held_out
 
     splats = results.final_splats(pipeline)
     settings = splats.draw_settings
@@ -74,25 +76,28 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
             wanted="A run with photographs that training did not use, to measure quality on.",
             hint="Take more photographs: at least four; one of every eight is held out.",
         )
-    trained = pipeline.manifest("train")
+    manifest = pipeline.manifest("train")
     views = load_evaluation_views(reconstruction.folder, training, settings)
-    deciding = {view.name for view in deciding_views(training, settings)}
-    backend = results.backend_of_run(pipeline)
-    dropout = pipeline.load("train").dropout
-    finetuner = FineTuner(views, training_extent(reconstruction), backend, Report(), dropout)
-    pruning = pipeline.recorded_settings()["prune"]
-    # as many steps as pruning takes, by the time that half of the splats are left
-    steps = pruning.rounds * pruning.finetune_steps // sum(share >= 0.5 for share in SHARES)
+    chosen = {view.name for view in floater_views(training, settings)}
+    backend, report = results.backend_of_run(pipeline), Report()
+    inputs = {"sfm": reconstruction, "train": pipeline.load("train")}
+    pruning = replace(pipeline.recorded_settings()["prune"], max_mb=0.0, min_psnr=0.0, seconds=0.0)
+
+    def prune_to(splats: Splats, count: int) -> Splats:
+        asked = replace(pruning, max_splats=count)
+        return pruner_of(asked, inputs, views, backend, report).prune(splats).splats
+
     return TradeoffInputs(
         splats=splats,
-        training=[view for view in views if view.name in deciding],
+        training=[view for view in views if view.name in chosen],
         held_out=load_evaluation_views(reconstruction.folder, held, settings),
         views=reconstruction.views,
         units=reconstruction.units,
         backend=backend,
         levelled=reconstruction.levelled,
-        history=trained.metrics.get("history", ()) if trained else (),
+        history=manifest.metrics.get("history", ()) if manifest else (),
         exported=tuple(results.exported_formats(pipeline)),
         quantised=pipeline.load("quantise"),
-        finetune=lambda fewer, view_counts: finetuner.finetune(fewer, steps, view_counts),
+        prune_to=prune_to,
+        trained=inputs["train"].splats,
     )

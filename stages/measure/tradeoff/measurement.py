@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stages import formats
 from stages.formats.quantisation import splats_to_write
 from stages.formats.values import drop_undrawable
-from stages.measure.contribution import Contributions, measure_contributions
+from stages.measure.contribution import measure_contributions
 from stages.measure.coverage import camera_layout, find_gaps, patches_of, poorly_covered_regions
 from stages.measure.evaluation import (
     EvaluationView,
@@ -47,19 +47,17 @@ from stages.scene import (
 )
 from stages.scene.framing import median_depth
 
-# Shares of the splats that are kept, each taken from the one before: the contributions of single
-# splats do not add up where many are removed at once.
+# Of the run's splats: those that pruning to a given number is measured at.
 SHARES = (0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
-# Training views, evenly spaced, that decide which splats are removed. What none of them shows is
-# removed first, so as many as time allows, and 24 at least.
-DECIDING_PIXELS, _MIN_DECIDING = 24e6, 24
+# Training views, evenly spaced, that floaters are found by: as many as time allows, 24 at least.
+_FLOATER_PIXELS, _MIN_FLOATER_VIEWS = 24e6, 24
 TIMED_FRAMES = 4
 COVERAGE_VIEWS = 200  # at most, that coverage is measured by
 FRAMED_VIEWS = 3  # that extreme framings start from
 
 ProgressCallback = Callable[[str], None]
-FineTune = Callable[[Splats, NDArray[np.int32]], Splats]
-"""Continues the training of splats [N] that are visible in so many views [N] each."""
+PruneTo = Callable[[Splats, int], Splats]
+"""Prunes splats to so many at most, as `splat prune --max-splats` does."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class TradeoffInputs:
 
     Args:
         splats: the run's last, in the coordinates of its cameras.
-        training: views that decide which splats are removed.
+        training: views that floaters are found by.
         held_out: views that quality is measured with.
         views: all views of the run.
         units: of lengths.
@@ -77,7 +75,8 @@ class TradeoffInputs:
         history: as training logged it.
         exported: formats that the run wrote.
         quantised: the precision that was chosen for files; None where none was.
-        finetune: what `splat prune` does after each removal; None does nothing.
+        prune_to: what `splat prune --max-splats` does; None measures no pruning.
+        trained: the splats that pruning starts from; None for `splats`.
     """
 
     splats: Splats
@@ -90,7 +89,8 @@ class TradeoffInputs:
     history: Sequence[dict[str, Any]] = ()
     exported: tuple[str, ...] = ()
     quantised: QuantisedSplats | None = None
-    finetune: FineTune | None = None
+    prune_to: PruneTo | None = None
+    trained: Splats | None = None
 
     @property
     def on_cpu(self) -> bool:
@@ -119,7 +119,7 @@ def measure_tradeoff(inputs: TradeoffInputs, progress: ProgressCallback) -> Trad
         own=own,
         history=_history(inputs.history),
         formats=_formats(inputs, own_scores, progress),
-        pruned=(own, *_pruned(inputs, own_scores, contributions, progress)),
+        pruned=(own, *_pruned(inputs, own_scores, progress)),
         scores=tuple(own_scores),
         side_px=max(max(view.pixels.shape[:2]) for view in inputs.held_out),
         coverage=coverage,
@@ -184,27 +184,20 @@ def _identical(a: Splats, b: Splats) -> bool:
 
 
 def _pruned(
-    inputs: TradeoffInputs,
-    own: list[Score],
-    contributions: Contributions,
-    progress: ProgressCallback,
+    inputs: TradeoffInputs, own: list[Score], progress: ProgressCallback
 ) -> list[OperatingPoint]:
-    """Fewer and fewer splats, as `splat prune --max-splats` leaves them: those that change the
-    training pictures least are removed first, and the rest is fine-tuned each time.
-    contributions: of all splats."""
-    splats, points = inputs.splats, []
+    """Fewer and fewer splats, as `splat prune --max-splats` leaves them. Each number is reached
+    from the one before, by the same rounds as from the trained splats."""
+    points: list[OperatingPoint] = []
+    splats = inputs.trained if inputs.trained is not None else inputs.splats
+    if inputs.prune_to is None:
+        return points
     for share in SHARES:
         count = round(share * len(inputs.splats))
         if not 0 < count < len(splats):
             continue
         progress(f"keeping {share:.0%} of the splats")
-        if len(splats) < len(inputs.splats):
-            contributions = measure_contributions(splats, inputs.training, inputs.backend)
-        order = np.argsort(-contributions.picture_change, kind="stable")
-        kept = np.sort(order[:count])
-        splats = splats.take(kept)
-        if inputs.finetune is not None:
-            splats = inputs.finetune(splats, contributions.view_counts[kept])
+        splats = inputs.prune_to(splats, count)
         points.append(_point(inputs, f"{share:.0%}", splats, _scores(inputs, splats), own))
     return points
 
@@ -248,10 +241,10 @@ def measure_framings(
     return found
 
 
-def deciding_views(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
-    """The training views that decide which splats are removed."""
+def floater_views(views: Sequence[View], draw_settings: DrawSettings) -> list[View]:
+    """The training views that floaters are found by."""
     if not views:
         return []
     camera = draw_settings.camera(views[0].camera)
-    most = round(DECIDING_PIXELS / (camera.width * camera.height))
-    return evenly_spaced(views, max(_MIN_DECIDING, most))
+    most = round(_FLOATER_PIXELS / (camera.width * camera.height))
+    return evenly_spaced(views, max(_MIN_FLOATER_VIEWS, most))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stages.base.errors import SplatError
+from stages.base.stage import Report
 from stages.formats import FORMATS
 from stages.measure.bootstrap import BETTER, INCONCLUSIVE, WORSE
 from stages.measure.evaluation import load_evaluation_views
@@ -24,11 +25,20 @@ from stages.measure.tradeoff.comparison import (
 from stages.measure.tradeoff.measurement import (
     SHARES,
     TradeoffInputs,
-    deciding_views,
+    floater_views,
     measure_tradeoff,
 )
 from stages.measure.tradeoff.report import write_report
-from stages.scene import Camera, DrawSettings, QuantisedSplats, View, evenly_spaced, split_held_out
+from stages.prune import PruneSettings, pruner_of
+from stages.scene import (
+    Camera,
+    DrawSettings,
+    QuantisedSplats,
+    TrainedSplats,
+    View,
+    evenly_spaced,
+    split_held_out,
+)
 from tests.small_scene import small_scene
 
 COURSE = [
@@ -51,8 +61,23 @@ def inputs(scene):
         for views in split_held_out(reconstruction.views)
     )
     splats = replace(scene.splats, draw_settings=draw_settings)
+    stages = {"sfm": reconstruction, "train": TrainedSplats(splats)}
+
+    def prune_to(some, count):
+        asked = PruneSettings(max_splats=count, finetune_steps=10)
+        return pruner_of(asked, stages, training, "cpu", Report()).prune(some).splats
+
     return TradeoffInputs(
-        splats, training, held, reconstruction.views, "metres", "cpu", True, COURSE, ("ply", "spz")
+        splats,
+        training,
+        held,
+        reconstruction.views,
+        "metres",
+        "cpu",
+        True,
+        COURSE,
+        ("ply", "spz"),
+        prune_to=prune_to,
     )
 
 
@@ -105,25 +130,30 @@ def test_pruning_by_contribution_is_better_than_by_chance(tradeoff, inputs) -> N
     assert half.psnr_db > mean_psnr_db(chance, inputs.held_out, "cpu") + 1
 
 
-def test_fewer_splats_are_those_that_fine_tuning_left(inputs) -> None:
-    """As `splat prune` does after each removal: the next one starts from there."""
+def test_pruning_costs_what_the_report_foretold(tradeoff, inputs) -> None:
+    """The first number is reached as `splat prune` reaches it, others by way of larger ones: to a
+    twentieth of the loss."""
+    from stages.measure.evaluation import mean_psnr_db
+
+    counts = [round(250 * s) for s in SHARES]
+    for place, share in ((0, 1e-9), (3, 0.05)):
+        pruned = inputs.prune_to(inputs.splats, counts[place])
+        loss_db = tradeoff.own.psnr_db - mean_psnr_db(pruned, inputs.held_out, "cpu")
+        foretold_db = tradeoff.own.psnr_db - tradeoff.pruned[1 + place].psnr_db
+        assert foretold_db == pytest.approx(loss_db, abs=share * loss_db)
+
+
+def test_pruning_starts_from_what_was_trained(inputs) -> None:
     seen = []
 
-    def brighter(splats, view_counts):
-        assert len(splats) == len(view_counts)
-        seen.append(float(splats.sh[:, 0].mean()))
-        return replace(splats, sh=splats.sh + np.float32(0.01))
+    def keeping(splats, count):
+        seen.append((len(splats), count))
+        return splats.take(np.arange(count))
 
-    before = float(inputs.splats.sh[:, 0].mean())
-    found = measure_tradeoff(replace(inputs, finetune=brighter), lambda label: None)
-    assert len(found.pruned) == 1 + len(seen) == 1 + len(SHARES)
-    assert seen[-1] - before > 0.05
-    assert found.pruned[-1].psnr_db != pytest.approx(measured_plain(inputs), abs=1e-3)
-
-
-def measured_plain(inputs) -> float:
-    """PSNR of the fewest splats where nothing was fine-tuned."""
-    return float(measure_tradeoff(inputs, lambda label: None).pruned[-1].psnr_db)
+    fewer = replace(inputs, splats=inputs.splats.take(np.arange(200)), trained=inputs.splats)
+    measure_tradeoff(replace(fewer, prune_to=keeping), lambda label: None)
+    counts = [round(200 * s) for s in SHARES]
+    assert seen == list(zip([250, *counts], counts, strict=False))
 
 
 def test_the_report_is_one_file_that_needs_no_other(tradeoff, inputs, tmp_path) -> None:
@@ -271,10 +301,10 @@ def test_a_few_views_are_evenly_spaced() -> None:
 
 def test_all_training_views_decide_where_time_allows() -> None:
     views = [View(str(i), "", camera(800, 600)) for i in range(60)]
-    assert len(deciding_views(views, DrawSettings(side=480))) == 60
-    assert len(deciding_views(views, DrawSettings(side=800))) == 50
+    assert len(floater_views(views, DrawSettings(side=480))) == 60
+    assert len(floater_views(views, DrawSettings(side=800))) == 50
     assert (
-        len(deciding_views([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings()))
+        len(floater_views([replace(v, camera=camera(8000, 6000)) for v in views], DrawSettings()))
         == 24
     )
 
