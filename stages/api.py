@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from stages import STAGE_NAMES, load_stage
 from stages.raster.backends import backend_of_settings
 from stages.run.pipeline import Listener, Pipeline
+from stages.run.results import reconstruction_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -78,7 +79,7 @@ def process(
     manifests = pipeline.run(settings, listener=listener)
     return Scene(
         run_folder=Path(run_folder),
-        reconstruction=pipeline.load("sfm"),
+        reconstruction=reconstruction_of(pipeline),
         splats=pipeline.load("quantise").splats,
         assets=pipeline.load("export"),
         metrics={manifest.stage: manifest.metrics for manifest in manifests},

@@ -98,8 +98,8 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     from stages.scene.storage import save_splats
 
     deadline = time.monotonic() + (settings.seconds or math.inf)
-    reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
+    reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
     splats, backend = trained.splats, backend_of_settings(settings)
     training, held_out = (
         load_evaluation_views(
@@ -155,8 +155,8 @@ def pruner_of(
     from stages.scene import training_extent
     from stages.training.finetune import FineTuner
 
-    reconstruction: Reconstruction = inputs["sfm"]
     trained: TrainedSplats = inputs["train"]
+    reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
     extent = training_extent(reconstruction)
     finetuner = FineTuner(training, extent, backend, report, trained.dropout)
     targets = Targets(

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from stages.measure.evaluation import EvaluationView
-    from stages.scene import DrawSettings, QuantisedSplats, Reconstruction, Splats
+    from stages.scene import DrawSettings, QuantisedSplats, Reconstruction, Splats, TrainedSplats
 
 _DECISIONS, _FLAT, _FINETUNED = "decisions.json", "flat_dc.npy", "finetuned"
 # Change of colour (of 255) that a splat's higher SH degrees may make and still be dropped, largest
@@ -115,13 +115,15 @@ def run(
     from stages.scene import QuantisedSplats
 
     splats: Splats = inputs["prune"]
-    decider, evaluator = _measures(inputs["sfm"], splats.draw_settings, settings, report)
+    trained: TrainedSplats = inputs["train"]
+    reconstruction = inputs["sfm"].with_cameras(trained.cameras)
+    decider, evaluator = _measures(reconstruction, splats.draw_settings, settings, report)
     kept, by_degree, threshold = _choose_sh_degrees(splats, settings, decider)
     finetuning = FormatFinetuning.of(
-        kept, inputs["sfm"], inputs["train"].dropout, settings, decider.views, report
+        kept, reconstruction, trained.dropout, settings, decider.views, report
     )
     plain = finetuning.to_plain_drawing(kept)
-    flat = _flat_colours(kept if plain is None else plain, inputs["sfm"], settings)
+    flat = _flat_colours(kept if plain is None else plain, reconstruction, settings)
     quantised = QuantisedSplats(kept, {}, flat, plain=plain, drawing=settings.drawing)
     sog = splats_to_write(FORMATS["sog"], quantised)
     bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)

@@ -89,6 +89,12 @@ class TrainSettings:
         panel="Light and masks",
         choices=("auto", "on", "off"),
     )
+    refine_in_training: bool = setting(
+        False,
+        "Let training move the cameras of its photographs, and one focal length factor for all: "
+        "for known cameras that are only nearly right.",
+        panel="Known cameras",
+    )
     drawing: str = drawing_setting()
     blocks: str = setting(
         "1",
@@ -159,10 +165,15 @@ def run(
         splats = smoothed(splats, trainer.smoothing_widths(splats.means))
     if len(splats) == 0:
         raise _nothing_left()
+    refined = None
+    if trainer.refinement is not None:
+        trainer.register_held_out()
+        refined = trainer.refinement.result
+        reconstruction = reconstruction.with_cameras(refined)
     views, draw_settings = trainer.held_out, trainer.draw_settings
     write_quality(trainer.render, views, draw_settings, reconstruction, folder, report)
     write_history(trainer.history, trainer.times, folder, report)
-    trained = TrainedSplats(splats, trainer.dropout)
+    trained = TrainedSplats(splats, trainer.dropout, refined)
     save(folder, trained)
     remove_checkpoint(folder)
     remove_cap(folder)
@@ -178,6 +189,11 @@ def _report_course(trainer: Trainer, report: Report) -> None:
     report.metric("steps", trainer.schedule.steps)
     report.metric("steps_skipped", int(trainer.stepper.skipped))
     report.metric("dropout", trainer.dropout)
+    if trainer.refinement is not None:
+        moved, turned_deg = trainer.refinement.changes
+        report.metric("cameras_moved", moved)
+        report.metric("cameras_turned_deg", turned_deg)
+        report.metric("focal_factor", round(trainer.refinement.focal_factor, 6))
     stopping = trainer.early_stopping
     report.metric("validation_views", len(stopping.rows))
     if stopping.stopped_at:
@@ -255,19 +271,28 @@ def save(folder: Path, trained: TrainedSplats) -> None:
     from stages.scene.storage import save_splats
 
     save_splats(folder, trained.splats)
+    facts: dict[str, Any] = {"dropout": trained.dropout}
+    if trained.cameras is not None:
+        poses = {name: pose.tolist() for name, pose in trained.cameras.poses.items()}
+        facts["cameras"] = {"poses": poses, "focal_factor": trained.cameras.focal_factor}
     with replacing(folder / _TRAINED) as temporary:
-        temporary.write_text(json.dumps({"dropout": trained.dropout}) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(facts) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> TrainedSplats:
     """The result of a finished folder. Raises SplatError if it is damaged."""
-    from stages.scene import TrainedSplats
+    import numpy as np
+
+    from stages.scene import RefinedCameras, TrainedSplats
     from stages.scene.storage import load_splats
 
-    splats = load_splats(folder)
+    splats, cameras = load_splats(folder), None
     with reading(folder / _TRAINED, stage_output("train-folder-damaged")):
         facts = json.loads((folder / _TRAINED).read_text(encoding="utf-8"))
-        return TrainedSplats(splats, bool(facts["dropout"]))
+        if found := facts.get("cameras"):
+            poses = {name: np.array(pose, np.float64) for name, pose in found["poses"].items()}
+            cameras = RefinedCameras(poses, float(found["focal_factor"]))
+        return TrainedSplats(splats, bool(facts["dropout"]), cameras)
 
 
 STAGE = Stage(

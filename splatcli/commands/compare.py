@@ -95,4 +95,6 @@ def _side(run: Pipeline, name: str) -> Candidate:
         facts["seed"] = str(trained.settings["seed"])
     for ending, figures in results.exported_formats(run).items():
         facts[f".{ending}"] = console.size(figures["size_bytes"])
-    return Candidate(name, splats, run.load("sfm"), results.backend_of_run(run), facts)
+    return Candidate(
+        name, splats, results.reconstruction_of(run), results.backend_of_run(run), facts
+    )

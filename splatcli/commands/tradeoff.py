@@ -67,7 +67,7 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
 
     splats = results.final_splats(pipeline)
     settings = splats.draw_settings
-    reconstruction = pipeline.load("sfm")
+    reconstruction = results.reconstruction_of(pipeline)
     training, held = split_held_out(reconstruction.views)
     if not held:
         raise UsageError(

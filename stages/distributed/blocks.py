@@ -320,10 +320,10 @@ def _check(settings: Any) -> None:
             wanted="A maximum that the blocks can share: the free memory limits only one block.",
             hint="Give --max-splats, for example 250000 for each block.",
         )
-    if settings.seconds or settings.within:
+    if settings.seconds or settings.within or settings.refine_in_training:
         raise UsageError(
             "blocks-without-end",
-            given="--blocks cannot be combined with --seconds or --within.",
+            given="--blocks cannot be combined with --seconds, --within or --refine-in-training.",
             wanted="Steps, which each block makes: --steps.",
-            hint="Leave --seconds and --within away.",
+            hint="Leave --seconds, --within and --refine-in-training away.",
         )

@@ -11,7 +11,7 @@ from stages.run import runfolder
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.scene import Splats, View
+    from stages.scene import Reconstruction, Splats, View
 
 _STAGES_WITH_SPLATS = ("seed", "train", "prune", "quantise")
 
@@ -47,6 +47,15 @@ def newest_splats(pipeline: Pipeline, antialias: bool = True) -> Splats:
     if pipeline.manifest("sfm") is None:
         return splats
     return replace(splats, place=pipeline.load("sfm").place)
+
+
+def reconstruction_of(pipeline: Pipeline) -> Reconstruction:
+    """The capture's cameras, as training has refined them. Raises SplatError
+    (stage-not-finished)."""
+    found: Reconstruction = pipeline.load("sfm")
+    if pipeline.manifest("train") is None:
+        return found
+    return found.with_cameras(pipeline.load("train").cameras)
 
 
 def final_splats(pipeline: Pipeline) -> Splats:

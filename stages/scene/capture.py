@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -123,6 +123,26 @@ class View:
 
 
 @dataclass(frozen=True)
+class RefinedCameras:
+    """Cameras that training has refined.
+
+    Args:
+        poses: world_to_camera [4, 4] of views by name.
+        focal_factor: of the focal lengths of all views.
+    """
+
+    poses: Mapping[str, NDArray[np.float64]]
+    focal_factor: float
+
+    def view(self, view: View) -> View:
+        """`view` with its refined camera."""
+        camera, factor = view.camera, self.focal_factor
+        pose = self.poses.get(view.name, camera.world_to_camera)
+        fx, fy = camera.fx * factor, camera.fy * factor
+        return replace(view, camera=replace(camera, fx=fx, fy=fy, world_to_camera=pose))
+
+
+@dataclass(frozen=True)
 class Reconstruction:
     """Posed pinhole views and a sparse point cloud, in the levelled and recentred world.
 
@@ -152,6 +172,12 @@ class Reconstruction:
     place: EarthPlace | None = None
     levelled: bool = False
     light_explained: float = 0.0
+
+    def with_cameras(self, refined: RefinedCameras | None) -> Reconstruction:
+        """The same with refined cameras; itself for None."""
+        if refined is None:
+            return self
+        return replace(self, views=tuple(refined.view(view) for view in self.views))
 
 
 def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[View, ...]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.scene.camera import Camera
+from stages.scene.capture import RefinedCameras
 from stages.scene.draw_settings import DrawSettings
 from stages.scene.place import EarthPlace
 
@@ -113,11 +114,15 @@ class Splats:
 class TrainedSplats:
     """The result of training.
 
-    dropout: whether some splats were dropped from each of the last steps (`training.dropout`).
+    Args:
+        splats: what was trained.
+        dropout: whether some were dropped from each of the last steps (`training.dropout`).
+        cameras: where training has refined them; None where it has not.
     """
 
     splats: Splats
     dropout: bool = False
+    cameras: RefinedCameras | None = None
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 from stages.base.stage import Report
 from stages.base.text import counted
 from stages.measure.evaluation import load_evaluation_views
-from stages.raster.backends import backend_of_settings
+from stages.raster.backends import backend_of, backend_of_settings
 from stages.scene import Reconstruction, draw_settings_of, split_held_out, training_extent
 from stages.scene.light import LEAST_EXPLAINED, NOISE_EV, spread_ev
+from stages.training.camera_refinement import CameraRefinement
 from stages.training.cap import cap_for, splats_determined
 from stages.training.schedule import Schedule
 from stages.training.trainer import Trainer
@@ -52,11 +53,18 @@ def make_trainer(
     report.metric("splat_cap_from", cap.origin)
     report.metric("splat_cap_free_mib", cap.free_mib)
     validation = validation_rows(len(train)) if settings.patience else ()
+    extent, backend = training_extent(reconstruction), backend_of_settings(settings)
+    refinement = None
+    if settings.refine_in_training:
+        cameras = {view.name: view.levels[-1].camera for view in train}
+        cameras |= {view.name: view.camera for view in held_out}
+        refinement = CameraRefinement.of(cameras, extent)
+        backend = _on_the_host(backend, report)
     seconds = settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0)
     return Trainer(
         schedule=Schedule(
             steps=settings.steps,
-            extent=training_extent(reconstruction),
+            extent=extent,
             sh_degree=settings.sh_degree,
             n_start=min(n_start, cap.splats),
             seed=settings.seed,
@@ -69,11 +77,23 @@ def make_trainer(
         report=report,
         smooth=settings.smooth,
         random_background=settings.background == "any",
-        backend=backend_of_settings(settings),
+        backend=backend,
         early_stopping=EarlyStopping(settings.patience, validation),
         seconds=seconds,
+        refinement=refinement,
         within=settings.within,
     )
+
+
+def _on_the_host(backend: str, report: Report) -> str:
+    """The backend, or the CPU's instead of a GPU's, whose steps do not give out their gradients."""
+    if backend_of(backend).name != "gpu":
+        return backend
+    report.warn(
+        "train-refinement-on-cpu",
+        "Cameras are refined on the CPU: --refine-in-training does not use the GPU yet.",
+    )
+    return "cpu"
 
 
 def corrects_light(reconstruction: Reconstruction, choice: str, report: Report) -> bool:

@@ -27,7 +27,7 @@ from stages.training.optimiser import Model
 from stages.training.validation import EarlyStopping
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATC11"
+MAGIC = b"SPLATC12"
 _PREVIOUS = "checkpoint-previous.bin"
 _TEMPORARY = FILE_NAME + ".tmp"
 _CHUNK_BYTES = 1 << 20
@@ -66,6 +66,7 @@ class TrainingState:
         early_stopping: of densification, with its best values so far.
         times: of each entry of the history, and, last, now.
         provenance: one entry for each change of backend or device.
+        refinement: of cameras, see `camera_refinement`; None where they stay as they are.
     """
 
     step: int
@@ -74,6 +75,7 @@ class TrainingState:
     early_stopping: EarlyStopping
     times: list[Elapsed]
     provenance: list[Provenance]
+    refinement: dict[str, Any] | None = None
 
 
 def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
@@ -159,6 +161,7 @@ def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
         EarlyStopping(**stopping | {"rows": tuple(stopping["rows"])}),
         [Elapsed(**t) for t in header["times"]],
         [Provenance(**entry) for entry in header["provenance"]],
+        header["refinement"],
     )
     return Model(*(np.ascontiguousarray(a) for a in arrays)), state
 

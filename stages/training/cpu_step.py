@@ -30,6 +30,8 @@ class CpuStep(HostStep):
         loss = image_loss(pool, forward.image, target, self._v_image, means=means)
         ignore_masked(level, self._v_image)
         backward = self.rasteriser.backward(forward, self._v_image)
+        if given.use_gradients is not None:
+            given.use_gradients(self._model, backward)
         coefficients, size = (
             (settings.sh_degree + 1) ** 2,
             (level.camera.width, level.camera.height),

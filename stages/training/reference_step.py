@@ -53,6 +53,8 @@ class ReferenceStep(HostStep):
         assert image.grad is not None
         v_image = image.grad.numpy().astype(np.float32)
         backward = self.rasteriser.backward(forward, v_image)
+        if given.use_gradients is not None:
+            given.use_gradients(self._model, backward)
         adam(self._model, backward, (settings.sh_degree + 1) ** 2, given.rates, *size)
         return float(value.detach())
 

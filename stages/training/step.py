@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, SupportsInt
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from stages.base.lazy import load_object
 from stages.raster.backends import backend_of
-from stages.raster.definition import Arrays, Rasteriser, RasterSettings
+from stages.raster.definition import Arrays, Backward, Rasteriser, RasterSettings
 from stages.scene import Camera
 from stages.training.dropout import INVISIBLE, Dropout
 from stages.training.optimiser import LearningRates, Model, empty_model
@@ -34,6 +35,8 @@ class StepInput:
         rates: learning rates.
         smooth: whether to render with the model's smoothing widths.
         dropout: drops splats from this step; None for none.
+        use_gradients: is called with the model and its gradients before Adam changes the model;
+            only steps on the host do this.
     """
 
     level: Level
@@ -41,6 +44,7 @@ class StepInput:
     rates: LearningRates
     smooth: bool = False
     dropout: Dropout | None = None
+    use_gradients: Callable[[Model, Backward], None] | None = None
 
 
 class TrainingStep(Protocol):

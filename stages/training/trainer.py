@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from stages.raster.backends import AUTO
 from stages.raster.definition import RasterSettings
 from stages.raster.smoothing import smoothing_widths
 from stages.scene import TRANSPARENT, Camera, DrawSettings, Splats
+from stages.training.camera_refinement import STARTS, CameraRefinement
 from stages.training.cap import lower_cap, most_opaque
 from stages.training.checkpoint import (
     Provenance,
@@ -37,8 +39,9 @@ from stages.training.optimiser import LearningRates, Model
 from stages.training.schedule import Schedule
 from stages.training.step import StepInput, TrainingStep, step_of
 from stages.training.validation import EarlyStopping, uses_dropout
-from stages.training.views import TrainingView
+from stages.training.views import Level, TrainingView
 
+REGISTRATION_STEPS = 60  # for each held-out view
 SMOOTHING_INTERVAL = 100  # steps after which the widths of the smoothing filter are computed again
 
 
@@ -60,6 +63,7 @@ class Trainer:
         backend: the rasteriser's, which also decides the training step.
         early_stopping: of densification; its validation views are trained on only afterwards.
         seconds: limit of wall time; 0 for none.
+        refinement: of the cameras of the training views; None leaves them as they are.
         within: rectangle of the ground plane that densification is limited to, see
             `density.BoundedDensity`; () for none.
     """
@@ -76,6 +80,7 @@ class Trainer:
     backend: str = AUTO
     early_stopping: EarlyStopping = field(default_factory=EarlyStopping)
     seconds: float = 0.0
+    refinement: CameraRefinement | None = None
     within: tuple[float, ...] = ()
     stepper: TrainingStep = field(init=False)
     clock: Clock = field(init=False, default_factory=Clock)
@@ -111,8 +116,11 @@ class Trainer:
         if self.smooth and step % SMOOTHING_INTERVAL == 0:
             self.replace_model(self.model)
         schedule = self.schedule
-        view = self.train[self._row(step)]
-        level = view.levels[schedule.level(step)]
+        row, refine = self._row(step), None
+        level = self.train[row].levels[schedule.level(step)]
+        if self.refinement is not None:
+            level = replace(level, camera=self.refinement.camera(row, level.camera))
+            refine = partial(self.refinement.update, row, schedule.share(step))
         if step + 1 < schedule.steps:
             self.train[self._row(step + 1)].prefetch(schedule.level(step + 1))
         settings = self.raster_settings(schedule.active_sh_degree(step))
@@ -123,7 +131,25 @@ class Trainer:
         dropout = None
         if self.dropout and not schedule.densifying(step):  # it would distort the mean gradients
             dropout = Dropout(len(self.train), schedule.dropout_key(step))
-        return self.stepper.step(StepInput(level, settings, rates, self.smooth, dropout))
+        given = StepInput(level, settings, rates, self.smooth, dropout, refine)
+        return self.stepper.step(given)
+
+    def register_held_out(self) -> None:
+        """Refine the camera of each held-out view on its own photograph, with the splats as they
+        are. Otherwise it would be compared from where the training views are no longer."""
+        assert self.refinement is not None
+        registered = []
+        settings = self.raster_settings(self.schedule.sh_degree)
+        for row, view in enumerate(self.held_out, len(self.train)):
+            level = Level.from_pixels(view.camera, view.pixels, view.mask, view.outside)
+            for number in range(REGISTRATION_STEPS):
+                share = max(STARTS, number / REGISTRATION_STEPS)
+                seen = replace(level, camera=self.refinement.camera(row, view.camera))
+                refine = partial(self.refinement.update, row, share, with_lens=False)
+                no_rates = LearningRates().scaled(0.0, 0.0)
+                self.stepper.step(StepInput(seen, settings, no_rates, use_gradients=refine))
+            registered.append(replace(view, camera=self.refinement.camera(row, view.camera)))
+        self.held_out = registered
 
     def _row(self, step: int) -> int:
         """Which training view `step` uses: no validation view while the model is densified."""
@@ -154,7 +180,10 @@ class Trainer:
     @property
     def cameras(self) -> list[Camera]:
         """Of the training views, at full size."""
-        return [view.levels[-1].camera for view in self.train]
+        cameras = [view.levels[-1].camera for view in self.train]
+        if self.refinement is None:
+            return cameras
+        return [self.refinement.camera(row, camera) for row, camera in enumerate(cameras)]
 
     def raster_settings(self, sh_degree: int) -> RasterSettings:
         """To render the model with SH coefficients up to `sh_degree`."""
@@ -181,6 +210,8 @@ class Trainer:
             self.clock = Clock(elapsed)
             self.schedule = self.schedule.as_planned(*state.plan)
             self.early_stopping = state.early_stopping
+            if self.refinement is not None and state.refinement is not None:
+                self.refinement.load(state.refinement)
             self.report.metric("resumed_from_step", step)
         now = Provenance.of_backend(step, self.backend)
         if changed := now.change_since(self.provenance):
@@ -194,7 +225,10 @@ class Trainer:
         """Write a checkpoint after `step` steps."""
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.elapsed()]
-        state = TrainingState(step, plan, self.history, self.early_stopping, times, self.provenance)
+        refined = None if self.refinement is None else self.refinement.state()
+        state = TrainingState(
+            *(step, plan, self.history, self.early_stopping, times, self.provenance, refined)
+        )
         save_checkpoint(self.folder, self.model, state)
 
     def _lower_cap(self, fits: int) -> None:
