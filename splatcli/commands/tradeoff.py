@@ -84,8 +84,8 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     pruning = replace(pipeline.recorded_settings()["prune"], max_mb=0.0, min_psnr=0.0, seconds=0.0)
 
     def prune_to(splats: Splats, count: int) -> Splats:
-        asked = replace(pruning, max_splats=count)
-        return pruner_of(asked, inputs, views, backend, report).prune(splats).splats
+        wanted = replace(pruning, max_splats=count)
+        return pruner_of(wanted, inputs, views, backend, report).prune(splats).splats
 
     return TradeoffInputs(
         splats=splats,

@@ -8,18 +8,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stages import train
+from stages import prune, quantise, train
 from stages.base.errors import Interrupted
 from stages.base.stage import Report
+from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.raster.cpu.rasteriser import CpuRasteriser
 from stages.raster.definition import RasterSettings
-from stages.scene import Reconstruction, TrainedSplats, split_held_out
+from stages.scene import Reconstruction, RefinedCameras, TrainedSplats, split_held_out
 from stages.training.camera_refinement import camera_gradients
 from stages.training.conversion import model_of
 from stages.training.step import step_of
 from tests.small_scene import small_scene
 
 SETTINGS = RasterSettings(near=0.1, sh_degree=0)
+QUICK = {
+    prune: prune.PruneSettings(rounds=0),
+    quantise: quantise.QuantiseSettings(rounding_steps=0),
+}
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +68,12 @@ def test_gradients_by_the_camera_are_those_of_differences(scene) -> None:
     assert focal == pytest.approx(zoomed, rel=0.05)
 
 
-def shaken(scene, size: float) -> Reconstruction:
-    """The small scene with every camera but the held-out ones moved by about `size`."""
+def shaken(scene, size: float, held_out: bool = False) -> Reconstruction:
+    """The small scene with every camera moved by about `size`; held-out ones if that is wanted."""
     rng, views = np.random.default_rng(4), []
     for number, view in enumerate(scene.reconstruction.views):
         turn, shift = rng.normal(0, size / 3, 3), rng.normal(0, size, 3)
-        if number % 8 == 0:  # held out
+        if number % 8 == 0 and not held_out:
             views.append(view)
             continue
         pose = moved(view.camera.world_to_camera, turn, shift)
@@ -170,3 +175,25 @@ def test_every_step_on_the_host_gives_its_gradients(scene) -> None:
         stepper.step(StepInput(level, SETTINGS, LearningRates(), use_gradients=keep))
     np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-3, atol=1e-3)
     assert found[0][1] == pytest.approx(found[1][1], rel=1e-3)
+
+
+@pytest.mark.parametrize("stage", [prune, quantise])
+def test_later_stages_measure_from_the_refined_cameras(scene, tmp_path, stage) -> None:
+    true = scene.reconstruction
+    cameras = RefinedCameras({v.name: v.camera.world_to_camera for v in true.views}, 1.0)
+    report = Report()
+    inputs = {
+        "sfm": shaken(scene, 0.03, held_out=True),
+        "train": TrainedSplats(scene.splats, cameras=cameras),
+        "prune": scene.splats,
+    }
+    stage.run(inputs, QUICK[stage], tmp_path, report)
+    right_db = mean_psnr_db(scene.splats, held_out_of(true, scene.splats), "cpu")
+    assert right_db > 30
+    name = "psnr_before_db" if stage is prune else "psnr_raw_db"
+    assert report.metrics[name] == pytest.approx(right_db, abs=0.01)
+
+
+def held_out_of(reconstruction, splats):
+    views = split_held_out(reconstruction.views)[1]
+    return load_evaluation_views(reconstruction.folder, views, splats.draw_settings)
