@@ -16,7 +16,10 @@ from stages.raster.backends import backend_of, backend_of_settings
 DEFAULT_PRESET = "standard"
 
 # Options that describe one capture: a batch gives the same options to all of its runs.
-_OF_ONE_CAPTURE = ("masks", "cameras", "split", "refine_cameras", "scale", "blocks", "view")
+_OF_ONE_CAPTURE = (
+    *("masks", "depth", "cameras", "split", "refine_cameras"),
+    *("scale", "blocks", "view"),
+)
 
 
 def presets() -> Mapping[str, Any]:

@@ -13,16 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base import threads
-from stages.base.errors import Interrupted, SplatError
+from stages.base.errors import Interrupted
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
-from stages.base.text import counted
 
 if TYPE_CHECKING:
     from stages.photos.decode import Decoded, PixelBudget, Unusable
     from stages.photos.masking import MaskedPhoto
     from stages.photos.quality import Measures
-    from stages.photos.sources import Findings, Source
+    from stages.photos.sources import DepthFile, Findings, Source
     from stages.scene import Capture, Photo
 
 FEWEST_PHOTOGRAPHS = 3
@@ -67,6 +66,14 @@ class IngestSettings:
         panel="Light and masks",
         affects_output=False,  # its content does, which is an input
     )
+    depth: Path | None = setting(
+        None,
+        "Folder of measured depth maps, named as the photographs are, or a transforms.json that "
+        "names them. A folder called depth in or beside that of the photographs is found without "
+        "this option.",
+        panel="Input",
+        affects_output=False,  # its content does, which is an input
+    )
     frames: int = setting(
         0,
         "Frames to take from each video, at most; 0 chooses by how far the camera moves.",
@@ -87,6 +94,7 @@ class _Ingested:
         error: why the file cannot be used.
         inside: share of the picture that its mask keeps.
         remarks: codes of `advice.TEXTS` that apply to it.
+        bad_depth: why its depth map cannot be used.
     """
 
     name: str
@@ -95,6 +103,7 @@ class _Ingested:
     error: Unusable | None = None
     inside: float = 1.0
     remarks: tuple[str, ...] = ()
+    bad_depth: Unusable | None = None
 
 
 def run(
@@ -102,14 +111,14 @@ def run(
 ) -> Capture:
     """Read the photographs in the folder inputs["photos"].
 
-    Writes to `folder`: photos/ (the normalised pictures), masks/ (where there are any) and
-    capture.json (`load` reads it).
+    Writes to `folder`: photos/ (the normalised pictures), masks/ and depth/ (where there are any)
+    and capture.json (`load` reads it).
 
     Raises:
-        SplatError: there are fewer than 3 usable photographs, or masks do not fit them.
+        SplatError: there are fewer than 3 usable photographs, or masks or --depth do not fit them.
         Interrupted: the user stopped it.
     """
-    from stages.photos import advice, capture_file, masking
+    from stages.photos import advice, capture_file, depth_files, masking
     from stages.photos.find import find
     from stages.photos.masks import check_pairing, mask_folder
     from stages.photos.quality import near_duplicates
@@ -117,8 +126,9 @@ def run(
 
     root = Path(inputs["photos"])
     apart = mask_folder(root, settings.masks)
-    found = find(root, apart)
+    found = find(root, apart, depth_files.depth_source(root, settings.depth))
     check_pairing(found, apart, settings.masks)
+    depth_files.check_paired(found, settings.depth)
     cut_out = _masks_cut_out(found, settings)
     if cut_out:
         settings = replace(settings, mask_means=TRANSPARENT)
@@ -128,9 +138,11 @@ def run(
         ingested += _ingest_video(source, settings, folder, report)
     unusable = [(one.name, str(one.error), one.error.hint) for one in ingested if one.error]
     advice.about_left_out(unusable, report.warn)
+    bad = [(one.name, str(one.bad_depth), one.bad_depth.hint) for one in ingested if one.bad_depth]
+    advice.about_depth(bad, report.warn)
     usable = [one for one in ingested if one.photos]
     if len(usable) < FEWEST_PHOTOGRAPHS:
-        raise _too_few(root, len(usable), unusable)
+        raise advice.too_few(root, len(usable), FEWEST_PHOTOGRAPHS, unusable)
     pictures = tuple(replace(one.photos[0], name=one.name) for one in usable)
     photos = tuple(photo for one in usable for photo in one.photos)
     files = bool(found.masks or settings.rig_mask)
@@ -146,6 +158,7 @@ def run(
         "ingest-mask-unused": found.stray_masks,
         "ingest-mask-missing": bare if len(bare) < len(pictures) else (),
         "ingest-rig-mask-unused": _rig_mask_unused(photos, settings),
+        "ingest-depth-unused": found.stray_depths,
     }
     advice.about_names(remarks, report.warn)
     duplicates = near_duplicates([one.measures.thumbnail for one in usable if one.measures])
@@ -194,9 +207,7 @@ def _ingest_photographs(
     report.progress(0, total, "reading photographs")
     with readers_set_up(), ThreadPoolExecutor(threads.count()) as pool:
         futures: list[Future[_Ingested]] = [
-            pool.submit(
-                _ingest_photograph, source, found.masks.get(source.name), settings, folder, budget
-            )
+            pool.submit(_ingest_photograph, source, found, settings, folder, budget)
             for source in found.sources
         ]
         try:
@@ -211,7 +222,7 @@ def _ingest_photographs(
 
 
 def _ingest_photograph(
-    source: Source, mask: Path | None, settings: IngestSettings, folder: Path, budget: PixelBudget
+    source: Source, found: Findings, settings: IngestSettings, folder: Path, budget: PixelBudget
 ) -> _Ingested:
     from stages.photos import faces
     from stages.photos.decode import Unusable, decode
@@ -224,9 +235,29 @@ def _ingest_photograph(
             decoded = decode(source.path, int(faces.WIDTHS * settings.max_side), budget)
         elif kind:
             raise Unusable(f"it is {kind}", hint_for(kind))
-        return _write(source.name, source.image, decoded, settings, folder, mask, kind=kind)
+        mask = found.masks.get(source.name)
+        done = _write(source.name, source.image, decoded, settings, folder, mask, kind=kind)
     except Unusable as error:
         return _Ingested(source.name, error=error)
+    depth = found.depths.get(source.name)
+    return done if depth is None else _with_depth(done, depth, decoded, folder)
+
+
+def _with_depth(done: _Ingested, file: DepthFile, decoded: Decoded, folder: Path) -> _Ingested:
+    """The photograph with its depth map, which is written, or with why that cannot be used."""
+    from stages.photos.decode import Unusable
+    from stages.photos.depth_files import FOLDERS, read_depth
+    from stages.photos.write import write_depth
+
+    photo = done.photos[0]
+    place = f"{FOLDERS[0]}/{photo.picture}.npy"
+    try:
+        if photo.face is not None:
+            raise Unusable("it is a 360-degree picture", "Give maps of photographs only")
+        write_depth(folder / place, read_depth(file, decoded))
+    except Unusable as error:
+        return replace(done, bad_depth=error)
+    return replace(done, photos=(replace(photo, depth=place),))
 
 
 def _ingest_video(
@@ -354,6 +385,8 @@ def _report_capture(
     report.metric("panoramas", sum(photo.face is not None for photo in photos))
     report.metric("with_focal_length", sum(photo.focal_px is not None for photo in photos))
     report.metric("masked", sum(bool(photo.mask) for photo in photos))
+    if any(photo.depth for photo in photos):
+        report.metric("with_depth", sum(bool(photo.depth) for photo in photos))
     report.metric("cameras", len({photo.camera for photo in photos}))
     report.metric("blurred", len(blurred))
     report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))
@@ -363,25 +396,4 @@ def _report_capture(
     report.metric("median_log2_luminance", round(float(medians[1]), 3))
 
 
-def _too_few(root: Path, usable: int, unusable: list[tuple[str, str, str]]) -> SplatError:
-    if root.is_file() and unusable:
-        return SplatError(
-            "ingest-video-unusable",
-            given=f"{root} cannot be used: {unusable[0][1]}.",
-            wanted="A video with pictures that decode.",
-            hint=f"{unusable[0][2]}.",
-        )
-    given = f"{root} holds {counted(usable, 'usable photograph')}."
-    if unusable:
-        few = "; ".join(f"{name}: {why}" for name, why, _ in unusable[:3])
-        more = f"; and {len(unusable) - 3} more" if len(unusable) > 3 else ""
-        given = f"{given[:-1]}; {len(unusable)} could not be read ({few}{more})."
-    return SplatError(
-        "ingest-too-few-photographs",
-        given=given,
-        wanted=f"At least {FEWEST_PHOTOGRAPHS}; an object or a room needs 20 to 50.",
-        hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
-    )
-
-
-STAGE = Stage(name="ingest", version=9, reads=(), settings_type=IngestSettings, run=run, load=load)
+STAGE = Stage(name="ingest", version=10, reads=(), settings_type=IngestSettings, run=run, load=load)

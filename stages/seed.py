@@ -50,6 +50,7 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     from stages.scene import Splats, draw_settings_of, logit, rgb_to_dc, split_held_out
     from stages.scene.storage import save_splats
     from stages.structure.seeding.empty_cells import fill_cells
+    from stages.structure.seeding.measured_depth import measured_points
     from stages.structure.seeding.plane_sweep import plane_sweep_points
     from stages.structure.seeding.view_selection import selected_views
 
@@ -73,6 +74,11 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
         more, more_colours = plane_sweep_points(reconstruction.folder, chosen, points)
         report.metric("plane_sweep_points", len(more))
         points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])
+        if any(view.depth for view in chosen):
+            more, more_colours = measured_points(reconstruction.folder, chosen, points, report)
+            report.metric("measured_points", len(more))
+            points = np.concatenate([points, more])
+            colours = np.concatenate([colours, more_colours])
     scales, clamped = _scales(points, reconstruction)
     report.metric("median_scale", float(np.median(scales)))
     report.metric("scales_clamped", clamped)

@@ -44,6 +44,7 @@ OPENGL_FROM_OURS = np.diag([1.0, -1.0, -1.0])
 APPLIED_TRANSFORM = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _PERSPECTIVE = ("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = "OPENCV_FISHEYE"
+MILLIMETRE = 0.001
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # of pictures that are named without one
 _ROLES = {"train_filenames": "train", "test_filenames": "test", "val_filenames": "val"}
 _LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
@@ -132,6 +133,22 @@ def read_points(path: Path) -> FilePoints | None:
         points, colours = _ply_points(path.parent / named)
         turn, shift, scale = _applied(data)
         return file_points((points / scale - shift) @ turn, colours)
+
+
+def depth_maps(path: Path) -> tuple[dict[str, Path], float]:
+    """(depth maps by `file_path`, the metres of one step of their values). Raises SplatError
+    "cameras-unreadable"."""
+    with reading(path, CAMERAS):
+        data = _document(path)
+        unit = float(data.get("depth_unit_scale_factor", MILLIMETRE))
+        if not (math.isfinite(unit) and unit > 0):
+            raise BadFileError("its depth_unit_scale_factor is not a positive number")
+        found = {}
+        for frame in data["frames"]:
+            if named := str(frame.get("depth_file_path") or ""):
+                check_inside(path.parent, named, path.parent)
+                found[str(_required(frame, "file_path"))] = path.parent / named
+        return found, unit
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -92,6 +92,7 @@ def _relocated(part: Reconstruction, place: Path) -> Reconstruction:
             view,
             image=(lead / view.image).as_posix(),
             mask=(lead / view.mask).as_posix() if view.mask else "",
+            depth=(lead / view.depth).as_posix() if view.depth else "",
         )
         for view in part.views
     )

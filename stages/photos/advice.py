@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from stages.base.errors import SplatError
 from stages.base.text import counted, listed
 from stages.photos.sources import RAW_ADVICE
 from stages.scene import Photo
@@ -44,6 +46,8 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "ingest-mask-missing": "Some photographs have no mask: {names}. There everything counts.",
     "ingest-rig-mask-unused": "The capture has no 360-degree pictures, so this mask is not used: "
     "{names}.",
+    "ingest-depth-unused": "Depth maps that belong to no photograph by their names are not used: "
+    "{names}.",
     "ingest-blurred": "Blurred, compared with the others: {names}. "
     "Take these again or remove them; more light or a shorter exposure helps.",
     "ingest-small": f"Smaller than {SMALL_BELOW_PX} pixels: {{names}}. "
@@ -65,6 +69,14 @@ def about_left_out(unusable: Sequence[tuple[str, str, str]], warn: Warn) -> None
         warn("ingest-left-out", f"{name} is left out: {why}. {hint}.")
     if rest := [name for name, *_ in unusable[_NAMED:]]:
         warn("ingest-left-out", f"Also left out, for similar reasons: {listed(rest)}.")
+
+
+def about_depth(left_out: Sequence[tuple[str, str, str]], warn: Warn) -> None:
+    """left_out: (photograph, why, what to do) of depth maps that cannot be used."""
+    for name, why, hint in left_out[:_NAMED]:
+        warn("ingest-depth-left-out", f"{name} is used without its depth map: {why}. {hint}.")
+    if rest := [name for name, *_ in left_out[_NAMED:]]:
+        warn("ingest-depth-left-out", f"Also without their depth maps: {listed(rest)}.")
 
 
 def about_capture(
@@ -159,3 +171,28 @@ def _about_cameras(photos: Sequence[Photo], warn: Warn) -> None:
 def _counted(kinds: Counter[str]) -> str:
     parts = [f"{count} x {kind or 'unknown'}" for kind, count in kinds.most_common(4)]
     return ", ".join(parts) + (", ..." if len(kinds) > 4 else "")
+
+
+def too_few(
+    root: Path, usable: int, fewest: int, unusable: Sequence[tuple[str, str, str]]
+) -> SplatError:
+    """The error of a capture `root` with too few usable photographs. fewest: that are wanted.
+    unusable: as for `about_left_out`."""
+    if root.is_file() and unusable:
+        return SplatError(
+            "ingest-video-unusable",
+            given=f"{root} cannot be used: {unusable[0][1]}.",
+            wanted="A video with pictures that decode.",
+            hint=f"{unusable[0][2]}.",
+        )
+    given = f"{root} holds {counted(usable, 'usable photograph')}."
+    if unusable:
+        few = "; ".join(f"{name}: {why}" for name, why, _ in unusable[:3])
+        more = f"; and {len(unusable) - 3} more" if len(unusable) > 3 else ""
+        given = f"{given[:-1]}; {len(unusable)} could not be read ({few}{more})."
+    return SplatError(
+        "ingest-too-few-photographs",
+        given=given,
+        wanted=f"At least {fewest}; an object or a room needs 20 to 50.",
+        hint="Take photographs in small steps around the scene, with 60-80 % overlap.",
+    )

@@ -31,8 +31,8 @@ def load_capture(folder: Path) -> Capture:
         if data["schema"] != _SCHEMA or not data["photos"]:
             raise BadFileError(f"it lists no photographs of schema {_SCHEMA}")
         photos = tuple(_photo(dict(row)) for row in data["photos"])
-        masks = [photo.mask for photo in photos if photo.mask]
-        for file in [*(photo.image for photo in photos), *masks]:
+        beside = [file for photo in photos for file in (photo.mask, photo.depth) if file]
+        for file in [*(photo.image for photo in photos), *beside]:
             inside = PurePosixPath(file)
             if inside.is_absolute() or ".." in inside.parts or not (folder / inside).is_file():
                 raise BadFileError(f"its picture {file} is not there")
@@ -43,6 +43,8 @@ def _row(photo: Photo) -> dict[str, Any]:
     row = asdict(photo)
     if photo.face is None:
         del row["face"]
+    if not photo.depth:
+        del row["depth"]
     return row
 
 

@@ -131,7 +131,7 @@ def decode(path: Path, max_side: int, budget: PixelBudget) -> Decoded:
     readable = [name for name in FORMATS if name in Image.OPEN]  # builds of Pillow differ
     try:
         with Image.open(io.BytesIO(data), formats=readable) as image:
-            stored = _check_size(image.size)
+            stored = check_size(image.size)
             with budget.spend(stored[0] * stored[1]):
                 return _decode(image, data, max_side)
     except (Unusable, MemoryError):
@@ -158,7 +158,8 @@ def _read(path: Path) -> bytes:
     return data
 
 
-def _check_size(size: tuple[int, int]) -> tuple[int, int]:
+def check_size(size: tuple[int, int]) -> tuple[int, int]:
+    """The size (width, height) of a picture. Raises Unusable if it is too large or too small."""
     if size[0] * size[1] > MAX_MEGAPIXELS * 1_000_000:
         why = f"{size[0]} x {size[1]} is more than {MAX_MEGAPIXELS} megapixels"
         raise Unusable(why, f"Scale it down to {MAX_MEGAPIXELS} megapixels or less")

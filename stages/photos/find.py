@@ -9,14 +9,15 @@ from pathlib import Path
 
 from stages.base.errors import ResourceError, SplatError
 from stages.base.text import counted, printable_name
-from stages.cameras import blender
-from stages.photos import masks
+from stages.cameras import blender, nerfstudio
+from stages.photos import depth_files, masks
 from stages.photos.sources import (
     OTHER_PICTURES,
     PICTURES,
     RAW,
     RAW_ADVICE,
     VIDEO,
+    DepthFile,
     Findings,
     Source,
     natural_key,
@@ -27,7 +28,7 @@ from stages.photos.sources import (
 from stages.scene.capture import PHOTOS_FOLDER
 
 
-def find(folder: Path, more_masks: Path | None = None) -> Findings:
+def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None) -> Findings:
     """Search `folder` and its sub-folders, without hidden files and folders.
 
     Links to folders are not followed, because they may form a loop.
@@ -35,6 +36,7 @@ def find(folder: Path, more_masks: Path | None = None) -> Findings:
     Args:
         folder: or a video, which counts as a folder that holds it.
         more_masks: a folder of masks besides those in `folder`.
+        depth: a folder of depth maps, or a transforms.json, besides those in `folder`.
 
     Raises:
         SplatError: the folder is missing, is another file, cannot be listed or holds no photograph
@@ -47,6 +49,7 @@ def find(folder: Path, more_masks: Path | None = None) -> Findings:
     files: dict[str, Path] = {}
     for path in _walk(folder):
         files[printable_name(path.relative_to(folder).as_posix())] = path
+    depths, stray_depths = _remove_depths(files, folder, depth)
     mask_of, stray = _remove_masks(files, folder, more_masks)
     names = sorted(files, key=natural_key)
     photographs = _posed(folder, [name for name in names if suffix_of(name) in PICTURES])
@@ -65,6 +68,8 @@ def find(folder: Path, more_masks: Path | None = None) -> Findings:
         others=len(names) - len(photographs) - sum(len(kind) for kind in kinds.values()),
         masks=mask_of,
         stray_masks=stray,
+        depths=depths,
+        stray_depths=stray_depths,
     )
     if not found.sources and not found.videos:
         raise _no_photographs(folder, found)
@@ -108,6 +113,37 @@ def _remove_masks(
         paired.setdefault(photograph, files.pop(mask))
     used = set(paired.values())
     stray = (name for name, path in found.items() if path not in used)
+    return paired, tuple(sorted(stray, key=natural_key))
+
+
+def _remove_depths(
+    files: dict[str, Path], folder: Path, source: Path | None
+) -> tuple[dict[str, DepthFile], tuple[str, ...]]:
+    """Remove maps of depth and of confidence from `files`, if any map belongs to a photograph:
+    those in a folder called depth, those beside photographs, and those of `source`. Returns maps by
+    the photograph's name, and stray ones."""
+    maps: dict[str, Path] = {}
+    unit = 0.0
+    if source is not None and source.is_file():
+        maps, unit = nerfstudio.depth_maps(source)
+    elif source is not None and source.is_dir() and source.resolve() != folder.resolve():
+        every = {path.relative_to(source).as_posix(): path for path in _walk(source)}
+        maps = {name: every[name] for name in every if suffix_of(name) in depth_files.SUFFIXES}
+    apart = {path.resolve() for path in maps.values()}
+    inside = {name for name in files if depth_files.is_map(name)}
+    inside |= {name for name, path in files.items() if apart and path.resolve() in apart}
+    for name in sorted(inside):
+        if files[name].resolve() not in apart:
+            short = name.partition("/")[2] if name.casefold().startswith("depth") else name
+            maps[short or name] = files[name]
+    pictures = [name for name in files if suffix_of(name) in PICTURES and name not in inside]
+    paired = depth_files.pair_depths(pictures, maps, unit)
+    if not paired:
+        return {}, ()
+    for name in [name for name in files if name in inside or depth_files.is_confidence(name)]:
+        del files[name]
+    used = {path for file in paired.values() for path in (file.path, *file.others)}
+    stray = (name for name, path in maps.items() if path not in used)
     return paired, tuple(sorted(stray, key=natural_key))
 
 

@@ -76,6 +76,18 @@ def mask_of(folder: Path, view: View, width: int, height: int) -> NDArray[np.uin
     return load_mask(folder / view.mask, width, height, view.outside) if view.mask else None
 
 
+def load_depth(path: Path) -> NDArray[np.float32]:
+    """[h, w] a depth map as ingest and structure from motion write it: z, 0 where nothing was
+    measured. Raises SplatError "photo-unreadable"."""
+    try:
+        depth = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise _unreadable(path, reason_of(error)) from error
+    if depth.ndim != 2 or depth.dtype != np.float32:
+        raise _unreadable(path, "it is no depth map")
+    return np.asarray(depth)
+
+
 def _unreadable(path: Path, reason: str) -> SplatError:
     return RunFolderError(
         "photo-unreadable",

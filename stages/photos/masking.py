@@ -161,15 +161,15 @@ def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArra
     """
     image, stored = _opened(path, name), decoded.stored
     turn = UPRIGHT.get(decoded.exif.orientation)
-    upright = (stored[1], stored[0]) if turn in _QUARTERS else stored
+    upright = (stored[1], stored[0]) if turn in QUARTERS else stored
     if (
         turn is not None
-        and turn in _QUARTERS
-        and _same_aspect(image.size, stored)
-        and not _same_aspect(image.size, upright)
+        and turn in QUARTERS
+        and same_aspect(image.size, stored)
+        and not same_aspect(image.size, upright)
     ):
         image = image.transpose(turn)
-    if not _same_aspect(image.size, upright):
+    if not same_aspect(image.size, upright):
         sizes = f"{image.width} x {image.height}, the photograph {upright[0]} x {upright[1]}"
         raise _unfit(path, name, f"it is {sizes}")
     values = _values(image)
@@ -183,7 +183,7 @@ def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArra
     return np.asarray(resized > 0), image.size != upright
 
 
-_QUARTERS = (
+QUARTERS = (
     Image.Transpose.TRANSPOSE,
     Image.Transpose.ROTATE_270,
     Image.Transpose.TRANSVERSE,
@@ -217,7 +217,7 @@ def _values(image: Image.Image) -> NDArray[np.float32]:
     return np.asarray(grey, np.float32)
 
 
-def _same_aspect(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
+def same_aspect(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
     """Whether both have the same aspect ratio, to a few hundredths."""
     return abs(size[0] * wanted[1] / (size[1] * wanted[0]) - 1.0) < MAX_ASPECT_DIFFERENCE
 

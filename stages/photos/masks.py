@@ -50,14 +50,16 @@ def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> N
     )
 
 
-def names_for(photograph: str) -> tuple[str, ...]:
+def names_for(photograph: str, ending: str = "_mask") -> tuple[str, ...]:
     """Names that the mask of a photograph ("day 1/a.jpg") may have, case-folded, without its own
-    ending: those of COLMAP (a.jpg.png), nerfstudio (a.png) and Metashape (a_mask.png)."""
+    suffix: those of COLMAP (a.jpg.png), nerfstudio (a.png) and Metashape (a_mask.png)."""
     stem = str(PurePosixPath(photograph).with_suffix(""))
-    return photograph.casefold(), stem.casefold(), f"{stem}_mask".casefold()
+    return photograph.casefold(), stem.casefold(), f"{stem}{ending}".casefold()
 
 
-def pair_masks(photographs: Iterable[str], masks: Mapping[str, Path]) -> dict[str, Path]:
+def pair_masks(
+    photographs: Iterable[str], masks: Mapping[str, Path], ending: str = "_mask"
+) -> dict[str, Path]:
     """The mask of each photograph that has one, by the photograph's name.
 
     The folder of masks need not have the photographs' sub-folders if no name is used twice.
@@ -65,19 +67,20 @@ def pair_masks(photographs: Iterable[str], masks: Mapping[str, Path]) -> dict[st
     Args:
         photographs: names relative to their folder.
         masks: by name relative to theirs.
+        ending: see `names_for`.
     """
     photographs = list(photographs)
     by_stem = {stem_of(name): path for name, path in sorted(masks.items())}
     found = {}
     for name in photographs:
-        match = next((by_stem[key] for key in names_for(name) if key in by_stem), None)
+        match = next((by_stem[key] for key in names_for(name, ending) if key in by_stem), None)
         if match is not None:
             found[name] = match
     bare = [PurePosixPath(name).name for name in photographs]
     if not found and len({name.casefold() for name in bare}) == len(bare):
         short = {PurePosixPath(name).name: path for name, path in sorted(masks.items())}
         if short != dict(masks) or bare != photographs:
-            again = pair_masks(bare, short)
+            again = pair_masks(bare, short, ending)
             found = {
                 name: again[last]
                 for name, last in zip(photographs, bare, strict=True)

@@ -45,6 +45,16 @@ class Source:
 
 
 @dataclass(frozen=True)
+class DepthFile:
+    """A photograph's depth map. unit: metres of one step of its values; 0 if its kind decides.
+    others: more maps of the same photograph."""
+
+    path: Path
+    unit: float = 0.0
+    others: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
 class Findings:
     """What a folder holds.
 
@@ -57,6 +67,8 @@ class Findings:
         others: how many files are something else.
         masks: mask files by the name of their photograph.
         stray_masks: mask files that belong to no photograph.
+        depths: depth maps by the name of their photograph.
+        stray_depths: depth maps that belong to no photograph.
     """
 
     sources: tuple[Source, ...]
@@ -66,6 +78,8 @@ class Findings:
     others: int
     masks: Mapping[str, Path] = field(default_factory=dict)
     stray_masks: tuple[str, ...] = ()
+    depths: Mapping[str, DepthFile] = field(default_factory=dict)
+    stray_depths: tuple[str, ...] = ()
 
 
 def suffix_of(name: str) -> str:

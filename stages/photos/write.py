@@ -1,4 +1,4 @@
-"""Writes normalised pictures and masks."""
+"""Writes normalised pictures, masks and depth maps."""
 
 from __future__ import annotations
 
@@ -55,3 +55,10 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
     Image.fromarray(mask).save(encoded, "PNG", compress_level=3)
     with replacing(path) as temporary:
         temporary.write_bytes(encoded.getvalue())
+
+
+def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
+    """Write a depth map [h, w] as .npy. Raises SplatError if it cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.lib.format.write_array(file, np.ascontiguousarray(depth), (1, 0), allow_pickle=False)

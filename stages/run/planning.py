@@ -15,7 +15,7 @@ from stages.run.request import Request, request_for, why_again
 from stages.run.workspace import Layout
 
 PHOTOS = "photos"  # the input of a stage that reads no other
-MASKS, RIG_MASK = "masks", "rig_mask"
+MASKS, RIG_MASK, DEPTH = "masks", "rig_mask", "depth"
 _NAMED_AT_MOST = 3
 
 
@@ -102,10 +102,11 @@ class Planner:
         return request_for(stage, settings, inputs, files)
 
     def _files(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
-        """Records of the user's own files that the stage reads, by input: photographs, masks, and
-        files that settings name. Masks and named files that were removed after the stage finished
-        count as unchanged."""
+        """Records of the user's own files that the stage reads, by input: photographs, masks, depth
+        maps, and files that settings name. Named files and those beside the photographs that were
+        removed after the stage finished count as unchanged."""
         from stages.cameras.table import files_of
+        from stages.photos import depth_files
         from stages.photos.masks import mask_folder
 
         done = Manifest.read(self.layout.workspace(stage).final)
@@ -118,15 +119,24 @@ class Planner:
                 self._photo_records = record_files(photos, known.get(PHOTOS), users=True)
             found[PHOTOS] = self._photo_records
             masks = mask_folder(photos, named.get(MASKS))
-            named.pop(MASKS, None)
-            named |= {MASKS: masks} if masks is not None else {}
+            depth = depth_files.depth_source(photos, named.get(DEPTH))
+            found_beside = {MASKS: masks, DEPTH: depth}
+            named |= {name: path for name, path in found_beside.items() if path is not None}
         for name, path in named.items():
             if name in known and not path.exists():
                 found[name] = known[name]
                 continue
-            files = [path] if name in (MASKS, RIG_MASK) else files_of(path)
-            records = (record_files(file, known.get(name), users=True) for file in files)
-            found[name] = {key: record for part in records for key, record in part.items()}
+            if name == DEPTH:
+                files = depth_files.files_of(path)
+            else:
+                files = [path] if name in (MASKS, RIG_MASK) else files_of(path)
+            found[name] = {}
+            for file in files:  # maps of depth and of confidence have the same names
+                lead = f"{file.name}/" if file.name == depth_files.CONFIDENCE else ""
+                old = known.get(name, {}).items()
+                before = {key[len(lead) :]: one for key, one in old if key.startswith(lead)}
+                records = record_files(file, before, users=True)
+                found[name] |= {lead + key: record for key, record in records.items()}
         return found
 
     def existing_photos(self) -> Path:

@@ -57,6 +57,8 @@ class Photo:
             TRANSPARENT: nothing is there; `image` is composited over black, and the mask is alpha.
         gps: latitude and longitude in degrees from EXIF or XMP, or None.
         gps_height: metres, above sea level or the ellipsoid as the receiver has it, or None.
+        depth: a .npy, [h, w] float32 of any size, relative to the capture's folder; "" for none.
+            Measured z in metres, 0 where nothing was measured.
         gps_error_m: standard deviation of `gps` as the receiver states it, metres, or None.
         face: of a panorama; None for a photograph. The intrinsics of faces are exact.
     """
@@ -76,6 +78,7 @@ class Photo:
     gps: tuple[float, float] | None = None
     gps_height: float | None = None
     gps_error_m: float | None = None
+    depth: str = ""
     face: Face | None = None
 
     @property
@@ -104,7 +107,7 @@ class View:
 
     Args:
         name, duplicate_of, outside: as in `Photo`.
-        image, mask: as in `Photo`, relative to the reconstruction's folder.
+        image, mask, depth: as in `Photo`, relative to the reconstruction's folder.
         camera: pose and intrinsics.
         role: "train" or "test" where a benchmark defines the split; "" elsewhere.
         light: exposure and white balance, see `scene.light`; None if they could not be measured.
@@ -120,6 +123,7 @@ class View:
     outside: str = ""
     light: Light | None = None
     frame: str = ""
+    depth: str = ""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,12 @@ from stages.structure.gps import MetricScale
 from stages.structure.levelling import level_and_recentre
 from stages.structure.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric_scale
 from stages.structure.sparse_model import SparseModel, point_errors
-from stages.structure.undistorted_images import IMAGES, mask_file, write_undistorted_images
+from stages.structure.undistorted_images import (
+    IMAGES,
+    depth_file,
+    mask_file,
+    write_undistorted_images,
+)
 from stages.structure.undistortion import SimpleRadial, undistorted_px
 
 COLMAP = "colmap"
@@ -137,6 +142,7 @@ def write_reconstruction(
             mask_file(photo),
             photo.outside,
             frame=photo.face.frame if photo.face else "",
+            depth=depth_file(photo),
         )
         for photo, camera, role in zip(photos, cameras, roles or [""] * len(photos), strict=True)
     )

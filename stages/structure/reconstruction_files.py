@@ -78,6 +78,7 @@ def _view_to_dict(view: View) -> dict[str, Any]:
         "duplicate_of": view.duplicate_of,
         **({"role": view.role} if view.role else {}),
         **({"mask": view.mask, "outside": view.outside} if view.mask else {}),
+        **({"depth": view.depth} if view.depth else {}),
         **({"light": list(view.light)} if view.light else {}),
         **({"frame": view.frame} if view.frame else {}),
         "width": camera.width,

@@ -1,4 +1,4 @@
-"""Undistorted pictures and masks of a reconstruction, as files."""
+"""Undistorted pictures, masks and depth maps of a reconstruction, as files."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from stages.base.atomic import replacing
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.cameras.lens import Lens
+from stages.photos.load import load_depth
+from stages.photos.write import write_depth
 from stages.scene import TRANSPARENT, Camera, Photo
 from stages.structure.undistortion import (
     remap_tables,
@@ -23,6 +25,7 @@ from stages.structure.undistortion import (
 
 IMAGES = "colmap/images"
 MASKS = "colmap/masks"
+DEPTH = "colmap/depth"
 _JPEG = (
     *(cv2.IMWRITE_JPEG_QUALITY, 97),
     *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
@@ -36,6 +39,11 @@ def mask_file(photo: Photo) -> str:
     return f"{MASKS}/{photo.picture}.png" if photo.mask else ""
 
 
+def depth_file(photo: Photo) -> str:
+    """Path of a photograph's undistorted depth map in the reconstruction; "" without one."""
+    return f"{DEPTH}/{photo.picture}.npy" if photo.depth else ""
+
+
 def write_undistorted_images(
     photos: Sequence[Photo],
     cameras: Sequence[Camera],
@@ -44,7 +52,8 @@ def write_undistorted_images(
     folder: Path,
     report: Report,
 ) -> tuple[list[Camera], float]:
-    """Write undistorted pictures and masks. A photograph without distortion is copied unchanged.
+    """Write undistorted pictures, masks and depth maps. A photograph without distortion is copied
+    unchanged.
 
     Args:
         photos: V photographs.
@@ -76,6 +85,7 @@ def write_undistorted_images(
             tables = {key: remap_tables(camera, lens, pinhole)}
         _write_picture(photo, source, folder, tables[key] if lens.distorts else None)
         _write_mask(photo, source, folder, tables[key] if lens.distorts else None)
+        _write_depth(photo, source, folder, camera, lens, pinhole)
     report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
     return pinholes, float(np.mean(shares))
 
@@ -101,6 +111,23 @@ def _write_mask(photo: Photo, source: Path, folder: Path, tables: _Tables | None
     target = folder / mask_file(photo)
     target.parent.mkdir(parents=True, exist_ok=True)
     _encode(target, mask)
+
+
+def _write_depth(
+    photo: Photo, source: Path, folder: Path, camera: Camera, lens: Lens, pinhole: Camera
+) -> None:
+    """At the depth map's own number of pixels a degree, without interpolation across edges."""
+    if not photo.depth:
+        return
+    depth = load_depth(source / photo.depth)
+    if lens.distorts:
+        height, width = depth.shape
+        across, down = width / camera.width, height / camera.height
+        sides = round(pinhole.width * across), round(pinhole.height * down)
+        tables = remap_tables(camera.resized(width, height), lens, pinhole.resized(*sides))
+        moved = cv2.remap(depth, *tables, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        depth = np.asarray(moved, np.float32)
+    write_depth(folder / depth_file(photo), depth)
 
 
 def _read(path: Path) -> np.ndarray:

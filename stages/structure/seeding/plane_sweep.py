@@ -40,7 +40,7 @@ SAME_SURFACE = 0.05  # relative depth difference
 
 
 @dataclass(frozen=True)
-class _DepthMap:
+class DepthMap:
     """Of one reference view: depth [H, W], and NCC [H, W], -1 without an estimate."""
 
     camera: Camera
@@ -75,7 +75,7 @@ def plane_sweep_points(
     for i, depth_map in enumerate(depth_maps):
         others = [j for j in range(len(depth_maps)) if j in sources[i] or i in sources[j]]
         consistent = _consistent(depth_map, [depth_maps[j] for j in others])
-        rows, columns = _best_per_cell(depth_map, consistent, np.concatenate(positions))
+        rows, columns = best_per_cell(depth_map, consistent, np.concatenate(positions))
         at = pixel_centres(rows, columns)
         depths = depth_map.depth[rows, columns].astype(np.float64)
         positions.append(unproject(depth_map.camera, at, depths))
@@ -91,13 +91,13 @@ def _sweep(
     cameras: list[Camera],
     grey: list[NDArray[np.float32]],
     points: NDArray[np.float64],
-) -> _DepthMap:
+) -> DepthMap:
     """The best depth hypothesis at each pixel, by the mean NCC of the two best source views."""
     camera = cameras[i]
     nothing = np.full((camera.height, camera.width), -1, np.float32)
     depths = visible_points(camera, points)[2]
     if not sources or not len(depths):
-        return _DepthMap(camera, np.ones_like(nothing), nothing)
+        return DepthMap(camera, np.ones_like(nothing), nothing)
     nearest, farthest = np.percentile(depths, (1, 99)) * DEPTH_MARGIN
     inverse = np.linspace(1 / farthest, 1 / nearest, PLANES)
     mean = _box(grey[i])
@@ -118,7 +118,7 @@ def _sweep(
     score = scores.max(0)
     score[(best == 0) | (best == PLANES - 1) | (variance < FLAT / 2)] = -1
     depth = 1 / (inverse[0] + _peak(scores, best) * (inverse[1] - inverse[0]))
-    return _DepthMap(camera, depth.astype(np.float32), score)
+    return DepthMap(camera, depth.astype(np.float32), score)
 
 
 def _mean_of_best_two(values: Sequence[NDArray[np.floating]]) -> NDArray[np.floating]:
@@ -172,7 +172,7 @@ def _peak(scores: NDArray[np.float32], best: NDArray[np.intp]) -> NDArray[np.flo
     return np.asarray(middle + np.clip(0.5 * (below - above) / bend, -1, 1), np.float64)
 
 
-def _consistent(depth_map: _DepthMap, others: list[_DepthMap]) -> NDArray[np.bool_]:
+def _consistent(depth_map: DepthMap, others: list[DepthMap]) -> NDArray[np.bool_]:
     """[H, W] where enough of the other depth maps agree with this one."""
     height, width = depth_map.depth.shape
     rows, columns = np.divmod(np.arange(height * width), width)
@@ -190,20 +190,24 @@ def _consistent(depth_map: _DepthMap, others: list[_DepthMap]) -> NDArray[np.boo
     return consistent.reshape(height, width)
 
 
-def _best_per_cell(
-    depth_map: _DepthMap, consistent: NDArray[np.bool_], points: NDArray[np.float64]
+def best_per_cell(
+    depth_map: DepthMap,
+    consistent: NDArray[np.bool_],
+    points: NDArray[np.float64],
+    size: float = CELL,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(rows, columns) of the consistent pixel with the largest NCC in each cell without points.
+    """(rows, columns) of the consistent pixel with the largest NCC in each cell, of `size` pixels,
+    without points.
     Points far in front of or behind a consistent depth are on another surface and do not count."""
     height, width = consistent.shape
-    taken = np.zeros((int(height // CELL) + 1, int(width // CELL) + 1), bool)
+    taken = np.zeros((int(height // size) + 1, int(width // size) + 1), bool)
     _, pixels, depths = visible_points(depth_map.camera, points)
     there = cells(pixels)
     same = np.abs(depths / depth_map.depth[there] - 1) < SAME_SURFACE
-    rows, columns = cells(pixels[same | ~consistent[there]], CELL)
+    rows, columns = cells(pixels[same | ~consistent[there]], size)
     taken[rows, columns] = True
     rows, columns = np.nonzero(consistent)
-    down, across = cells(pixel_centres(rows, columns), CELL)
+    down, across = cells(pixel_centres(rows, columns), size)
     cell = down * taken.shape[1] + across
     free = ~taken.ravel()[cell]
     rows, columns, cell = rows[free], columns[free], cell[free]

@@ -1,0 +1,181 @@
+"""Measured depth beside photographs: which file belongs to which photograph, and what it holds.
+
+Read are 16-bit PNG and TIFF (millimetres), and TIFF, EXR and .npy of floating-point numbers
+(metres): the depth along the camera's axis (z), 0 or NaN where nothing was measured. A
+transforms.json of nerfstudio's names a map for each photograph, and the metres of one step of all.
+Apps of phones write how confident they are, in three levels; only the highest is used.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from stages.base.errors import SplatError
+from stages.cameras import nerfstudio
+from stages.cameras.nerfstudio import MILLIMETRE
+from stages.photos.decode import UPRIGHT, Decoded, Unusable, check_size
+from stages.photos.masking import QUARTERS, same_aspect
+from stages.photos.masks import pair_masks
+from stages.photos.sources import DepthFile, Findings, suffix_of
+from stages.scene import fitted_size
+
+FOLDERS = ("depth", "depths")  # beside the photographs' folder, or in it
+CONFIDENCE = "confidence"  # a folder beside that of the maps
+SUFFIXES = frozenset({".png", ".tif", ".tiff", ".exr", ".npy"})
+MAX_SIDE = 320  # of a map that is kept, pixels: seeds are no denser
+_MOST_BYTES = 1 << 30
+_EXPORT = "Export it as 16-bit PNG in millimetres, or as TIFF, EXR or .npy in metres"
+_SCANNER_APP = re.compile(r"(^|/)depth(_[0-9]+\.)")  # depth_00012.png is of frame_00012.jpg
+_CONFIDENCE = re.compile(r"(^|/)conf_[0-9]+\.")
+
+
+def depth_source(photos: Path, chosen: Path | None) -> Path | None:
+    """What holds the depth maps outside the photographs' folder: the folder or transforms.json that
+    was chosen, or a folder called depth beside the photographs'."""
+    near = (photos.absolute().parent / name for name in FOLDERS)
+    return chosen or next((p for p in near if p.is_dir() and p != photos.absolute()), None)
+
+
+def files_of(source: Path) -> list[Path]:
+    """The files and folders of maps and of their confidence. Raises SplatError."""
+    if not source.is_file():
+        return [path for path in (source, source.with_name(CONFIDENCE)) if path.is_dir()]
+    return [source, *nerfstudio.depth_maps(source)[0].values()]
+
+
+def pair_depths(
+    photographs: Iterable[str], maps: Mapping[str, Path], unit: float = 0.0
+) -> dict[str, DepthFile]:
+    """The depth map of each photograph that has one, paired as masks are: a.png, a.jpg.png or
+    a_depth.png for a.jpg, and depth_1.png for frame_1.jpg.
+
+    Args:
+        photographs: names relative to their folder.
+        maps: files by name relative to theirs.
+        unit: see `DepthFile`.
+    """
+    left = {_SCANNER_APP.sub(r"\1frame\2", name): path for name, path in maps.items()}
+    found: dict[str, DepthFile] = {}
+    names = list(photographs)
+    while more := pair_masks(names, left, "_depth"):
+        for name, path in more.items():
+            first = found.get(name, DepthFile(path, unit))
+            others = (*first.others, path) if name in found else ()
+            found[name] = DepthFile(first.path, unit, others)
+        used = set(more.values())
+        left = {name: path for name, path in left.items() if path not in used}
+    return found
+
+
+def is_map(name: str) -> bool:
+    """Whether a file in the photographs' folder may be a depth map, by its name."""
+    marked = name.casefold().startswith(tuple(f"{folder}/" for folder in FOLDERS))
+    return suffix_of(name) in SUFFIXES and (marked or bool(_SCANNER_APP.search(name)))
+
+
+def is_confidence(name: str) -> bool:
+    """Whether a file in the photographs' folder may say how confident a map is."""
+    return name.casefold().startswith(f"{CONFIDENCE}/") or bool(_CONFIDENCE.search(name))
+
+
+def confidence_of(path: Path) -> Path | None:
+    """The file that says how confident a map is, if there is one."""
+    beside = path.with_name(path.name.replace("depth_", "conf_", 1))
+    found = (path.parent.with_name(CONFIDENCE) / path.name, beside)
+    return next((file for file in found if file != path and file.is_file()), None)
+
+
+def check_paired(found: Findings, chosen: Path | None) -> None:
+    """Raises SplatError "depth-missing" if nothing in `chosen` is the map of a photograph."""
+    if chosen is not None and not found.depths:
+        photograph = (found.sources or found.videos)[0].name
+        raise SplatError(
+            "depth-missing",
+            given=f"{chosen} holds no depth map of a photograph such as {photograph}.",
+            wanted=f"Files named as the photographs are ({', '.join(sorted(SUFFIXES))}), or a "
+            "transforms.json with depth_file_path.",
+            hint="Check the path, or leave --depth away: depth is not required.",
+        )
+
+
+def read_depth(file: DepthFile, decoded: Decoded) -> NDArray[np.float32]:
+    """[h, w] metres, 0 where nothing was measured; upright, its longer side at most MAX_SIDE.
+
+    decoded: the photograph. Raises Unusable.
+    """
+    if file.others:
+        names = ", ".join(path.name for path in (file.path, *file.others))
+        raise Unusable(f"there are {1 + len(file.others)} for it ({names})", "Keep one of them")
+    try:
+        values = _values(file.path)
+        confidence = confidence_of(file.path)
+        sure = None if confidence is None else _values(confidence)
+    except Unusable:
+        raise
+    except FileNotFoundError as error:
+        raise Unusable(f"{file.path.name} does not exist", "Put it back") from error
+    except Exception as error:  # decoders raise whatever the damage leads to
+        raise Unusable(f"{file.path.name} does not decode", _EXPORT) from error
+    if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype.itemsize == 1:
+        raise Unusable(f"{file.path.name} is a picture of 8 bits or in colour", _EXPORT)
+    whole = values.dtype.kind != "f"
+    with np.errstate(over="ignore", invalid="ignore"):
+        metres = values.astype(np.float32) * np.float32(file.unit or (MILLIMETRE if whole else 1))
+        metres = np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
+    if sure is not None and sure.shape == metres.shape:
+        highest = 2 if sure.max() <= 2 else 255
+        metres = np.where(sure >= highest, metres, np.float32(0))
+    if not metres.any():
+        raise Unusable(f"{file.path.name} holds no confident measurement", _EXPORT)
+    metres = _upright(metres, decoded, file.path.name)
+    size = fitted_size(metres.shape[1], metres.shape[0], MAX_SIDE)
+    return np.asarray(cv2.resize(metres, size, interpolation=cv2.INTER_NEAREST_EXACT))
+
+
+def _upright(metres: NDArray[np.float32], decoded: Decoded, name: str) -> NDArray[np.float32]:
+    """Turned with the photograph where it has the proportions of the stored file."""
+    size, stored = metres.shape[::-1], decoded.stored
+    turn = UPRIGHT.get(decoded.exif.orientation)
+    upright = (stored[1], stored[0]) if turn in QUARTERS else stored
+    if turn in QUARTERS and same_aspect(size, stored) and not same_aspect(size, upright):
+        metres = np.asarray(Image.fromarray(metres).transpose(turn))
+    elif not same_aspect(size, upright):
+        sizes = f"{size[0]} x {size[1]}, the photograph {upright[0]} x {upright[1]}"
+        raise Unusable(f"{name} is {sizes}", "Use a map with its photograph's proportions")
+    return metres
+
+
+def _values(path: Path) -> NDArray[Any]:
+    """The values of a file as they are stored. Raises what decoders raise, and Unusable."""
+    if path.stat().st_size > _MOST_BYTES:
+        raise Unusable(f"{path.name} is larger than 1 GiB", _EXPORT)
+    if path.suffix.lower() == ".npy":
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+        values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+        check_size(values.shape[1::-1])
+        return np.asarray(values)
+    if path.suffix.lower() == ".exr":
+        return _exr(path)
+    with Image.open(path, formats=("PNG", "TIFF")) as image:
+        check_size(image.size)
+        return np.asarray(image)
+
+
+def _exr(path: Path) -> NDArray[np.float32]:
+    """The grey channel, or red."""
+    import av
+
+    with av.open(io.BytesIO(path.read_bytes()), "r", format="exr_pipe") as opened:
+        codec = opened.streams.video[0].codec_context
+        check_size((codec.width, codec.height))
+        values = next(opened.decode(video=0)).to_ndarray()
+    return np.asarray(values if values.ndim == 2 else values[..., 0], np.float32)
