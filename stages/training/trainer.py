@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.base.errors import Interrupted
 from stages.base.stage import Report
 from stages.measure.evaluation import EvaluationView
 from stages.raster.backends import AUTO
@@ -136,11 +137,15 @@ class Trainer:
 
     def register_held_out(self) -> None:
         """Refine the camera of each held-out view on its own photograph, with the splats as they
-        are. Otherwise it would be compared from where the training views are no longer."""
+        are. Otherwise it would be compared from where the training views are no longer. Raises
+        Interrupted if the report asks to stop."""
         assert self.refinement is not None
-        registered = []
+        registered: list[EvaluationView] = []
         settings = self.raster_settings(self.schedule.sh_degree)
         for row, view in enumerate(self.held_out, len(self.train)):
+            self.report.progress(len(registered), len(self.held_out), "registering")
+            if self.report.stop_requested.is_set():
+                raise Interrupted("stopped while registering held-out views")
             level = Level.from_pixels(view.camera, view.pixels, view.mask, view.outside)
             for number in range(REGISTRATION_STEPS):
                 share = max(STARTS, number / REGISTRATION_STEPS)
