@@ -72,7 +72,8 @@ class PruneSettings:
     )
     finetune_steps: int = setting(
         90,
-        "Steps of fine-tuning after a round that costs too much; 0 for none.",
+        "Steps of fine-tuning after each round that costs too much, or that a target needs; 0 for "
+        "none.",
         panel="Advanced",
         min=0,
         max=100_000,
@@ -225,7 +226,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=15,
+    version=16,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

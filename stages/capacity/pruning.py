@@ -106,8 +106,7 @@ class Pruner:
         backend: name of the rasteriser.
         finetuner: on the same views.
         rounds: the largest number, unless a target needs more.
-        finetune_steps: after each round that costs too much without them; where a target needs more
-            rounds, they share `rounds * finetune_steps` steps.
+        finetune_steps: after each round that costs too much without them, or that a target needs.
         report: for progress.
         deadline: after which no round begins, as `time.monotonic`, unless a target needs it.
     """
@@ -155,8 +154,7 @@ class Pruner:
             measured = self._sse_change(state, after)
             kept = excess <= 0 and self.targets.allows(after.psnr_db, best_db)
             if not kept and (excess > 0 or self._can_be_saved(after, best_db)):
-                steps = self.finetune_steps * self.rounds // planned
-                fewer, after = self._finetuned(fewer, steps, after)
+                fewer, after = self._finetuned(fewer, after)
                 kept = excess > 0 or self.targets.allows(after.psnr_db, best_db)
             found.add_round(removal, measured, after.psnr_db, kept)
             if kept:
@@ -190,13 +188,11 @@ class Pruner:
         least_db = LEAST_LEFT * (best_db - after.psnr_db)
         return self.finetune_steps > 0 and self.targets.allows(best_db - least_db, best_db)
 
-    def _finetuned(
-        self, splats: Splats, steps: int, before: Contributions
-    ) -> tuple[Splats, Contributions]:
-        """The splats after so many steps, and their contributions. before: those of `splats`."""
-        if not steps:
+    def _finetuned(self, splats: Splats, before: Contributions) -> tuple[Splats, Contributions]:
+        """The fine-tuned splats, and their contributions. before: those of `splats`."""
+        if not self.finetune_steps:
             return splats, before
-        trained = self.finetuner.finetune(splats, steps, before.view_counts)
+        trained = self.finetuner.finetune(splats, self.finetune_steps, before.view_counts)
         return trained, self._contributions(trained, before.previous)
 
     def _measured_views(self) -> Iterator[EvaluationView]:
