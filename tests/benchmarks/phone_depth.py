@@ -64,7 +64,7 @@ def phone_depth(
     found = near * (1 + rng.normal() * SCALE_ERROR)
     found = found + (NOISE_M + NOISE * near) * noise / noise.std()
     spread = cv2.dilate(near, np.ones((3, 3))) / cv2.erode(near, np.ones((3, 3))) - 1
-    patches = cv2.GaussianBlur(rng.normal(size=noise.shape), (0, 0), 3.0)
+    patches = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 3.0)
     holes = (spread > EDGE) & (patches > 0)  # at half of the edges; the others stay wrong
     holes |= (grey < DARK) | (near > RANGE_M)
     return np.where(holes, 0, np.round(1000 * found)).astype(np.uint16)
@@ -78,7 +78,8 @@ def write_phone_depth(
     for path in photographs:
         index = int(path.stem.split("_")[1]) - 1
         depth = true_depth(scene, make.LENS, make.poses()[index])
-        measured = phone_depth(depth, cv2.imread(str(path)), np.random.default_rng([seed, index]))
+        shown = np.asarray(cv2.imread(str(path)), np.uint8)
+        measured = phone_depth(depth, shown, np.random.default_rng([seed, index]))
         cv2.imwrite(str(folder / f"{path.stem}.png"), measured)
 
 

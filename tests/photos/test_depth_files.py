@@ -6,6 +6,7 @@ import io
 import json
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -72,7 +73,8 @@ def taken(photos: Path, depth: Path | None = None) -> tuple[Capture, dict[str, s
     return capture, dict(report.warnings)
 
 
-def maps_of(capture: Capture) -> list[np.ndarray | None]:
+def maps_of(capture: Capture) -> list[Any]:
+    """The map of each photograph; None for one without."""
     return [load_depth(capture.folder / p.depth) if p.depth else None for p in capture.photos]
 
 

@@ -10,15 +10,14 @@ import pytest
 
 from stages.base.stage import Report
 from stages.photos.write import write_depth
-from stages.scene import View
+from stages.scene import Camera, Reconstruction, View
 from stages.structure.reconstruction_files import (
     FILE_NAME,
     load_reconstruction,
     save_reconstruction,
 )
 from stages.structure.seeding.measured_depth import measured_points
-from tests.structure.seeding.test_plane_sweep import HALF, PLATE, WALL, capture
-from tests.test_seed import grid
+from tests.structure.seeding.wall_and_plate import HALF, PLATE, WALL, capture
 
 METRES_PER_UNIT = 0.4
 
@@ -42,7 +41,7 @@ def plain(tmp_path: Path) -> tuple[Path, tuple[View, ...], np.ndarray]:
     views, points = capture(tmp_path, plain=True)
     views = tuple(replace(view, depth=f"{view.name}.npy") for view in views)
     for view in views:
-        write_depth(tmp_path / view.depth, METRES_PER_UNIT * true_depth(view))
+        write_depth(tmp_path / view.depth, np.float32(METRES_PER_UNIT) * true_depth(view))
     return tmp_path, views, points
 
 
@@ -118,12 +117,13 @@ def test_holes_stay_empty_and_no_map_gives_nothing(plain) -> None:
 def test_a_reconstruction_keeps_its_maps_and_one_without_says_nothing_of_them(
     tmp_path: Path,
 ) -> None:
-    bare = grid()
+    camera, one = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(4)), np.ones(1)
+    views = tuple(View(f"{i}.jpg", f"{i}.jpg", camera) for i in range(4))
+    colours, tracks = np.zeros((1, 3), np.uint8), np.ones(1, np.int32)
+    bare = Reconstruction(tmp_path, views, np.ones((1, 3)), colours, one, tracks)
     save_reconstruction(tmp_path, bare)
     assert "depth" not in (tmp_path / FILE_NAME).read_text()
-    views = (replace(bare.views[0], depth="colmap/depth/0.npy"), *bare.views[1:])
-    save_reconstruction(tmp_path, replace(bare, views=views))
-    assert [view.depth for view in load_reconstruction(tmp_path).views] == [
-        views[0].depth,
-        *3 * [""],
-    ]
+    mapped = replace(views[0], depth="colmap/depth/0.npy")
+    save_reconstruction(tmp_path, replace(bare, views=(mapped, *views[1:])))
+    loaded = load_reconstruction(tmp_path)
+    assert [view.depth for view in loaded.views] == [mapped.depth, "", "", ""]
