@@ -124,7 +124,7 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
         one_more()
 
     def one_more() -> None:
-        progress.write("registering photographs", next(registered), len(job.names))
+        progress.write("registering photographs", next(registered), int(job.frames.max()) + 1)
 
     return dict(
         pycolmap.incremental_mapping(

@@ -60,10 +60,13 @@ class Band:
 
 
 def poses() -> list[NDArray[np.float64]]:
-    """[4, 4] world_to_camera of each: at every second place of the sample's walk, in its order."""
+    """[4, 4] world_to_camera of each: at one of every two places of the sample's walk, in its
+    order, low and high in turn."""
     rng = np.random.default_rng(360)
     found = []
-    for pose in make.poses()[::2]:
+    walk = make.poses()
+    for number in range(PANORAMAS):
+        pose = walk[2 * number + number % 2]
         eye = -pose[:3, :3].T @ pose[:3, 3]
         heading = rng.uniform(0, 2 * np.pi)
         ahead = np.array([np.cos(heading), 0.0, np.sin(heading)])
