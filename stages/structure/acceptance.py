@@ -32,6 +32,8 @@ def accepted_model(
         enough = len(model.points) >= _FEWEST_PARTIAL_POINTS
         if best.passed or (enough and allow_partial):
             return model
+    if best.configuration.learned and attempts[0].failures[0].code == "sfm-too-few-features":
+        best = attempts[0]  # the photographs show nothing, and the gates after that do not say so
     worst = with_hint(best.failures[0], features)
     groups = best.result.groups if best.result is not None else ()
     if worst.code == "sfm-too-few-registered" and len(groups) > 1:

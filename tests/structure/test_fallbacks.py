@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+
 from stages.base.errors import SplatError
+from stages.scene import Capture
+from stages.structure.acceptance import accepted_model
 from stages.structure.fallbacks import (
     CONFIGURATIONS,
     LEARNED,
@@ -143,6 +149,18 @@ def test_the_attempt_with_most_photographs_is_used_and_sift_where_they_are_as_ma
     sift, learned = passed(9), passed(10, learned=True)
     assert best_attempt([sift, learned]) is learned
     assert best_attempt([sift, passed(9, learned=True)]) is sift
+
+
+def test_photographs_that_show_nothing_are_reported_as_that() -> None:
+    """Learned features find some matches on a blank wall, and then fail for another reason."""
+    blank = Attempt(
+        CONFIGURATIONS[0], failing("sfm-too-few-features"), ModelStatistics(photographs=10)
+    )
+    some = ModelStatistics(photographs=10, registered=3, models=(3,), points=80)
+    learned = Attempt(LEARNED, failing("sfm-too-few-registered"), some)
+    with pytest.raises(SplatError) as caught:
+        accepted_model([blank, learned], Capture(Path("."), ()), allow_partial=False)
+    assert caught.value.code == "sfm-too-few-features"
 
 
 def test_sift_follows_where_learned_features_fail_first() -> None:
