@@ -110,7 +110,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     )
     evaluated = held_out or training
     before_db = psnr_of_views_db(splats, evaluated, backend)
-    pruner = pruner_of(settings, inputs, training, backend, report, deadline)
+    pruner = pruner_of(settings, reconstruction, trained, training, backend, report, deadline)
     found = pruner.prune(splats)
     loss_db = before_db - psnr_of_views_db(found.splats, evaluated, backend)
     report_backend(report, backend)
@@ -135,17 +135,19 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
 
 def pruner_of(
     settings: PruneSettings,
-    inputs: Mapping[str, Any],
+    reconstruction: Reconstruction,
+    trained: TrainedSplats,
     training: Sequence[EvaluationView],
     backend: str,
     report: Report,
     deadline: float = math.inf,
 ) -> Pruner:
-    """What prunes the splats of inputs["train"].
+    """What prunes the splats of `trained`.
 
     Args:
         settings: of the stage.
-        inputs: of the stage.
+        reconstruction: with the cameras that training refined.
+        trained: what was trained.
         training: the training views.
         backend: name of the rasteriser.
         report: for progress.
@@ -156,8 +158,6 @@ def pruner_of(
     from stages.scene import training_extent
     from stages.training.finetune import FineTuner
 
-    trained: TrainedSplats = inputs["train"]
-    reconstruction: Reconstruction = inputs["sfm"].with_cameras(trained.cameras)
     extent = training_extent(reconstruction)
     finetuner = FineTuner(training, extent, backend, report, trained.dropout)
     targets = Targets(

@@ -80,12 +80,14 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
     views = load_evaluation_views(reconstruction.folder, training, settings)
     chosen = {view.name for view in floater_views(training, settings)}
     backend, report = results.backend_of_run(pipeline), Report()
-    inputs = {"sfm": reconstruction, "train": pipeline.load("train")}
+    trained = pipeline.load("train")
     pruning = replace(pipeline.recorded_settings()["prune"], max_mb=0.0, min_psnr=0.0, seconds=0.0)
 
     def prune_to(splats: Splats, count: int) -> Splats:
         wanted = replace(pruning, max_splats=count)
-        return pruner_of(wanted, inputs, views, backend, report).prune(splats).splats
+        return (
+            pruner_of(wanted, reconstruction, trained, views, backend, report).prune(splats).splats
+        )
 
     return TradeoffInputs(
         splats=splats,
@@ -99,5 +101,5 @@ def _inputs(pipeline: Pipeline) -> TradeoffInputs:
         exported=tuple(results.exported_formats(pipeline)),
         quantised=pipeline.load("quantise"),
         prune_to=prune_to,
-        trained=inputs["train"].splats,
+        trained=trained.splats,
     )

@@ -152,7 +152,9 @@ class Trainer:
                 seen = replace(level, camera=self.refinement.camera(row, view.camera))
                 refine = partial(self.refinement.update, row, share, with_lens=False)
                 no_rates = LearningRates().scaled(0.0, 0.0)
-                self.stepper.step(StepInput(seen, settings, no_rates, use_gradients=refine))
+                self.stepper.step(
+                    StepInput(seen, settings, no_rates, self.smooth, use_gradients=refine)
+                )
             registered.append(replace(view, camera=self.refinement.camera(row, view.camera)))
         self.held_out = registered
 

@@ -61,11 +61,13 @@ def inputs(scene):
         for views in split_held_out(reconstruction.views)
     )
     splats = replace(scene.splats, draw_settings=draw_settings)
-    stages = {"sfm": reconstruction, "train": TrainedSplats(splats)}
+    trained = TrainedSplats(splats)
 
     def prune_to(some, count):
         asked = PruneSettings(max_splats=count, finetune_steps=10)
-        return pruner_of(asked, stages, training, "cpu", Report()).prune(some).splats
+        return (
+            pruner_of(asked, reconstruction, trained, training, "cpu", Report()).prune(some).splats
+        )
 
     return TradeoffInputs(
         splats,
