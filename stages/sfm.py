@@ -193,7 +193,6 @@ def _from_photographs(
     )
     attempts = fallbacks.try_configurations(
         runner.run_configuration,
-        already_exhaustive=job.matching == "exhaustive",
         out_of_time=runner.out_of_time,
         features=features,
     )
@@ -312,5 +311,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=17, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=18, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

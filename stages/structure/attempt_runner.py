@@ -76,7 +76,7 @@ class AttemptRunner:
         """
         frames = self.base.frames
         photographs = int(frames.max()) + 1
-        empty = ModelStatistics(photographs=photographs, mapper=configuration.mapper)
+        empty = ModelStatistics(photographs=photographs)
         job = self._job(configuration)
         try:
             self._extract_features(job)
@@ -120,8 +120,7 @@ class AttemptRunner:
         result = load_result(Path(job.out))
         if result.model is not None:
             result = replace(result, model=without_implausible_views(result.model))
-        photographs = attempt.statistics.photographs
-        statistics = model_statistics(result, photographs, attempt.configuration.mapper)
+        statistics = model_statistics(result, attempt.statistics.photographs)
         statistics = replace(statistics, learned=attempt.configuration.learned)
         failures = tuple(before) + tuple(check_model(statistics))
         return replace(attempt, statistics=statistics, failures=failures, result=result)
@@ -142,11 +141,9 @@ class AttemptRunner:
             progress=str(self.folder / "progress.json"),
             max_features=round(base.max_features * (MORE_FEATURES if more else 1)),
             peak_threshold=base.peak_threshold * (LOWER_PEAK if more else 1.0),
-            matching="exhaustive" if configuration.exhaustive else base.matching,
+            matching="exhaustive" if more else base.matching,
             drop_stationary=configuration.drop_stationary,
-            mapper=configuration.mapper,
             loose=configuration.loose,
-            other_pair=configuration.other_pair,
         )
 
     def _extract_features(self, job: Job) -> None:

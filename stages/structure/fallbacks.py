@@ -20,21 +20,18 @@ class Configuration:
 
     Args:
         name: for messages and metrics.
-        more_features: lower SIFT's peak threshold and allow more features.
-        exhaustive: match every pair, whatever the settings say.
+        more_features: lower SIFT's peak threshold, allow more features, and match every pair,
+            whatever the settings say.
         learned: add learned features and their matches to SIFT's.
-        drop_stationary, loose, other_pair, mapper: as in `job.Job`.
+        drop_stationary, loose: as in `job.Job`.
         fixes: codes of the failures after which this configuration is tried.
     """
 
     name: str
     more_features: bool = False
-    exhaustive: bool = False
     learned: bool = False
     drop_stationary: bool = False
     loose: bool = False
-    other_pair: bool = False
-    mapper: str = "incremental"
     fixes: frozenset[str] = frozenset()
 
 
@@ -53,26 +50,12 @@ LEARNED = Configuration(
 CONFIGURATIONS = (  # by SIFT alone
     Configuration("standard"),
     Configuration("without stationary matches", drop_stationary=True, fixes=_CAMERA),
-    Configuration("looser registration", loose=True, fixes=_UNREGISTERED),
-    Configuration(
-        "every pair matched", exhaustive=True, fixes=_UNREGISTERED | _UNCONNECTED | _SPARSE
-    ),
+    Configuration("looser registration", loose=True, fixes=_UNREGISTERED | {"sfm-crashed"}),
     Configuration(
         "more features",
         more_features=True,
-        exhaustive=True,
         loose=True,
         fixes=_UNREGISTERED | _UNCONNECTED | _SPARSE,
-    ),
-    Configuration(
-        "another initial pair",
-        exhaustive=True,
-        loose=True,
-        other_pair=True,
-        fixes=_UNREGISTERED | _CAMERA | {"sfm-high-error", "sfm-crashed"},
-    ),
-    Configuration(
-        "global mapper", exhaustive=True, mapper="global", fixes=_UNREGISTERED | {"sfm-crashed"}
     ),
 )
 
@@ -105,14 +88,12 @@ class Attempt:
 
     @property
     def rank(self) -> tuple[bool, int, int, int]:
-        """Orders attempts that failed: any incremental model before the global mapper's and those
-        that learned features may have joined falsely, then by registered photographs, points, and
-        the size of any model found."""
+        """Orders attempts that failed: models that learned features may have joined falsely are the
+        last, then by registered photographs, points, and the size of any model found."""
         largest = max(self.statistics.models, default=0)
         failures = {failure.code for failure in self.failures}
         false = self.configuration.learned and bool(failures & _FALSE_JOIN)
-        trusted = self.statistics.mapper != "global" and not false
-        return (trusted, self.statistics.registered, self.statistics.points, largest)
+        return (not false, self.statistics.registered, self.statistics.points, largest)
 
 
 def best_attempt(attempts: list[Attempt]) -> Attempt:
@@ -137,7 +118,6 @@ def configurations(features: str) -> tuple[Configuration, ...]:
 def try_configurations(
     run: Callable[[Configuration], Attempt],
     *,
-    already_exhaustive: bool,
     out_of_time: Callable[[], bool],
     features: str = "sift",
 ) -> list[Attempt]:
@@ -147,15 +127,13 @@ def try_configurations(
 
     Args:
         run: runs one configuration.
-        already_exhaustive: the settings match every pair anyway, so a configuration that adds
-            nothing else is skipped.
         out_of_time: whether to stop; the first configuration is run all the same.
         features: as in `configurations`.
     """
     attempts: list[Attempt] = []
     for configuration in configurations(features):
         if attempts:
-            if not _may_help(configuration, attempts, already_exhaustive):
+            if not _may_help(configuration, attempts):
                 continue
             if out_of_time():
                 break
@@ -163,9 +141,7 @@ def try_configurations(
     return attempts
 
 
-def _may_help(
-    configuration: Configuration, attempts: list[Attempt], already_exhaustive: bool
-) -> bool:
+def _may_help(configuration: Configuration, attempts: list[Attempt]) -> bool:
     if any(attempt.passed for attempt in attempts):
         return configuration.learned and attempts[0].statistics.left_out > 0
     by_sift = [attempt for attempt in attempts if not attempt.configuration.learned]
@@ -174,9 +150,4 @@ def _may_help(
         return False
     if configuration is CONFIGURATIONS[0]:
         return True
-    only_adds_pairs = configuration == Configuration(
-        configuration.name, exhaustive=True, fixes=configuration.fixes
-    )
-    if already_exhaustive and only_adds_pairs:
-        return False
     return bool(configuration.fixes & failures)

@@ -28,7 +28,6 @@ class ModelStatistics:
         photographs: how many were given.
         registered: how many are in the largest model.
         models: registered photographs of each model found.
-        mapper: "incremental" or "global".
         learned: whether learned features took part.
         timed_out: whether the mapper ran out of time.
         points: in the largest model.
@@ -54,7 +53,6 @@ class ModelStatistics:
     photographs: int
     registered: int = 0
     models: tuple[int, ...] = ()
-    mapper: str = "incremental"
     learned: bool = False
     timed_out: bool = False
     points: int = 0
@@ -113,7 +111,6 @@ class Thresholds:
     fewest_inconsistent: int = 3
     rotation_to_other_deg: float = 15.0
     cut_points: int = 30
-    cut_points_global: int = 100
     cut_points_learned: int = 150
     same_position_share: float = 0.9
 
@@ -290,9 +287,7 @@ def _check_consistency(model: ModelStatistics, thresholds: Thresholds) -> Iterat
             "Some photographs are in two models, whose relative rotations differ by "
             f"{model.rotation_to_other_deg:.0f} degrees."
         )
-    # The global mapper registers every photograph; without common points such a pose is a guess.
-    least = thresholds.cut_points_global if model.mapper == "global" else thresholds.cut_points
-    least = thresholds.cut_points_learned if model.learned else least
+    least = thresholds.cut_points_learned if model.learned else thresholds.cut_points
     if model.cut_views and model.cut_points < least:
         yield failure(
             "sfm-weak-link",

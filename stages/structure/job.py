@@ -68,9 +68,7 @@ class Job:
         max_features, peak_threshold: of SIFT (Lowe 2004).
         matching: which pairs: "selected" by retrieval, "exhaustive" or "sequential".
         drop_stationary: drop matches that stay in place in the picture (a date stamp).
-        mapper: "incremental" or "global".
         loose: register photographs with fewer inliers.
-        other_pair: start from another initial pair than COLMAP would.
         refine: refine the poses of known cameras.
         max_seconds: time limit of mapping.
         source: of a chunk: the database of the whole job; of "learned": that of SIFT.
@@ -94,9 +92,7 @@ class Job:
     peak_threshold: float = 0.0045
     matching: str = "selected"
     drop_stationary: bool = False
-    mapper: str = "incremental"
     loose: bool = False
-    other_pair: bool = False
     refine: bool = False
     max_seconds: int = 3600
     source: str = ""

@@ -13,7 +13,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from stages.structure import database as sqlite
 from stages.structure.epipolar import MatchedPair, epipolar_distances, inlier_ratios
 from stages.structure.job import Job, ProgressWriter
 from stages.structure.sparse_model import SparseModel, save_model
@@ -44,8 +43,8 @@ def map_photographs(job: Job) -> None:
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     started = time.monotonic()
-    models = _global(job, scratch) if job.mapper == "global" else _incremental(job, scratch)
-    timed_out = job.mapper != "global" and time.monotonic() - started >= job.max_seconds
+    models = _incremental(job, scratch)
+    timed_out = time.monotonic() - started >= job.max_seconds
     ordered = sorted(
         (m for m in models.values() if m.num_reg_frames() > 0),
         key=lambda m: (-m.num_reg_frames(), -m.num_points3D(), min(m.reg_image_ids())),
@@ -109,12 +108,6 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
         options.mapper.abs_pose_min_inlier_ratio = 0.15
         options.mapper.init_min_num_inliers = 50
         options.mapper.init_min_tri_angle = 8.0
-    if job.other_pair:
-        pair = _other_pair(Path(job.database))
-        if pair is not None:
-            options.init_image_id1, options.init_image_id2 = pair
-            options.multiple_models = False
-            options.mapper.init_min_tri_angle = 4.0
     registered = itertools.count(1)
     progress = ProgressWriter(Path(job.progress))
 
@@ -136,36 +129,6 @@ def _incremental(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
             next_image_callback=one_more,
         )
     )
-
-
-def _global(job: Job, scratch: Path) -> dict[int, pycolmap.Reconstruction]:
-    database = scratch / "database.db"  # calibration rewrites the two-view geometries
-    sqlite.copy(Path(job.database), database)
-    if any(camera.focal_px is None for camera in job.cameras):
-        pycolmap.calibrate_view_graph(database)
-    options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = 1
-    options.random_seed = options.mapper.random_seed = job.seed
-    options.mapper.num_threads = 1
-    options.mapper.rotation_averaging.random_seed = job.seed
-    options.mapper.global_positioning.random_seed = job.seed
-    options.mapper.retriangulation.random_seed = job.seed
-    models = dict(pycolmap.global_mapping(database, job.images_root, scratch, options))
-    for model in models.values():
-        model.normalize()
-        model.extract_colors_for_all_images(job.images_root, num_threads=1)
-    return models
-
-
-def _other_pair(database: Path) -> tuple[int, int] | None:
-    """Image ids of the calibrated pair with most inliers among pairs that are not neighbours in the
-    capture's order. COLMAP prefers pairs with most inliers, so it tries these last."""
-    pairs = [pair for pair in sqlite.verified_pairs(database) if pair[3] == 2]
-    far = [pair for pair in pairs if pair[1] - pair[0] >= 2] or pairs
-    if not far:
-        return None
-    first, second, _, _ = max(far, key=lambda pair: (pair[2], -pair[0], -pair[1]))
-    return first + 1, second + 1
 
 
 def _sparse_model(

@@ -296,15 +296,13 @@ def sideways_share(model: SparseModel) -> float:
     return float(np.sqrt(max(0.0, 1.0 - (along**2).sum() / whole))) if whole else 0.0
 
 
-def model_statistics(result: MappingResult, photographs: int, mapper: str) -> ModelStatistics:
+def model_statistics(result: MappingResult, photographs: int) -> ModelStatistics:
     """The statistics that the gates check. photographs: how many were given. The faces of a
     panorama count as one."""
     model = result.model
     sizes = tuple(len(group) for group in result.groups)
     if model is None or not model.names:
-        return ModelStatistics(
-            photographs=photographs, models=sizes, mapper=mapper, timed_out=result.timed_out
-        )
+        return ModelStatistics(photographs=photographs, models=sizes, timed_out=result.timed_out)
     sample = np.arange(0, len(model.points), max(1, len(model.points) // _SAMPLED_POINTS))
     angles = triangulation_angles(model, sample)
     errors = point_errors(model)
@@ -315,7 +313,6 @@ def model_statistics(result: MappingResult, photographs: int, mapper: str) -> Mo
         photographs=photographs,
         registered=len(registered),
         models=sizes,
-        mapper=mapper,
         timed_out=result.timed_out,
         points=len(model.points),
         mean_reprojection_error_px=float(errors.mean()) if len(errors) else 0.0,

@@ -35,17 +35,11 @@ class Script:
     def __call__(self, configuration: Configuration) -> Attempt:
         self.tried.append(configuration.name)
         codes = self.results.get(configuration.name, (self.otherwise,))
-        return Attempt(
-            configuration,
-            failing(*codes),
-            ModelStatistics(photographs=10, mapper=configuration.mapper),
-        )
+        return Attempt(configuration, failing(*codes), ModelStatistics(photographs=10))
 
 
-def run(script: Script, exhaustive: bool = True) -> Attempt:
-    return best_attempt(
-        try_configurations(script, already_exhaustive=exhaustive, out_of_time=lambda: False)
-    )
+def run(script: Script) -> Attempt:
+    return best_attempt(try_configurations(script, out_of_time=lambda: False))
 
 
 def test_a_good_capture_is_reconstructed_once() -> None:
@@ -60,24 +54,16 @@ def test_no_fallback_is_tried_for_a_lack_of_parallax() -> None:
     assert script.tried == ["standard"]
 
 
-def test_unregistered_photographs_try_looser_registration_first_and_the_global_mapper_last() -> (
-    None
-):
+def test_unregistered_photographs_try_looser_registration_and_then_more_features() -> None:
     script = Script("sfm-too-few-registered")
     run(script)
-    assert script.tried == [
-        "standard",
-        "looser registration",
-        "more features",
-        "another initial pair",
-        "global mapper",
-    ]
+    assert script.tried == ["standard", "looser registration", "more features"]
 
 
-def test_sequential_matching_is_followed_by_every_pair() -> None:
-    script = Script("sfm-too-few-registered", every_pair_matched=())
-    assert run(script, exhaustive=False).configuration.name == "every pair matched"
-    assert script.tried == ["standard", "looser registration", "every pair matched"]
+def test_a_crash_of_the_mapper_tries_once_more() -> None:
+    script = Script("sfm-crashed")
+    run(script)
+    assert script.tried == ["standard", "looser registration"]
 
 
 def test_a_wrong_camera_drops_stationary_matches() -> None:
@@ -94,20 +80,8 @@ def test_few_features_are_followed_by_more_features_alone() -> None:
 
 def test_when_time_is_up_the_first_attempt_has_still_been_made() -> None:
     script = Script("sfm-too-few-registered")
-    try_configurations(script, already_exhaustive=True, out_of_time=lambda: True)
+    try_configurations(script, out_of_time=lambda: True)
     assert script.tried == ["standard"]
-
-
-def test_among_failures_the_global_mapper_ranks_last() -> None:
-    few = Attempt(
-        CONFIGURATIONS[0], failing("sfm-too-few-registered"), ModelStatistics(10, registered=5)
-    )
-    all_of_them = Attempt(
-        CONFIGURATIONS[-1],
-        failing("sfm-weak-link"),
-        ModelStatistics(10, registered=10, mapper="global"),
-    )
-    assert best_attempt([few, all_of_them]) is few
 
 
 def test_every_fallback_lists_what_it_may_fix() -> None:
@@ -129,7 +103,7 @@ def tried(first: Attempt, features: str) -> list[str]:
         return passed(10, learned=True) if configuration.learned else first
 
     names: list[str] = []
-    try_configurations(run, already_exhaustive=True, out_of_time=lambda: False, features=features)
+    try_configurations(run, out_of_time=lambda: False, features=features)
     return names
 
 
@@ -165,8 +139,6 @@ def test_photographs_that_show_nothing_are_reported_as_that() -> None:
 
 def test_sift_follows_where_learned_features_fail_first() -> None:
     script = Script("sfm-high-error", standard=())
-    attempts = try_configurations(
-        script, already_exhaustive=True, out_of_time=lambda: False, features="learned"
-    )
+    attempts = try_configurations(script, out_of_time=lambda: False, features="learned")
     assert script.tried == ["learned features", "standard"]
     assert best_attempt(attempts).configuration.name == "standard"

@@ -95,7 +95,7 @@ def test_a_face_without_points_stays_and_faces_are_counted_as_their_panorama() -
     rig = replace(bare, view_frames=np.repeat(np.arange(6, dtype=np.int32), 2))
     assert len(without_implausible_views(rig).names) == 12
     result = MappingResult(rig, (("a",) * 6,), timed_out=False)
-    statistics = model_statistics(result, 6, "incremental")
+    statistics = model_statistics(result, 6)
     assert (statistics.registered, statistics.left_out) == (6, 0)
 
 

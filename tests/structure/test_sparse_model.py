@@ -39,7 +39,7 @@ def test_points_behind_a_camera_have_infinite_error() -> None:
 def test_figures_of_a_half_circle() -> None:
     model = orbit_model(views=7, points=200)
     result = MappingResult(model, (model.names,), timed_out=False)
-    statistics = model_statistics(result, 8, "incremental")
+    statistics = model_statistics(result, 8)
     assert (statistics.photographs, statistics.registered, statistics.points) == (8, 7, 200)
     assert statistics.mean_track_length == 7
     # Opposite ends, 4 away and 1 up: 2 atan(4) = 152 degrees in the middle, less around it.
@@ -65,7 +65,7 @@ def test_inconsistent_pairs_are_counted_and_one_is_named() -> None:
     model = orbit_model(views=6, points=40)
     fits = np.array([0.9, 0.5, 0.1, 1.0, 0.0])
     result = MappingResult(replace(model, pair_inlier_ratios=fits), (model.names,), timed_out=False)
-    statistics = model_statistics(result, 6, "incremental")
+    statistics = model_statistics(result, 6)
     assert statistics.pairs_inconsistent == 2
     assert statistics.inconsistent_pair == ("02.jpg", "03.jpg")
 
@@ -77,9 +77,7 @@ def test_cameras_in_one_place_have_no_baseline_and_no_angle() -> None:
     poses[:, :3, 3] = -np.einsum("vij,j->vi", poses[:, :3, :3], centre)
     still = replace(model, world_to_camera=poses)
     assert triangulation_angles(still, np.arange(40)).max() < 1e-5
-    statistics = model_statistics(
-        MappingResult(still, (model.names,), timed_out=False), 6, "incremental"
-    )
+    statistics = model_statistics(MappingResult(still, (model.names,), timed_out=False), 6)
     assert statistics.baseline_over_depth < 1e-9
 
 
@@ -123,10 +121,7 @@ def test_one_photograph_with_an_absurd_lens_goes_and_many_are_left_for_the_gates
     assert len(without_implausible_views(two_cameras(12, 1, k=0.1)).names) == 12
     many = without_implausible_views(two_cameras(12, 4, k=-3.0))
     assert len(many.names) == 12
-    assert (
-        model_statistics(MappingResult(many, (many.names,), False), 12, "incremental").distortion
-        == -3.0
-    )
+    assert model_statistics(MappingResult(many, (many.names,), False), 12).distortion == -3.0
 
 
 def test_a_saved_result_comes_back_equal(tmp_path: Path) -> None:
@@ -144,4 +139,4 @@ def test_nothing_found_is_a_result_too(tmp_path: Path) -> None:
     save_model(tmp_path / "m", None, groups=[], timed_out=False)
     result = load_result(tmp_path / "m")
     assert result.model is None
-    assert model_statistics(result, 5, "incremental").registered == 0
+    assert model_statistics(result, 5).registered == 0
