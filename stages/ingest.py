@@ -375,12 +375,10 @@ def _rig_mask_unused(photos: Sequence[Photo], settings: IngestSettings) -> Seque
 def _report_capture(
     photos: tuple[Photo, ...], duplicates: list[tuple[int, ...]], report: Report
 ) -> None:
-    import numpy as np
 
     from stages.photos import advice
 
     blurred = advice.about_capture(photos, duplicates, report.warn)
-    known = [photo.exposure_ev for photo in photos if photo.exposure_ev is not None]
     report.metric("photographs", len(photos))
     report.metric("panoramas", sum(photo.face is not None for photo in photos))
     report.metric("with_focal_length", sum(photo.focal_px is not None for photo in photos))
@@ -390,10 +388,6 @@ def _report_capture(
     report.metric("cameras", len({photo.camera for photo in photos}))
     report.metric("blurred", len(blurred))
     report.metric("near_duplicates", sum(len(group) - 1 for group in duplicates))
-    report.metric("exposure_range_stops", round(max(known) - min(known), 2) if known else None)
-    medians = np.median([[p.sharpness, p.log2_luminance] for p in photos], axis=0)
-    report.metric("median_sharpness", round(float(medians[0]), 3))
-    report.metric("median_log2_luminance", round(float(medians[1]), 3))
 
 
 STAGE = Stage(name="ingest", version=10, reads=(), settings_type=IngestSettings, run=run, load=load)

@@ -205,9 +205,7 @@ def _from_photographs(
     _report_model(found, best.statistics.mean_reprojection_error_px, capture, report)
     acceptance.report_metrics(best, model, report)
     acceptance.report_joined(attempts, capture, report)
-    report.metric("pairs_compared", runner.pairs_compared())
-    report.metric("pairs_matched_by_learned_features", runner.learned_pairs())
-    return found, runner.seconds_by_step()
+    return found, runner.seconds
 
 
 def _from_known_cameras(

@@ -73,11 +73,8 @@ def test_poses_and_lens_come_out_as_they_are_and_not_by_copying(
 
 def test_pairs_are_counted(small: tuple[Reconstruction, Report, Path]) -> None:
     _, report, _ = small
-    compared, matched, verified = (
-        report.metrics[f"pairs_{what}"] for what in ("compared", "matched", "verified")
-    )
-    assert compared == 36
-    assert 8 <= verified <= matched <= compared
+    matched, verified = (report.metrics[f"pairs_{what}"] for what in ("matched", "verified"))
+    assert 8 <= verified <= matched <= 36
 
 
 def test_up_is_up_and_the_subject_is_at_the_origin(

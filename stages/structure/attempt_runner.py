@@ -7,24 +7,22 @@ database, whose content does not depend on how often it was interrupted.
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
 from zipfile import BadZipFile
 
 import numpy as np
 
-from stages.base.atomic import replacing
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.structure import database as sqlite
 from stages.structure.chunks import ChunkExecutor, extract_features_in_chunks, match_pairs_in_chunks
-from stages.structure.fallbacks import CONFIGURATIONS, LEARNED, Attempt, Configuration
+from stages.structure.fallbacks import CONFIGURATIONS, Attempt, Configuration
 from stages.structure.gates import (
     ModelStatistics,
     check_keypoints,
@@ -32,13 +30,12 @@ from stages.structure.gates import (
     check_pairs,
     connected_groups,
 )
-from stages.structure.job import Job, compared_pairs_path, selected_pairs_path
+from stages.structure.job import Job
 from stages.structure.process import WorkerCrashed, WorkerTimedOut, run_step
 from stages.structure.sparse_model import load_result, model_statistics, without_implausible_views
 
 MORE_FEATURES = 2.0  # factor on the number of features
 LOWER_PEAK = 0.4  # factor on SIFT's peak threshold
-_SECONDS = "seconds.json"
 
 
 @dataclass
@@ -53,6 +50,7 @@ class AttemptRunner:
         allow_partial: go on to mapping although the gates before it failed.
         join_all: match learned features for all photographs, also for those that SIFT registers.
         executor: runs chunks of features and matching; None: one worker process does it all.
+        seconds: wall-clock seconds of each step so far, over all configurations.
     """
 
     folder: Path
@@ -62,6 +60,7 @@ class AttemptRunner:
     allow_partial: bool = False
     join_all: bool = False
     executor: ChunkExecutor | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
 
     def out_of_time(self) -> bool:
         return self.seconds_left() <= 0
@@ -183,8 +182,9 @@ class AttemptRunner:
         """Add learned features and matches to those of the matched `job`; returns the job with the
         database of both."""
         source = Path(job.database)
-        learned = replace(job, database=str(_learned(source)), source=job.database)
-        if not Path(learned.database).exists():  # it appears when it is complete
+        target = source.with_name(f"{source.stem}-learned.db")
+        learned = replace(job, database=str(target), source=job.database)
+        if not target.exists():  # it appears when it is complete
             photographs = self._unregistered(source)
             self._run(replace(learned, step="learned", photographs=photographs))
         return learned
@@ -236,42 +236,17 @@ class AttemptRunner:
 
     @contextmanager
     def _timed(self, step: str) -> Iterator[None]:
-        started, before = time.monotonic(), self.seconds_by_step()
+        started = time.monotonic()
         try:
             yield
         finally:
-            before[step] = before.get(step, 0.0) + time.monotonic() - started
-            with replacing(self.folder / _SECONDS) as path:
-                path.write_text(json.dumps(before))
-
-    def seconds_by_step(self) -> dict[str, float]:
-        """Wall-clock seconds of each step, over all configurations and interrupted runs."""
-        try:
-            return dict(json.loads((self.folder / _SECONDS).read_text()))
-        except (OSError, ValueError):
-            return {}
-
-    def learned_pairs(self) -> int:
-        """Pairs that were matched by learned features."""
-        database = Path(self._job(LEARNED).database)
-        path = selected_pairs_path(replace(self.base, database=str(_learned(database))))
-        return len(json.loads(path.read_text())) if path.exists() else 0
-
-    def pairs_compared(self) -> int:
-        """Pairs that pair selection compared by their largest features."""
-        path = compared_pairs_path(self._job(CONFIGURATIONS[0]))
-        return int(path.read_text()) if path.exists() else 0
+            self.seconds[step] = self.seconds.get(step, 0.0) + time.monotonic() - started
 
 
 def mapping_seconds(photographs: int) -> float:
     """Time limit of one mapping: several times what good captures need on two slow cores. Captures
     that cannot be mapped would otherwise go on without end."""
     return 240.0 + 10.0 * photographs
-
-
-def _learned(database: Path) -> Path:
-    """The copy of a database that learned features are added to."""
-    return database.with_name(f"{database.stem}-learned.db")
 
 
 def _is_mapped(out: Path) -> bool:

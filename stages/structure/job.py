@@ -184,11 +184,6 @@ def known_cameras_path(job: Job) -> Path:
     return Path(job.database).with_suffix(".known.npz")
 
 
-def compared_pairs_path(job: Job) -> Path:
-    """File with the number of pairs that pair selection compared by their largest features."""
-    return Path(job.database).with_suffix(".compared")
-
-
 def similarity_path(job: Job) -> Path:
     """File with the matches that pair selection found: similarity [P, P]."""
     return Path(job.database).with_suffix(".similarity.npz")

@@ -7,7 +7,6 @@ mapping continues from both.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from stages.structure import database as sqlite
 from stages.structure.features import read_grey
-from stages.structure.job import Job, ProgressWriter, selected_pairs_path
+from stages.structure.job import Job, ProgressWriter
 from stages.structure.learned_features import LearnedFeatures, XFeat, mutual_nearest
 from stages.structure.learned_matching import LighterGlue
 from stages.structure.matching import two_view_geometry
@@ -35,7 +34,7 @@ _SCALE = 4.0  # of a keypoint, pixels; COLMAP does not use it
 
 def match_learned(job: Job) -> None:
     """Write `job.database`: a copy of `job.source` with learned keypoints, and matches that may
-    join `job.photographs` to the others. The pairs are written to `selected_pairs_path`."""
+    join `job.photographs` to the others."""
     torch.set_num_threads(1)  # photographs and pairs run side by side
     partial = Path(job.database).with_suffix(".partial.db")
     sqlite.copy(Path(job.source), partial)
@@ -48,7 +47,6 @@ def match_learned(job: Job) -> None:
     ):
         _write_keypoints(database, features)
         _write_matches(job, database, stored, features, wanted)
-    selected_pairs_path(job).write_text(json.dumps(wanted))
     os.replace(partial, job.database)
 
 

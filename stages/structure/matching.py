@@ -21,7 +21,6 @@ from stages.structure.job import (
     Job,
     ProgressWriter,
     chunks_path,
-    compared_pairs_path,
     selected_pairs_path,
     similarity_path,
     vocabulary_path,
@@ -186,7 +185,7 @@ class _Matcher:
 
 def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
     """[P, P] matches among the largest features of the pairs that retrieval proposes; 0 for others.
-    Stored for resumed runs, with the number of these pairs for the parent process."""
+    Stored for resumed runs."""
     photographs, stored = len(job.names), similarity_path(job)
     if stored.exists():
         found: NDArray[np.int32] = np.load(stored)["similarity"]
@@ -212,7 +211,6 @@ def _similarity(job: Job, features: _IndexedFeatures) -> NDArray[np.int32]:
         for done, (pair, count) in enumerate(zip(wanted, counts, strict=True), 1):
             similarity[pair] = count
             progress.write("selecting pairs", done, len(wanted))
-    compared_pairs_path(job).write_text(str(len(wanted)))
     similarity += similarity.T
     with replacing(stored) as partial:
         np.savez_compressed(partial, similarity=similarity)

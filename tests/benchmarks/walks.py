@@ -29,7 +29,7 @@ from tests.structure.truth import centres, similarity
 ENDS = 10  # photographs at the beginning and at the end, whose places tell the drift
 REPORTED = (
     "points",
-    *(f"pairs_{what}" for what in ("looked_at", "matched", "verified")),
+    *(f"pairs_{what}" for what in ("matched", "verified")),
     *(f"{step}_seconds" for step in ("features", "matching", "mapping")),
 )
 
