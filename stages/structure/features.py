@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -61,21 +61,17 @@ def _extract(job: Job, missing: list[int], have: int) -> None:
 
 
 def _features(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
-    """(position, features) of each photograph in order, from several threads that run at most one
-    photograph each ahead."""
-    threads = _threads(job)
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: list[tuple[int, Future[Features]]] = []
-        for position in positions:
-            root, mask = Path(job.images_root), job.masks[position] if job.masks else ""
-            arguments = root / job.names[position], job.max_features, job.peak_threshold
-            future = pool.submit(sift_features, *arguments, root / mask if mask else None)
-            waiting.append((position, future))
-            if len(waiting) > threads:
-                position, future = waiting.pop(0)
-                yield position, future.result()
-        for position, future in waiting:
-            yield position, future.result()
+    """(position, features) of each photograph in order, from several threads."""
+    root = Path(job.images_root)
+
+    def of_photograph(position: int) -> Features:
+        mask = job.masks[position] if job.masks else ""
+        picture = root / job.names[position]
+        settings = job.max_features, job.peak_threshold
+        return sift_features(picture, *settings, root / mask if mask else None)
+
+    with ThreadPoolExecutor(_threads(job)) as pool:
+        yield from zip(positions, pool.map(of_photograph, positions), strict=True)
 
 
 def _threads(job: Job) -> int:

@@ -22,14 +22,6 @@ if TYPE_CHECKING:
     from stages.scene import Capture
 
 
-STEPS = (
-    *("features", "matching", "mapping"),
-    *("neighbours", "triangulation"),  # with known cameras
-    *("pair selection", "features chunk", "matching chunk"),  # with an executor
-    "learned",
-)
-
-
 @dataclass(frozen=True)
 class CameraGuess:
     """Intrinsics as known before structure from motion.
@@ -52,7 +44,7 @@ class Job:
     """One step of structure from motion for P photographs.
 
     Args:
-        step: one of `STEPS`.
+        step: one of those in `worker`.
         images_root: folder that `names` and `masks` are relative to.
         database: COLMAP's database.
         out: folder for the model of mapping (`sparse_model.save_model`).

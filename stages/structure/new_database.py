@@ -46,19 +46,15 @@ def create(path: Path, job: Job, only: Collection[int] | None = None) -> None:
     os.replace(partial, path)
 
 
-def rig_numbers(cameras: Sequence[CameraGuess]) -> list[int]:
-    """[C] the id of each camera's rig: its own id, or that of the first camera of a panorama's
-    rig, which is the rig's reference."""
-    first: dict[str, int] = {}
-    numbers = enumerate(cameras, 1)
-    return [first.setdefault(c.rig, number) if c.rig else number for number, c in numbers]
-
-
 def _write_rigs(database: pycolmap.Database, cameras: Sequence[CameraGuess]) -> list[int]:
-    """Write cameras and rigs; returns the id of each camera's rig."""
-    rig_of = rig_numbers(cameras)
+    """Write cameras and rigs; returns the id of each camera's rig: its own id, or that of the first
+    camera of a panorama's rig, which is the rig's reference."""
+    rig_of: list[int] = []
+    first: dict[str, int] = {}
     rigs: dict[int, pycolmap.Rig] = {}
-    for camera_id, (guess, rig_id) in enumerate(zip(cameras, rig_of, strict=True), 1):
+    for camera_id, guess in enumerate(cameras, 1):
+        rig_id = first.setdefault(guess.rig, camera_id) if guess.rig else camera_id
+        rig_of.append(rig_id)
         camera = _camera(camera_id, guess)
         database.write_camera(camera, use_camera_id=True)
         rig = rigs.setdefault(rig_id, pycolmap.Rig())

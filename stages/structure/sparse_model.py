@@ -20,18 +20,11 @@ from stages.structure.gates import THRESHOLDS, ModelStatistics
 _SMALLEST_PART = 0.1  # of the photographs; a few outer ones may be weakly connected
 
 
-@dataclass(frozen=True)
-class Cut:
-    """A cut into two parts. points: observed in both; views: photographs of the smaller part."""
-
-    points: int
-    views: tuple[int, ...]
-
-
 def weakest_cut(
     points: NDArray[np.integer], views: NDArray[np.integer], photographs: int, fewest: int = 3
-) -> Cut:
-    """The cut with the fewest points in common, among cuts along the second eigenvector of the
+) -> tuple[int, tuple[int, ...]]:
+    """(points observed in both parts, photographs of the smaller part) of the cut with the fewest
+    points in common, among cuts along the second eigenvector of the
     normalised Laplacian of the view graph (Fiedler 1973; Shi and Malik 2000).
 
     Args:
@@ -44,7 +37,7 @@ def weakest_cut(
     count = int(points.max(initial=-1)) + 1
     smallest = max(fewest, round(_SMALLEST_PART * photographs))
     if photographs < 2 * smallest:
-        return Cut(count, ())
+        return count, ()
     shared = _shared(points, views, photographs)
     root = 1.0 / np.sqrt(np.maximum(shared.sum(axis=1), 1e-9))
     order = np.argsort(np.linalg.eigh(-root[:, None] * shared * root)[1][:, 1] * root)
@@ -59,7 +52,7 @@ def weakest_cut(
     shared_points = np.cumsum(change)[smallest - 1 : photographs - smallest]
     cut = smallest + int(shared_points.argmin())
     part = order[:cut] if 2 * cut <= photographs else order[cut:]
-    return Cut(int(shared_points.min()), tuple(sorted(part.tolist())))
+    return int(shared_points.min()), tuple(sorted(part.tolist()))
 
 
 def _shared(
@@ -308,7 +301,9 @@ def model_statistics(result: MappingResult, photographs: int) -> ModelStatistics
     errors = point_errors(model)
     inconsistent = np.flatnonzero(model.pair_inlier_ratios < CONSISTENT_RATIO)
     registered, frames = np.unique(model.view_frames, return_inverse=True)
-    cut = weakest_cut(model.observed_points, frames[model.observing_views], len(registered))
+    cut_points, part = weakest_cut(
+        model.observed_points, frames[model.observing_views], len(registered)
+    )
     return ModelStatistics(
         photographs=photographs,
         registered=len(registered),
@@ -328,8 +323,8 @@ def model_statistics(result: MappingResult, photographs: int) -> ModelStatistics
         pairs_inconsistent=len(inconsistent),
         inconsistent_pair=_names(model, model.pairs[inconsistent[0]]) if len(inconsistent) else (),
         rotation_to_other_deg=float(model.rotations_to_others_deg.max(initial=0.0)),
-        cut_points=cut.points,
-        cut_views=len(cut.views),
+        cut_points=cut_points,
+        cut_views=len(part),
     )
 
 

@@ -23,8 +23,10 @@ def main(arguments: list[str]) -> int:
         "features": features.extract_features,
         "matching": matching.match_all,
         "mapping": mapping.map_photographs,
+        # with known cameras
         "neighbours": known_cameras_worker.match_neighbours,
         "triangulation": known_cameras_worker.triangulate,
+        # with an executor
         "pair selection": matching.select_pairs,
         "features chunk": features.extract_chunk,
         "matching chunk": matching.match_chunk,
