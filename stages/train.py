@@ -61,13 +61,6 @@ class TrainSettings:
         min=0,
         max=1e7,
     )
-    patience: float = setting(
-        0.0,
-        "Stop densifying when it no longer improves any validation view by this many dB. 0: never.",
-        panel="Advanced",
-        min=0,
-        max=10,
-    )
     smooth: bool = setting(
         False,
         "Train under a 3D smoothing filter, so that no detail is finer than the "
@@ -185,7 +178,7 @@ def run(
 
 
 def _report_course(trainer: Trainer, report: Report) -> None:
-    """How many steps were made by which backends, and whether densification stopped early."""
+    """How many steps were made, and by which backends."""
     report.metric("steps", trainer.schedule.steps)
     report.metric("steps_skipped", int(trainer.stepper.skipped))
     report.metric("dropout", trainer.dropout)
@@ -194,16 +187,6 @@ def _report_course(trainer: Trainer, report: Report) -> None:
         report.metric("cameras_moved", moved)
         report.metric("cameras_turned_deg", turned_deg)
         report.metric("focal_factor", round(trainer.refinement.focal_factor, 6))
-    stopping = trainer.early_stopping
-    report.metric("validation_views", len(stopping.rows))
-    if stopping.stopped_at:
-        report.metric("densification_stopped_at", stopping.stopped_at)
-        report.warn(
-            "train-densification-stopped",
-            f"Densification stopped early, after {stopping.stopped_at:,} steps, and training ended "
-            f"after {trainer.schedule.steps:,}: no validation view improved by "
-            f"{stopping.patience_db:g} dB. --patience 0 trains for all steps.",
-        )
     entries = trainer.provenance
     report.metric("provenance", [asdict(entry) for entry in entries])
     if len(entries) > 1:

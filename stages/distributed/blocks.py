@@ -259,8 +259,8 @@ class _BlockTraining:
         from stages.distributed import merge
         from stages.measure.evaluation import load_evaluation_views
         from stages.scene import TrainedSplats, training_extent
+        from stages.training.dropout import uses_dropout
         from stages.training.finetune import FineTuner
-        from stages.training.validation import uses_dropout
 
         degree, backend = self.settings.sh_degree, backend_of_settings(self.settings)
         splats, counts = merge.merge_blocks(

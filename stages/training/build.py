@@ -16,7 +16,6 @@ from stages.training.camera_refinement import CameraRefinement
 from stages.training.cap import cap_for, splats_determined
 from stages.training.schedule import Schedule
 from stages.training.trainer import Trainer
-from stages.training.validation import EarlyStopping, validation_rows
 from stages.training.views import load_views
 
 if TYPE_CHECKING:
@@ -52,7 +51,6 @@ def make_trainer(
     report.metric("splat_cap", cap.splats)
     report.metric("splat_cap_from", cap.origin)
     report.metric("splat_cap_free_mib", cap.free_mib)
-    validation = validation_rows(len(train)) if settings.patience else ()
     extent, backend = training_extent(reconstruction), backend_of_settings(settings)
     refinement = None
     if settings.refine_in_training:
@@ -78,7 +76,6 @@ def make_trainer(
         smooth=settings.smooth,
         random_background=settings.background == "any",
         backend=backend,
-        early_stopping=EarlyStopping(settings.patience, validation),
         seconds=seconds,
         refinement=refinement,
         within=settings.within,

@@ -24,10 +24,9 @@ from stages.base.atomic import sync_folder
 from stages.raster.backends import backend_of
 from stages.training.clock import Elapsed
 from stages.training.optimiser import Model
-from stages.training.validation import EarlyStopping
 
 FILE_NAME = "checkpoint.bin"
-MAGIC = b"SPLATC12"
+MAGIC = b"SPLATC13"
 _PREVIOUS = "checkpoint-previous.bin"
 _TEMPORARY = FILE_NAME + ".tmp"
 _CHUNK_BYTES = 1 << 20
@@ -63,7 +62,6 @@ class TrainingState:
         plan: (steps in all, step of the last change of the plan, share of the run done by then),
             see `schedule.Schedule`.
         history: results of evaluations.
-        early_stopping: of densification, with its best values so far.
         times: of each entry of the history, and, last, now.
         provenance: one entry for each change of backend or device.
         refinement: of cameras, see `camera_refinement`; None where they stay as they are.
@@ -72,7 +70,6 @@ class TrainingState:
     step: int
     plan: tuple[int, int, float]
     history: list[dict[str, Any]]
-    early_stopping: EarlyStopping
     times: list[Elapsed]
     provenance: list[Provenance]
     refinement: dict[str, Any] | None = None
@@ -153,12 +150,10 @@ def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
     header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
     steps, since, share = header["plan"]
-    stopping = header["early_stopping"]
     state = TrainingState(
         int(header["step"]),
         (int(steps), int(since), float(share)),
         header["history"],
-        EarlyStopping(**stopping | {"rows": tuple(stopping["rows"])}),
         [Elapsed(**t) for t in header["times"]],
         [Provenance(**entry) for entry in header["provenance"]],
         header["refinement"],

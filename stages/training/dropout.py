@@ -5,6 +5,9 @@ With few training views, fine splats overfit: they match the pixels of those vie
 needles and fog from everywhere else. With dropout, neighbouring splats learn to replace each other.
 The dropout probability of a splat that n training views see is (2 / n)^2, at most 0.3: splats that
 many views see are hardly ever dropped.
+
+Only captures of few training views are overfitted, so only they use dropout, once densification has
+ended. With more views dropout costs quality (docs/experiments/overfitting.md).
 """
 
 from __future__ import annotations
@@ -16,12 +19,18 @@ from numpy.typing import NDArray
 
 from stages.training.density import estimated_view_counts
 
+DROPOUT_BELOW = 15  # training views
 VIEW_SCALE = 2.0  # views: the dropout probability is (VIEW_SCALE / n)^2
 MAX_PROBABILITY = 0.3
 INVISIBLE = -20.0  # opacity logit of a dropped splat
 INCREMENT = 0x9E3779B9  # between the hash inputs of consecutive splats
 FACTORS = (16, 0x85EBCA6B), (13, 0xC2B2AE35)  # (shift, factor) of the rounds of `noise`
 _UINT32 = 2.0**32
+
+
+def uses_dropout(views: int) -> bool:
+    """Whether a run with this many training views overfits them, and so uses dropout."""
+    return views < DROPOUT_BELOW
 
 
 @dataclass(frozen=True)

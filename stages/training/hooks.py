@@ -18,12 +18,12 @@ from stages.training.density import AdaptiveDensity, BoundedDensity
 from stages.training.free_space import FreeSpace, known_free_space
 from stages.training.optimiser import empty_model
 from stages.training.time_limit import TimeLimit
-from stages.training.validation import EVALUATIONS
 
 if TYPE_CHECKING:
     from stages.training.trainer import Trainer
 
 CHECKPOINT_SECONDS = 30.0
+EVALUATIONS = 10  # evenly spaced over the run
 FLOATER_REMOVALS = 20  # during a run, evenly spaced
 
 
@@ -47,7 +47,6 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
         FinalColourRefit(),
         Evaluation(views, time_limit),
         time_limit,
-        trainer.early_stopping,
         Checkpointing(),
         Progress(),
         LivePreview(),

@@ -66,14 +66,6 @@ class Schedule:
         schedule is compressed or stretched."""
         return replace(self, steps=max(steps, step + 1), since=(step, self.share(step)))
 
-    def without_densification(self, step: int) -> Schedule:
-        """The same run if densification ends after `step` steps. The total becomes what it would be
-        if that had been planned."""
-        if self.share(step) >= DENSIFICATION_END:
-            return self
-        steps = max(step + 1, round(step / DENSIFICATION_END))
-        return replace(self, steps=steps, since=(step, DENSIFICATION_END))
-
     def densifying(self, step: int) -> bool:
         """Whether the model is still densified after `step` steps."""
         return self.share(step) < DENSIFICATION_END

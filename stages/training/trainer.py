@@ -2,7 +2,7 @@
 
 Each step renders one training view, computes the loss and its gradients, and updates the splats
 with Adam. Everything that happens between steps is a `hooks.StepHook`: densification, removal of
-floaters, evaluation, early stopping, checkpoints, progress and the live preview.
+floaters, evaluation, checkpoints, progress and the live preview.
 """
 
 from __future__ import annotations
@@ -33,13 +33,12 @@ from stages.training.checkpoint import (
 )
 from stages.training.clock import Clock, Elapsed
 from stages.training.conversion import initial_model
-from stages.training.dropout import Dropout
+from stages.training.dropout import Dropout, uses_dropout
 from stages.training.hooks import step_hooks
 from stages.training.memory_limited_step import MemoryLimitedStep
 from stages.training.optimiser import LearningRates, Model
 from stages.training.schedule import Schedule
 from stages.training.step import StepInput, TrainingStep, step_of
-from stages.training.validation import EarlyStopping, uses_dropout
 from stages.training.views import Level, TrainingView
 
 REGISTRATION_STEPS = 60  # for each held-out view
@@ -51,7 +50,7 @@ class Trainer:
     """One training run.
 
     Args:
-        schedule: what happens at which step; a time limit or early stopping replaces it.
+        schedule: what happens at which step; a time limit replaces it.
         train: the training views.
         held_out: the held-out views that the model is evaluated on.
         draw_settings: how the splats are drawn.
@@ -62,7 +61,6 @@ class Trainer:
         random_background: whether each step has a background of its own, as it always has where
             views are cut out.
         backend: the rasteriser's, which also decides the training step.
-        early_stopping: of densification; its validation views are trained on only afterwards.
         seconds: limit of wall time; 0 for none.
         refinement: of the cameras of the training views; None leaves them as they are.
         within: rectangle of the ground plane that densification is limited to, see
@@ -79,7 +77,6 @@ class Trainer:
     smooth: bool = False
     random_background: bool = False
     backend: str = AUTO
-    early_stopping: EarlyStopping = field(default_factory=EarlyStopping)
     seconds: float = 0.0
     refinement: CameraRefinement | None = None
     within: tuple[float, ...] = ()
@@ -159,10 +156,8 @@ class Trainer:
         self.held_out = registered
 
     def _row(self, step: int) -> int:
-        """Which training view `step` uses: no validation view while the model is densified."""
-        left_out = self.early_stopping.rows if self.schedule.densifying(step) else ()
-        rows = [row for row in range(len(self.train)) if row not in left_out]
-        return rows[self.schedule.view(step, len(rows))]
+        """Which training view `step` uses."""
+        return self.schedule.view(step, len(self.train))
 
     @property
     def dropout(self) -> bool:
@@ -216,7 +211,6 @@ class Trainer:
             *self.times, elapsed = state.times
             self.clock = Clock(elapsed)
             self.schedule = self.schedule.as_planned(*state.plan)
-            self.early_stopping = state.early_stopping
             if self.refinement is not None and state.refinement is not None:
                 self.refinement.load(state.refinement)
             self.report.metric("resumed_from_step", step)
@@ -233,9 +227,7 @@ class Trainer:
         plan = (self.schedule.steps, *self.schedule.since)
         times = [*self.times, self.clock.elapsed()]
         refined = None if self.refinement is None else self.refinement.state()
-        state = TrainingState(
-            *(step, plan, self.history, self.early_stopping, times, self.provenance, refined)
-        )
+        state = TrainingState(*(step, plan, self.history, times, self.provenance, refined))
         save_checkpoint(self.folder, self.model, state)
 
     def _lower_cap(self, fits: int) -> None:

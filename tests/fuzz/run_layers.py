@@ -19,7 +19,6 @@ from stages.scene import Capture, Photo, load_splats, save_splats
 from stages.scene.storage import FILE_NAME
 from stages.training import checkpoint
 from stages.training.optimiser import new_model
-from stages.training.validation import EarlyStopping
 from tests.formats.truth import many_splats
 from tests.fuzz.layer import SPLATS, Layer
 
@@ -101,7 +100,7 @@ def _checkpoint(folder: Path) -> None:
     start = many_splats(SPLATS)
     values = (start.means, start.quaternions, start.log_scales, start.opacity_logits, start.sh)
     model = new_model(*(np.asarray(array, np.float32) for array in values))
-    state = checkpoint.TrainingState(7, (30, 0, 0.0), [{"step": 7}], EarlyStopping(), [], [])
+    state = checkpoint.TrainingState(7, (30, 0, 0.0), [{"step": 7}], [], [])
     checkpoint.save_checkpoint(folder, model, state)
 
 

@@ -16,14 +16,13 @@ from stages.training.checkpoint import (
     save_checkpoint,
 )
 from stages.training.optimiser import Model, new_model
-from stages.training.validation import EarlyStopping
 from tests.scenes import cloud
 
 Warnings = list[tuple[str, str]]
 
 
 def save(folder: Path, step: int) -> None:
-    state = TrainingState(step, (30, 0, 0.0), [{"step": step}], EarlyStopping(), [], [])
+    state = TrainingState(step, (30, 0, 0.0), [{"step": step}], [], [])
     save_checkpoint(folder, model(step), state)
 
 

@@ -4,18 +4,29 @@ import numpy as np
 import pytest
 import torch
 
+from stages.base.stage import Report
 from stages.raster.backends import rasteriser_of
 from stages.raster.definition import RasterSettings, splat_arrays
-from stages.scene import rgb_to_dc
+from stages.raster.draw import render
+from stages.scene import DrawSettings, rgb_to_dc
 from stages.training import gpu_step
 from stages.training.cpu_step import CpuStep
-from stages.training.dropout import MAX_PROBABILITY, Dropout, noise
+from stages.training.dropout import (
+    DROPOUT_BELOW,
+    MAX_PROBABILITY,
+    Dropout,
+    noise,
+    uses_dropout,
+)
 from stages.training.loss import channel_means
 from stages.training.optimiser import LearningRates, new_model
 from stages.training.reference_step import ReferenceStep
+from stages.training.schedule import DENSIFICATION_END, Schedule
 from stages.training.step import StepInput
+from stages.training.trainer import Trainer
 from stages.training.views import Level
 from tests.scenes import camera, cloud
+from tests.training.pictures import view_of
 
 VIEWS = 20
 
@@ -78,3 +89,28 @@ def test_dropped_splats_do_not_move_and_others_replace_them(step_class):
     np.testing.assert_array_equal(
         step.model().opacity_logits[dropped], before.opacity_logits[dropped]
     )
+
+
+@pytest.mark.parametrize(
+    ("views", "dropout"), [(1, True), (DROPOUT_BELOW - 1, True), (DROPOUT_BELOW, False)]
+)
+def test_dropout_is_for_captures_of_few_views(views, dropout):
+    assert uses_dropout(views) == dropout
+
+
+def test_splats_are_dropped_only_after_densification(tmp_path, monkeypatch):
+    where = camera(40, 30)
+    picture = np.clip(render(cloud(80, 40, 30, degree=0), where, RasterSettings()).image, 0, 1)
+    start = cloud(60, 40, 30, degree=0, seed=4)
+    schedule = Schedule(steps=200, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
+    views = [view_of(f"{k}", picture, where) for k in range(4)]
+    made = Trainer(schedule, views, [], DrawSettings(near=0.1), 200, tmp_path, Report())
+    dropped, step = [], made.stepper.step
+
+    def recording(given):
+        dropped.append(given.dropout is not None)
+        return step(given)
+
+    monkeypatch.setattr(made.stepper, "step", recording)
+    made.run(start)
+    assert dropped == [k >= DENSIFICATION_END * 200 for k in range(200)]

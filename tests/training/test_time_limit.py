@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.training.schedule import DENSIFICATION_END, RATE_DECAY_END, RESOLUTIONS, Schedule
+from stages.training.schedule import RATE_DECAY_END, RESOLUTIONS, Schedule
 from stages.training.time_limit import TimeLimit
 
 
@@ -67,12 +67,3 @@ def test_pictures_are_whole_to_the_very_end_of_any_plan():
     for step in range(10, 990, 7):
         plan = plan.replanned(step, 1000)
     assert {plan.level(step) for step in range(990, 1001)} == {len(RESOLUTIONS) - 1}
-
-
-def test_a_run_whose_densification_ended_is_as_long_as_if_that_had_been_the_plan():
-    plan = schedule(3000).without_densification(600)
-    assert plan.share(600) == DENSIFICATION_END
-    assert plan.steps == round(600 / DENSIFICATION_END)
-    assert not any(plan.densifies_after(step) for step in range(600, plan.steps))
-    late = schedule(3000)
-    assert late.without_densification(2500) is late

@@ -24,11 +24,11 @@ from stages.training.checkpoint import MAGIC
 from stages.training.clock import Clock, Elapsed
 from stages.training.conversion import splats_of
 from stages.training.density import AdaptiveDensity
+from stages.training.hooks import EVALUATIONS
 from stages.training.loss import image_loss
 from stages.training.optimiser import LearningRates, apply_gradients, new_model
 from stages.training.schedule import Schedule
 from stages.training.trainer import Trainer
-from stages.training.validation import EVALUATIONS
 from stages.training.views import Level, TrainingView, load_views
 from tests.scenes import camera, cloud, splats
 from tests.small_scene import small_scene
