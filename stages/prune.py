@@ -226,7 +226,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=16,
+    version=17,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

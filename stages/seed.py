@@ -197,5 +197,5 @@ def _too_few(usable: int, points: int) -> SplatError:
 
 
 STAGE = Stage(
-    name="seed", version=5, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
+    name="seed", version=6, reads=("sfm",), settings_type=SeedSettings, run=run, load=load
 )

@@ -78,7 +78,7 @@ class TrainSettings:
         "auto",
         "Bring all photographs to the median exposure and white balance before "
         "training: auto (if they differ by more than a camera's noise and points agree), on or "
-        "off.",
+        "off. Vignetting that points agree about is corrected unless this is off.",
         panel="Light and masks",
         choices=("auto", "on", "off"),
     )
@@ -279,5 +279,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=20, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=21, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -84,11 +84,16 @@ class _BlockTraining:
         from stages.distributed import partition
         from stages.scene import draw_settings_of, split_held_out
         from stages.train import save
-        from stages.training.build import corrects_light
+        from stages.training.build import corrects_light, corrects_vignetting
 
         started = time.monotonic()
         light = corrects_light(self.whole, self.settings.light, self.report)
-        self.settings = replace(self.settings, light="on" if light else "off")
+        vignetting = corrects_vignetting(self.whole, self.settings.light, self.report)
+        if not light:
+            views = tuple(replace(view, light=None) for view in self.whole.views)
+            self.whole = replace(self.whole, views=views)
+        one_choice = "on" if light else "auto" if vignetting else "off"
+        self.settings = replace(self.settings, light=one_choice)
         coarse = self._coarse(seeds, max(blocks, COARSE_SPLATS))
         training, held = split_held_out(self.whole.views)
         points, weights = partition.weighted_points(replace(self.whole, views=training))
@@ -100,7 +105,7 @@ class _BlockTraining:
         folders = self._blocks(seeds, coarse, cells, assigned, partition.margin(points))
         parts = self._parts(folders, cells, assigned)
         draw_settings = draw_settings_of(
-            self.whole.views, self.settings.train_side, light, self.settings.antialias
+            self.whole.views, self.settings.train_side, light, self.settings.antialias, vignetting
         )
         crosses = partition.crosses_blocks(assigned)
         crossing = [v for v, across in zip(self.whole.views, crosses, strict=True) if across]

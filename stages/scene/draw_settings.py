@@ -27,6 +27,7 @@ class DrawSettings:
             none.
         background: grey level behind everything, 0 to 1: black, or white for cut-out photographs.
         light: whether photographs are corrected to their median light (`scene.light`) first.
+        vignetting: whether their vignetting is corrected.
         antialias: whether opacities are reduced by as much as the rasteriser's dilation enlarges
             the area of a splat: the 2D Mip filter of Mip-Splatting (Yu et al. 2024, section 4.2).
             Splats are trained for one of the two and look wrong when they are drawn as the other.
@@ -37,6 +38,7 @@ class DrawSettings:
     background: float = 0.0
     light: bool = False
     antialias: bool = False
+    vignetting: bool = False
 
     def camera(self, camera: Camera) -> Camera:
         """`camera` at the size of training and evaluation; never enlarged."""
@@ -44,11 +46,15 @@ class DrawSettings:
 
 
 def draw_settings_of(
-    views: tuple[View, ...], side: int = 0, light: bool = False, antialias: bool = False
+    views: tuple[View, ...],
+    side: int = 0,
+    light: bool = False,
+    antialias: bool = False,
+    vignetting: bool = False,
 ) -> DrawSettings:
     """How splats trained on these views are drawn. The others: as in `DrawSettings`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
-    return DrawSettings(near_plane(views), side, float(cut_out), light, antialias)
+    return DrawSettings(near_plane(views), side, float(cut_out), light, antialias, vignetting)
 
 
 def near_plane(views: tuple[View, ...]) -> float:

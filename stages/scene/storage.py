@@ -1,7 +1,7 @@
 """Splats on disk between stages: exact, deterministic, and quick to load.
 
 Layout: the 8 bytes of `MAGIC`, then one block in NumPy's .npy format (version 1.0) for each array
-in the order of `FIELDS`, and one for the draw settings: near plane, side, background and light.
+in the order of `FIELDS`, and one for the draw settings: those of `DrawSettings`.
 Where the splats have a place on the earth, a last one holds its JSON in UTF-8. There is no
 compression and no timestamp (a zip file, and so .npz, would have them), so equal splats give equal
 bytes.
@@ -25,7 +25,7 @@ from stages.scene.draw_settings import DrawSettings
 from stages.scene.place import EarthPlace
 from stages.scene.splats import ROW_FIELDS, Splats
 
-MAGIC = b"SPLATS4\n"
+MAGIC = b"SPLATS5\n"
 FIELDS = (*ROW_FIELDS, "origin")
 FILE_NAME = "splats.bin"
 _DTYPES = {"<f4", "<f8", "|u1"}
@@ -64,14 +64,15 @@ def load_splats(path: Path) -> Splats:
             raise ValueError("it does not start as a splats file")
         arrays = {name: _read_array(file, size, name) for name in FIELDS}
         drawn = _read_array(file, size, "draw settings").astype(np.float64)
-        near, side, grey, light, antialias = drawn
+        near, side, grey, *flags = drawn
         place = None
         if file.tell() < size:
             place = EarthPlace.from_json(json.loads(_read_array(file, size, "place").tobytes()))
         if file.read(1):
             raise ValueError("bytes follow its end")
+        light, antialias, vignetting = map(bool, flags)
         draw_settings = DrawSettings(
-            float(near), int(side), float(grey), bool(light), bool(antialias)
+            float(near), int(side), float(grey), light, antialias, vignetting
         )
         return Splats(**arrays, draw_settings=draw_settings, place=place)  # type: ignore[arg-type]
 

@@ -13,5 +13,6 @@ Without known cameras (`stages.sfm`):
 With known cameras: `match_cameras`, `known_cameras`, `known_cameras_worker` and `known_points`.
 
 Both end in `finish`: `levelling`, `metric_scale` (`markers`), `undistortion` and
-`undistorted_images`; then `light` measures exposure, and `reconstruction_files` stores the result.
+`undistorted_images`; then `light` measures exposure and vignetting, and `reconstruction_files`
+stores the result.
 """

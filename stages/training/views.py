@@ -110,7 +110,12 @@ class _Stored(Sequence[Level]):
 
 
 def load_views(
-    folder: Path, views: Iterable[View], train_side: int, work: Path, light: bool = False
+    folder: Path,
+    views: Iterable[View],
+    train_side: int,
+    work: Path,
+    light: bool = False,
+    vignetting: bool = False,
 ) -> list[TrainingView]:
     """The training views at their resolutions.
 
@@ -120,6 +125,7 @@ def load_views(
         train_side: largest length of the longer side at full resolution, pixels.
         work: folder for a file with all pixels, which is mapped into memory.
         light: whether to correct exposure and white balance.
+        vignetting: whether to correct it.
 
     Raises SplatError, and OSError if the disk is full.
     """
@@ -129,7 +135,7 @@ def load_views(
             levels = _Stored(album)
             for _, scale in RESOLUTIONS:
                 camera = view.camera.fitted(max(16, round(train_side * scale)))
-                photograph = load_evaluation_view(folder, view, camera)
+                photograph = load_evaluation_view(folder, view, camera, vignetting)
                 masked = photograph.mask, view.outside
                 kept_light = view.light if light else None
                 levels.add(Level.from_pixels(camera, photograph.pixels, *masked, kept_light))

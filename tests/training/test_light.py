@@ -1,4 +1,4 @@
-"""Whether training corrects the light of photographs."""
+"""Whether training corrects the light and the vignetting of photographs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from stages.base.stage import Report
 from stages.scene import Reconstruction
 from stages.scene.light import Light
-from stages.training.build import corrects_light
+from stages.training.build import corrects_light, corrects_vignetting
 from tests.small_scene import small_scene
 
 
@@ -48,3 +48,14 @@ def test_on_is_obeyed_and_auto_says_what_it_leaves(
     assert corrects_light(lit(tmp_path, light, explained), choice, report) is corrects
     assert [code for code, _ in report.warnings] == codes
     assert report.metrics["light_corrected"] is (corrects and ev is not None)
+
+
+def test_vignetting_is_corrected_where_it_was_found(tmp_path: Path) -> None:
+    even = small_scene(tmp_path, views=4).reconstruction
+    views = (replace(even.views[0], vignetting=(0.3, 0.0, 0.0)), *even.views[1:])
+    for choice in ("auto", "on"):
+        assert corrects_vignetting(replace(even, views=views), choice, Report())
+        assert not corrects_vignetting(even, choice, Report())
+    report = Report()
+    assert not corrects_vignetting(replace(even, views=views), "off", report)
+    assert report.metrics["vignetting_corrected"] is False
