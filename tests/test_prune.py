@@ -14,11 +14,11 @@ from stages import formats, prune
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.capacity import pruning
-from stages.capacity.selection import select_removal
 from stages.measure import contribution, evaluation
 from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
 from stages.measure.floaters import near_camera_floaters
+from stages.measure.selection import select_removal
 from stages.raster.draw import render
 from stages.scene import IGNORE, Splats, TrainedSplats, View, split_held_out
 from tests.scenes import camera, join, splats

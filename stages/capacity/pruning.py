@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stages.base.stage import Report
-from stages.capacity.selection import ROUND_SHARE, Removal, select_removal
 from stages.capacity.targets import Psnr, Targets
 from stages.measure.contribution import Contributions, measure_contributions
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
+from stages.measure.selection import ROUND_SHARE, Removal, select_removal
 from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 

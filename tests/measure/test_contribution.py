@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.capacity.selection import Removal
 from stages.measure.contribution import colours_by_degree, measure_contributions, squared_error
 from stages.measure.evaluation import image_renderer, load_evaluation_views
+from stages.measure.selection import Removal
 from stages.scene import Splats
 from tests.formats.truth import colour, many_splats
 from tests.small_scene import small_scene
