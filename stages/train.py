@@ -47,8 +47,8 @@ class TrainSettings:
     sh_degree: int = setting(2, "Degree of view-dependent colour, 0 (none) to 3.", min=0, max=3)
     max_splats: int = setting(
         0,
-        "Largest number of splats. 0: what free memory allows, with no more "
-        "parameters than the photographs have pixel values.",
+        "Largest number of splats; a third of them goes again before training ends. 0: what "
+        "free memory allows, with no more parameters than the photographs have pixel values.",
         panel="Size",
         min=0,
         max=100_000_000,
@@ -172,7 +172,7 @@ def run(
     remove_cap(folder)
     report.metric("splats", len(splats))
     _report_course(trainer, report)
-    _report_cap(trainer, len(splats), report)
+    _report_cap(trainer, report)
     report.metric("train_seconds", round(time.monotonic() - started, 1))
     return trained
 
@@ -199,7 +199,7 @@ def _report_course(trainer: Trainer, report: Report) -> None:
         )
 
 
-def _report_cap(trainer: Trainer, splats: int, report: Report) -> None:
+def _report_cap(trainer: Trainer, report: Report) -> None:
     """Whether the cap of splats was lowered or reached."""
     from stages.training.cap import DEVICE_MEMORY, PHOTOGRAPHS
 
@@ -212,7 +212,7 @@ def _report_cap(trainer: Trainer, splats: int, report: Report) -> None:
             "train-gpu-memory",
             f"The GPU's memory was full: trained with at most {trainer.cap:,} splats.",
         )
-    if splats < 0.98 * trainer.cap:
+    if max(entry["splats"] for entry in trainer.history) < 0.98 * trainer.cap:
         return
     more = "more memory, or a higher --max-splats, may add detail"
     if origin == PHOTOGRAPHS:
@@ -279,5 +279,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=21, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=22, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.scene import DrawSettings, Splats, morton
 from stages.training.optimiser import Model, new_model
@@ -26,10 +27,7 @@ def initial_model(start: Splats, sh_degree: int, cap: int) -> Model:
 def splats_of(model: Model, sh_degree: int, start: Splats, draw_settings: DrawSettings) -> Splats:
     """The model as splats with unit quaternions, without rows that are not finite. start: has the
     origin of their coordinates."""
-    norms = np.linalg.norm(model.quaternions.astype(np.float64), axis=1, keepdims=True)
-    valid = np.isfinite(norms[:, 0]) & (norms[:, 0] > 0)
-    for array in model.arrays:
-        valid &= np.isfinite(array).all(tuple(range(1, array.ndim)))
+    norms, valid = _norms(model), valid_rows(model)
     return Splats(
         model.means[valid],
         (model.quaternions[valid] / norms[valid]).astype(np.float32),
@@ -40,3 +38,17 @@ def splats_of(model: Model, sh_degree: int, start: Splats, draw_settings: DrawSe
         start.origin,
         draw_settings,
     )
+
+
+def valid_rows(model: Model) -> NDArray[np.bool_]:
+    """[N] splats of which all parameters are finite, and the rotation is one."""
+    norms = _norms(model)[:, 0]
+    valid = np.isfinite(norms) & (norms > 0)
+    for array in model.arrays:
+        valid &= np.isfinite(array).all(tuple(range(1, array.ndim)))
+    return np.asarray(valid)
+
+
+def _norms(model: Model) -> NDArray[np.float64]:
+    """[N, 1] of the quaternions."""
+    return np.asarray(np.linalg.norm(model.quaternions.astype(np.float64), axis=1, keepdims=True))

@@ -88,18 +88,19 @@ class BoundedDensity:
 
     def prune(self, model: Model, remove_giants: bool) -> Model:
         """See `AdaptiveDensity.prune`."""
-        inside = self._inside(model)
+        inside = self.inside(model)
         outer = self.rule.prune(model.take(~inside), False)
         return self.rule.prune(model.take(inside), remove_giants).joined(outer)
 
     def grow(self, model: Model, budget: int) -> Model:
         """See `AdaptiveDensity.grow`."""
-        inside = self._inside(model)
+        inside = self.inside(model)
         outer = model.take(~inside)
         outer.reset_gradients()
         return self.rule.grow(model.take(inside), budget - len(outer)).joined(outer)
 
-    def _inside(self, model: Model) -> NDArray[np.bool_]:
+    def inside(self, model: Model) -> NDArray[np.bool_]:
+        """[N] splats inside the bounds."""
         ground = model.means[:, [0, 2]]
         return np.asarray(((ground >= self.bounds[:2]) & (ground < self.bounds[2:])).all(1))
 

@@ -17,6 +17,7 @@ from stages.training.colour_refit import ColourRefit, needs_colour_refit
 from stages.training.density import AdaptiveDensity, BoundedDensity
 from stages.training.free_space import FreeSpace, known_free_space
 from stages.training.optimiser import empty_model
+from stages.training.sparsification import Sparsification
 from stages.training.time_limit import TimeLimit
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     return [
         FloaterRemoval(known_free_space(start.means, trainer.cameras)),
         Densification(density),
+        Sparsification(start, density),
         FinalColourRefit(),
         Evaluation(views, time_limit),
         time_limit,

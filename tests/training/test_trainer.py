@@ -312,10 +312,8 @@ def test_invalid_rows_at_the_start_do_not_spread(tmp_path):
         start.sh_degrees,
     )
     model = t.run(broken)
-    invalid = ~np.isfinite(model.means).all(1)
-    assert invalid.sum() == 1
     for array in model.arrays:
-        assert np.isfinite(array[~invalid]).all()
+        assert np.isfinite(array).all()
     clean, start = small_problem(tmp_path, "clean")
     clean.run(start)
     assert psnr_of(t) == pytest.approx(psnr_of(clean), abs=1.0)  # of 60 splats one is missing
