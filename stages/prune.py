@@ -1,4 +1,4 @@
-"""Stage 5: removes floaters and splats that do not improve the pictures, and fine-tunes the rest.
+"""Stage 5: removes floaters and splats that do not improve the pictures.
 
 See `capacity.pruning`. The PSNR of the held-out views before and after is in the report.
 """
@@ -72,8 +72,7 @@ class PruneSettings:
     )
     finetune_steps: int = setting(
         90,
-        "Steps of fine-tuning after each round that costs too much, or that a target needs; 0 for "
-        "none.",
+        "Steps of fine-tuning after each round that a target needs; 0 for none.",
         panel="Advanced",
         min=0,
         max=100_000,

@@ -1,5 +1,5 @@
-"""Prunes a model in rounds: remove what contributes least, measure, fine-tune what is left where
-that cost too much, and undo a round that fine-tuning does not save.
+"""Prunes a model in rounds: remove what contributes least, measure, and undo a round that cost too
+much. Rounds that a target needs are kept whatever they cost, and fine-tuned.
 
 What is removed minimises a rate-distortion cost, see `measure.rate_distortion`: the Lagrange
 multiplier says how much squared error one parameter must save to be kept.
@@ -25,9 +25,6 @@ from stages.training.finetune import FineTuner
 
 HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
 MAX_VIEWS = 48  # measured in a round; what the others showed at first goes on counting
-# The part of a loss that fine-tuning is taken to leave at least. 90 steps left 0.2 to 0.7 of the
-# mean loss by a tenth of the splats in most rounds, on five captures.
-LEAST_LEFT = 0.25
 TINY = float(np.finfo(np.float64).tiny)
 # why pruning stopped
 RATE_DISTORTION, LOSS, ROUNDS, TIME = "rate_distortion", "loss", "rounds", "time"
@@ -42,7 +39,7 @@ class PruningRound:
         removed, floaters: how many splats it removed, and how many of them are floaters.
         sh_reduced: splats that stayed with a lower SH degree.
         predicted_sse, measured_sse: change of the summed squared error by the removal alone.
-        psnr_db: mean over the views, after fine-tuning if that was tried.
+        psnr_db: mean over the views, after fine-tuning if there was any.
         kept: False if the round was undone.
     """
 
@@ -106,7 +103,7 @@ class Pruner:
         backend: name of the rasteriser.
         finetuner: on the same views.
         rounds: the largest number, unless a target needs more.
-        finetune_steps: after each round that costs too much without them, or that a target needs.
+        finetune_steps: after each round that a target needs.
         report: for progress.
         deadline: after which no round begins, as `time.monotonic`, unless a target needs it.
     """
@@ -152,8 +149,8 @@ class Pruner:
             fewer = removal.apply(found.splats)
             after = self._measure(fewer, state, removal)
             measured = self._sse_change(state, after)
-            kept = excess <= 0 and self.targets.allows(after.psnr_db, best_db)
-            if not kept and (excess > 0 or self._can_be_saved(after, best_db)):
+            kept = self.targets.allows(after.psnr_db, best_db)
+            if excess > 0 or (self.targets.min_psnr_db and not kept):
                 fewer, after = self._finetuned(fewer, after)
                 kept = excess > 0 or self.targets.allows(after.psnr_db, best_db)
             found.add_round(removal, measured, after.psnr_db, kept)
@@ -182,11 +179,6 @@ class Pruner:
             return state
         found.splats = fewer
         return after
-
-    def _can_be_saved(self, after: Contributions, best_db: Psnr) -> bool:
-        """Whether fine-tuning may bring back so much of a loss that it is allowed."""
-        least_db = LEAST_LEFT * (best_db - after.psnr_db)
-        return self.finetune_steps > 0 and self.targets.allows(best_db - least_db, best_db)
 
     def _finetuned(self, splats: Splats, before: Contributions) -> tuple[Splats, Contributions]:
         """The fine-tuned splats, and their contributions. before: those of `splats`."""
