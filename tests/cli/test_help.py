@@ -61,9 +61,7 @@ def test_help_of_train_says_what_a_run_that_goes_on_keeps() -> None:
     text = " ".join(help_of("train").split())
     assert "as before, else standard" in text
     assert "as before, else by preset" in text
-    assert "photographs have pixel values. [default: (by preset)]" in " ".join(
-        help_of("process").split()
-    )
+    assert "in training (pixels). [default: (by preset)]" in " ".join(help_of("process").split())
 
 
 @pytest.mark.skipif(not hasattr(os, "wait4"), reason="no account of a child's processor time")

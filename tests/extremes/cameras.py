@@ -135,5 +135,6 @@ def _coincident_training(backend):
         )
         trainer = build.make_trainer(reconstruction, 40, settings, folder, Report())
         model = trainer.run(scene.splats)
-        missing = int(not 0 < scene_extent(views) < np.inf) + abs(len(model) - len(scene.splats))
-        return missing + broken(*model.arrays)
+        degenerate = int(not 0 < scene_extent(views) < np.inf)
+        removed = 1 - len(model) / len(scene.splats)  # sparsification takes a third
+        return degenerate + int(not 0 <= removed < 0.5) + broken(*model.arrays)

@@ -10,6 +10,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from stages.photos.exif import Exif
 from stages.run.manifest import MANIFEST, Manifest, write_sealed
 from stages.run.runfile import RUN_FILE, RunFile
 from stages.scene import load_splats, save_splats
+from stages.scene.draw_settings import DrawSettings
 from tests.formats.truth import many_splats, red_splat
 from tests.fuzz.cost import Meter
 
@@ -265,7 +267,8 @@ def test_a_jpeg_of_very_many_scans_is_refused(tmp_path: Path) -> None:
 def test_stored_splats_of_no_size_are_refused(tmp_path: Path, value: float) -> None:
     path = save_splats(tmp_path / "splats.bin", red_splat())
     whole = path.read_bytes()
-    path.write_bytes(whole[:-32] + np.float64(value).tobytes() + whole[-24:])
+    side = len(whole) - 8 * (len(fields(DrawSettings)) - 1)  # the second of the last block
+    path.write_bytes(whole[:side] + np.float64(value).tobytes() + whole[side + 8 :])
     refused(load_splats, path)
 
 
