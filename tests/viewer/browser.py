@@ -88,7 +88,7 @@ class Browser:
         self._errors = profile / "stderr.txt"
         descriptors = (str(their_in), str(their_out))
         options = (*_OPTIONS, f"--user-data-dir={profile}")
-        with self._errors.open("wb") as errors:
+        with self._errors.open("ab") as errors:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _LAUNCH, *descriptors, program, *options],
                 pass_fds=(their_in, their_out),
