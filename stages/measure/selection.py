@@ -62,8 +62,8 @@ def select_removal(
     their parameters, least first; None if there are none.
 
     A contribution is measured by how much the pictures change. By how much their error changes,
-    neighbours that are each a little too much seem harmful one by one, and are missed together: on
-    banana lost 5 dB without the tenth that seemed to do most harm. Fine-tuning corrects what the
+    neighbours that are each a little too much seem harmful one by one, and are missed together: a
+    capture lost 5 dB without the tenth that seemed to do most harm. Fine-tuning corrects what the
     residual asks for in any case. The predicted change of the error is measured by the error.
 
     Floaters, and splats outside the region around the views, are removed at any multiplier. Splats
