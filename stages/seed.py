@@ -70,7 +70,6 @@ def run(inputs: Mapping[str, Any], settings: SeedSettings, folder: Path, report:
     training, _ = split_held_out(reconstruction.views)  # held-out views give no points or colours
     if settings.fill:
         chosen = selected_views(training, points)
-        report.metric("seeding_views", len(chosen))
         more, more_colours = plane_sweep_points(reconstruction.folder, chosen, points)
         report.metric("plane_sweep_points", len(more))
         points, colours = np.concatenate([points, more]), np.concatenate([colours, more_colours])

@@ -284,7 +284,6 @@ class _BlockTraining:
         by_block = [int((~removed[i:j]).sum()) for i, j in pairwise(ends)]
         self.report.metric("splats", len(splats))
         self.report.metric("splats_by_block", by_block)
-        self.report.metric("splats_at_seams", int(seam.sum()))
         self.report.metric("pruned_at_seams", int(removed.sum()))
         return TrainedSplats(splats, dropout)
 
