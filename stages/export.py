@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
 from stages.base.errors import Interrupted, QualityError, SplatError
+from stages.base.lazy import load_object
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
@@ -142,7 +143,7 @@ def _write_meshes(
         return []
     from stages.scene import ExportedFile
     from stages.surface.collision_mesh import make_collision_mesh
-    from stages.surface.files import write_checked
+    from stages.surface.files import fault_of
 
     made = make_collision_mesh(
         splats, reconstruction, settings.mesh_triangles, backend_of_settings(settings), report
@@ -151,7 +152,8 @@ def _write_meshes(
     files = []
     for row in rows:
         path = folder / f"{settings.name}.{row.ending}"
-        if fault := write_checked(path, row, made.mesh, reconstruction.units):
+        load_object(row.writer)(path, made.mesh, reconstruction.units)
+        if fault := fault_of(path, row, made.mesh):
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
     return files

@@ -141,11 +141,11 @@ def run(
     Raises SplatError of family RECONSTRUCTION when no reconstruction passes, and Interrupted.
     """
     from stages.structure import light, metric_scale, reconstruction_files
-    from stages.structure.crs import check_crs
+    from stages.structure.crs import projected_system
 
     capture: Capture = inputs["ingest"]
     if settings.crs:
-        check_crs(settings.crs)
+        projected_system(settings.crs)
     if settings.scale:
         metric_scale.check_distance(settings.scale, capture.photos)  # before hours of work
     if (folder / _FINISHED).exists():

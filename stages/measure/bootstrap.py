@@ -21,14 +21,13 @@ class Difference:
     Args:
         mean: candidate minus baseline.
         low, high: ends of the interval; infinite for a single view.
-        views, seeds: how many of each the differences are of.
+        views: how many the differences are of.
     """
 
     mean: float
     low: float
     high: float
     views: int
-    seeds: int
 
     @property
     def verdict(self) -> str:
@@ -62,14 +61,14 @@ def paired_difference(differences: NDArray[np.floating]) -> Difference:
     views, seeds = table.shape
     mean = float(table.mean())
     if views == 1:
-        return Difference(mean, -math.inf, math.inf, views, seeds)
+        return Difference(mean, -math.inf, math.inf, views)
     random = np.random.default_rng(_SEED)
     rows, columns = (_resample_weights(random, count) for count in (views, seeds))
     means = np.einsum("dp,ps,ds->d", rows, table, columns, optimize=True)
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(means, (tail, 100 - tail)) - mean
     wider = _widening(min(count for count in table.shape if count > 1))
-    return Difference(mean, mean + wider * low, mean + wider * high, views, seeds)
+    return Difference(mean, mean + wider * low, mean + wider * high, views)
 
 
 def _resample_weights(random: np.random.Generator, count: int) -> NDArray[np.float64]:

@@ -26,12 +26,6 @@ class FileRecord:
 FileRecords = dict[str, FileRecord]
 
 
-def sha256_file(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file's bytes. Raises OSError."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def record_files(
     folder: Path,
     known: Mapping[str, FileRecord] | None = None,
@@ -82,7 +76,9 @@ def _record(path: Path, known: FileRecord | None) -> FileRecord:
     stat = path.stat()
     if known is not None and (known.size, known.mtime_ns) == (stat.st_size, stat.st_mtime_ns):
         return known
-    return FileRecord(sha256_file(path), stat.st_size, stat.st_mtime_ns)
+    with path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    return FileRecord(sha256, stat.st_size, stat.st_mtime_ns)
 
 
 def combined_digest(records: Mapping[str, FileRecord]) -> str:

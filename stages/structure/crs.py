@@ -22,12 +22,6 @@ from stages.structure.gps import MetricScale, about_vertical
 _STEP_M = 50.0  # of the differences that give the axes of the grid
 
 
-def check_crs(crs: str) -> None:
-    """Raise SplatError if `crs` ("EPSG:25832") is not a projected system in metres that is known
-    here."""
-    _system(crs)
-
-
 def turned_to_grid(scale: MetricScale, crs: str, report: Report) -> MetricScale:
     """The scale after which +X and +Z follow the east and north of the grid `crs`, in its metres.
 
@@ -36,7 +30,7 @@ def turned_to_grid(scale: MetricScale, crs: str, report: Report) -> MetricScale:
 
     Args:
         scale: with a place.
-        crs: checked by `check_crs`.
+        crs: checked by `projected_system`.
         report: receives a warning for a place outside the area that the system is made for.
 
     Raises SplatError "crs-elsewhere".
@@ -55,7 +49,7 @@ def in_crs(place: EarthPlace, crs: str, report: Report) -> EarthPlace:
     SplatError "crs-elsewhere"."""
     import pyproj
 
-    target = _system(crs)
+    target = projected_system(crs)
     transform = pyproj.Transformer.from_crs(place.crs, target, always_xy=True).transform
 
     def coordinates(local: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -106,8 +100,9 @@ def _written(place: EarthPlace) -> str:
     return f"{place.crs} " + ", ".join(f"{value:.6g}" for value in place.offset)
 
 
-def _system(crs: str) -> Any:
-    """The system of PROJ. Raises SplatError."""
+def projected_system(crs: str) -> Any:
+    """The `pyproj.CRS` of `crs` ("EPSG:25832"). Raises SplatError if that is not a projected system
+    in metres that is known here."""
     try:
         import pyproj
     except ImportError as error:

@@ -36,12 +36,6 @@ _TRIANGLES = 4
 _Y_UP = np.array([1.0, -1.0, -1.0])
 
 
-def write_checked(path: Path, row: MeshFormat, mesh: Mesh, units: str) -> str:
-    """Write the mesh; what is wrong with the file, see `fault_of`."""
-    load_object(row.writer)(path, mesh, units)
-    return fault_of(path, row, mesh)
-
-
 def fault_of(path: Path, row: MeshFormat, mesh: Mesh) -> str:
     """What is wrong with a file that should hold `mesh`, as the independent reader finds it; "" if
     nothing is."""

@@ -19,7 +19,7 @@ from stages.scene.place import (
     geocentric,
     geodetic,
 )
-from stages.structure.crs import check_crs, in_crs
+from stages.structure.crs import in_crs, projected_system
 from stages.structure.gps import MetricScale, about_vertical
 from stages.structure.metric_scale import UNKNOWN_SCALE, KnownScale, find_metric_scale
 
@@ -203,7 +203,7 @@ def test_a_grid_of_another_region_is_a_warning_or_an_error() -> None:
 def test_a_system_that_is_no_grid_in_metres_is_refused(crs: str, code: str) -> None:
     pytest.importorskip("pyproj")
     with pytest.raises(SplatError) as raised:
-        check_crs(crs)
+        projected_system(crs)
     assert (raised.value.code, raised.value.family) == (code, Family.USAGE)
     assert crs in raised.value.given
 
@@ -211,7 +211,7 @@ def test_a_system_that_is_no_grid_in_metres_is_refused(crs: str, code: str) -> N
 def test_without_pyproj_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyproj", None)
     with pytest.raises(SplatError) as raised:
-        check_crs("EPSG:25832")
+        projected_system("EPSG:25832")
     assert raised.value.code == "crs-needs-pyproj"
     assert 'pip install "splatcli[geo]"' in raised.value.hint
 
