@@ -91,12 +91,13 @@ Put = Callable[[Rendering], None]
 def picture_sink(path: Path, depth: bool) -> Iterator[Put]:
     """Writes the picture `path`; with `depth` also its depth as .depth.tiff. Raises SplatError."""
 
-    def put(rendering: Rendering) -> None:
-        save_picture(path, eight_bits(rendering.image))
-        if depth:
-            save_depth(path.with_suffix(".depth.tiff"), rendering.median_depth)
+    yield lambda rendering: _save(path, rendering, depth)
 
-    yield put
+
+def _save(path: Path, rendering: Rendering, depth: bool) -> None:
+    save_picture(path, eight_bits(rendering.image))
+    if depth:
+        save_depth(path.with_suffix(".depth.tiff"), rendering.median_depth)
 
 
 @contextmanager
@@ -109,10 +110,7 @@ def folder_sink(folder: Path, frames: int, depth: bool) -> Iterator[Put]:
     def put(rendering: Rendering) -> None:
         nonlocal number
         number += 1
-        path = folder / f"frame_{number:0{max(4, len(str(frames)))}}.png"
-        save_picture(path, eight_bits(rendering.image))
-        if depth:
-            save_depth(path.with_suffix(".depth.tiff"), rendering.median_depth)
+        _save(folder / f"frame_{number:0{max(4, len(str(frames)))}}.png", rendering, depth)
 
     yield put
 
