@@ -93,7 +93,6 @@ def run(
     quantised: QuantisedSplats = replace(inputs["quantise"], drawing=settings.drawing)
     reconstruction: Reconstruction = inputs["sfm"]
     place = reconstruction.place
-    _clear(folder)
     splats, dropped = drop_undrawable(replace(quantised.splats, place=place))
     _warn_of_missing(len(splats), dropped, report)
     chosen = tuple(name for name in dict.fromkeys(settings.formats) if name in FORMATS)
@@ -157,17 +156,6 @@ def _write_meshes(
             raise _failed(path, fault, "mesh")
         files.append(ExportedFile(row.ending, path.name, path.stat().st_size))
     return files
-
-
-def _clear(folder: Path) -> None:
-    """Remove partial files that a killed writer left; whole files are written over."""
-    import shutil
-
-    for path in sorted(folder.glob(".partial-*")):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
 
 
 def _warn_of_missing(count: int, dropped: int, report: Report) -> None:

@@ -84,14 +84,6 @@ def test_equal_inputs_give_equal_files_and_load_gives_the_list(
     assert contents[0] == contents[1]
 
 
-def test_what_a_killed_export_left_is_gone(scene: SmallScene, tmp_path: Path) -> None:
-    (tmp_path / ".partial-1-scene.ply").write_bytes(b"half")
-    (tmp_path / ".partial-x").mkdir()
-    (tmp_path / ".partial-x" / "scene.usdc").write_bytes(b"half")
-    exported(scene, tmp_path, formats=("ply",))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["assets.json", "scene.ply"]
-
-
 @pytest.mark.parametrize("name", ["ply", "glb", "usdc"])
 @pytest.mark.parametrize("damage", ["quaternion order", "sh", "handedness", "one missing"])
 def test_a_wrong_file_does_not_pass(
