@@ -118,6 +118,7 @@ def run(inputs: Mapping[str, Any], settings: PruneSettings, folder: Path, report
     report.metric("psnr_before_db", round(mean_db, 3))
     report.metric("psnr_db", round(mean_db - lost_db, 3))
     report.metric("psnr_change_db", round(-lost_db, 3))
+    report.metric("psnr_change_worst_view_db", round(-float(loss_db.max()), 3))
     report.metric("finetune_steps", pruner.finetuner.steps)
     _report_result(splats, found, report)
     report.metric("summary", summarise(trained, found, settings.strength, pruner.finetuner.steps))
@@ -202,6 +203,7 @@ def _report_result(before: Splats, found: PruningResult, report: Report) -> None
     report.metric("splats_by_sh_degree", degrees)
     cost_figures = asdict(cost) | {"bits_per_parameter": cost.bits_per_parameter}
     report.metric("rate_distortion", cost_figures)
+    report.metric("training_psnr_before_db", round(found.start_db, 3))
     report.metric("training_psnr_db", round(found.end_db, 3))
     report.metric("stopped_by", found.stopped_by)
     report.metric("rounds", [asdict(one) for one in found.rounds])
