@@ -13,7 +13,7 @@ from tests import sample
 pytest.importorskip("triton")
 pytestmark = [pytest.mark.gpu, pytest.mark.slow, pytest.mark.timeout(900)]
 
-WORDS = ("--steps", "40", "--train-side", "64", "--max-splats", "40", "--backend", "gpu")
+WORDS = ("--steps", "40", "--train-side", "32", "--max-splats", "40", "--backend", "gpu")
 
 
 def test_a_run_on_the_gpu_backend_ends_with_verified_assets(sample_run: Path, tmp_path: Path):
