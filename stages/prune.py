@@ -224,7 +224,7 @@ def load(folder: Path) -> Splats:
 
 STAGE = Stage(
     name="prune",
-    version=18,
+    version=19,
     reads=("sfm", "train"),
     settings_type=PruneSettings,
     run=run,

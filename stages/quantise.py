@@ -314,7 +314,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=11,
+    version=12,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     run=run,

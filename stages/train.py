@@ -279,5 +279,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=22, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=23, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -6,6 +6,10 @@ needles and fog from everywhere else. With dropout, neighbouring splats learn to
 The dropout probability of a splat that n training views see is (2 / n)^2, at most 0.3: splats that
 many views see are hardly ever dropped.
 
+Neighbours overlap, so what one dropped splat leaves is drawn by those around it. `NEIGHBOURHOOD`
+consecutive splats therefore share a random number (Fang et al. 2026, "DropAnSH-GS"): the splats are
+in Morton order, so these lie close together.
+
 Only captures of few training views are overfitted, so only they use dropout, once densification has
 ended. With more views dropout costs quality (docs/experiments/overfitting.md).
 """
@@ -22,8 +26,9 @@ from stages.training.density import estimated_view_counts
 DROPOUT_BELOW = 15  # training views
 VIEW_SCALE = 2.0  # views: the dropout probability is (VIEW_SCALE / n)^2
 MAX_PROBABILITY = 0.3
+NEIGHBOURHOOD = 8  # consecutive splats that share a random number
 INVISIBLE = -20.0  # opacity logit of a dropped splat
-INCREMENT = 0x9E3779B9  # between the hash inputs of consecutive splats
+INCREMENT = 0x9E3779B9  # between the hash inputs of consecutive neighbourhoods
 FACTORS = (16, 0x85EBCA6B), (13, 0xC2B2AE35)  # (shift, factor) of the rounds of `noise`
 _UINT32 = 2.0**32
 
@@ -53,9 +58,11 @@ class Dropout:
 
 
 def noise(n: int, key: int) -> NDArray[np.uint32]:
-    """[n] uniform over 32 bits: a hash of row and key by the finaliser of MurmurHash3 (Appleby,
-    public domain), which gives the same values on every device and in any order."""
-    h = np.arange(n, dtype=np.uint32) * np.uint32(INCREMENT) + np.uint32(key)
+    """[n] uniform over 32 bits, the same for all splats of a neighbourhood: a hash of neighbourhood
+    and key by the finaliser of MurmurHash3 (Appleby, public domain), which gives the same values on
+    every device and in any order."""
+    h = np.arange(n, dtype=np.uint32) // np.uint32(NEIGHBOURHOOD)
+    h = h * np.uint32(INCREMENT) + np.uint32(key)
     for shift, factor in FACTORS:
         h ^= h >> np.uint32(shift)
         h *= np.uint32(factor)

@@ -27,6 +27,7 @@ from stages.training.dropout import (
     INCREMENT,
     INVISIBLE,
     MAX_PROBABILITY,
+    NEIGHBOURHOOD,
     VIEW_SCALE,
     Dropout,
 )
@@ -322,7 +323,7 @@ def dropped(dropout: Dropout, counts: Tensor) -> Tensor:
 
 
 def _noise(n: int, key: int, device: torch.device) -> Tensor:
-    h = (torch.arange(n, device=device) * INCREMENT + key) & _LOW
+    h = (torch.arange(n, device=device) // NEIGHBOURHOOD * INCREMENT + key) & _LOW
     for shift, factor in FACTORS:
         h = ((h ^ (h >> shift)) * factor) & _LOW
     return h ^ (h >> 16)

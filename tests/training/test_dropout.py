@@ -14,6 +14,7 @@ from stages.training.cpu_step import CpuStep
 from stages.training.dropout import (
     DROPOUT_BELOW,
     MAX_PROBABILITY,
+    NEIGHBOURHOOD,
     Dropout,
     noise,
     uses_dropout,
@@ -31,7 +32,7 @@ from tests.training.pictures import view_of
 VIEWS = 20
 
 
-def shares(seen, steps=400):
+def shares(seen, steps=4000):
     """How often each splat is dropped, visible in so many of `VIEWS` steps."""
     seen = np.asarray(seen, np.int32)
     return np.mean([Dropout(VIEWS, key).dropped(seen) for key in range(steps)], axis=0)
@@ -46,12 +47,20 @@ def test_splats_that_few_views_see_are_dropped_often_and_others_hardly_ever():
     np.testing.assert_allclose(found, wanted, atol=0.004)
 
 
-def test_random_numbers_of_steps_and_of_splats_are_independent():
-    lots = np.array([noise(5000, key) for key in range(64)]) / 2.0**32
+def test_random_numbers_of_steps_and_of_neighbourhoods_are_independent():
+    lots = np.array([noise(40000, key)[::NEIGHBOURHOOD] for key in range(64)]) / 2.0**32
     assert abs(lots.mean() - 0.5) < 0.005
     assert abs(np.corrcoef(lots[:32].ravel(), lots[32:].ravel())[0, 1]) < 0.01  # steps
     assert abs(np.corrcoef(lots[:, :-1].ravel(), lots[:, 1:].ravel())[0, 1]) < 0.01  # neighbours
     assert (noise(5000, 7) == noise(9000, 7)[:5000]).all()
+
+
+def test_neighbourhoods_are_dropped_together():
+    found = noise(4 * NEIGHBOURHOOD + 3, 7)
+    whole = found[: 4 * NEIGHBOURHOOD].reshape(4, NEIGHBOURHOOD)
+    assert (whole == whole[:, :1]).all()
+    assert len(set(whole[:, 0])) == 4
+    assert (found[-3:] == found[-1]).all()
 
 
 def test_dropout_without_counts_and_without_splats():
