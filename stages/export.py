@@ -1,4 +1,4 @@
-"""Stage 7: writes files that other programs open, and proves each one.
+"""Stage 7: writes files that other programs open, and checks each one.
 
 Every file is read back by a parser that did not write it, drawn from cameras of the capture, and
 compared with the splats that it was made from. A wrong file stops the export. Nothing is trained

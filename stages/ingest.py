@@ -1,4 +1,4 @@
-"""The ingest stage: photographs -> Capture, each as upright 8-bit sRGB with what Exif says of it.
+"""Stage 1: photographs -> Capture, each as upright 8-bit sRGB with what EXIF says of it.
 
 Reads JPEG, PNG, TIFF, WebP, HEIC, AVIF and BMP from a folder and its sub-folders, in which nothing
 is written, and takes sharp frames from videos. Warnings say what a photographer should change.

@@ -1,6 +1,7 @@
 """Stage 5: removes floaters and splats that do not improve the pictures.
 
-See `capacity.pruning`. The PSNR of the held-out views before and after is in the report.
+Training views choose what is removed and bound the loss (see `capacity.pruning`). The PSNR (dB) of
+the held-out views before and after is in the report, and decides nothing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Capture -> Reconstruction: camera poses and a sparse point cloud.
+"""Stage 2: Capture -> Reconstruction: camera poses and a sparse point cloud.
 
 Structure from motion by COLMAP, in a worker process. A model is used only if it passes the quality
 gates (`structure.gates`). If it does not, other configurations are tried (`structure.fallbacks`),

@@ -1,4 +1,8 @@
-"""Stage 4: optimise splats so that their renders match the training views."""
+"""Stage 4: Splats -> TrainedSplats: optimises splats so that renders match the training views.
+
+Follows Kerbl et al. 2023 (see `training.trainer` and `training.schedule`). Splats are split and
+removed on the way (`training.hooks`). Held-out views are evaluated and decide nothing.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Chooses the bit depths of a .sog file by measuring what each costs, and predicts file sizes."""
+"""Chooses the bit depth of each attribute of a .sog file by the PSNR (dB) that each bit costs and
+the bytes that it saves, and predicts file sizes (bytes)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 much. Rounds that a target needs are kept whatever they cost, and fine-tuned.
 
 What is removed minimises a rate-distortion cost, see `measure.rate_distortion`: the Lagrange
-multiplier says how much squared error one parameter must save to be kept.
+multiplier says how much squared error, summed over the views' colour values in 0..1, one parameter
+must save to be kept. `measure.selection` chooses, `targets` bounds the loss (dB).
 """
 
 from __future__ import annotations

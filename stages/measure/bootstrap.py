@@ -1,4 +1,5 @@
-"""Whether one of two results is better: paired differences and their bootstrap interval."""
+"""Whether one of two results is better: the mean of paired differences (in their unit, mostly dB of
+PSNR) and its percentile bootstrap interval (Efron and Tibshirani 1993)."""
 
 from __future__ import annotations
 

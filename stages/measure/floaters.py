@@ -1,16 +1,16 @@
 """Floaters: splats in free space, where no surface is.
 
-A floater fits the few training views that it was made for and hides the scene from others. What can
-be known of free space differs by the moment, so there are four rules, from the most to the least
-that is known. Merging any two would change which splats go.
+A floater fits the few training views that it was made for and hides the scene from others. Four
+rules find them, because each situation gives other knowledge of free space. Merging any two would
+change which splats are removed.
 
 - `stages.training.free_space`, during training: free space is what at least two and fewer than four
   training views look past, by the depths of the seed points. It needs these depths, and removes
   what densification puts there.
-- `near_camera_floaters`, once training is over: a splat close to a camera, compared with the depth
-  that is drawn there, which at most two views need. It needs the views and a measurement of each
-  splat's contribution.
-- `splats_in_masks`, then, too: a splat that is shown only where masks ignore what is there. It
+- `near_camera_floaters`, in sparsification and pruning: a splat that at most two views see, closer
+  to a camera than a quarter of the median depth that is drawn for it. It needs the views and each
+  splat's contribution to them.
+- `splats_in_masks`, there, too: a splat that is shown only where masks ignore what is there. It
   needs the same.
 - `isolated_splats`, for a file without its views: a splat far from its neighbours, compared with
   their own distances.

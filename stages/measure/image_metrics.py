@@ -1,5 +1,8 @@
-"""Image quality metrics: PSNR, SSIM and FLIP. Images are [H, W, 3], data range 1, sRGB values as
-stored. `valid` [H, W] marks the pixels that count; None for all."""
+"""Image quality metrics: PSNR (dB), SSIM (Wang et al. 2004) and FLIP (Andersson et al. 2020).
+
+Images are [H, W, 3], data range 1, sRGB values as stored. `valid` [H, W] marks the pixels that
+count; None for all.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The contact sheet of held-out views and the plot of the evaluations during training."""
+"""The contact sheet of held-out views beside their renders (`held_out.png`), and the plot of the
+evaluations during training (`training.png`)."""
 
 from __future__ import annotations
 

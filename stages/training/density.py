@@ -1,5 +1,5 @@
-"""Adaptive density control (Kerbl et al. 2023, section 5.2): splats are split where the gradient of
-their positions is large, and faint, oversized or invalid splats are removed.
+"""Adaptive density control (Kerbl et al. 2023, section 5.2): splats are split where the mean
+gradient by their 2D position is large. Nearly transparent, very large and invalid ones are removed.
 
 A split replaces a splat by two along its longest axis (Deng et al. 2024, "Efficient Density Control
 for 3D Gaussian Splatting"), instead of a copy of a small splat and two random samples of a large

@@ -1,11 +1,11 @@
 """Removes floaters that appear during training: splats in space that the seeds show to be free.
 
-Densification lets splats grow away from surfaces. Where many views look, the other views correct
-them; where only two or three do, nothing does, and a few splats near the cameras reproduce what
-those views show behind them. The training loss does not rise, but other views look into a cloud.
-The seed splats know better, because their points lie where views agree or at the depth that one
-view estimated. So a splat is a floater if it lies clearly in front of the seeds in the few views
-that look past it, and at the depth of the seeds in none.
+Densification can leave splats far in front of surfaces. Where many views look, their gradients move
+or fade such splats. Where only two or three look, a few splats near the cameras can reproduce what
+these views show behind them: the training loss does not rise, but other views see a cloud. Seeds do
+not lie there, because views agree on their depths, or one view estimated them. So a splat is a
+floater if few views look past it at seeds that lie at least twice as far away (`NEAR`), and no view
+has seeds at its depth (`FAR`). Positions are [N, 3], depths are along the optical axis.
 """
 
 from __future__ import annotations

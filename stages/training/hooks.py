@@ -1,4 +1,6 @@
-"""What happens between training steps, each as one object with one method."""
+"""What happens between training steps, each as one object with one method. `step_hooks` lists them
+in their order. Splats are removed by three: `FloaterRemoval`, `Densification` and `Sparsification`.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
-"""What happens at which step, as in Kerbl et al. 2023.
+"""What happens at which step, after Kerbl et al. 2023.
 
 The published schedule has 30,000 steps. Its events are scaled to the number of steps of the run,
-which may change during the run.
+which may change during the run. Unlike the published one, it never resets opacities, draws at half
+the size in the first fifth, raises the learning rates of short runs (`boost`), lets all of them
+decay, and bounds the number of splats by a budget that rises linearly. Steps count from 0.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Splats that contribute little to the pictures are removed while training goes on, once
-densification has ended: the others learn to replace them in the steps that are left.
+"""After densification, four rounds of training remove together a third of the splats: those without
+which the training pictures change least. The steps that are left train the others to replace them.
 
-GaussianSpa (Zhang et al. 2025) drives opacities to zero for this by an optimisation of its own.
-Here what goes is chosen as in `capacity.pruning`, by how much the pictures would change.
+Each round measures contributions (`measure.contribution`, [N]) and removes the tenth that
+`measure.selection` chooses, floaters first, as in pruning. GaussianSpa (Zhang et al. 2025) removes
+splats in training, too, but drives opacities to zero by an optimisation of its own.
 """
 
 from __future__ import annotations

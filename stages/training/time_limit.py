@@ -1,4 +1,4 @@
-"""A limit of wall time: how many steps fit into it."""
+"""A limit of wall time (seconds): how many training steps fit into it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """The training loop of 3D Gaussian splatting (Kerbl et al. 2023).
 
 Each step renders one training view, computes the loss and its gradients, and updates the splats
-with Adam. Everything that happens between steps is a `hooks.StepHook`: densification, removal of
-floaters, evaluation, checkpoints, progress and the live preview.
+with Adam. Everything that happens between steps is a `hooks.StepHook`: removal of floaters,
+densification, sparsification, the colour refit, evaluation, the time limit, checkpoints, progress
+and the live preview.
 """
 
 from __future__ import annotations
