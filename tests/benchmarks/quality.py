@@ -45,7 +45,7 @@ from stages.run.pipeline import Pipeline
 from stages.scene import Reconstruction, Splats, draw_settings_of, split_held_out
 from stages.sfm import SfmSettings
 from stages.train import PRESETS, TrainSettings
-from stages.training.build import corrects_light
+from stages.training.build import corrects_light, corrects_vignetting
 from tests.benchmarks.captures import SOURCES, photographs_of
 from tests.benchmarks.sample_test_views import evaluation_views
 from tests.benchmarks.verdicts import Cell, grouped, read, verdicts, write
@@ -92,8 +92,12 @@ class Capture:
     @cache  # noqa: B019 - a few captures, each with one or two sizes
     def test_views(self, side: int) -> tuple[EvaluationView, ...]:
         """Those with a longer side of at most `side` pixels."""
-        light = corrects_light(self.reconstruction, TrainSettings().light, Report())
-        settings = draw_settings_of(self.reconstruction.views, side, light)
+        choice = TrainSettings().light
+        light = corrects_light(self.reconstruction, choice, Report())
+        vignetting = corrects_vignetting(self.reconstruction, choice, Report())
+        settings = draw_settings_of(
+            self.reconstruction.views, side, light=light, vignetting=vignetting
+        )
         _, held = split_held_out(self.reconstruction.views)
         found = tuple(load_evaluation_views(self.reconstruction.folder, held, settings))
         if self.name != SAMPLE:
