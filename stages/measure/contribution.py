@@ -19,6 +19,7 @@ from stages.raster.backends import rasteriser_of
 from stages.raster.definition import (
     ERROR_CHANGE,
     LARGEST_WEIGHT,
+    PICTURE_CHANGE,
     SQUARED_WEIGHT,
     WEIGHT,
     WEIGHTED_RESIDUAL,
@@ -123,13 +124,10 @@ def measure_contributions(
         sse += float(np.sum(residual.astype(np.float64) ** 2))
         solid = forward.image[4][forward.image[3] > 0.5]
         depths.append(float(np.median(solid)) if solid.size else np.inf)
-        without_residual = rasteriser.contributions(forward, np.zeros_like(residual))[
-            :, ERROR_CHANGE
-        ]
         found = rasteriser.contributions(forward, residual)
         rows = forward.visible
         change[rows] += found[:, ERROR_CHANGE]
-        picture[rows] += without_residual
+        picture[rows] += found[:, PICTURE_CHANGE]
         weight[rows] += found[:, WEIGHT]
         kept_weight[rows] += _kept_weight(rasteriser, forward, view, found)
         view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT

@@ -33,9 +33,10 @@ QUATERNION_MIN = (
 # RGB last. A row has whole vectors of 16 columns; those after the last coefficient are zero.
 MEAN, ROTATION, LOG_SCALE, OPACITY, SH, SH_REST = 0, 3, 7, 10, 11, 14
 # Columns of a row of contributions of one splat to one picture. With w the splat's blend weight in
-# a pixel and r = render - photograph: change of the squared error if the splat is removed; sum of
-# w; largest w; sum of w^2; sum of w r for each channel (3 columns).
-ERROR_CHANGE, WEIGHT, LARGEST_WEIGHT, SQUARED_WEIGHT, WEIGHTED_RESIDUAL = range(5)
+# a pixel and r = render - photograph: change of the squared error if the splat is removed; squared
+# change of the picture then; sum of w; largest w; sum of w^2; sum of w r for each channel (3
+# columns).
+ERROR_CHANGE, PICTURE_CHANGE, WEIGHT, LARGEST_WEIGHT, SQUARED_WEIGHT, WEIGHTED_RESIDUAL = range(6)
 CONTRIBUTIONS = WEIGHTED_RESIDUAL + 3
 
 

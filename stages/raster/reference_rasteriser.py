@@ -15,6 +15,7 @@ from stages.raster.definition import (
     CONTRIBUTIONS,
     ERROR_CHANGE,
     LARGEST_WEIGHT,
+    PICTURE_CHANGE,
     SQUARED_WEIGHT,
     WEIGHT,
     WEIGHTED_RESIDUAL,
@@ -132,7 +133,7 @@ class ReferenceRasteriser:
                     continue
                 alpha, errors = alphas_at(projected, rows, pixels), _part(planes, place)
                 weights, passed = weights_of(alpha)
-                change = torch.zeros_like(alpha)
+                change, square = torch.zeros_like(alpha), torch.zeros_like(alpha)
                 for channel in range(3):
                     painted = weights * rgb[rows, channel : channel + 1]
                     background = passed * settings.background[channel]
@@ -140,8 +141,10 @@ class ReferenceRasteriser:
                     shift = behind * alpha / (1 - alpha) - painted
                     shift = torch.where(weights > 0, shift, torch.zeros_like(shift))
                     change += shift * (shift + 2 * errors[channel])
+                    square += shift.square()
                 index = projected.index[rows]
                 found[index, ERROR_CHANGE] += change.sum(1)
+                found[index, PICTURE_CHANGE] += square.sum(1)
                 found[index, WEIGHT] += weights.sum(1)
                 found[index, LARGEST_WEIGHT] = torch.maximum(
                     found[index, LARGEST_WEIGHT], weights.amax(1)

@@ -11,6 +11,7 @@ from stages.raster.definition import (
     CONTRIBUTIONS,
     ERROR_CHANGE,
     LARGEST_WEIGHT,
+    PICTURE_CHANGE,
     SQUARED_WEIGHT,
     WEIGHT,
     WEIGHTED_RESIDUAL,
@@ -68,8 +69,11 @@ def test_the_change_of_the_error_is_that_of_drawing_without_the_splat(backend, s
 def test_against_its_own_picture_no_splat_is_better_gone(backend):
     scene, where = faint_cloud(1), camera(40, 30)
     forward = rasteriser_of(backend).forward(splat_arrays(scene), where, SETTINGS)
-    change = measured(backend, scene, forward.image[:3].copy(), where)[:, ERROR_CHANGE]
-    assert (change >= 0).all()
+    found = measured(backend, scene, forward.image[:3].copy(), where)
+    assert (found[:, ERROR_CHANGE] >= 0).all()
+    np.testing.assert_array_equal(found[:, PICTURE_CHANGE], found[:, ERROR_CHANGE])
+    other = measured(backend, scene, photograph(), where)
+    np.testing.assert_array_equal(other[:, PICTURE_CHANGE], found[:, PICTURE_CHANGE])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -107,4 +111,4 @@ def test_a_worked_pixel(backend):
     found = measured(
         backend, scene, black, camera(1, 1), replace(SETTINGS, background=(0.0, 0.0, 0.0))
     )
-    np.testing.assert_allclose(found, [[-0.75, 0.5, 0.5, 0.25, 0.25, 0.25, 0.25]], rtol=1e-4)
+    np.testing.assert_allclose(found, [[-0.75, 0.75, 0.5, 0.5, 0.25, 0.25, 0.25, 0.25]], rtol=1e-4)

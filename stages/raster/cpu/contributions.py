@@ -28,6 +28,7 @@ from stages.raster.definition import (
     CONTRIBUTIONS,
     ERROR_CHANGE,
     LARGEST_WEIGHT,
+    PICTURE_CHANGE,
     SQUARED_WEIGHT,
     WEIGHT,
     WEIGHTED_RESIDUAL,
@@ -107,7 +108,8 @@ def contribution_tiles(ticket, tiles, residual, out):
 @kernel
 def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, slot):
     zero, one, two = splat16(_F(0.0)), splat16(_F(1.0)), splat16(_F(2.0))
-    change, total, largest, squares = zero, zero, zero, zero
+    change, square = zero, zero
+    total, largest, squares = zero, zero, zero
     residual_r, residual_g, residual_b = zero, zero, zero
     while blocks:
         block = lowest_bit(blocks)
@@ -133,12 +135,10 @@ def _entry(frame, number, blocks, paint, row, work, last, last_at, lanes, out, s
             behind = vload(work, BEHIND + plane)
             shift = behind * ratio - painted
             change = vfma(shift, shift + two * vload(work, RESIDUAL + plane), change)
+            square = vfma(shift, shift, square)
             vstore(work, BEHIND + plane, behind + painted)
-    out[slot, ERROR_CHANGE], out[slot, WEIGHT], out[slot, SQUARED_WEIGHT] = (
-        vsum(change),
-        vsum(total),
-        vsum(squares),
-    )
+    out[slot, ERROR_CHANGE], out[slot, PICTURE_CHANGE] = vsum(change), vsum(square)
+    out[slot, WEIGHT], out[slot, SQUARED_WEIGHT] = vsum(total), vsum(squares)
     out[slot, WEIGHTED_RESIDUAL], out[slot, WEIGHTED_RESIDUAL + 1] = (
         vsum(residual_r),
         vsum(residual_g),

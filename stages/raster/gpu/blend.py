@@ -236,7 +236,7 @@ def contribution_kernel(
     tiles_x,
     TILE: tl.constexpr,
 ):
-    """out [entries, 7] at each entry's slot: columns as in `definition.CONTRIBUTIONS`. residual
+    """out [entries, 8] at each entry's slot: columns as in `definition.CONTRIBUTIONS`. residual
     [3, H, W]: see `cpu.contributions`."""
     x, y, i, j, at, inside = pixels_of(tl.program_id(0), tiles_x, width, height, TILE)
     start, count, finished_at = furthest(starts, last, at, inside)
@@ -258,21 +258,24 @@ def contribution_kernel(
         weight, ratio = alpha * passing, alpha * inverse
         painted = weight * tl.load(record + COLOUR)
         shift = behind_r * ratio - painted
-        change = shift * (shift + 2.0 * e_r)
+        change, square = shift * (shift + 2.0 * e_r), shift * shift
         behind_r += painted
         painted = weight * tl.load(record + COLOUR + 1)
         shift = behind_g * ratio - painted
         change += shift * (shift + 2.0 * e_g)
+        square += shift * shift
         behind_g += painted
         painted = weight * tl.load(record + COLOUR + 2)
         shift = behind_b * ratio - painted
         change += shift * (shift + 2.0 * e_b)
+        square += shift * shift
         behind_b += painted
-        to = out + tl.load(slots + entry) * 7
+        to = out + tl.load(slots + entry) * 8
         tl.store(to, sum_of(change, 0))
-        tl.store(to + 1, sum_of(weight, 0))
-        tl.store(to + 2, top_of(weight, 0))
-        tl.store(to + 3, sum_of(weight * weight, 0))
-        tl.store(to + 4, sum_of(weight * e_r, 0))
-        tl.store(to + 5, sum_of(weight * e_g, 0))
-        tl.store(to + 6, sum_of(weight * e_b, 0))
+        tl.store(to + 1, sum_of(square, 0))
+        tl.store(to + 2, sum_of(weight, 0))
+        tl.store(to + 3, top_of(weight, 0))
+        tl.store(to + 4, sum_of(weight * weight, 0))
+        tl.store(to + 5, sum_of(weight * e_r, 0))
+        tl.store(to + 6, sum_of(weight * e_g, 0))
+        tl.store(to + 7, sum_of(weight * e_b, 0))
