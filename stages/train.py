@@ -283,5 +283,5 @@ def load(folder: Path) -> TrainedSplats:
 
 
 STAGE = Stage(
-    name="train", version=23, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
+    name="train", version=24, reads=("sfm", "seed"), settings_type=TrainSettings, run=run, load=load
 )

@@ -57,6 +57,7 @@ def select_removal(
     sse_per_parameter: float,
     most: int,
     share: float = ROUND_SHARE,
+    change: float = np.inf,
 ) -> Removal | None:
     """The splats and SH coefficients that contribute less than `sse_per_parameter` for each of
     their parameters, least first; None if there are none.
@@ -77,6 +78,8 @@ def select_removal(
         sse_per_parameter: the Lagrange multiplier of the rate-distortion cost.
         most: splats to remove.
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
+        change: summed squared change of the pictures that removed splats may make, as if the
+            effects of single removals added up. Floaters do not count.
     """
     seen, near = contributions.view_counts > 0, near_view_frusta(splats, list(cameras))
     floaters = near_camera_floaters(splats, contributions, list(cameras))
@@ -88,6 +91,8 @@ def select_removal(
     order = np.argsort(ratio, kind="stable")
     allowed = free | _least_of_neighbours(splats, ratio)
     chosen = order[(allowed & (ratio < sse_per_parameter))[order]][:most]
+    changes = np.where(free[chosen], 0.0, contributions.picture_change[chosen])
+    chosen = chosen[np.cumsum(changes) <= change]
     removed = np.zeros(len(splats), bool)
     removed[chosen] = True
     # SH coefficients that contribute more than the last removed splat stay

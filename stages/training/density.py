@@ -10,6 +10,7 @@ what a split breaks.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,19 @@ GRADIENT_THRESHOLD = 2e-4  # of the mean gradient by the 2D position, as publish
 # Splats that fewer views see are densified last: floaters are among them.
 ENOUGH_VIEWS = 4.0
 MIN_OPACITY = 0.005
+
+
+class DensityRule(Protocol):
+    """What densifies: models in, models out."""
+
+    def prune(self, model: Model, remove_giants: bool) -> Model:
+        """The model without splats that no step can improve, see `AdaptiveDensity.prune`."""
+
+    def grow(self, model: Model, budget: int) -> Model:
+        """The model with new splats, at most `budget` in all; accumulated gradients are reset."""
+
+    def inside(self, model: Model) -> NDArray[np.bool_]:
+        """[N] splats in the region that the rule densifies."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +85,10 @@ class AdaptiveDensity:
         grown = model.take(keep).joined(split_along_longest_axis(model.take(chosen)))
         grown.reset_gradients()
         return grown
+
+    def inside(self, model: Model) -> NDArray[np.bool_]:
+        """See `DensityRule.inside`: all [N]."""
+        return np.ones(len(model), bool)
 
 
 @dataclass(frozen=True)

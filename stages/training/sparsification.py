@@ -1,9 +1,13 @@
-"""After densification, four rounds of training remove together a third of the splats: those without
-which the training pictures change least. The steps that are left train the others to replace them.
+"""After densification, rounds of training remove the splats without which the training pictures
+would change least. The steps that are left repair what the removal costs.
 
-Each round measures contributions (`measure.contribution`, [N]) and removes the tenth that
-`measure.selection` chooses, floaters first, as in pruning. GaussianSpa (Zhang et al. 2025) removes
-splats in training, too, but drives opacities to zero by an optimisation of its own.
+The pictures decide how many. A round may change them by as much as lowers their PSNR by its part
+of `LOSS_DB`, if the changes by single splats add up and are not correlated with the present error.
+So a scene keeps the splats that it needs, whatever the cap was.
+
+GaussianSpa (Zhang et al. 2025) removes splats during training by an optimisation that drives their
+opacities to zero. Here splats are chosen by how much the pictures would change, as in
+`capacity.pruning`.
 """
 
 from __future__ import annotations
@@ -19,30 +23,29 @@ from stages.measure.selection import ROUND_SHARE, select_removal
 from stages.raster.smoothing import smoothed
 from stages.scene import Camera, Splats, evenly_spaced
 from stages.training.conversion import splats_of, valid_rows
-from stages.training.density import BoundedDensity
+from stages.training.density import DensityRule
 from stages.training.optimiser import Model, empty_model
 
 if TYPE_CHECKING:
-    from stages.training.density import AdaptiveDensity
     from stages.training.trainer import Trainer
     from stages.training.views import TrainingView
 
-# Shares of the run after which a tenth of the splats is removed. Together they remove a third.
-SHARES = (0.52, 0.63, 0.74, 0.85)
+SHARES = (0.52, 0.57, 0.62, 0.67, 0.72, 0.77, 0.82, 0.87)  # of the run, after which a round happens
+LOSS_DB = 0.1  # PSNR of the training views that all rounds together may cost
 MAX_VIEWS = 48  # on which contributions are measured
 
 
 @dataclass(frozen=True)
 class Sparsification:
-    """Removes splats that contribute least to the training views, see `SHARES`.
+    """Removes splats that contribute least to the training views.
 
     Args:
         start: of the run; has the origin of the coordinates.
-        density: what densifies; splats outside its bounds stay.
+        density: what densifies; splats outside its region stay.
     """
 
     start: Splats
-    density: AdaptiveDensity | BoundedDensity
+    density: DensityRule
 
     def after_step(self, trainer: Trainer, step: int) -> None:
         """See `hooks.StepHook`."""
@@ -55,27 +58,28 @@ class Sparsification:
         trainer.replace_model(self._sparser(trainer, model))
 
     def _sparser(self, trainer: Trainer, model: Model) -> Model:
-        """The model without a tenth of its splats."""
+        """The model after one round."""
         splats = splats_of(model, trainer.schedule.sh_degree, self.start, trainer.draw_settings)
         if trainer.smooth:
             splats = smoothed(splats, model.smoothing)
-        most = int(ROUND_SHARE * len(splats))
-        if not most:
-            return model
         rows = evenly_spaced(range(len(trainer.train)), MAX_VIEWS)
         cameras = [trainer.cameras[row] for row in rows]
-        views = map(_evaluation_view, [trainer.train[row] for row in rows], cameras)
+        background = trainer.draw_settings.background
+        views = (
+            _evaluation_view(trainer.train[row], camera, background)
+            for row, camera in zip(rows, cameras, strict=True)
+        )
         contributions = measure_contributions(splats, views, trainer.backend)
-        removal = select_removal(splats, contributions, cameras, np.inf, most)
+        change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
+        most = int(ROUND_SHARE * len(splats))
+        removal = select_removal(splats, contributions, cameras, np.inf, most, change=change)
         if removal is None:
             return model
-        removed = removal.removed
-        if isinstance(self.density, BoundedDensity):
-            removed &= self.density.inside(model)
-        return model.take(~removed)
+        return model.take(~removal.removed | ~self.density.inside(model))
 
 
-def _evaluation_view(view: TrainingView, camera: Camera) -> EvaluationView:
+def _evaluation_view(view: TrainingView, camera: Camera, background: float) -> EvaluationView:
     level = view.levels[-1]
     pixels = np.ascontiguousarray(level.pixels.transpose(1, 2, 0))
-    return EvaluationView(view.name, camera, pixels, level.mask, level.outside)
+    photograph = EvaluationView(view.name, camera, pixels, level.mask, level.outside)
+    return photograph.in_median_light(level.light).over(background)

@@ -108,6 +108,9 @@ class Clouds:
         more.means[:] = 0.0, 0.0, 3.0
         return model.joined(more)
 
+    def inside(self, model):
+        return np.ones(len(model), bool)
+
 
 @pytest.mark.parametrize("steps", [1, 60, 403])
 def test_no_floater_is_left_at_the_end_of_training(tmp_path, monkeypatch, steps):

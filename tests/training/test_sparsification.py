@@ -1,43 +1,55 @@
 """Splats that contribute least are removed while training goes on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stages.base.stage import Report
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
-from stages.scene import DrawSettings
+from stages.scene import TRANSPARENT, DrawSettings
 from stages.training.conversion import model_of
 from stages.training.density import AdaptiveDensity, BoundedDensity
+from stages.training.hooks import FLOATER_REMOVALS
 from stages.training.schedule import DENSIFICATION_END, Schedule
-from stages.training.sparsification import SHARES, Sparsification
+from stages.training.sparsification import LOSS_DB, SHARES, Sparsification
 from stages.training.trainer import Trainer
-from tests.scenes import camera, cloud
+from tests.scenes import camera, cloud, join
 from tests.training.pictures import view_of
 
 STEPS = 300
 WHERE = camera(40, 30)
+NOISE = 0.1  # of the photographs: 20 dB, so that there is an error which a loss is a part of
+NEAR = DrawSettings(near=0.1)
+RULE = AdaptiveDensity(10.0, 3)
 
 
-def trainer(folder, start, within=()):
-    """A run on the picture of `start` that does not densify."""
-    picture = np.clip(render(start, WHERE, RasterSettings()).image, 0, 1)
+def drawn(splats):
+    return np.clip(render(splats, WHERE, RasterSettings()).image, 0, 1)
+
+
+def noisy(picture, noise=NOISE):
+    return np.clip(picture + np.random.default_rng(0).normal(0, noise, picture.shape), 0, 1)
+
+
+def trainer(folder, start, within=(), views=None, draw=NEAR):
+    """A run on a noisy picture of `start`, or on other views, that does not densify."""
     schedule = Schedule(steps=STEPS, extent=10.0, sh_degree=0, n_start=len(start), seed=0)
-    views = [view_of(f"{k}", picture, WHERE) for k in range(3)]
-    draw = DrawSettings(near=0.1)
+    views = views or [view_of(f"{k}", noisy(drawn(start)), WHERE) for k in range(3)]
     return Trainer(
         *(schedule, views, [], draw, len(start), folder, Report()), backend="cpu", within=within
     )
 
 
-def sparser(made, start, share, density):
+def sparser(made, start, share=SHARES[0], density=RULE):
     """The model after the step that reaches this share of the run."""
     made.stepper.load(model_of(start))
     Sparsification(start, density).after_step(made, round(share * STEPS))
     return made.model
 
 
-def test_a_third_of_the_splats_is_gone_at_the_end_and_none_before_densification_ends(tmp_path):
+def test_splats_are_removed_after_densification_at_the_planned_steps_only(tmp_path):
     start = cloud(400, 40, 30, degree=0)
     counts = {}
     made = trainer(tmp_path, start)
@@ -46,29 +58,67 @@ def test_a_third_of_the_splats_is_gone_at_the_end_and_none_before_densification_
     )
     end = made.run(start)
     half = int(DENSIFICATION_END * STEPS)
-    assert len(end) == counts[STEPS]
-    assert 0.6 < counts[STEPS] / counts[half] < 0.72
+    assert len(end) == counts[STEPS] < counts[half]
     fewer = [step for step in range(half + 1, STEPS + 1) if counts[step] < counts[step - 1]]
-    assert {round(share * STEPS) for share in SHARES} <= set(fewer)  # and floaters
+    rounds = {round(share * STEPS) for share in SHARES}
+    floaters = {round(STEPS * part / FLOATER_REMOVALS) for part in range(FLOATER_REMOVALS + 1)}
+    assert set(fewer) <= rounds | floaters
+    assert set(fewer) & rounds
 
 
-def test_the_picture_changes_far_less_than_without_a_tenth_at_random(tmp_path):
+def test_a_round_costs_no_more_than_its_part_of_the_bound(tmp_path):
+    start = cloud(2000, 40, 30, degree=0)
+    picture = noisy(drawn(start))
+    left = sparser(trainer(tmp_path, start), start)
+    assert 0 < 2000 - len(left) < 200  # the bound and not the largest share of a round decides
+    kept = start.take(np.isin(start.means[:, 0], left.means[:, 0]))
+    change = np.square(drawn(kept) - drawn(start)).sum()
+    allowed = np.square(drawn(start) - picture).sum() * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
+    # removed splats may lie over each other, which sums of single changes do not know
+    assert 0.5 * allowed < change < 1.5 * allowed
+
+
+def test_the_picture_changes_far_less_than_without_as_many_at_random(tmp_path):
     start = cloud(300, 40, 30, degree=0)
-    left = sparser(trainer(tmp_path, start), start, SHARES[0], AdaptiveDensity(10.0, 3))
+    left = sparser(trainer(tmp_path, start), start)
     kept = np.isin(start.means[:, 0], left.means[:, 0])
     at_random = np.random.default_rng(0).permutation(kept)
     picture, chosen, random = (
-        render(start.take(rows), WHERE, RasterSettings()).image
-        for rows in (np.ones(300, bool), kept, at_random)
+        drawn(start.take(rows)) for rows in (np.ones(300, bool), kept, at_random)
     )
-    assert kept.sum() == len(left) == 270
+    assert kept.sum() == len(left) < 300
     assert np.square(chosen - picture).sum() < 0.1 * np.square(random - picture).sum()
+
+
+def test_a_scene_keeps_what_its_photographs_need_and_loses_at_most_a_tenth_of_the_rest(tmp_path):
+    needed = cloud(100, 40, 30, degree=0)
+    # hardly opaque: an 8-bit picture does not show them
+    faint = replace(cloud(400, 40, 30, degree=0, seed=1), opacity_logits=np.full(400, -5.4, "f4"))
+    start = join(needed, faint)
+    exact = [view_of(f"{k}", drawn(start), WHERE) for k in range(3)]
+    left = sparser(trainer(tmp_path, start, views=exact), start)
+    assert np.isin(needed.means[:, 0], left.means[:, 0]).mean() > 0.9
+    assert 440 < len(left) < 500
+
+
+def test_cut_out_views_are_compared_over_the_background_that_they_are_drawn_on(tmp_path):
+    """Over black, as they are stored, their error on white would be large, and so would be what a
+    round may cost."""
+    start = cloud(300, 40, 30, degree=0)
+    view = view_of("cut out", drawn(start), WHERE)
+    alpha = np.rint(255 * render(start, WHERE, RasterSettings()).alpha).astype(np.uint8)
+    levels = [replace(level, mask=alpha, outside=TRANSPARENT) for level in view.levels]
+    views = [replace(view, levels=levels)] * 3
+    white = replace(NEAR, background=1.0)
+    on_white = sparser(trainer(tmp_path, start, views=views, draw=white), start)
+    on_black = sparser(trainer(tmp_path, start, views=views), start)
+    assert abs(len(on_white) - len(on_black)) <= 3
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.6, 0.9, 1.0])
 def test_between_these_steps_nothing_is_removed(tmp_path, share):
     start = cloud(100, 40, 30, degree=0)
-    left = sparser(trainer(tmp_path, start), start, share, AdaptiveDensity(10.0, 3))
+    left = sparser(trainer(tmp_path, start), start, share)
     assert len(left) == 100
 
 
@@ -85,12 +135,12 @@ def test_splats_outside_the_bounds_stay(tmp_path):
 def test_splats_that_are_not_finite_do_not_stop_it(tmp_path):
     start = cloud(100, 40, 30, degree=0)
     start.means[3] = np.nan
-    left = sparser(trainer(tmp_path, start), start, SHARES[0], AdaptiveDensity(10.0, 3))
+    left = sparser(trainer(tmp_path, start), start)
     assert np.isfinite(left.means).all()
     assert 85 < len(left) < 99
 
 
 def test_one_splat_stays(tmp_path):
     start = cloud(1, 40, 30, degree=0)
-    left = sparser(trainer(tmp_path, start), start, SHARES[0], AdaptiveDensity(10.0, 3))
+    left = sparser(trainer(tmp_path, start), start)
     assert len(left) == 1
