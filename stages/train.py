@@ -51,7 +51,7 @@ class TrainSettings:
     sh_degree: int = setting(2, "Degree of view-dependent colour, 0 (none) to 3.", min=0, max=3)
     max_splats: int = setting(
         0,
-        "Largest number of splats; a third of them is removed before training ends. 0: what "
+        "Largest number of splats; those that photographs can spare are removed later. 0: what "
         "free memory allows, with no more parameters than the photographs have pixel values.",
         panel="Size",
         min=0,
