@@ -216,7 +216,9 @@ def _report_cap(trainer: Trainer, report: Report) -> None:
             "train-gpu-memory",
             f"The GPU's memory was full: trained with at most {trainer.cap:,} splats.",
         )
-    if max(entry["splats"] for entry in trainer.history) < 0.98 * trainer.cap:
+    densified = max(entry["splats"] for entry in trainer.history)
+    report.metric("densified_splats", densified)
+    if densified < 0.98 * trainer.cap:
         return
     more = "more memory, or a higher --max-splats, may add detail"
     if origin == PHOTOGRAPHS:
@@ -226,7 +228,8 @@ def _report_cap(trainer: Trainer, report: Report) -> None:
         )
     report.warn(
         "train-splat-cap-reached",
-        f"Densification stopped at the cap of {trainer.cap:,} splats; {more}.",
+        f"Densification stopped at the cap of {trainer.cap:,} splats, of which the photographs need "
+        f"{report.metrics['splats']:,}; {more}.",
     )
 
 
