@@ -228,8 +228,8 @@ def _report_cap(trainer: Trainer, report: Report) -> None:
         )
     report.warn(
         "train-splat-cap-reached",
-        f"Densification stopped at the cap of {trainer.cap:,} splats, of which the photographs need "
-        f"{report.metrics['splats']:,}; {more}.",
+        f"Densification stopped at the cap of {trainer.cap:,} splats, of which the photographs "
+        f"need {report.metrics['splats']:,}; {more}.",
     )
 
 
