@@ -244,12 +244,15 @@ def squared_error(splats: Splats, views: Iterable[EvaluationView], backend: str)
     return found
 
 
-def near_view_frusta(splats: Splats, cameras: Iterable[Camera]) -> NDArray[np.bool_]:
-    """[N] splats that project into a picture or just beyond its edge, where new views look."""
+def near_view_frusta(
+    splats: Splats, cameras: Iterable[Camera], margin: float = MARGIN
+) -> NDArray[np.bool_]:
+    """[N] splats that project into a picture or just beyond its edge, where new views look: by at
+    most `margin` of its longer side."""
     near = np.zeros(len(splats), bool)
     for camera in cameras:
         pixels, z = camera.project(splats.means)
         size = np.array([camera.width, camera.height])
-        margin = MARGIN * size.max()
-        near |= (z > 0) & ((pixels > -margin) & (pixels < size + margin)).all(1)
+        beyond = margin * size.max()
+        near |= (z > 0) & ((pixels > -beyond) & (pixels < size + beyond)).all(1)
     return near

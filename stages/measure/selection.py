@@ -58,6 +58,7 @@ def select_removal(
     most: int,
     share: float = ROUND_SHARE,
     change: float = np.inf,
+    complete: bool = True,
 ) -> Removal | None:
     """The splats and SH coefficients that contribute less than `sse_per_parameter` for each of
     their parameters, least first; None if there are none.
@@ -67,9 +68,10 @@ def select_removal(
     capture lost 5 dB without the tenth that seemed to do most harm. Fine-tuning corrects what the
     residual asks for in any case. The predicted change of the error is measured by the error.
 
-    Floaters, and splats outside the region around the views, are removed at any multiplier. Splats
-    that fewer than `FEW_VIEWS` views see, or that lie just outside all pictures, are removed last,
-    and only if `sse_per_parameter` is infinite: the views say little about them.
+    Floaters, splats outside the region around the views, and those that lie within a picture and
+    are hidden in all of them are removed at any multiplier. Other splats that fewer than
+    `FEW_VIEWS` views see, or that lie just outside all pictures, are removed last, and only if
+    `sse_per_parameter` is infinite: the views say little about them.
 
     Args:
         splats: N splats.
@@ -80,11 +82,14 @@ def select_removal(
         share: of the splats; so many times `SH_FACTOR` may lose SH degrees.
         change: summed squared change of the pictures that removed splats may make, as if the
             effects of single removals added up. Floaters do not count.
+        complete: whether these are all training views. If not, another may see what they do not.
     """
     seen, near = contributions.view_counts > 0, near_view_frusta(splats, list(cameras))
     floaters = near_camera_floaters(splats, contributions, list(cameras))
     floaters |= splats_in_masks(contributions)
     free = floaters | (~seen & ~near)
+    if complete:
+        free |= ~seen & near_view_frusta(splats, list(cameras), margin=0.0)
     ratio = contributions.picture_change / parameters_per_splat(splats.sh_degrees)
     ratio[(contributions.view_counts < FEW_VIEWS) & near] = np.finfo(np.float64).max
     ratio[free] = -np.inf

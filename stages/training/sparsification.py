@@ -19,7 +19,7 @@ import numpy as np
 
 from stages.measure.contribution import measure_contributions
 from stages.measure.evaluation import EvaluationView
-from stages.measure.selection import ROUND_SHARE, select_removal
+from stages.measure.selection import select_removal
 from stages.raster.smoothing import smoothed
 from stages.scene import Camera, Splats, evenly_spaced
 from stages.training.conversion import splats_of, valid_rows
@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from stages.training.trainer import Trainer
     from stages.training.views import TrainingView
 
-SHARES = (0.52, 0.57, 0.62, 0.67, 0.72, 0.77, 0.82, 0.87)  # of the run, after which a round happens
+SHARES = (0.52, 0.63, 0.74, 0.85)  # of the run, after which a round happens
+LARGEST_ROUND = 0.2  # of the splats
 LOSS_DB = 0.1  # PSNR of the training views that all rounds together may cost
 MAX_VIEWS = 48  # on which contributions are measured
 
@@ -71,8 +72,11 @@ class Sparsification:
         )
         contributions = measure_contributions(splats, views, trainer.backend)
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
-        most = int(ROUND_SHARE * len(splats))
-        removal = select_removal(splats, contributions, cameras, np.inf, most, change=change)
+        most = int(LARGEST_ROUND * len(splats))
+        every = len(rows) == len(trainer.train)
+        removal = select_removal(
+            *(splats, contributions, cameras, np.inf, most), change=change, complete=every
+        )
         if removal is None:
             return model
         return model.take(~removal.removed | ~self.density.inside(model))
