@@ -41,6 +41,13 @@ class TrainSettings:
         min=1,
         max=1_000_000,
     )
+    steps_per_view: int = setting(
+        400,
+        "Training steps for each training view, at most: more fit these views alone. 0: no limit.",
+        panel="Advanced",
+        min=0,
+        max=1_000_000,
+    )
     train_side: int = setting(
         800,
         "Longer side of the photographs in training (pixels).",

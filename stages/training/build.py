@@ -59,10 +59,11 @@ def make_trainer(
         cameras |= {view.name: view.camera for view in held_out}
         refinement = CameraRefinement.of(cameras, extent)
         backend = _on_the_host(backend, report)
+    most_steps = settings.steps_per_view * len(train)
     seconds = settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0)
     return Trainer(
         schedule=Schedule(
-            steps=settings.steps,
+            steps=_limited_steps(settings, len(train), report),
             extent=extent,
             sh_degree=settings.sh_degree,
             n_start=min(n_start, cap.splats),
@@ -78,9 +79,24 @@ def make_trainer(
         random_background=settings.background == "any",
         backend=backend,
         seconds=seconds,
+        most_steps=most_steps,
         refinement=refinement,
         within=settings.within,
     )
+
+
+def _limited_steps(settings: TrainSettings, views: int, report: Report) -> int:
+    """The steps of a run on so many training views, with a warning if they are fewer than asked."""
+    most = settings.steps_per_view * views
+    if not most or settings.steps <= most:
+        return settings.steps
+    report.warn(
+        "train-steps-limited",
+        f"Training makes {most:,} steps instead of {settings.steps:,}: {settings.steps_per_view} "
+        f"for each of {counted(views, 'training view')}. More would fit these views alone; "
+        "--steps-per-view 0 makes them all.",
+    )
+    return most
 
 
 def _on_the_host(backend: str, report: Report) -> str:

@@ -43,7 +43,7 @@ def step_hooks(trainer: Trainer, start: Splats) -> list[StepHook]:
     density: DensityRule = BoundedDensity(adaptive, trainer.within) if trainer.within else adaptive
     # Of very many held-out views a part is evaluated, so that it takes less time than training.
     views = [trainer.held_out[i] for i in evaluation_subset(len(trainer.held_out))]
-    time_limit = TimeLimit(trainer.seconds)
+    time_limit = TimeLimit(trainer.seconds, trainer.most_steps)
     return [
         FloaterRemoval(known_free_space(start.means, trainer.cameras)),
         Densification(density),

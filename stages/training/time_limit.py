@@ -24,10 +24,12 @@ class TimeLimit:
 
     Args:
         seconds: the limit; 0 for none.
+        most_steps: of the run; 0 for any number.
         reserve: seconds of it that are kept for what follows the last step.
     """
 
     seconds: float
+    most_steps: int = 0
     reserve: float = 0.0
     _last: tuple[int, float] | None = None
 
@@ -42,7 +44,8 @@ class TimeLimit:
             return None
         self._last = step, elapsed
         left = self.seconds - self.reserve - elapsed
-        return step + max(1, int(left * steps / seconds))
+        fitting = step + max(1, int(left * steps / seconds))
+        return min(fitting, self.most_steps) if self.most_steps else fitting
 
     def reserve_for_end(self, evaluation_seconds: float) -> None:
         """Keep time for the end of a run in which one evaluation took so long."""

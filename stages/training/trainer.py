@@ -63,6 +63,7 @@ class Trainer:
             views are cut out.
         backend: the rasteriser's, which also decides the training step.
         seconds: limit of wall time; 0 for none.
+        most_steps: that a limit of wall time may plan; 0 for any number.
         refinement: of the cameras of the training views; None leaves them as they are.
         within: rectangle of the ground plane that densification is limited to, see
             `density.BoundedDensity`; () for none.
@@ -79,6 +80,7 @@ class Trainer:
     random_background: bool = False
     backend: str = AUTO
     seconds: float = 0.0
+    most_steps: int = 0
     refinement: CameraRefinement | None = None
     within: tuple[float, ...] = ()
     stepper: TrainingStep = field(init=False)

@@ -1,19 +1,23 @@
-"""Runs with a time limit, and schedules that change during the run."""
+"""How many steps a run makes: its settings, its training views and a time limit decide."""
 
 import numpy as np
 import pytest
 
+from stages.base.stage import Report
+from stages.train import TrainSettings
+from stages.training.build import make_trainer
 from stages.training.schedule import RATE_DECAY_END, RESOLUTIONS, Schedule
 from stages.training.time_limit import TimeLimit
+from tests.small_scene import small_scene
 
 
 def schedule(steps=3000):
     return Schedule(steps=steps, extent=1.0, sh_degree=2, n_start=1000, seed=0)
 
 
-def simulated(seconds, cost, steps=100_000):
+def simulated(seconds, cost, steps=100_000, most_steps=0):
     """(seconds that a run takes, its schedule at the end), if a step at a share costs `cost`."""
-    plan, pace = schedule(steps), TimeLimit(seconds, reserve=1.0)
+    plan, pace = schedule(steps), TimeLimit(seconds, most_steps, reserve=1.0)
     spent, step = 0.0, 0
     while step < plan.steps:
         spent += cost(plan.share(step))
@@ -40,6 +44,26 @@ def test_a_run_with_a_time_limit_ends_within_a_tenth_of_it_and_goes_through_all_
     assert took == pytest.approx(seconds, rel=0.1)
     assert plan.share(plan.steps) == pytest.approx(1.0)
     assert plan.rate_factor(plan.steps) == pytest.approx(RATE_DECAY_END * plan.boost)
+
+
+def test_a_time_limit_plans_no_more_steps_than_the_training_views_allow():
+    took, plan = simulated(60.0, lambda share: 0.02, steps=500, most_steps=800)
+    assert plan.steps == 800
+    assert took < 20
+    assert plan.share(800) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("steps", "per_view", "wanted"), [(500, 100, 400), (400, 100, 400), (500, 0, 500)]
+)
+def test_each_training_view_takes_a_bounded_number_of_steps(tmp_path, steps, per_view, wanted):
+    scene, report = small_scene(tmp_path, views=5), Report()  # one of them is held out
+    settings = TrainSettings(steps=steps, steps_per_view=per_view, max_splats=100)
+    made = make_trainer(scene.reconstruction, 50, settings, tmp_path, report)
+    assert made.schedule.steps == wanted
+    limited = [text for code, text in report.warnings if code == "train-steps-limited"]
+    assert len(limited) == (wanted < steps)
+    assert all("400 steps instead of 500" in text for text in limited)
 
 
 def test_steps_that_take_a_second_each_still_end_in_time():
