@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -20,8 +20,9 @@ _NARROWEST = 0.9  # of the outermost lit radius: how far within it that ring lie
 _MARGIN = 0.01  # of the radius, for the blurred rim
 
 
-def brightest(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """[h, w] the brightest value of each pixel in any channel of any picture [H, W, 3], small."""
+def brightest(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """[h, w] the brightest value of each pixel in any channel of any picture [H, W, 3], small. At
+    least one picture."""
     small = [_reduced(picture) for picture in pictures]
     return np.asarray(np.max(small, axis=0), np.uint8)
 

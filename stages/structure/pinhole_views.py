@@ -106,6 +106,7 @@ def write_pinhole_views(
             photos[number], cameras[number], number, cut, tables[id(cut)], source, folder
         )
         shown += shown_share(cut.field, cut.faces)
+    report.progress(len(photos), len(photos), "undistorting", photographs=len(photos))
     _report(photos, cuts, 1.0 - shown / len(photos), report)
     return sorted(views, key=lambda view: view.number)
 
@@ -127,11 +128,10 @@ def _cuts(
     folded: list[str] = []
     for members in groups.values():
         camera = cameras[members[0]]
-        looked_at = [i for i in members if photos[i].outside != TRANSPARENT]
-        pictures = [
-            read_picture(source / photos[i].image) for i in evenly_spaced(looked_at, LOOKED_AT)
-        ]
-        radius = circle_radius(brightest(pictures), camera) if pictures else float("inf")
+        opaque = [i for i in members if photos[i].outside != TRANSPARENT]
+        chosen = evenly_spaced(opaque, LOOKED_AT)
+        pictures = (read_picture(source / photos[i].image) for i in chosen)
+        radius = circle_radius(brightest(pictures), camera) if chosen else float("inf")
         field = Field.of(camera, lenses[members[0]], radius)
         if field.folded_share() > _LOST_SHARE:
             folded += [photos[i].name for i in members]
