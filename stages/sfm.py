@@ -280,7 +280,7 @@ def usable_features(wanted: str, report: Report) -> str:
 def _report_model(
     found: Reconstruction, mean_error_px: float, capture: Capture, report: Report
 ) -> None:
-    names = {view.name for view in found.views}
+    names = {name for view in found.views for name in (view.name, view.frame)}
     report.metric("photographs", len(capture.photos))
     report.metric("registered_images", len(found.views))
     lost = dict.fromkeys(photo.source for photo in capture.photos if photo.name not in names)
@@ -309,5 +309,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=19, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=20, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

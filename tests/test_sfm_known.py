@@ -17,7 +17,7 @@ from stages.scene import Reconstruction, split_held_out
 from stages.scene.place import local_positions
 from stages.scene.rotations import quaternions_of
 from tests.structure import bad_captures
-from tests.structure.truth import TRUTH, centres, similarity
+from tests.structure.truth import TRUTH, centres, off_by, similarity
 
 POSES = {
     photo["name"]: np.array(photo["world_to_camera"])
@@ -137,16 +137,6 @@ def split_file(path: Path) -> list[str]:
     }
     path.write_text(json.dumps(data))
     return names
-
-
-def off_by(pose: np.ndarray, degrees: float, metres: float, r: np.random.Generator) -> np.ndarray:
-    """A camera turned and moved by about as much, at random."""
-    turn, _ = cv2.Rodrigues(np.radians(degrees) * r.normal(size=3) / np.sqrt(3))
-    found = pose.copy()
-    found[:3, :3] = turn @ pose[:3, :3]
-    centre = -pose[:3, :3].T @ pose[:3, 3] + metres * r.normal(size=3) / np.sqrt(3)
-    found[:3, 3] = -found[:3, :3] @ centre
-    return found
 
 
 @pytest.mark.slow

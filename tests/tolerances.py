@@ -109,3 +109,13 @@ ENGINE_DB = {"playcanvas": 34.0, "spark": 29.0, "three": 26.0}
 PlayCanvas 36 (16-bit colours); Spark 34, of a .splat 30 (8-bit colours); three 28 and 27 (it cuts
 splats at two standard deviations, and draws each primitive of a quantised .glb by itself). Wrong
 quaternions, axes or colours come to 20 or less."""
+
+FISHEYE_LEVELS = 2.5
+"""Of 255, by which a pixel of a fisheye's face may differ from the colour of its direction: half a
+step of rounding in the photograph and in the face, and what cubic interpolation leaves of a colour
+that is not linear in the picture."""
+
+FISHEYE_DEPTH = 0.03
+"""Relative error of z in a face, of a depth map with a pixel a degree, to 60 degrees from the
+photograph's axis: 0.7 pixels to the nearest, times the slope of the cosine there, and rounding of
+the face's size."""

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError
 
 MAX_ANGLE = 1.5  # radians from the axis; a pinhole camera sees less than pi / 2
+_BEHIND = 3.1  # radians from the axis; the direction straight behind is a circle in the picture
+_TURNS, _ANGLES = 32, 361  # samples of the angle up to which a lens does not fold
 _ITERATIONS = 60
 _STEP = 1e-6
 _TOLERANCE = 1e-9
@@ -56,11 +58,17 @@ class Lens:
     @property
     def distorts(self) -> bool:
         """Whether it differs from a pinhole."""
-        return "fisheye" in self.kind or any(self._terms)
+        return self.by_angle or any(self._terms)
+
+    @property
+    def by_angle(self) -> bool:
+        """Whether it is a fisheye: a function of the angle from the axis, which may be 90 degrees
+        and more."""
+        return "fisheye" in self.kind
 
     def distort(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
         """[..., 2] distorted coordinates of `uv` [..., 2]."""
-        if "fisheye" not in self.kind:
+        if not self.by_angle:
             return self._distorted(uv)
         radius = np.linalg.norm(uv, axis=-1, keepdims=True)
         return self._distorted(uv * _ratio(np.arctan(radius), radius))
@@ -68,6 +76,44 @@ class Lens:
     def undistort(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N, 2] the inverse of `distort` by Newton's method, in the region around the axis where
         `distort` is injective; NaN outside it, and beyond `MAX_ANGLE`."""
+        at, found = self._solved(seen)
+        if self.by_angle:
+            with np.errstate(all="ignore"):
+                angle = np.linalg.norm(at, axis=1, keepdims=True)
+                found &= angle[:, 0] < MAX_ANGLE
+                at = at * _ratio(np.tan(angle), angle)
+        return np.where(found[:, None], at, np.nan)
+
+    def project(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[..., 2] distorted coordinates of directions [..., 3] of any length, of a fisheye. They
+        mean nothing beyond `widest_angle`."""
+        across = np.linalg.norm(directions[..., :2], axis=-1, keepdims=True)
+        angle = np.arctan2(across, directions[..., 2:])
+        return self._distorted(directions[..., :2] * _ratio(angle, across))
+
+    def directions(self, seen: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[N, 3] unit directions that a fisheye shows at `seen` [N, 2]: the inverse of `project`.
+        NaN as of `undistort`, but up to all around."""
+        at, found = self._solved(seen)
+        with np.errstate(all="ignore"):
+            angle = np.linalg.norm(at, axis=1, keepdims=True)
+            found &= angle[:, 0] < _BEHIND
+            shown = np.hstack([at * _ratio(np.sin(angle), angle), np.cos(angle)])
+        return np.where(found[:, None], shown, np.nan)
+
+    def widest_angle(self) -> float:
+        """The angle from the axis, radians, up to which a fisheye is injective: beyond, its radius
+        decreases, and the picture would show two directions at one place."""
+        angles, turns = np.linspace(0, _BEHIND, _ANGLES), np.linspace(0, 2 * np.pi, _TURNS)
+        around = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+        at = angles[:, None, None] * around
+        with np.errstate(all="ignore"):
+            found = np.linalg.det(self._jacobian(at.reshape(-1, 2))).reshape(at.shape[:2])
+        good = np.logical_and.accumulate((found > 0).all(axis=1))
+        return float(angles[max(int(good.sum()) - 1, 0)])
+
+    def _solved(self, seen: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """([N, 2] what `_distorted` takes to `seen`, [N] whether it was found)."""
         at = seen.copy()
         with np.errstate(all="ignore"):
             for _ in range(_ITERATIONS):
@@ -79,11 +125,7 @@ class Lens:
             # A step may jump over a fold: from the axis on, the determinant must stay positive.
             for share in np.linspace(0.0, 1.0, 17):
                 found &= np.linalg.det(self._jacobian(share * at)) > 0
-            if "fisheye" in self.kind:
-                angle = np.linalg.norm(at, axis=1, keepdims=True)
-                found &= angle[:, 0] < MAX_ANGLE
-                at = at * _ratio(np.tan(angle), angle)
-        return np.where(found[:, None], at, np.nan)
+        return at, found
 
     def _jacobian(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
         """[N, 2, 2] derivatives of `_distorted`."""

@@ -70,7 +70,7 @@ def faces(pixels: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> I
             continue
         w, x, y, z = quaternions_of(rotation).tolist()
         yield CutFace(
-            f"{yaw:03d}{pitch:+03d}",
+            direction_name(yaw, pitch),
             np.asarray(cv2.remap(around, *tables, cv2.INTER_CUBIC), np.uint8),
             None if cut is None else np.asarray(cut, np.uint8),
             focal,
@@ -81,23 +81,34 @@ def faces(pixels: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> I
 def face_photos(photo: Photo, masked: MaskedPhoto) -> Iterator[tuple[Photo, MaskedPhoto]]:
     """The faces of a panorama as photographs, with their pictures and masks; `photo` and `masked`
     are of the whole."""
-    image = PurePosixPath(photo.image)
     for face in faces(masked.decoded.pixels, masked.mask):
         cut = replace(masked.decoded, pixels=face.pixels, unchanged_jpeg=None)
         part = replace(masked, decoded=cut, mask=face.mask)
-        file, side = f"{image}/{face.name}{image.suffix}", len(face.pixels)
-        described = replace(
-            photo,
-            name=f"{photo.name}/{face.name}",
-            image=file,
-            width=side,
-            height=side,
-            focal_px=face.focal_px,
-            camera=f"{photo.camera} {face.name}",
-            mask=part.file(file),
-            face=Face(photo.camera, photo.name, face.turn),
-        )
-        yield described, part
+        side = len(face.pixels)
+        described = face_photo(photo, face.name, side, side, face.focal_px)
+        mask, place = part.file(described.image), Face(photo.camera, photo.name, face.turn)
+        yield replace(described, mask=mask, face=place), part
+
+
+def direction_name(yaw_deg: int, pitch_deg: int) -> str:
+    """The name of a face by its direction ("072+25")."""
+    return f"{yaw_deg:03d}{pitch_deg:+03d}"
+
+
+def face_photo(photo: Photo, name: str, width: int, height: int, focal_px: float) -> Photo:
+    """The photograph that shows one face of `photo`, without a mask, a depth map and a turn."""
+    image = PurePosixPath(photo.image)
+    return replace(
+        photo,
+        name=f"{photo.name}/{name}",
+        image=f"{image}/{name}{image.suffix}",
+        width=width,
+        height=height,
+        focal_px=focal_px,
+        camera=f"{photo.camera} {name}",
+        mask="",
+        depth="",
+    )
 
 
 def face_rotation(yaw_deg: float, pitch_deg: float) -> NDArray[np.float64]:

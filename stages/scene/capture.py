@@ -22,13 +22,13 @@ IGNORE, TRANSPARENT = "ignore", "transparent"  # meaning of pixels outside a mas
 
 @dataclass(frozen=True)
 class Face:
-    """Where a pinhole picture was cut out of a panorama.
+    """Where a pinhole picture was cut out of a panorama or of a wide fisheye photograph.
 
     Args:
         rig: a key that is equal for panoramas of the same camera and size: one COLMAP rig.
-        frame: the name of the panorama: one COLMAP frame of that rig.
-        turn: unit quaternion (w, x, y, z) of the rotation from the panorama's axes (x right, y
-            down, z towards its middle) to those of the pinhole camera.
+        frame: the name of the panorama or photograph: one COLMAP frame of that rig.
+        turn: unit quaternion (w, x, y, z) of the rotation from its axes (x right, y down, z towards
+            its middle) to those of the pinhole camera.
     """
 
     rig: str
@@ -38,7 +38,8 @@ class Face:
 
 @dataclass(frozen=True)
 class Photo:
-    """One usable photograph, or one face of a panorama, as ingest wrote it.
+    """One usable photograph, or one face of a panorama, as ingest wrote it; or one face of a
+    photograph with a wide fisheye.
 
     Args:
         name: the user's own relative path in posix style ("day 1/IMG_01.HEIC"); of a
@@ -111,7 +112,7 @@ class View:
         camera: pose and intrinsics.
         role: "train" or "test" where a benchmark defines the split; "" elsewhere.
         light: exposure and white balance, see `scene.light`; None if they could not be measured.
-        frame: the name of the panorama that this is a face of; "" for a photograph.
+        frame: the name of the panorama or wide fisheye that this is a face of; "" for a photograph.
         vignetting: of its camera, see `scene.light`; None if none was found.
     """
 
@@ -192,7 +193,7 @@ def split_held_out(views: tuple[View, ...]) -> tuple[tuple[View, ...], tuple[Vie
 
     A near-duplicate of another view would measure how well that other view was learnt, so the first
     of the eight that is no near-duplicate is held out instead. With fewer than 4 views nothing is.
-    The faces of a panorama count as one, and are held out together.
+    The faces of a panorama or fisheye count as one, and are held out together.
     """
     ordered = tuple(sorted(views, key=lambda view: view.name))
     if any(view.role for view in ordered):

@@ -10,9 +10,9 @@ Without known cameras (`stages.sfm`):
 - `sparse_model` holds the result with its statistics (`view_graph`, `epipolar`), `gates` check
   them, and `acceptance` decides which model is used.
 
-With known cameras: `match_cameras`, `known_cameras`, `known_cameras_worker` and `known_points`.
+With known cameras: `match_cameras`, `known_cameras`, `known_cameras_worker` and `known_points`;
+`pinhole_views` cuts wide fisheyes into faces.
 
-Both end in `finish`: `levelling`, `metric_scale` (`markers`), `undistortion` and
-`undistorted_images`; then `light` measures exposure and vignetting, and `reconstruction_files`
-stores the result.
+Both end in `finish`: `levelling`, `metric_scale` (`markers`) and `undistorted_images`; then `light`
+measures exposure and vignetting, and `reconstruction_files` stores the result.
 """

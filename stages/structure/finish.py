@@ -14,6 +14,7 @@ from stages.base.stage import Report
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.colmap import ColmapModel, write_colmap_model
 from stages.cameras.lens import Lens
+from stages.cameras.undistortion import SimpleRadial, undistorted_px
 from stages.scene import Camera, Capture, Photo, Reconstruction, View
 from stages.structure.gps import MetricScale
 from stages.structure.levelling import level_and_recentre
@@ -25,7 +26,6 @@ from stages.structure.undistorted_images import (
     mask_file,
     write_undistorted_images,
 )
-from stages.structure.undistortion import SimpleRadial, undistorted_px
 
 COLMAP = "colmap"
 SPARSE = f"{COLMAP}/sparse/0"

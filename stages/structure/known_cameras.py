@@ -1,5 +1,5 @@
-"""A reconstruction from known cameras: pictures undistorted, poses checked against matches, points
-from the camera file, from matches with the poses held fixed, or at random."""
+"""A reconstruction from known cameras: pinhole pictures, poses checked against matches, points from
+the camera file, from matches with the poses held fixed, or at random."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
 from stages.cameras.table import read_cameras, read_points
+from stages.cameras.undistortion import undistorted_camera
 from stages.scene import Camera, Capture, Photo, Reconstruction
+from stages.scene.rotations import quaternions_of
 from stages.structure import database as sqlite
 from stages.structure.finish import COLMAP, Observations, write_reconstruction
 from stages.structure.job import CameraGuess, Job, known_cameras_path, prepare_work_folder
@@ -28,16 +30,17 @@ from stages.structure.known_points import find_points
 from stages.structure.levelling import levelling_rotation, up_direction
 from stages.structure.match_cameras import PosedPhoto, match_cameras
 from stages.structure.metric_scale import KnownScale, find_metric_scale
+from stages.structure.pinhole_views import PinholeView, write_pinhole_views
 from stages.structure.process import run_step
 from stages.structure.sparse_model import camera_centres
-from stages.structure.undistorted_images import IMAGES, mask_file, write_undistorted_images
+from stages.structure.undistorted_images import IMAGES, mask_file
 
 NEIGHBOURS = 10
 _NEXT_IN_ORDER = 2  # photographs, which are matched whatever the poses say
-EXHAUSTIVE_UP_TO = 25  # photographs
+EXHAUSTIVE_UP_TO = 25  # views
+_SAME_PART = 1e-6  # difference of the rotations of two faces in the same direction
 INLIER_RATIO, ROUGH_INLIER_RATIO = 0.5, 0.5  # of the median pair; rough: at four times the distance
 FEWEST_PAIRS = 3
-_LOST_SHARE = 0.02
 
 
 def reconstruct(
@@ -78,17 +81,16 @@ def reconstruct(
     _check_usable(posed, refine)
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
     photos, taken, lenses = zip(*((p.photo, p.camera, p.lens) for p in posed), strict=True)
-    cameras, share = write_undistorted_images(photos, taken, lenses, capture.folder, folder, report)
-    _report_lost_area(1.0 - share, report)
-    training = [i for i, one in enumerate(posed) if one.role != "test"]
-    job = _job(photos, cameras, training, folder, work, seed, max_features, refine)
+    views = write_pinhole_views(photos, taken, lenses, capture.folder, folder, report)
+    training = [i for i, view in enumerate(views) if posed[view.number].role != "test"]
+    job = _job([views[i] for i in training], folder, work, seed, max_features, refine)
     _match(job, work, report, seconds_left)
     triangulated = Path(job.out) / "points.npz"
     _check_poses(Path(job.out), report, allow_partial)
     if refine:
-        cameras = _refined(cameras, triangulated, report)
+        views = _refined(views, triangulated, report)
     cloud, observations = find_points(
-        from_file, triangulated, training, photos, cameras, folder, seed, report
+        from_file, triangulated, training, views, _whole(views, posed), folder, seed, report
     )
     georeference = found.georeference
     if georeference.metres_per_unit and not known_scale.metres_per_unit:
@@ -99,47 +101,62 @@ def reconstruct(
         )
     known_scale = replace(known_scale, place=georeference.place)
     axes = georeference.axes
-    return _finish(posed, cameras, cloud, observations, folder, report, known_scale, axes)
+    roles = [posed[view.number].role for view in views]
+    return _finish(views, roles, cloud, observations, folder, report, known_scale, axes)
 
 
-def _report_lost_area(lost: float, report: Report) -> None:
-    report.metric("area_lost_by_undistortion", round(lost, 4))
-    if lost > _LOST_SHARE:
-        report.warn(
-            "sfm-edges-lost",
-            f"The lens distortion is so strong that {lost:.0%} of the photographs' area, at their "
-            "edges, is outside the undistorted pictures and is not used.",
-        )
+def _whole(views: Sequence[PinholeView], posed: Sequence[PosedPhoto]) -> list[Camera]:
+    """[V] one camera for all views of a photograph: of each, the pinhole camera that shows most of
+    what the photograph shows, whose axis is the photograph's."""
+    cameras = []
+    for view in views:
+        camera = view.camera
+        if view.photo.face:
+            taken = posed[view.number]
+            pose = _of_photograph(view)
+            camera = replace(undistorted_camera(taken.camera, taken.lens), world_to_camera=pose)
+        cameras.append(camera)
+    return cameras
+
+
+def _of_photograph(view: PinholeView) -> NDArray[np.float64]:
+    """[4, 4] the pose of the photograph that a view shows a part of."""
+    pose = view.camera.world_to_camera.copy()
+    pose[:3] = view.rotation.T @ pose[:3]
+    return pose
 
 
 def _job(
-    photos: Sequence[Photo],
-    cameras: Sequence[Camera],
-    training: Sequence[int],
+    views: Sequence[PinholeView],
     folder: Path,
     work: Path,
     seed: int,
     max_features: int,
     refine: bool,
 ) -> Job:
-    """The job for the undistorted training photographs, each with a camera of its own."""
-    chosen = [cameras[i] for i in training]
+    """The job for the training views, each with a camera of its own. The faces of a photograph are
+    a rig."""
+    photos, chosen = [view.photo for view in views], [view.camera for view in views]
     known = {
         "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in chosen]),
         "sizes": np.array([(c.width, c.height) for c in chosen], np.int32),
         "world_to_camera": np.array([c.world_to_camera for c in chosen]),
+        "rotations": np.array([view.rotation for view in views]),
+        "photographs": np.unique([view.number for view in views], return_inverse=True)[1],
     }
-    known["pairs"] = neighbours(known["world_to_camera"])
+    known["pairs"] = neighbours(known["world_to_camera"], known["rotations"], known["photographs"])
+    faces = any(photo.face for photo in photos)
     job = Job(
         step="",
         images_root=str((folder / IMAGES).resolve()),
         database=str(work / "known.db"),
         out=str(work / "known"),
         progress=str(work / "progress.json"),
-        names=tuple(photos[i].picture for i in training),
-        masks=tuple(_mask_from_images(photos[i]) for i in training),
-        camera_of=tuple(range(len(training))),
-        cameras=tuple(CameraGuess(c.width, c.height, (c.fx * c.fy) ** 0.5) for c in chosen),
+        names=tuple(photo.picture for photo in photos),
+        masks=tuple(_mask_from_images(photo) for photo in photos),
+        camera_of=tuple(range(len(views))),
+        frame_of=tuple(known["photographs"].tolist()) if faces else (),
+        cameras=tuple(_guess(view) for view in views),
         seed=seed,
         threads=threads.count(),
         max_features=max_features,
@@ -151,28 +168,47 @@ def _job(
     return job
 
 
+def _guess(view: PinholeView) -> CameraGuess:
+    camera, face = view.camera, view.photo.face
+    rig = (f"{view.number}", tuple(quaternions_of(view.rotation).tolist())) if face else ("", ())
+    return CameraGuess(camera.width, camera.height, (camera.fx * camera.fy) ** 0.5, *rig)
+
+
 def _mask_from_images(photo: Photo) -> str:
     """Path of a photograph's undistorted mask, relative to the undistorted pictures."""
     return os.path.relpath(mask_file(photo), IMAGES) if photo.mask else ""
 
 
-def neighbours(poses: NDArray[np.float64]) -> NDArray[np.int32]:
-    """[Q, 2] pairs to match, of world-to-camera matrices [V, 4, 4]: each camera with those nearest
-    in position and direction, and with the next in order, in case the poses are wrong."""
+def neighbours(
+    poses: NDArray[np.float64], faces: NDArray[np.float64], photographs: NDArray[np.int64]
+) -> NDArray[np.int32]:
+    """[Q, 2] pairs to match: each view with those nearest in position and direction, and with the
+    same part of the photographs next in order, in case the poses are wrong. The views of one
+    photograph show different things, and are not matched.
+
+    Args:
+        poses: world-to-camera matrices [V, 4, 4].
+        faces: [V, 3, 3] from each photograph's axes to the camera's.
+        photographs: [V] number of each view's photograph.
+    """
     count = len(poses)
     first, second = np.triu_indices(count, 1)
+    apart = photographs[first] != photographs[second]
+    first, second = first[apart], second[apart]
     if count > EXHAUSTIVE_UP_TO:
         rotations = poses[:, :3, :3]
         centres = camera_centres(poses)
         distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
         angle = np.arccos(np.clip(rotations[:, 2] @ rotations[:, 2].T, -1.0, 1.0))
         cost = distance / max(float(np.median(distance)), 1e-300) + angle
-        np.fill_diagonal(cost, np.inf)
+        cost[photographs[:, None] == photographs[None]] = np.inf
         near = np.argsort(cost, axis=1, kind="stable")[:, :NEIGHBOURS]
         selected = np.zeros((count, count), np.bool_)
         np.put_along_axis(selected, near, True, axis=1)
         selected |= selected.T
-        keep = selected[first, second] | (second - first <= _NEXT_IN_ORDER)
+        alike = np.abs(faces[first] - faces[second]).max(axis=(1, 2)) < _SAME_PART
+        following = photographs[second] - photographs[first] <= _NEXT_IN_ORDER
+        keep = selected[first, second] | (following & alike)
         first, second = first[keep], second[keep]
     return np.stack([first, second], axis=1).astype(np.int32)
 
@@ -187,9 +223,10 @@ def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], floa
             marker.touch()
 
 
-def _refined(cameras: Sequence[Camera], path: Path, report: Report) -> list[Camera]:
-    """The cameras with refined poses; reports by how much they moved."""
+def _refined(views: Sequence[PinholeView], path: Path, report: Report) -> list[PinholeView]:
+    """The views with refined poses; reports by how much they moved."""
     poses = np.load(path)["world_to_camera"]
+    cameras = [view.camera for view in views]
     moved = [replace(c, world_to_camera=p) for c, p in zip(cameras, poses, strict=True)]
     away = [float(np.linalg.norm(a.centre - b.centre)) for a, b in zip(moved, cameras, strict=True)]
     before = np.array([camera.world_to_camera for camera in cameras])
@@ -199,7 +236,7 @@ def _refined(cameras: Sequence[Camera], path: Path, report: Report) -> list[Came
     report.metric(
         "cameras_turned_deg", {"median": float(np.median(angles)), "max": float(angles.max())}
     )
-    return moved
+    return [replace(view, camera=camera) for view, camera in zip(views, moved, strict=True)]
 
 
 def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
@@ -248,8 +285,8 @@ def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
 
 
 def _finish(
-    posed: Sequence[PosedPhoto],
-    cameras: Sequence[Camera],
+    views: Sequence[PinholeView],
+    roles: Sequence[str],
     cloud: FilePoints,
     observations: Observations,
     folder: Path,
@@ -258,13 +295,13 @@ def _finish(
     axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
     """Level, recentre and scale; write the COLMAP model. axes: as in `Georeference`."""
-    turn, levelled = _levelling(cameras, axes)
+    turn, levelled = _levelling(views, axes)
     middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
     world_from_new = np.eye(4)
     world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
-    cameras = [camera.moved(world_from_new) for camera in cameras]
+    cameras = [view.camera.moved(world_from_new) for view in views]
     points = (cloud.points - middle) @ turn.T
-    photos = [one.photo for one in posed]
+    photos = [view.photo for view in views]
     pictures = [folder / IMAGES / photo.picture for photo in photos]
     if known_scale.place is not None:
         known_scale = replace(known_scale, place=known_scale.place.moved(world_from_new))
@@ -281,19 +318,20 @@ def _finish(
         observations,
         levelled=levelled,
         metric=scale,
-        roles=[one.role for one in posed],
+        roles=roles,
     )
 
 
 def _levelling(
-    cameras: Sequence[Camera], axes: NDArray[np.float64] | None
+    views: Sequence[PinholeView], axes: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], bool]:
     """(rotation [3, 3] to a world with up = -Y, whether up is known): by the axes of the file, with
-    +Z to the north, or else by how the cameras were held."""
+    +Z to the north, or else by how the photographs were held."""
     if axes is not None:
         east, north, up = axes
         return np.stack([east, -up, north]), True
-    rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
+    photographs = {view.number: _of_photograph(view)[:3, :3] for view in views}
+    rotations = np.array([*photographs.values()])
     found = up_direction(rotations)
     if found is None:
         return np.eye(3), False

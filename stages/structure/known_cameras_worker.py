@@ -45,6 +45,7 @@ def triangulate(job: Job) -> None:
     out.mkdir(parents=True)
     pairs = _matched_points(Path(job.database))
     lens, poses = known["intrinsics"], known["world_to_camera"]
+    mistakes = _corrected(poses, known["rotations"], known["photographs"])
     side = float(known["sizes"].max())
     found = {
         "pairs": len(pairs),
@@ -53,7 +54,7 @@ def triangulate(job: Job) -> None:
         "rough": median_inlier_ratio(pairs, lens, poses, 4.0 * side),
         "mistakes": {
             name: median_inlier_ratio(pairs, lens, corrected, side)
-            for name, corrected in likely_mistakes(poses).items()
+            for name, corrected in mistakes.items()
         },
     }
     if job.refine:
@@ -62,6 +63,23 @@ def triangulate(job: Job) -> None:
         known = {**known, "world_to_camera": poses}
     (out / "pose_check.json").write_text(json.dumps(found), encoding="utf-8")
     _save_points(_triangulated(job, known, out / "colmap"), poses, out / "points.npz")
+
+
+def _corrected(
+    poses: NDArray[np.float64], faces: NDArray[np.float64], photographs: NDArray[np.int64]
+) -> dict[str, NDArray[np.float64]]:
+    """`likely_mistakes` of the photographs' poses, as poses of the views.
+
+    Args:
+        poses: [V, 4, 4] of the views.
+        faces: [V, 3, 3] from the photographs' axes to those of the views.
+        photographs: [V] number of each view's photograph.
+    """
+    turns = np.tile(np.eye(4), (len(faces), 1, 1))
+    turns[:, :3, :3] = faces
+    first = np.unique(photographs, return_index=True)[1]
+    whole = turns[first].transpose(0, 2, 1) @ poses[first]
+    return {name: turns @ fixed[photographs] for name, fixed in likely_mistakes(whole).items()}
 
 
 def _camera(number: int, lens: NDArray[np.float64], size: NDArray[np.int32]) -> pycolmap.Camera:
@@ -100,6 +118,7 @@ def _refined(job: Job, known: Mapping[str, Any], scratch: Path) -> NDArray[np.fl
         model = _triangulated(job, {**known, "world_to_camera": poses}, scratch, slack)
         options = pycolmap.BundleAdjustmentOptions()
         options.refine_focal_length = options.refine_extra_params = False
+        options.refine_sensor_from_rig = False  # the faces of a photograph lie exactly
         options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
         options.ceres.solver_options.num_threads = 1
         options.print_summary = False
@@ -120,14 +139,7 @@ def _triangulated(
 ) -> pycolmap.Reconstruction:
     """Triangulate the matches with fixed poses. slack: factor on COLMAP's error thresholds."""
     scratch.mkdir()
-    model = pycolmap.Reconstruction()
-    for number, (name, lens, size, pose) in enumerate(
-        zip(job.names, known["intrinsics"], known["sizes"], known["world_to_camera"], strict=True),
-        1,
-    ):
-        model.add_camera_with_trivial_rig(_camera(number, lens, size))
-        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    model = _posed(job, known)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = job.seed
@@ -144,6 +156,30 @@ def _triangulated(
     model.extract_colors_for_all_images(job.images_root, num_threads=1)
     model.update_point_3d_errors()
     shutil.rmtree(scratch)
+    return model
+
+
+def _posed(job: Job, known: Mapping[str, Any]) -> pycolmap.Reconstruction:
+    """A model of the views, without points, with the rigs and frames of the database. Each view has
+    a camera of its own with the same number."""
+    model = pycolmap.Reconstruction()
+    for number, lens in enumerate(zip(known["intrinsics"], known["sizes"], strict=True), 1):
+        model.add_camera(_camera(number, *lens))
+    frame_of: dict[int, int] = {}
+    with pycolmap.Database.open(job.database) as database:
+        for rig in database.read_all_rigs():
+            model.add_rig(rig)
+        for frame in database.read_all_frames():
+            frame_of |= {data.id: frame.frame_id for data in frame.data_ids}
+            reference = known["world_to_camera"][frame.rig_id - 1]
+            frame.rig_from_world = pycolmap.Rigid3d(reference[:3])
+            model.add_frame(frame)
+    for number, name in enumerate(job.names, 1):
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        image.frame_id = frame_of[number]
+        model.add_image(image)
+    for frame_id in sorted(set(frame_of.values())):
+        model.register_frame(frame_id)
     return model
 
 

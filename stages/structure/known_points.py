@@ -17,11 +17,12 @@ from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
 from stages.photos.load import load_mask
-from stages.scene import TRANSPARENT, Camera, Photo
+from stages.scene import TRANSPARENT, Camera
 from stages.structure.finish import NO_OBSERVATIONS, Observations
+from stages.structure.pinhole_views import PinholeView
 from stages.structure.undistorted_images import mask_file
 
-POINTS_PER_VIEW = 20  # with fewer triangulated points, random ones are added
+POINTS_PER_PHOTOGRAPH = 20  # with fewer triangulated points, random ones are added
 _VISIBLE_SHARE = 0.1  # of a file's points must be in the pictures of two cameras at least
 
 
@@ -29,8 +30,8 @@ def find_points(
     from_file: FilePoints | None,
     triangulated: Path,
     training: Sequence[int],
-    photos: Sequence[Photo],
-    cameras: Sequence[Camera],
+    views: Sequence[PinholeView],
+    whole: Sequence[Camera],
     folder: Path,
     seed: int,
     report: Report,
@@ -40,24 +41,27 @@ def find_points(
     Args:
         from_file: the points of the camera file; used if its cameras look at them.
         triangulated: points.npz of `known_cameras_worker`.
-        training: positions of the photographs that may be used.
-        photos, cameras: of all views; cameras undistorted.
+        training: positions of the views that may be used.
+        views: all.
+        whole: [V] a pinhole camera of each view's photograph, the same for those of one.
         folder: of the reconstruction, for masks.
         seed: of random points.
         report: receives the metric "points_source" and warnings.
 
     Raises SplatError "cameras-no-common-view".
     """
-    chosen = [cameras[i] for i in training]
-    cloud = _visible_file_points(from_file, chosen, report)
+    chosen = [views[i] for i in training]
+    cloud = _visible_file_points(from_file, [view.camera for view in chosen], report)
     if cloud is not None:
         report.metric("points_source", "camera file")
         return cloud, NO_OBSERVATIONS
     cloud, observations = _triangulated(triangulated, training)
     source = "triangulation"
-    if len(cloud.points) < POINTS_PER_VIEW * len(training):
-        outside = [_empty_space(folder, photos[i], cameras[i]) for i in training]
-        cloud, source = _with_random(cloud, chosen, outside, seed, report), "random"
+    photographs = {view.number: (whole[i], view) for i, view in zip(training, chosen, strict=True)}
+    if len(cloud.points) < POINTS_PER_PHOTOGRAPH * len(photographs):
+        cameras = [camera for camera, _ in photographs.values()]
+        outside = [_empty_space(folder, view) for _, view in photographs.values()]
+        cloud, source = _with_random(cloud, cameras, outside, seed, report), "random"
     report.metric("points_source", source)
     return cloud, observations
 
@@ -88,9 +92,11 @@ def _triangulated(path: Path, training: Sequence[int]) -> tuple[FilePoints, Obse
     return FilePoints(data["points"], data["colours"], data["errors_px"], tracks), observed
 
 
-def _empty_space(folder: Path, photo: Photo, camera: Camera) -> NDArray[np.bool_] | None:
-    """[H, W] where a photograph with a transparent background shows nothing; None for others."""
-    if photo.outside != TRANSPARENT:
+def _empty_space(folder: Path, view: PinholeView) -> NDArray[np.bool_] | None:
+    """[H, W] where a photograph with a transparent background shows nothing; None for others, and
+    for one that is cut into faces."""
+    photo, camera = view.photo, view.camera
+    if photo.outside != TRANSPARENT or photo.face:
         return None
     mask = load_mask(folder / mask_file(photo), camera.width, camera.height, photo.outside)
     return np.asarray(mask == 0)

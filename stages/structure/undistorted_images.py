@@ -14,14 +14,14 @@ from stages.base.atomic import replacing
 from stages.base.errors import Interrupted, SplatError
 from stages.base.stage import Report
 from stages.cameras.lens import Lens
-from stages.photos.load import load_depth
-from stages.photos.write import write_depth
-from stages.scene import TRANSPARENT, Camera, Photo
-from stages.structure.undistortion import (
+from stages.cameras.undistortion import (
     remap_tables,
     undistorted_camera,
     visible_share,
 )
+from stages.photos.load import load_depth
+from stages.photos.write import write_depth
+from stages.scene import TRANSPARENT, Camera, Photo
 
 IMAGES = "colmap/images"
 MASKS = "colmap/masks"
@@ -91,26 +91,26 @@ def write_undistorted_images(
 
 
 def _write_picture(photo: Photo, source: Path, folder: Path, tables: _Tables | None) -> None:
-    image = _read(source / photo.image)
+    image = read_picture(source / photo.image)
     target = folder / IMAGES / photo.picture
-    target.parent.mkdir(parents=True, exist_ok=True)
     if tables is None:
+        target.parent.mkdir(parents=True, exist_ok=True)
         with replacing(target) as partial:
             shutil.copyfile(source / photo.image, partial)
     else:
-        _encode(target, cv2.remap(image, *tables, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        write_picture_as(
+            target, cv2.remap(image, *tables, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        )
 
 
 def _write_mask(photo: Photo, source: Path, folder: Path, tables: _Tables | None) -> None:
     if not photo.mask:
         return
-    mask = _read(source / photo.mask)[..., 0]
+    mask = read_picture(source / photo.mask)[..., 0]
     if tables is not None:
         soft = cv2.INTER_LINEAR if photo.outside == TRANSPARENT else cv2.INTER_NEAREST
         mask = cv2.remap(mask, *tables, interpolation=soft, borderMode=cv2.BORDER_REPLICATE)
-    target = folder / mask_file(photo)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    _encode(target, mask)
+    write_picture_as(folder / mask_file(photo), mask)
 
 
 def _write_depth(
@@ -130,7 +130,8 @@ def _write_depth(
     write_depth(folder / depth_file(photo), depth)
 
 
-def _read(path: Path) -> np.ndarray:
+def read_picture(path: Path) -> np.ndarray:
+    """[H, W, 3] BGR, of a picture that ingest wrote. Raises SplatError "sfm-photo-unreadable"."""
     try:
         data = np.fromfile(path, np.uint8)  # cv2.imread fails on some paths under Windows
     except OSError:
@@ -147,8 +148,9 @@ def _read(path: Path) -> np.ndarray:
     return image
 
 
-def _encode(path: Path, image: np.ndarray) -> None:
-    """As PNG or JPEG, by the suffix: lossless photographs stay lossless."""
+def write_picture_as(path: Path, image: np.ndarray) -> None:
+    """As PNG or JPEG, by the suffix: lossless photographs stay lossless. Makes its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".png":
         encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1]
     else:

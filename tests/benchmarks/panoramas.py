@@ -14,6 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,12 +84,16 @@ def poses() -> list[NDArray[np.float64]]:
 
 
 def picture(pose: NDArray[np.float64], width: int) -> NDArray[np.uint8]:
-    """[W / 2, W, 3] what a panorama shows; as `render.photograph`, with compiled shadows."""
+    """[W / 2, W, 3] what a panorama shows."""
+    return drawn([Band(width, _BAND, first) for first in range(0, width // 2, _BAND)], pose)
+
+
+def drawn(bands: Sequence[Any], pose: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """[H, W, 3] the bands of a picture, one below the other; as `render.photograph`, with compiled
+    shadows. bands: each with what `Band` has."""
     render.occluded = _occluded
     shapes = list(make.scene())
-    bands = [Band(width, _BAND, first) for first in range(0, width // 2, _BAND)]
-    rows = [render.photograph(shapes, Light(), band, pose) for band in bands]  # type: ignore[arg-type]
-    return np.concatenate(rows)
+    return np.concatenate([render.photograph(shapes, Light(), band, pose) for band in bands])
 
 
 def draw(number: int, folder: Path, width: int) -> None:

@@ -8,6 +8,12 @@ import pytest
 from stages.cameras.colmap_records import _MODELS, _optics
 from stages.cameras.lens import Lens
 
+FISHEYES = {
+    "equidistant": Lens("fisheye"),
+    "radial": Lens("fisheye", (-0.03, 0.004, -0.0005)),
+    "prism": Lens("prism fisheye", (-0.02,), tangential=(1e-3, -2e-3), prism=(1e-3, 0, 2e-3, 0)),
+    "polynomial": Lens("polynomial fisheye", parameters=(0.01, -0.05)),
+}
 _LARGE = {"omega": 0.9, "alpha": 0.6, "beta": 1.2}
 
 
@@ -60,3 +66,28 @@ def test_the_optical_axis_stays(kind: str) -> None:
     lens = Lens(kind, (0.1, 0.2))
     np.testing.assert_array_equal(lens.distort(np.zeros((1, 2))), [[0, 0]])
     np.testing.assert_array_equal(lens.undistort(np.zeros((1, 2))), [[0, 0]])
+
+
+@pytest.mark.parametrize("name", FISHEYES)
+def test_a_fisheye_shows_directions_beside_and_behind_the_camera(name: str) -> None:
+    lens = FISHEYES[name]
+    random = np.random.default_rng(0)
+    angle, turn = random.uniform(0, np.radians(115), 300), random.uniform(0, 2 * np.pi, 300)
+    across = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * np.sin(angle)[:, None]
+    rays = np.column_stack([across, np.cos(angle)])
+    seen = lens.project(3.0 * rays)
+    np.testing.assert_allclose(lens.directions(seen), rays, atol=1e-9)
+    front = angle < 1.4
+    flat = rays[front, :2] / rays[front, 2:]
+    np.testing.assert_allclose(seen[front], lens.distort(flat), atol=1e-12)
+    np.testing.assert_allclose(lens.undistort(seen[front]), flat, rtol=1e-9, atol=1e-9)
+    assert lens.widest_angle() > np.radians(115)
+
+
+def test_the_angle_at_which_a_fisheye_folds() -> None:
+    """By hand: a (1 - a^2 / 3) is largest at a = 1."""
+    lens = Lens("fisheye", (-1 / 3,))
+    assert lens.widest_angle() == pytest.approx(1.0, abs=0.01)
+    assert lens.widest_angle() < 1.0
+    assert np.isnan(lens.directions(np.array([[0.67, 0.0]]))).all()
+    assert Lens("fisheye").widest_angle() == pytest.approx(3.1)

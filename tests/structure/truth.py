@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from tests.structure.bad_captures import SAMPLE
@@ -21,3 +22,13 @@ def similarity(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, floa
     turn = u @ np.diag(signs) @ vt
     scale = float((s * signs).sum() / (a**2).sum())
     return turn, scale, target.mean(axis=0) - scale * turn @ source.mean(axis=0)
+
+
+def off_by(pose: np.ndarray, degrees: float, metres: float, r: np.random.Generator) -> np.ndarray:
+    """A camera turned and moved by about as much, at random."""
+    turn, _ = cv2.Rodrigues(np.radians(degrees) * r.normal(size=3) / np.sqrt(3))
+    found = pose.copy()
+    found[:3, :3] = turn @ pose[:3, :3]
+    centre = -pose[:3, :3].T @ pose[:3, 3] + metres * r.normal(size=3) / np.sqrt(3)
+    found[:3, 3] = -found[:3, :3] @ centre
+    return found

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.cameras.lens import PINHOLE, Lens
-from stages.scene import Camera
-from stages.structure.undistortion import (
+from stages.cameras.undistortion import (
     SimpleRadial,
     remap_tables,
     undistorted_camera,
     undistorted_px,
     visible_share,
 )
+from stages.scene import Camera
 
 
 def simple_radial(k: float) -> Lens:

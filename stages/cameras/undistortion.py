@@ -16,7 +16,7 @@ from stages.scene import Camera
 
 _LARGEST_GROWTH = 2.0  # of either side, as COLMAP limits it
 _SMALLEST_SHARE = 0.2  # of either side; below, the pinhole camera keeps the photograph's rectangle
-_WIDEST = np.tan(np.radians(60.0))  # beyond, a pinhole picture spends many pixels on little
+WIDEST = np.tan(np.radians(60.0))  # beyond, a pinhole picture spends many pixels on little
 _GRID = 33  # samples along either side, for the share of the photograph that stays visible
 _NEWTON_STEPS = 100
 
@@ -92,7 +92,7 @@ def _from_principal_point(
 def _inner_rectangle(camera: Camera, lens: Lens) -> tuple[float, float, float, float]:
     """left, top, right, bottom relative to the principal point. An edge that no pinhole camera can
     show does not limit the rectangle."""
-    samples, widest = (257, np.inf) if isinstance(lens, SimpleRadial) else (129, _WIDEST)
+    samples, widest = (257, np.inf) if isinstance(lens, SimpleRadial) else (129, WIDEST)
     width, height = camera.width, camera.height
     x, y = np.linspace(0.0, width, samples), np.linspace(0.0, height, samples)
 

@@ -1,0 +1,59 @@
+"""Finds the image circle of a fisheye: beyond it, every photograph of the lens is black."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.scene import Camera
+
+LOOKED_AT = 12  # photographs, evenly spaced
+_SIDE = 512  # pixels of the longer side, at which they are compared
+_DARK = 12  # of 255, in every channel
+_CORNERS = 0.01  # of the picture: the least that is dark
+_DARK_SHARE = 0.97  # of the pixels beyond the circle
+_LIT_SHARE = 0.95  # of those on a ring within it
+_NARROWEST = 0.9  # of the outermost lit radius: how far within it that ring lies
+_MARGIN = 0.01  # of the radius, for the blurred rim
+
+
+def brightest(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """[h, w] the brightest value of each pixel in any channel of any picture [H, W, 3], small. At
+    least one picture."""
+    small = [_reduced(picture) for picture in pictures]
+    return np.asarray(np.max(small, axis=0), np.uint8)
+
+
+def circle_radius(lit: NDArray[np.uint8], camera: Camera) -> float:
+    """The radius of the image circle around the principal point, in pixels of the photographs;
+    infinite where there is none.
+
+    Args:
+        lit: of photographs of one camera, see `brightest`.
+        camera: theirs.
+    """
+    height, width = lit.shape
+    small = camera.resized(width, height)
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    away = np.hypot(x - small.cx, y - small.cy)
+    shown = lit > _DARK
+    rings = away.astype(np.int64)
+    share = np.bincount(rings.ravel(), shown.ravel()) / np.maximum(np.bincount(rings.ravel()), 1)
+    outermost = int(np.flatnonzero(share >= 0.5).max(initial=0))
+    beyond = away > outermost + 2
+    full = np.flatnonzero(share[: outermost + 1] >= _LIT_SHARE)
+    if not len(full) or full[-1] < _NARROWEST * outermost or beyond.mean() < _CORNERS:
+        return float("inf")
+    if (~shown[beyond]).mean() < _DARK_SHARE:
+        return float("inf")
+    return float(full[-1] * (1.0 - _MARGIN) * camera.width / width)
+
+
+def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = picture.shape[:2]
+    scale = min(1.0, _SIDE / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA).max(axis=-1))
