@@ -86,7 +86,7 @@ def make_trainer(
 
 
 def _limited_steps(settings: TrainSettings, views: int, report: Report) -> int:
-    """The steps of a run on so many training views, with a warning if they are fewer than requested."""
+    """The steps of a run on so many training views; warns if they are fewer than requested."""
     most = settings.steps_per_view * views
     if not most or settings.steps <= most:
         return settings.steps
