@@ -42,7 +42,7 @@ class TrainSettings:
         max=1_000_000,
     )
     steps_per_view: int = setting(
-        400,
+        800,
         "Training steps for each training view, at most: more fit these views alone. 0: no limit.",
         panel="Advanced",
         min=0,

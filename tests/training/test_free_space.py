@@ -126,7 +126,8 @@ def test_no_floater_is_left_at_the_end_of_training(tmp_path, monkeypatch, steps)
     model = made.run(start)
     assert clouds.made == sum(schedule.densifies_after(step) for step in range(steps))
     assert (model.means[:, 2] > 0.5 * FAR).all()
-    assert len(model) > 0.6 * len(start)  # sparsification removes a third of the wall
+    # of a wall in one colour sparsification may remove a fifth four times
+    assert len(model) > 0.4 * len(start)
 
 
 def test_floaters_are_removed_a_few_times_in_a_run_and_at_its_end():
