@@ -59,7 +59,6 @@ def make_trainer(
         cameras |= {view.name: view.camera for view in held_out}
         refinement = CameraRefinement.of(cameras, extent)
         backend = _on_the_host(backend, report)
-    most_steps = settings.steps_per_view * len(train)
     seconds = settings.seconds and max(settings.seconds - (time.monotonic() - began), 1.0)
     return Trainer(
         schedule=Schedule(
@@ -79,7 +78,7 @@ def make_trainer(
         random_background=settings.background == "any",
         backend=backend,
         seconds=seconds,
-        most_steps=most_steps,
+        most_steps=settings.steps_per_view * len(train),
         refinement=refinement,
         within=settings.within,
     )
