@@ -98,8 +98,10 @@ def test_ctrl_c_of_a_terminal_reaches_the_command_once() -> None:
     import pty
     import termios
 
+    # print would fail in the handler if the signal interrupts the print of "ready"
     counting = (
-        "count = []; signal.signal(2, lambda *_: (count.append(1), print('heard', flush=True)));"
+        "count = [];"
+        "signal.signal(2, lambda *_: (count.append(1), os.write(1, b'heard')));"
         "print('ready', flush=True); time.sleep(1.5); sys.exit(len(count))"
     )
     pid, terminal = pty.fork()
