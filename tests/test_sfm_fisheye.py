@@ -13,6 +13,7 @@ from stages.base.stage import Report
 from stages.photos.faces import face_rotation
 from stages.scene import Reconstruction, split_held_out
 from stages.scene.rotations import quaternions_of
+from tests import tolerances
 from tests.benchmarks import fisheyes
 from tests.structure.truth import off_by
 
@@ -112,4 +113,4 @@ def test_rough_poses_are_refined_and_faces_stay_together(capture: Path, tmp_path
         cosines = [np.clip((np.trace(step) - 1) / 2, -1, 1) for step in steps]
         return float(np.degrees(np.arccos(cosines)).mean())
 
-    assert off(relative) < 0.6 * off(rough)
+    assert off(relative) < tolerances.REFINED_FISHEYE * off(rough)
