@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from stages.scene import DrawSettings, QuantisedSplats, Reconstruction, Splats, TrainedSplats
 
 _DECISIONS, _FLAT, _FINETUNED = "decisions.json", "flat_dc.npy", "finetuned"
+_SOG = "sog"  # the format whose bits are chosen
 # Change of colour (of 255) that a splat's higher SH degrees may make and still be dropped, largest
 # first.
 _THRESHOLDS_OF_255 = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)
@@ -104,8 +105,8 @@ def run(
     """Decide on the splats of inputs["prune"] by training views of inputs["sfm"].
 
     Metrics: psnr_raw_db, psnr_kept_db, psnr_splat32_db (means over the held-out views, or over
-    the deciding views where none are held out), sh_degree, splats_by_sh_degree, bits, raw_mib,
-    kept_mib; formats: by format that was fine-tuned to, rounded_db and finetuned_db (see
+    the deciding views where none are held out), sh_degree, splats_by_sh_degree, bits (if a .sog is
+    requested), raw_mib, kept_mib; formats: by format that was fine-tuned to, rounded_db and finetuned_db (see
     `capacity.rounding`). Raises SplatError if a photograph cannot be read, and Interrupted.
     """
     from stages.capacity.bits import choose_bits
@@ -125,8 +126,10 @@ def run(
     plain = finetuning.to_plain_drawing(kept)
     flat = _flat_colours(kept if plain is None else plain, reconstruction, settings)
     quantised = QuantisedSplats(kept, {}, flat, plain=plain, drawing=settings.drawing)
-    sog = splats_to_write(FORMATS["sog"], quantised)
-    bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
+    bits, sog_db = None, None
+    if _SOG in settings.formats:
+        sog = splats_to_write(FORMATS[_SOG], quantised)
+        bits, sog_db = choose_bits(sog, decider.psnr, settings.sog_loss_db)
     figures = {
         "psnr_raw_db": evaluator.psnr(splats),
         **evaluator.psnr_at_sizes(kept, "psnr_kept"),
@@ -235,16 +238,21 @@ def _measures(
         load_evaluation_views(folder, views, draw_settings, report.stop_requested)
         for views in (deciding, evaluated)
     )
-    return _Measure(decider, backend, report), _Measure(evaluator, backend, Report(), what)
+    # As it is, three lower degrees, each threshold, and about as many bit depths.
+    planned = 5 + len(_THRESHOLDS_OF_255) + _BIT_DEPTH_MEASUREMENTS * (_SOG in settings.formats)
+    return _Measure(decider, backend, report, planned), _Measure(
+        evaluator, backend, Report(), what=what
+    )
 
 
 @dataclass
 class _Measure:
-    """Measures splats on views that are loaded once."""
+    """Measures splats on views that are loaded once. planned: about how many times."""
 
     views: Sequence[EvaluationView]
     backend: str
     report: Report
+    planned: int = 0
     what: str = "training"
     done: int = 0
 
@@ -254,9 +262,8 @@ class _Measure:
 
         mean = round(mean_psnr_db(splats, self.views, self.backend, scale), 4)
         self.done += 1
-        # As it is, three lower degrees, each threshold, and about as many bit depths.
-        total = 5 + len(_THRESHOLDS_OF_255) + _BIT_DEPTH_MEASUREMENTS
-        self.report.progress(self.done, max(total, self.done), "measuring", psnr_db=mean)
+        total = max(self.planned, self.done)
+        self.report.progress(self.done, total, "measuring", psnr_db=mean)
         return mean
 
     def psnr_at_sizes(self, splats: Splats, stem: str) -> dict[str, float]:
@@ -314,7 +321,7 @@ def load(folder: Path) -> QuantisedSplats:
 
 STAGE = Stage(
     name="quantise",
-    version=12,
+    version=13,
     reads=("sfm", "train", "prune"),
     settings_type=QuantiseSettings,
     run=run,

@@ -247,9 +247,15 @@ def test_colours_without_view_dependence_are_the_means_of_what_is_seen(
 def test_a_sog_gets_no_more_bits_than_its_views_show(scene: SmallScene, tmp_path: Path) -> None:
     for name, allowed in (("a", 0.02), ("b", 2.0)):
         (tmp_path / name).mkdir()
-        _, metrics = decide(scene, tmp_path / name, sog_loss_db=allowed)
+        settings = {"formats": ("sog",), "rounding_steps": 0, "sog_loss_db": allowed}
+        _, metrics = decide(scene, tmp_path / name, **settings)
         kept = json.loads((tmp_path / name / "decisions.json").read_text())
         assert kept["bits"] == metrics["bits"]
     fewest = metrics["bits"]
     assert fewest["position"] < 16
     assert all(fewest[name] < 8 for name in ("rotation", "scale", "colour", "opacity"))
+
+
+def test_bits_are_measured_only_where_a_sog_is_requested(scene: SmallScene, tmp_path: Path) -> None:
+    _, metrics = decide(scene, tmp_path, formats=())
+    assert metrics["bits"] is None
