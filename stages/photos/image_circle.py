@@ -20,6 +20,7 @@ _DARK_SHARE = 0.9  # of the pixels beyond the circle; scattered light is not
 _RIM = 0.3  # of the pixels on a ring: what no ring beyond the circle has
 _LEAST_LIT = 0.5  # of the pixels on the rings just within it; the rest shows dark things
 _LIT_SHARE = 0.95  # of that share: what the last ring within it has at least
+_FEWEST = 32  # pixels of a ring; the outermost rings are a few pixels in the corners
 _WITHIN = 0.9  # of the rim's radius: from where on rings say how much is lit
 _MARGIN = 0.01  # of the radius, for the blurred rim
 
@@ -46,7 +47,8 @@ def circle_radius(lit: NDArray[np.uint8], camera: Camera) -> float:
     black = np.median(lit[away >= np.quantile(away, 1.0 - _CORNERS)])
     shown = lit > black + _DARK
     rings = away.astype(np.int64)
-    share = np.bincount(rings.ravel(), shown.ravel()) / np.maximum(np.bincount(rings.ravel()), 1)
+    counts = np.bincount(rings.ravel())
+    share = np.bincount(rings.ravel(), shown.ravel()) / np.maximum(counts, _FEWEST)
     rim = int(np.flatnonzero(share >= _RIM).max(initial=0))
     usual = np.median(share[int(_WITHIN * rim) : rim + 1])
     beyond = away > rim + 2
