@@ -309,5 +309,5 @@ def _load_finished(folder: Path, report: Report) -> Reconstruction:
 
 
 STAGE = Stage(
-    name="sfm", version=20, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
+    name="sfm", version=21, reads=("ingest",), settings_type=SfmSettings, run=run, load=load
 )

@@ -147,8 +147,10 @@ def read_model(folder: Path) -> tuple[CameraFile, ColmapModel]:
 
 
 def read_points(folder: Path) -> FilePoints | None:
-    """The model's points; None if the folder has none. Raises SplatError "cameras-unreadable"."""
-    if not _part(folder, "points3D")[0].is_file():
+    """The model's points; None if the folder has none, or an empty points3D.txt, as COLMAP's own
+    manual advises for known cameras. Raises SplatError "cameras-unreadable"."""
+    path, text = _part(folder, "points3D")
+    if not path.is_file() or (text and not path.stat().st_size):
         return None
     model = read_model(folder)[1]
     tracks = np.bincount(model.observed_points, minlength=len(model.points)).astype(np.int32)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,7 @@ def pair_depths(
         maps: files by name relative to theirs.
         unit: see `DepthFile`.
     """
-    left = {_SCANNER_APP.sub(r"\1frame\2", name): path for name, path in maps.items()}
+    left = {_of_frame(name): path for name, path in maps.items()}
     found: dict[str, DepthFile] = {}
     names = list(photographs)
     while more := pair_masks(names, left, "_depth"):
@@ -74,6 +74,16 @@ def pair_depths(
         used = set(more.values())
         left = {name: path for name, path in left.items() if path not in used}
     return found
+
+
+def needs_no_photograph(name: str, files: Container[str]) -> bool:
+    """Whether a map in the photographs' folder is of a frame of 3D Scanner App, of which not every
+    one has a picture: `files` then holds that frame's .json."""
+    return f"{_of_frame(name).rpartition('.')[0]}.json" in files
+
+
+def _of_frame(name: str) -> str:
+    return _SCANNER_APP.sub(r"\1frame\2", name)
 
 
 def is_map(name: str) -> bool:

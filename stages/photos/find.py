@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -26,6 +27,8 @@ from stages.photos.sources import (
     suffix_of,
 )
 from stages.scene.capture import PHOTOS_FOLDER
+
+_FRAME = re.compile(r"(^|/)frame_[0-9]+\.json$")  # of 3D Scanner App
 
 
 def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None) -> Findings:
@@ -52,7 +55,8 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
     depths, stray_depths = _remove_depths(files, folder, depth)
     mask_of, stray = _remove_masks(files, folder, more_masks)
     names = sorted(files, key=natural_key)
-    photographs = _posed(folder, [name for name in names if suffix_of(name) in PICTURES])
+    pictures = [name for name in names if suffix_of(name) in PICTURES]
+    photographs = _posed(folder, _without_pictures_of_scans(files, pictures))
     stems = {stem_of(name) for name in photographs}
     unpaired = [name for name in names if stem_of(name) not in stems]
     kinds = {
@@ -84,6 +88,18 @@ def _posed(folder: Path, pictures: list[str]) -> list[str]:
         with suppress(SplatError):
             named = {stem_of(view.name) for view in blender.read(folder).views}
     return [name for name in pictures if stem_of(name) in named] or pictures
+
+
+def _without_pictures_of_scans(files: Iterable[str], pictures: list[str]) -> list[str]:
+    """The pictures without those that 3D Scanner App puts beside its frames, a small copy of one
+    and the texture of its mesh: where a folder holds frame_*.json, frames have a .json each."""
+    frames = {name.rpartition(".")[0] for name in files if _FRAME.search(name)}
+    scans = {name.rpartition("/")[0] for name in frames}
+    return [
+        name
+        for name in pictures
+        if name.rpartition("/")[0] not in scans or name.rpartition(".")[0] in frames
+    ]
 
 
 def _remove_masks(
@@ -143,7 +159,11 @@ def _remove_depths(
     for name in [name for name in files if name in inside or depth_files.is_confidence(name)]:
         del files[name]
     used = {path for file in paired.values() for path in (file.path, *file.others)}
-    stray = (name for name, path in maps.items() if path not in used)
+    stray = (
+        name
+        for name, path in maps.items()
+        if path not in used and not depth_files.needs_no_photograph(name, files)
+    )
     return paired, tuple(sorted(stray, key=natural_key))
 
 

@@ -1,4 +1,5 @@
-"""Finds the image circle of a fisheye: beyond it, every photograph of the lens is black."""
+"""Finds the image circle of a fisheye: beyond it, every photograph of the lens is as dark as its
+corners."""
 
 from __future__ import annotations
 
@@ -12,11 +13,15 @@ from stages.scene import Camera
 
 LOOKED_AT = 12  # photographs, evenly spaced
 _SIDE = 512  # pixels of the longer side, at which they are compared
-_DARK = 12  # of 255, in every channel
+_BLACKEST = 40  # of 255: black of a sensor, and light that the lens scatters, in every channel
+_DARK = 12  # of 255 above that black
 _CORNERS = 0.01  # of the picture: the least that is dark
-_DARK_SHARE = 0.97  # of the pixels beyond the circle
-_LIT_SHARE = 0.95  # of those on a ring within it
-_NARROWEST = 0.9  # of the outermost lit radius: how far within it that ring lies
+_DARK_SHARE = 0.9  # of the pixels beyond the circle; scattered light is not
+_RIM = 0.3  # of the pixels on a ring: what no ring beyond the circle has
+_LEAST_LIT = 0.5  # of the pixels on the rings just within it; the rest shows dark things
+_LIT_SHARE = 0.95  # of that share: what the last ring within it has at least
+_FEWEST = 32  # pixels of a ring; the outermost rings are a few pixels in the corners
+_WITHIN = 0.9  # of the rim's radius: from where on rings say how much is lit
 _MARGIN = 0.01  # of the radius, for the blurred rim
 
 
@@ -39,16 +44,19 @@ def circle_radius(lit: NDArray[np.uint8], camera: Camera) -> float:
     small = camera.resized(width, height)
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     away = np.hypot(x - small.cx, y - small.cy)
-    shown = lit > _DARK
+    black = np.median(lit[away >= np.quantile(away, 1.0 - _CORNERS)])
+    shown = lit > black + _DARK
     rings = away.astype(np.int64)
-    share = np.bincount(rings.ravel(), shown.ravel()) / np.maximum(np.bincount(rings.ravel()), 1)
-    outermost = int(np.flatnonzero(share >= 0.5).max(initial=0))
-    beyond = away > outermost + 2
-    full = np.flatnonzero(share[: outermost + 1] >= _LIT_SHARE)
-    if not len(full) or full[-1] < _NARROWEST * outermost or beyond.mean() < _CORNERS:
+    counts = np.bincount(rings.ravel())
+    share = np.bincount(rings.ravel(), shown.ravel()) / np.maximum(counts, _FEWEST)
+    rim = int(np.flatnonzero(share >= _RIM).max(initial=0))
+    usual = np.median(share[int(_WITHIN * rim) : rim + 1])
+    beyond = away > rim + 2
+    if black > _BLACKEST or usual < _LEAST_LIT or beyond.mean() < _CORNERS:
         return float("inf")
     if (~shown[beyond]).mean() < _DARK_SHARE:
         return float("inf")
+    full = np.flatnonzero(share[: rim + 1] >= _LIT_SHARE * usual)
     return float(full[-1] * (1.0 - _MARGIN) * camera.width / width)
 
 

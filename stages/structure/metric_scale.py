@@ -67,6 +67,12 @@ def find_metric_scale(
     centres = np.array([camera.centre for camera in cameras])
     if known.distance:
         metric: MetricScale | None = _from_distance(known.distance, photos, centres)
+        if known.marker:
+            report.warn(
+                "sfm-marker-unused",
+                f"--marker {known.marker:g} is not used: the distance of --scale says how large "
+                "the scene is. Give only one of them; a run folder keeps both, so start another.",
+            )
     elif known.marker:
         metric = _from_markers(known.marker, marker_sides(pictures, cameras), report)
     elif known.metres_per_unit:

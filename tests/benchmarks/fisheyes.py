@@ -1,8 +1,9 @@
 """Fisheye pictures of the sample's scene: `python -m tests.benchmarks.fisheyes FOLDER`.
 
-Draws 12 circular ones of 180 degrees along the sample's walk into FOLDER/photos, and their cameras,
-equidistant, as a COLMAP model into FOLDER/cameras. With `--run RUN` it compares the splats of a
-finished run with the held-out pictures, within and beyond what one pinhole picture of them shows.
+Draws 12 circular ones of 180 degrees, or `--degrees`, along the sample's walk into FOLDER/photos,
+and their cameras, equidistant, as a COLMAP model into FOLDER/cameras. With `--run RUN` it compares
+the splats of a finished run with the held-out pictures, within and beyond what one pinhole picture
+of them shows.
 """
 
 from __future__ import annotations
@@ -37,27 +38,30 @@ from stages.structure.undistorted_images import IMAGES, mask_file
 from tests.benchmarks import panoramas
 
 SIDE = 800  # pixels; 255 a radian
+DEGREES = 180.0  # across a picture
 _BAND = 80  # rows that are drawn at once
 
 
 @dataclass(frozen=True)
 class Band:
-    """Rows of a square equidistant picture of 180 degrees, in place of a `render.Lens`."""
+    """Rows of a square equidistant picture, in place of a `render.Lens`."""
 
     width: int
     height: int
     first: int
+    degrees: float
 
     def rays(self, world_to_camera: NDArray[np.float64], dx: float, dy: float) -> Array:
         """[3, H W] unit directions in the world through the points (dx, dy) of each pixel."""
-        rays = directions(self.width, dx, dy)[self.first : self.first + self.height]
+        whole = directions(self.width, self.degrees, dx, dy)
+        rays = whole[self.first : self.first + self.height]
         return (world_to_camera[:3, :3].T @ rays.reshape(-1, 3).T).astype(np.float32)
 
 
-def directions(side: int, dx: float = 0.5, dy: float = 0.5) -> NDArray[np.float64]:
+def directions(side: int, degrees: float, dx: float = 0.5, dy: float = 0.5) -> NDArray[np.float64]:
     """[S, S, 3] unit directions of the camera through the points (dx, dy) of each pixel."""
     u, v = np.meshgrid(np.arange(side) + dx - side / 2, np.arange(side) + dy - side / 2)
-    angle = np.pi / side * np.hypot(u, v)
+    angle = np.minimum(np.radians(degrees) / side * np.hypot(u, v), np.pi)
     turn = np.arctan2(v, u)
     return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1)
 
@@ -72,30 +76,31 @@ def name(number: int) -> str:
     return f"fisheye_{number:02d}.jpg"
 
 
-def picture(pose: NDArray[np.float64], side: int) -> NDArray[np.uint8]:
-    """[S, S, 3] what a fisheye shows: black beyond 90 degrees from its axis."""
-    bands = [Band(side, _BAND, first) for first in range(0, side, _BAND)]
+def picture(pose: NDArray[np.float64], side: int, degrees: float) -> NDArray[np.uint8]:
+    """[S, S, 3] what a fisheye shows: black beyond half of `degrees` from its axis."""
+    bands = [Band(side, _BAND, first, degrees) for first in range(0, side, _BAND)]
     shown = panoramas.drawn(bands, pose)
-    return np.where(directions(side)[..., 2:] > 0, shown, np.uint8(0))
+    inside = directions(side, degrees)[..., 2:] > np.cos(np.radians(degrees) / 2)
+    return np.where(inside, shown, np.uint8(0))
 
 
-def draw(number: int, folder: Path, side: int) -> None:
+def draw(number: int, folder: Path, side: int, degrees: float = DEGREES) -> None:
     """Draw one, unless it is in `folder`."""
     path = folder / name(number)
     if not path.exists():
         unfinished = path.with_suffix(".partial")
-        pixels = picture(poses()[number], side)
+        pixels = picture(poses()[number], side, degrees)
         Image.fromarray(pixels).save(unfinished, "JPEG", quality=95, subsampling=0)
         unfinished.replace(path)
 
 
-def taken(number: int, side: int) -> Camera:
+def taken(number: int, side: int, degrees: float = DEGREES) -> Camera:
     """The camera of a picture; its lens is equidistant."""
-    focal = side / np.pi
+    focal = side / np.radians(degrees)
     return Camera(side, side, focal, focal, side / 2, side / 2, poses()[number])
 
 
-def compare(run: Path, photos: Path) -> str:
+def compare(run: Path, photos: Path, degrees: float = DEGREES) -> str:
     """Of the trained splats of a run: PSNR of the held-out pictures within what one pinhole picture
     shows, and beyond. Each figure is of all pixels of the picture's faces."""
     splats = load_splats(run / "4-train" / "splats.bin")
@@ -104,7 +109,7 @@ def compare(run: Path, photos: Path) -> str:
     lines = [f"{len(splats)} splats, {figures['registered_images']} views"]
     for number in range(0, panoramas.PANORAMAS, HELD_OUT_EVERY):
         side = Image.open(photos / name(number)).width
-        camera = taken(number, side)
+        camera = taken(number, side, degrees)
         one = undistorted_camera(camera, Lens("fisheye"))
         parts: dict[str, list[tuple[Array, Array]]] = {"within": [], "beyond": []}
         with TemporaryDirectory() as folder:
@@ -150,10 +155,10 @@ def kept_of(view: PinholeView, folder: Path) -> NDArray[np.bool_]:
     return np.asarray(load_image(folder / mask_file(view.photo), *size)[..., 0] > 0)
 
 
-def write_cameras(folder: Path, side: int) -> None:
+def write_cameras(folder: Path, side: int, degrees: float = DEGREES) -> None:
     """A COLMAP model of the pictures' cameras, as text and without points."""
     folder.mkdir(parents=True, exist_ok=True)
-    camera = taken(0, side)
+    camera = taken(0, side, degrees)
     lens = f"{camera.fx} {camera.fy} {camera.cx} {camera.cy} 0 0 0 0"
     (folder / "cameras.txt").write_text(f"1 OPENCV_FISHEYE {side} {side} {lens}\n")
     lines = []
@@ -167,16 +172,17 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--side", type=int, default=SIDE, help="of a picture (pixels)")
+    parser.add_argument("--degrees", type=float, default=DEGREES, help="across a picture")
     parser.add_argument("--run", type=Path, help="a finished run of the pictures in FOLDER")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args(words)
     photos = options.folder / "photos"
     if options.run:
-        print(compare(options.run, photos))
+        print(compare(options.run, photos, options.degrees))
         return
     photos.mkdir(parents=True, exist_ok=True)
-    write_cameras(options.folder / "cameras", options.side)
-    one = partial(draw, folder=photos, side=options.side)
+    write_cameras(options.folder / "cameras", options.side, options.degrees)
+    one = partial(draw, folder=photos, side=options.side, degrees=options.degrees)
     with ProcessPoolExecutor(options.jobs) as pool:
         list(pool.map(one, range(panoramas.PANORAMAS)))
 

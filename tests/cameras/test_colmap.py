@@ -14,6 +14,7 @@ from stages.cameras.colmap import (
     locate,
     read,
     read_model,
+    read_points,
     write_colmap_model,
 )
 from tests.cameras.models import example
@@ -131,6 +132,16 @@ def test_lenses_are_read_and_distortion_is_counted(
     assert view.name == "my photo.jpg"
     np.testing.assert_array_equal(camera.centre, [-0.5, 0, -2])
     assert found.distorted == distorted
+
+
+@pytest.mark.parametrize("points", [None, "", "# 3D point list with one line of data per point\n"])
+def test_a_text_model_of_known_cameras_needs_no_points(tmp_path: Path, points: str | None) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.jpg\n\n")
+    if points is not None:
+        (tmp_path / "points3D.txt").write_text(points)
+    found = read_points(tmp_path)
+    assert found is None or not len(found.points)
 
 
 def damaged(folder: Path, name: str, change) -> None:

@@ -141,8 +141,12 @@ def test_3d_scanner_app_s_maps_lie_among_its_photographs(tmp_path: Path) -> None
         save(tmp_path / "scan" / f"frame_0000{number}.jpg", textured(number))
         save(tmp_path / "scan" / f"depth_0000{number}.png", MILLIMETRES)
         save(tmp_path / "scan" / f"conf_0000{number}.png", np.full((HIGH, WIDE), 2, np.uint8))
-    capture, _ = taken(tmp_path / "scan")
+    for number in range(4):
+        (tmp_path / "scan" / f"frame_0000{number}.json").write_text("{}")
+    save(tmp_path / "scan" / "depth_00003.png", MILLIMETRES)  # a frame without a picture
+    capture, warnings = taken(tmp_path / "scan")
     assert [photo.name for photo in capture.photos] == [f"frame_0000{i}.jpg" for i in range(3)]
+    assert "ingest-depth-unused" not in warnings
     for found in maps_of(capture):
         np.testing.assert_allclose(found, METRES, atol=1e-6)
 

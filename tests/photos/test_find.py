@@ -95,3 +95,20 @@ def test_names_that_are_no_utf8_are_spelt_out(tmp_path: Path) -> None:
         except OSError:
             pytest.skip("this disk wants UTF-8")
     assert [source.name for source in find(tmp_path).sources] == ["\\xfe.jpg", "\\xff.jpg"]
+
+
+def test_3d_scanner_app_s_other_pictures_are_no_photographs(tmp_path: Path) -> None:
+    """Its folder also holds a small copy of a frame and the texture of the mesh; not every frame
+    has a picture. Photographs in other folders stay."""
+    scan, more = tmp_path / "scan", tmp_path / "more"
+    scan.mkdir()
+    more.mkdir()
+    for number in range(6):
+        (scan / f"frame_0000{number}.json").write_text("{}")
+    for name in ("frame_00000.jpg", "frame_00003.jpg", "thumb_00000.jpg", "textured_output.jpg"):
+        Image.new("RGB", (8, 6)).save(scan / name)
+    Image.new("RGB", (8, 6)).save(more / "a.jpg")
+    (scan / "info.json").write_text("{}")
+    assert [one.name for one in find(scan).sources] == ["frame_00000.jpg", "frame_00003.jpg"]
+    both = [one.name for one in find(tmp_path).sources]
+    assert both == ["more/a.jpg", "scan/frame_00000.jpg", "scan/frame_00003.jpg"]

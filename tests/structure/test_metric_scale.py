@@ -69,6 +69,17 @@ def test_a_distance_between_two_photographs_makes_the_world_metric() -> None:
     assert "3.5 m apart" in report.metrics["scale_source"]
 
 
+def test_a_marker_beside_a_distance_is_said_to_be_unused() -> None:
+    report = Report()
+    posed = [Camera(640, 480, 600.0, 600.0, 320.0, 240.0, pose) for pose in cameras()]
+    known = KnownScale(("2.jpg", "9.jpg", "3.5"), marker=0.05)
+    photos = capture_of([None] * 12).photos
+    metric = find_metric_scale(known, photos, posed, [], True, report)
+    assert metric is not None
+    assert "3.5 m apart" in metric.source
+    assert [code for code, _ in report.warnings] == ["sfm-marker-unused"]
+
+
 def test_points_move_with_the_cameras() -> None:
     poses, metric = cameras(), MetricScale(3.0, "", about_vertical(0.5))
     points = np.random.default_rng(1).normal(size=(20, 3))
