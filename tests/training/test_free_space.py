@@ -99,7 +99,7 @@ class Clouds:
     def __init__(self):
         self.made = 0
 
-    def prune(self, model, remove_giants):
+    def cull(self, model, remove_giants):
         return model
 
     def grow(self, model, budget):
