@@ -29,12 +29,12 @@ def losses_of(row: Format, file_name: str, splats: Splats) -> list[Loss]:
     if row.position_loss and (loss := load_object(row.position_loss)(splats)):
         advice = "`splat edit --drop-floaters` removes outliers; .ply, .glb and .usdz hold them."
         found.append(Loss("range", f"{file_name} {loss}. {advice}"))
-    if splats.draw_settings.antialias and not row.antialias:
+    if splats.draw_settings.antialias and not row.drawn_antialiased:
         found.append(
             Loss(
                 "drawing",
                 f"{file_name} holds splats for antialiased drawing"
-                f"{'' if row.says_antialias else ', of which the file says nothing'}, and most "
+                f"{'' if row.says_drawing else ', of which the file says nothing'}, and most "
                 f"programs draw .{row.ending} plainly: splats look too strong there, the more the "
                 "farther away. A viewer that compensates opacities (Spark, Brush, PlayCanvas with "
                 "antialiasing switched on) draws it right. For others, in the run's folder: "
