@@ -32,6 +32,7 @@ from stages.raster.reference import sh_basis
 from stages.scene import IGNORE, Camera, Splats
 
 VISIBLE_WEIGHT = 1.0 / 255.0  # a smaller blend weight cannot change an 8-bit picture
+MAX_MEASURED_VIEWS = 48  # in a round of removal; enough to say which splats contribute least
 MARGIN = 0.25  # of the longer side: as far as seeding continues a picture beyond its edge
 
 
