@@ -69,7 +69,7 @@ class Sparsification:
             _evaluation_view(trainer.train[row], camera, background)
             for row, camera in zip(rows, cameras, strict=True)
         )
-        contributions = measure_contributions(splats, views, trainer.backend)
+        contributions = measure_contributions(splats, views, trainer.backend, truncation=False)
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
         most = int(LARGEST_ROUND * len(splats))
         every = len(rows) == len(trainer.train)
