@@ -87,7 +87,7 @@ class Format:
         beside = [path, page] if page != path and page.is_file() else [path]
         if self.streamed:
             candidates = sorted(path.parent.glob("*_*/*"))
-            return [*beside, *(file for file in candidates if CHUNK.match(file.parent.name))]
+            return [*beside, *(file for file in candidates if CHUNK_FOLDER.match(file.parent.name))]
         return beside
 
     def size_bytes(self, path: Path) -> int:
@@ -95,7 +95,7 @@ class Format:
         return sum(file.stat().st_size for file in self.files(path))
 
 
-CHUNK = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
+CHUNK_FOLDER = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
 _MESH = re.compile(r"\.mesh\.(glb|ply)$")  # of the names of meshes
 
 _GLB = Format(
