@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ReconstructionError, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 
@@ -187,12 +187,11 @@ def _report_outliers(reasons: dict[str, NDArray[np.bool_]], points: int, report:
 
 
 def _too_few(usable: int, points: int) -> SplatError:
-    return SplatError(
+    return ReconstructionError(
         "seed-too-few-points",
         given=f"Only {usable} of {points} reconstructed points can be used.",
         wanted=f"At least {_FEWEST_SPLATS} distinct points to start from.",
         hint="Take more photographs with more overlap of a scene with texture, and start again.",
-        family=Family.RECONSTRUCTION,
     )
 
 

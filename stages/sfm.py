@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ReconstructionError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.base.text import counted
@@ -251,14 +251,13 @@ def _check_duplicates(capture: Capture) -> None:
 
     different = len({photo.duplicate_of or photo.source for photo in capture.photos})
     if different < _FEWEST_PHOTOGRAPHS:
-        raise SplatError(
+        raise ReconstructionError(
             "sfm-no-parallax",
             given=f"The {len(capture.photos)} photographs show only "
             f"{counted(different, 'picture')} that {'are' if different > 1 else 'is'} not nearly "
             "the same as another.",
             wanted="Depth can be measured only when the camera moves sideways.",
             hint=MOVE,
-            family=Family.RECONSTRUCTION,
         )
 
 

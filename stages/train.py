@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages.base.bad_files import reading, stage_output
-from stages.base.errors import QualityError, SplatError
+from stages.base.errors import QualityError, ResourceError, SplatError
 from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 from stages.capacity.output_formats import drawing_setting
@@ -241,14 +241,13 @@ def _report_cap(trainer: Trainer, report: Report) -> None:
 
 
 def _does_not_fit(full: MemoryFull, cap: int) -> SplatError:
-    return SplatError(
+    return ResourceError(
         full.code,
         given=full.given,
         wanted=full.wanted,
         hint=f"Run the same command again to resume from the last checkpoint with at most {cap:,} "
         f"splats. --max-splats {cap} starts again; so does a larger --max-splats, once other "
         "programs that use the GPU are closed.",
-        family=full.family,
     )
 
 

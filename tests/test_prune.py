@@ -269,7 +269,7 @@ def test_measuring_a_part_of_the_views_removes_about_as_much_at_no_more_loss(
 ) -> None:
     trained = join(scene.splats, unseen(5), floater_before(scene, 1))
     reference, _ = run(scene, trained, tmp_path)
-    monkeypatch.setattr(pruning, "MAX_VIEWS", 4)
+    monkeypatch.setattr(pruning, "MAX_MEASURED_VIEWS", 4)
     result, report = run(scene, trained, tmp_path)
     assert len(result) == pytest.approx(len(reference), rel=0.15)
     assert training_db(scene, result) > training_db(scene, reference) - 0.3
@@ -280,7 +280,7 @@ def test_measuring_a_part_of_the_views_removes_about_as_much_at_no_more_loss(
 
 
 def test_what_only_an_unmeasured_view_shows_stays(scene, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(pruning, "MAX_VIEWS", 1)  # of nine, the first
+    monkeypatch.setattr(pruning, "MAX_MEASURED_VIEWS", 1)  # of nine, the first
     result, _ = run(scene, scene.splats, tmp_path)
     far = scene.reconstruction.views[5].camera
     seen = [Splats.take(s, far.project(s.means)[1] < 3) for s in (scene.splats, result)]

@@ -90,7 +90,7 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
     prover = Prover.of(splats, cameras, source_format=format_of(source).ending)
     proof = prover.require(target, "convert-verify-failed")
     figures = proof.figures
-    if splats.draw_settings.antialias and not format_of(target).antialias:
+    if splats.draw_settings.antialias and not format_of(target).drawn_antialiased:
         figures = figures | {"plain_drawing_db": round(prover.plain_drawing_db(), 2)}
     loss = losses_shown(format_of(target), proof, splats)
     return figures, loss and f"{target.name} differs visibly from {source.name}: {loss}"

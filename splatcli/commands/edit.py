@@ -71,7 +71,7 @@ def _edit(
     with ExitStack() as stack:
         if target.parent.is_dir():
             stack.enter_context(scratch.scratch_in(target.parent))
-        scene = _load_scene(source, row.antialias)
+        scene = _load_scene(source, row.drawn_antialiased)
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps = []

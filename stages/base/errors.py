@@ -61,6 +61,12 @@ class UsageError(SplatError):
     family = Family.USAGE
 
 
+class ReconstructionError(SplatError):
+    """See `Family.RECONSTRUCTION`."""
+
+    family = Family.RECONSTRUCTION
+
+
 class RunFolderError(SplatError):
     """See `Family.RUN_FOLDER`."""
 

@@ -9,7 +9,6 @@ loop closure, belong to the undistorted `corrected_images`.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from stages.cameras.camera_file import (
     CameraFile,
     Georeference,
     cameras_of,
-    content_of,
+    json_of,
     poses_of,
     stored_size,
 )
@@ -63,7 +62,7 @@ def read(path: Path) -> CameraFile:
     posed = []
     for file in with_picture:
         with reading(file, CAMERAS):
-            frame = json.loads(content_of(file).decode("utf-8-sig"))
+            frame = json_of(file)
             if not isinstance(frame, dict):
                 raise BadFileError("it is not an object")
             parse: Callable[..., Posed] = _polycam if images else _scanner_app

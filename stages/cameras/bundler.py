@@ -26,11 +26,6 @@ from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 _CAMERA_LINES = 5
 
 
-def locate(path: Path) -> Path | None:
-    """The path itself, if it is an .out file."""
-    return path if path.suffix.lower() == ".out" else None
-
-
 def read(path: Path) -> CameraFile:
     """The cameras that were registered. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):

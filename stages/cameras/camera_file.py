@@ -6,6 +6,7 @@ are the file's own; each module says what it changes.
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -164,6 +165,12 @@ def poses_of(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> ND
     with np.errstate(all="ignore"):  # `make_views` checks the result
         translations = -np.einsum("vij,vj->vi", rotations, centres)
     return np.concatenate([rotations, translations[:, :, None]], axis=2)
+
+
+def json_of(path: Path) -> Any:
+    """The content of a file of JSON, with or without a byte order mark. Raises as `content_of`, and
+    ValueError."""
+    return json.loads(content_of(path).decode("utf-8-sig"))
 
 
 def content_of(path: Path) -> bytes:

@@ -18,7 +18,7 @@ from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras import colmap_records as records
 from stages.cameras.camera_file import CameraFile, FilePoints, cameras_of
-from stages.cameras.colmap_records import POINT2D, Image
+from stages.cameras.colmap_records import POINT2D, ImageRecord
 from stages.scene import Camera
 from stages.scene.rotations import matrices_of, quaternions_of
 
@@ -164,7 +164,7 @@ def _part(folder: Path, name: str) -> tuple[Path, bool]:
     return (text, True) if text.is_file() and not binary.is_file() else (binary, False)
 
 
-def _read(folder: Path) -> tuple[CameraFile, list[Image]]:
+def _read(folder: Path) -> tuple[CameraFile, list[ImageRecord]]:
     path, text = _part(folder, "cameras")
     with reading(path, CAMERAS):
         optics = dict((records.text_cameras if text else records.binary_cameras)(path))

@@ -46,7 +46,7 @@ POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
 @dataclass(frozen=True)
-class Image:
+class ImageRecord:
     """camera: its id. pose [7]: quaternion w, x, y, z and translation. seen [n]: 2D points of type
     `POINT2D`; point -1 is none."""
 
@@ -92,7 +92,7 @@ def binary_cameras(path: Path) -> Iterator[tuple[int, Optics]]:
         at += 24 + 8 * count
 
 
-def binary_images(path: Path) -> Iterator[Image]:
+def binary_images(path: Path) -> Iterator[ImageRecord]:
     """Of images.bin. Raises struct.error and ValueError."""
     data, at = path.read_bytes(), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
@@ -100,7 +100,7 @@ def binary_images(path: Path) -> Iterator[Image]:
         end = data.index(b"\0", at + 64)
         (count,) = struct.unpack_from("<Q", data, end + 1)
         seen = np.frombuffer(data, POINT2D, count, end + 9)
-        yield Image(data[at + 64 : end].decode(), camera, tuple(pose), seen)
+        yield ImageRecord(data[at + 64 : end].decode(), camera, tuple(pose), seen)
         at = end + 9 + POINT2D.itemsize * count
 
 
@@ -130,7 +130,7 @@ def text_cameras(path: Path) -> Iterator[tuple[int, Optics]]:
         yield int(number), _optics(model, int(width), int(height), tuple(map(float, params)))
 
 
-def text_images(path: Path) -> Iterator[Image]:
+def text_images(path: Path) -> Iterator[ImageRecord]:
     """Of images.txt: two lines each, the second empty if nothing is seen. Raises BadFileError
     and ValueError."""
     lines = _lines(path)
@@ -141,7 +141,7 @@ def text_images(path: Path) -> Iterator[Image]:
         seen = np.array(next(lines, "").split(), np.float64).reshape(-1, 3)
         points = np.empty(len(seen), POINT2D)
         points["xy"], points["point"] = seen[:, :2], seen[:, 2]
-        yield Image(name.strip(), int(camera), tuple(map(float, pose)), points)
+        yield ImageRecord(name.strip(), int(camera), tuple(map(float, pose)), points)
 
 
 def text_points(path: Path) -> Iterator[tuple[float, ...]]:

@@ -34,11 +34,6 @@ _SOURCE = "the chunk's transform"
 _KINDS = {"frame": "perspective", "fisheye": "fisheye"}
 
 
-def locate(path: Path) -> Path | None:
-    """The path itself, if it is an .xml file."""
-    return path if path.suffix.lower() == ".xml" else None
-
-
 def read(path: Path) -> CameraFile:
     """The cameras that were aligned. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):

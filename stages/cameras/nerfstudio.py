@@ -92,11 +92,6 @@ def write(
         partial.write_text(json.dumps(data, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
-def locate(path: Path) -> Path | None:
-    """The path itself, if it is a .json file."""
-    return path if path.suffix.lower() == ".json" else None
-
-
 def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
     """The cameras of a file, named by `file_path`. size: of pictures that are not found and whose
     size the file does not say. Raises SplatError "cameras-unreadable"."""

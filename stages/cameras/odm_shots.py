@@ -9,7 +9,6 @@ longer side. Without cameras.json the lens is a pinhole of that focal length.
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from stages.cameras.camera_file import (
     CameraFile,
     Georeference,
     cameras_of,
-    content_of,
+    json_of,
     poses_of,
 )
 from stages.cameras.lens import PINHOLE, Lens
@@ -48,7 +47,7 @@ def read(path: Path) -> CameraFile:
     "cameras-unreadable"."""
     lenses = _lenses(path)
     with reading(path, CAMERAS):
-        shots = json.loads(content_of(path).decode("utf-8-sig"))["features"]
+        shots = json_of(path)["features"]
         if not shots:
             raise BadFileError("it holds no camera")
         about = [shot["properties"] for shot in shots]
@@ -81,7 +80,7 @@ def _lenses(path: Path) -> dict[str, tuple[list[float], Lens]]:
     if file == path:
         return {}
     with reading(file, CAMERAS):
-        cameras = json.loads(content_of(file).decode("utf-8-sig"))
+        cameras = json_of(file)
         # OpenSfM's names begin with a version, which ODM leaves out here
         return {str(name): optics_of(camera) for name, camera in cameras.items()}
 

@@ -8,7 +8,6 @@ metres east, north and up of it, as far as GPS is right; without GPS the referen
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,8 @@ from stages.cameras.camera_file import (
     FilePoints,
     Georeference,
     cameras_of,
-    content_of,
     file_points,
+    json_of,
 )
 from stages.cameras.lens import Lens
 from stages.scene import View
@@ -101,7 +100,7 @@ def read_points(path: Path) -> FilePoints | None:
 
 
 def _largest(path: Path) -> dict[str, Any]:
-    data = json.loads(content_of(path).decode("utf-8-sig"))
+    data = json_of(path)
     if not isinstance(data, list) or not data:
         raise BadFileError("it holds no reconstruction")
     for part in data:

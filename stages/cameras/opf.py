@@ -8,7 +8,6 @@ shift.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterator
@@ -26,7 +25,7 @@ from stages.cameras.camera_file import (
     Georeference,
     cameras_of,
     check_inside,
-    content_of,
+    json_of,
     poses_of,
 )
 from stages.cameras.lens import Lens
@@ -49,7 +48,7 @@ def locate(path: Path) -> Path | None:
 def read(path: Path) -> CameraFile:
     """The calibrated cameras. Raises SplatError "cameras-unreadable"."""
     with reading(path, CAMERAS):
-        project = json.loads(content_of(path).decode("utf-8-sig"))
+        project = json_of(path)
         if project.get("format") != "application/opf-project+json":
             raise BadFileError("it is not a project of the Open Photogrammetry Format")
         pictures = {
@@ -101,7 +100,7 @@ def _parts(path: Path, project: Any, form: str, kind: str = "") -> Iterator[dict
             if not file.is_file():
                 raise BadFileError(f"it names {name[:80]}, which is not there")
             with reading(file, CAMERAS):
-                content: dict[str, Any] = json.loads(content_of(file).decode("utf-8-sig"))
+                content: dict[str, Any] = json_of(file)
             yield content
 
 

@@ -26,11 +26,6 @@ _NEEDED = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 
 
-def locate(path: Path) -> Path | None:
-    """The path itself, if it is a .csv file."""
-    return path if path.suffix.lower() == ".csv" else None
-
-
 def read(path: Path) -> CameraFile:
     """The cameras of all rows; their pictures are beside the file, or in images/ there. Raises
     SplatError "cameras-unreadable"."""

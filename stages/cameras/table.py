@@ -3,7 +3,7 @@
 To add one:
 
 1. Write a module here with `locate(path)`, which returns the path to read, or None if `path` is not
-   such a file.
+   such a file. A format that its suffix identifies needs none: its row names the suffix.
 2. Give it `read(path)`, which returns a `CameraFile` made by `camera_file.make_views`.
 3. Give it `read_points(path)` if the file has sparse points, and `files(path)` if other files than
    the .ply beside it, or those of the folder, are read with it.
@@ -24,23 +24,25 @@ from stages.cameras.camera_file import CameraFile, FilePoints
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """A row of the list. module: in this package. description: for errors and help."""
+    """A row of the list. module: in this package. description: for errors and help. suffix: of the
+    files that the format reads; "" if its module locates them."""
 
     module: str
     description: str
+    suffix: str = ""
 
 
 CAMERA_FILES = (
     CameraFormat("opensfm", "OpenSfM's and ODM's reconstruction.json"),
     CameraFormat("odm_shots", "ODM's shots.geojson"),
     CameraFormat("arkit", "a folder with ARKit's frame_*.json, or Polycam's keyframes"),
-    CameraFormat("nerfstudio", "a transforms.json of nerfstudio's or instant-ngp's"),
+    CameraFormat("nerfstudio", "a transforms.json of nerfstudio's or instant-ngp's", ".json"),
     CameraFormat("blender", "a folder with a synthetic NeRF scene's transforms_train.json"),
     CameraFormat("colmap", "a folder with COLMAP's images.bin or images.txt"),
     CameraFormat("llff", "LLFF's poses_bounds.npy"),
-    CameraFormat("bundler", "Bundler's .out"),
-    CameraFormat("metashape", "Metashape's cameras as .xml"),
-    CameraFormat("realityscan", "RealityScan's camera parameters as .csv"),
+    CameraFormat("bundler", "Bundler's .out", ".out"),
+    CameraFormat("metashape", "Metashape's cameras as .xml", ".xml"),
+    CameraFormat("realityscan", "RealityScan's camera parameters as .csv", ".csv"),
     CameraFormat("realityscan_xmp", "a folder with RealityScan's .xmp beside the photographs"),
     CameraFormat("opf", "Pix4D's project.opf"),
 )
@@ -80,7 +82,10 @@ def _reader(path: Path) -> tuple[ModuleType, Path]:
     """(the format's module, what it reads)."""
     for row in CAMERA_FILES:
         module = importlib.import_module(f"stages.cameras.{row.module}")
-        located = module.locate(path)
+        if row.suffix:
+            located = path if path.suffix.lower() == row.suffix else None
+        else:
+            located = module.locate(path)
         if located is not None:
             return module, located
     raise UsageError(

@@ -87,7 +87,7 @@ class FormatFinetuning:
         format is requested, or `splats` are drawn so. Raises Interrupted."""
         rows = [FORMATS[name] for name in self.settings.formats]
         if not splats.draw_settings.antialias or all(
-            row.antialiased(self.settings.drawing) for row in rows
+            row.holds_antialiased(self.settings.drawing) for row in rows
         ):
             return None
         self.report.progress(0, 1, "fine-tuning to plain drawing")

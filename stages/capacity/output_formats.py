@@ -20,7 +20,7 @@ def formats_to_finetune(names: Iterable[str], drawing: str) -> tuple[str, ...]:
     to being drawn plainly. "ply" stands for all that are drawn plainly and round nothing, because
     all these hold the same splats."""
     chosen = {FORMATS[name] for name in names if name in FORMATS}
-    plain = any(not row.needs_finetuning and not row.antialiased(drawing) for row in chosen)
+    plain = any(not row.needs_finetuning and not row.holds_antialiased(drawing) for row in chosen)
     rounding = (n for n, row in FORMATS.items() if row in chosen and row.needs_finetuning)
     return (*((LOSSLESS,) if plain else ()), *rounding)
 

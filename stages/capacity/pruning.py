@@ -17,7 +17,11 @@ import numpy as np
 
 from stages.base.stage import Report
 from stages.capacity.targets import Psnr, Targets
-from stages.measure.contribution import Contributions, measure_contributions
+from stages.measure.contribution import (
+    MAX_MEASURED_VIEWS,
+    Contributions,
+    measure_contributions,
+)
 from stages.measure.evaluation import EvaluationView, image_renderer
 from stages.measure.rate_distortion import RateDistortion, rate_distortion_of
 from stages.measure.selection import ROUND_SHARE, Removal, select_removal
@@ -25,7 +29,6 @@ from stages.scene import Splats, evenly_spaced
 from stages.training.finetune import FineTuner
 
 HALVINGS = 3  # of the share of splats that a round removes, after rounds that cost too much
-MAX_VIEWS = 48  # measured in a round; what the others showed at first goes on counting
 TINY = float(np.finfo(np.float64).tiny)
 # why pruning stopped
 RATE_DISTORTION, LOSS, ROUNDS, TIME = "rate_distortion", "loss", "rounds", "time"
@@ -99,7 +102,7 @@ class Pruner:
 
     Args:
         views: training views. All are trained on and choose what is removed; of very many,
-            `MAX_VIEWS` are measured in each round.
+            `MAX_MEASURED_VIEWS` are measured in each round.
         targets: what pruning may cost and must reach.
         backend: name of the rasteriser.
         finetuner: on the same views.
@@ -120,7 +123,7 @@ class Pruner:
 
     def __post_init__(self) -> None:
         every = range(len(self.views))
-        self._measured = evenly_spaced(every, MAX_VIEWS)
+        self._measured = evenly_spaced(every, MAX_MEASURED_VIEWS)
         self._others = sorted(set(every) - set(self._measured))
         # in the order of `Contributions.scene_depth`
         self._cameras = [self.finetuner.cameras[i] for i in (*self._others, *self._measured)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.base.text import counted
 from stages.scene import Splats
 
@@ -61,34 +61,31 @@ class Targets:
     def check_start(self, psnr_db: float) -> None:
         """Raises SplatError (prune-psnr-not-reached) if even the unpruned model is below."""
         if self.min_psnr_db > psnr_db:
-            raise SplatError(
+            raise UsageError(
                 "prune-psnr-not-reached",
                 given=f"--min-psnr {self.min_psnr_db:g}, but all trained splats together reach "
                 f"{psnr_db:.2f} dB on the training views.",
                 wanted=f"At most {np.floor(psnr_db * 100) / 100:.2f}.",
                 hint="Pruning only removes splats. For a higher PSNR train longer, or with more "
                 "splats.",
-                family=Family.USAGE,
             )
 
     def check_end(self, splats: Splats, psnr_db: float) -> None:
         """Raises SplatError (prune-too-small, prune-targets-contradict)."""
         size = self.size_bytes(splats) if self.max_bytes else 0
         if size > self.max_bytes:
-            raise SplatError(
+            raise UsageError(
                 "prune-too-small",
                 given=f"--max-mb {self.max_bytes / 1e6:g} is less than "
                 f"{counted(len(splats), 'splat')} take.",
                 wanted=f"At least {np.ceil(size / 1e4) / 100:g}.",
                 hint="Ask for more megabytes, or for another format with --mb-of.",
-                family=Family.USAGE,
             )
         if self.min_psnr_db > psnr_db:
-            raise SplatError(
+            raise UsageError(
                 "prune-targets-contradict",
                 given=f"--min-psnr {self.min_psnr_db:g} and the requested size contradict each "
                 f"other: {counted(len(splats), 'splat')} reach {psnr_db:.2f} dB.",
                 wanted="Targets that this scene can meet together.",
                 hint=f"Ask for --min-psnr {np.floor(psnr_db * 100) / 100:.2f}, or allow more.",
-                family=Family.USAGE,
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -25,7 +25,7 @@ from stages.scene.place import EarthPlace
 EXTENSION = "KHR_gaussian_splatting"
 _COMPONENT_TYPES = {"<f4": 5126, "<i2": 5122, "<u2": 5123, "|u1": 5121, "<u4": 5125}
 _GLB_LIMIT_BYTES = (1 << 32) - 1
-ARRAY_BUFFER = 34962
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _POINTS = 0
 
 
@@ -79,16 +79,11 @@ def _document(
     primitives: list[dict[str, Attribute]], made_of: dict[str, Any], node_scale: float
 ) -> dict[str, Any]:
     """The JSON, whose buffer has no size and name yet."""
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, Any]] = []
-    offset = 0
+    written: list[tuple[str, Attribute]] = []
     described = []
     for attributes in primitives:
-        described.append(_primitive({n: len(views) + i for i, n in enumerate(attributes)}))
-        for name, attribute in attributes.items():
-            accessors.append(accessor(name, attribute, len(views)))
-            views.append(buffer_view(attribute, offset))
-            offset += attribute.rows.nbytes
+        described.append(_primitive({n: len(written) + i for i, n in enumerate(attributes)}))
+        written += attributes.items()
     document: dict[str, Any] = {
         "asset": made_of,
         "extensionsUsed": [EXTENSION],
@@ -103,10 +98,21 @@ def _document(
     return document | {
         "nodes": [node],
         "meshes": [{"primitives": described, "name": "splats"}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{}],
+        **buffer_fields(written),
     }
+
+
+def buffer_fields(written: Iterable[tuple[str, Attribute]]) -> dict[str, Any]:
+    """Accessors, buffer views and the buffer, which has no size and name yet, of vertex attributes
+    by name and of indices (name ""), in their order in the buffer."""
+    accessors: list[dict[str, Any]] = []
+    views: list[dict[str, Any]] = []
+    offset = 0
+    for name, attribute in written:
+        accessors.append(_accessor(name, attribute, len(views)))
+        views.append(_buffer_view(name, attribute, offset))
+        offset += attribute.rows.nbytes
+    return {"accessors": accessors, "bufferViews": views, "buffers": [{}]}
 
 
 def asset(
@@ -133,18 +139,18 @@ def asset(
     }
 
 
-def buffer_view(attribute: Attribute, offset: int, target: int = ARRAY_BUFFER) -> dict[str, Any]:
+def _buffer_view(name: str, attribute: Attribute, offset: int) -> dict[str, Any]:
     """The buffer view of an attribute whose bytes start at `offset`."""
     rows = attribute.rows
+    target = _ARRAY_BUFFER if name else _ELEMENT_ARRAY_BUFFER
     view = {"buffer": 0, "byteOffset": offset, "byteLength": rows.nbytes, "target": target}
     if rows.shape[1] > attribute.width:
         view["byteStride"] = rows.nbytes // len(rows)
     return view
 
 
-def accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
-    """The accessor of a vertex attribute, or of indices (name ""), in the buffer view of this
-    number."""
+def _accessor(name: str, attribute: Attribute, view: int) -> dict[str, Any]:
+    """The accessor of an attribute in the buffer view of this number."""
     rows, width = attribute.rows, attribute.width
     described: dict[str, Any] = {
         "bufferView": view,

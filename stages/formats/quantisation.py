@@ -91,7 +91,7 @@ def splats_to_write(row: Format, quantised: QuantisedSplats) -> Splats:
     if row.ending in quantised.finetuned:
         return quantised.finetuned[row.ending]
     splats = quantised.splats
-    if quantised.plain is not None and not row.antialiased(quantised.drawing):
+    if quantised.plain is not None and not row.holds_antialiased(quantised.drawing):
         splats = quantised.plain
     if not row.sh_degree and quantised.flat_dc is not None:
         sh = quantised.flat_dc[:, None].astype(splats.sh.dtype)

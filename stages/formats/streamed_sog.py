@@ -25,7 +25,7 @@ from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
 from stages.formats.json_fields import located, location_fields, whole
 from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
-from stages.formats.table import CHUNK
+from stages.formats.table import CHUNK_FOLDER
 from stages.formats.values import allocate, fill
 from stages.scene import Splats, View, morton
 from stages.scene.rotations import matrices_of
@@ -102,7 +102,7 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
             temporary.write_text(json.dumps(meta, allow_nan=False), encoding="utf-8")
             path.unlink(missing_ok=True)  # it must never refer to other chunks
             for old in path.parent.iterdir():
-                if CHUNK.match(old.name) and old.is_dir():
+                if CHUNK_FOLDER.match(old.name) and old.is_dir():
                     shutil.rmtree(old)
             for new in sorted(partial.iterdir()):
                 new.rename(path.with_name(new.name))

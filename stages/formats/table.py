@@ -42,8 +42,9 @@ class Format:
         sidecar: the suffix of a file beside it that belongs to it; "" if there is none.
         takes_views: whether the file also holds cameras.
         needs_finetuning: whether rounding is so coarse that splats are fine-tuned to it.
-        antialias: whether programs that the format is for draw it with opacity compensation.
-        says_antialias: whether a file says that its splats are to be drawn so.
+        drawn_antialiased: whether programs that the format is for draw it with opacity
+            compensation.
+        says_drawing: whether a file says that its splats are to be drawn so.
         streamed: whether the asset has levels of detail. Its file name is `ending` alone, its
             chunks lie in folders beside it, and a folder holds one such asset.
     """
@@ -63,18 +64,18 @@ class Format:
     sidecar: str = ""
     takes_views: bool = False
     needs_finetuning: bool = False
-    antialias: bool = False
-    says_antialias: bool = True
+    drawn_antialiased: bool = False
+    says_drawing: bool = True
     streamed: bool = False
 
     def matches(self, name: str) -> bool:
         """Whether a file of this lower-case name is of this format."""
         return name == self.ending if self.streamed else name.endswith("." + self.ending)
 
-    def antialiased(self, drawing: str) -> bool:
+    def holds_antialiased(self, drawing: str) -> bool:
         """Whether a file of the format holds splats for opacity compensation, under a choice among
         `DRAWINGS`."""
-        return drawing == ANTIALIASED or (drawing == AUTO and self.antialias)
+        return drawing == ANTIALIASED or (drawing == AUTO and self.drawn_antialiased)
 
     def file_name(self, stem: str) -> str:
         """The name of a file of this format."""
@@ -86,7 +87,7 @@ class Format:
         beside = [path, page] if page != path and page.is_file() else [path]
         if self.streamed:
             candidates = sorted(path.parent.glob("*_*/*"))
-            return [*beside, *(file for file in candidates if CHUNK.match(file.parent.name))]
+            return [*beside, *(file for file in candidates if CHUNK_FOLDER.match(file.parent.name))]
         return beside
 
     def size_bytes(self, path: Path) -> int:
@@ -94,7 +95,7 @@ class Format:
         return sum(file.stat().st_size for file in self.files(path))
 
 
-CHUNK = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
+CHUNK_FOLDER = re.compile(r"[0-9]+_[0-9]+$")  # folders of a streamed asset: level, number
 _MESH = re.compile(r"\.mesh\.(glb|ply)$")  # of the names of meshes
 
 _GLB = Format(
@@ -131,7 +132,7 @@ TABLE = (
         loses="has 8-bit colours that do not change with the view",
         sh_degree=0,
         needs_finetuning=True,
-        says_antialias=False,
+        says_drawing=False,
         holds_origin=False,
     ),
     _GLB,
@@ -168,7 +169,7 @@ TABLE = (
         holds_origin=False,
         loses="has sizes in steps of 6 %, 8-bit colours and view-dependent colour of 4 and 5 bits",
         needs_finetuning=True,
-        antialias=True,
+        drawn_antialiased=True,
         y_up=True,
     ),
     Format(
@@ -202,7 +203,7 @@ TABLE = (
         writer="stages.formats.html:write",
         reader="stages.formats.html:read",
         takes_views=True,
-        antialias=True,
+        drawn_antialiased=True,
     ),
 )
 BY_ENDING = {row.ending: row for row in TABLE}

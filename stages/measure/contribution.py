@@ -32,6 +32,7 @@ from stages.raster.reference import sh_basis
 from stages.scene import IGNORE, Camera, Splats
 
 VISIBLE_WEIGHT = 1.0 / 255.0  # a smaller blend weight cannot change an 8-bit picture
+MAX_MEASURED_VIEWS = 48  # in a round of removal; enough to say which splats contribute least
 MARGIN = 0.25  # of the longer side: as far as seeding continues a picture beyond its edge
 
 
@@ -93,6 +94,7 @@ def measure_contributions(
     views: Iterable[EvaluationView],
     backend: str,
     previous: Contributions | None = None,
+    truncation: bool = True,
 ) -> Contributions:
     """The contribution of each splat to the views.
 
@@ -102,6 +104,7 @@ def measure_contributions(
         backend: the rasteriser's name.
         previous: contributions of the same splats to further views. They may have been measured
             before the splats around them changed a little. The result includes them.
+        truncation: whether to measure the truncated figures; else these are [N, 0].
     """
     n = len(splats)
     change, picture, weight, kept_weight = np.zeros((4, n))
@@ -113,7 +116,7 @@ def measure_contributions(
         sse, depths = previous.sse, previous.scene_depth.tolist()
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
     settings = raster_settings_of(splats)
-    truncation = _ShTruncation(splats, previous.sh_sums if previous else ())
+    sh = _ShTruncation(splats, truncation, previous.sh_sums if previous else ())
     for view in views:
         forward = rasteriser.forward(arrays, view.camera, settings, depths=True)
         drawn, truth = forward.image[:3].transpose(1, 2, 0), view.image
@@ -131,8 +134,8 @@ def measure_contributions(
         weight[rows] += found[:, WEIGHT]
         kept_weight[rows] += _kept_weight(rasteriser, forward, view, found)
         view_counts[rows] += found[:, LARGEST_WEIGHT] >= VISIBLE_WEIGHT
-        truncation.add(view.camera.centre, rows, found)
-    truncated_sse_change, truncated_picture_change, truncated_colour = truncation.figures()
+        sh.add(view.camera.centre, rows, found)
+    truncated_sse_change, truncated_picture_change, truncated_colour = sh.figures()
     return Contributions(
         sse_change=change,
         picture_change=picture,
@@ -145,7 +148,7 @@ def measure_contributions(
         truncated_picture_change=truncated_picture_change,
         truncated_colour=truncated_colour,
         psnr_db=np.array(psnr_db),
-        sh_sums=truncation.sums,
+        sh_sums=sh.sums,
         previous=previous,
     )
 
@@ -171,9 +174,11 @@ class _ShTruncation:
     respect to that colour, q the splat's summed squared blend weights.
     """
 
-    def __init__(self, splats: Splats, start: tuple[NDArray[np.float64], ...]) -> None:
-        shape = (len(splats), splats.sh_degree, 3)
-        self.splats = splats
+    def __init__(
+        self, splats: Splats, wanted: bool, start: tuple[NDArray[np.float64], ...]
+    ) -> None:
+        self.splats, self.degrees = splats, splats.sh_degree if wanted else 0
+        shape = (len(splats), self.degrees, 3)
         if start:
             self.sums = tuple(sums.copy() for sums in start)
         else:
@@ -186,7 +191,7 @@ class _ShTruncation:
     ) -> None:
         """Add one view: its camera centre [3] and the rasteriser's contributions [K, ...] of the
         splats `rows` [K]."""
-        if not self.splats.sh_degree:
+        if not self.degrees:
             return
         every = colours_by_degree(self.splats.take(rows), centre)
         d = every[:, :-1] - every[:, -1:]

@@ -295,7 +295,7 @@ def _walls(
 
 
 @dataclass(frozen=True)
-class Region:
+class PoorRegion:
     """Adjacent patches that are poorly covered.
 
     Args:
@@ -318,7 +318,7 @@ class Region:
 
 def poorly_covered_regions(
     splats: Splats, patches: Patches, cameras: Sequence[Camera], backend: str, most: int = 3
-) -> tuple[Region, ...]:
+) -> tuple[PoorRegion, ...]:
     """The regions of the largest area, largest first."""
     poor = np.flatnonzero(patches.poorly_covered)
     found = []
@@ -330,7 +330,7 @@ def poorly_covered_regions(
         centre = patches.centres[own[patches.area[own].argmax()]]
         views, angle = np.median(patches.counts[rows]), np.median(patches.angles_deg[rows])
         share = float(area.sum() / patches.area.sum())
-        found.append(Region(centre, share, int(views), float(angle), best, ""))
+        found.append(PoorRegion(centre, share, int(views), float(angle), best, ""))
     found = sorted(found, key=lambda region: -region.share)[:most]
     return tuple(replace(r, move=_move(splats, r, cameras[r.best], backend)) for r in found)
 
@@ -350,7 +350,7 @@ def _connected(centres: NDArray[np.float64], side: float) -> list[NDArray[np.int
     return np.split(order, np.cumsum(np.bincount(labels))[:-1])
 
 
-def _move(splats: Splats, region: Region, camera: Camera, backend: str) -> str:
+def _move(splats: Splats, region: PoorRegion, camera: Camera, backend: str) -> str:
     """The first move, by twice the smallest sufficient angle, from which the region is not
     occluded."""
     offset, side = float(np.linalg.norm(region.centre - camera.centre)), _PROBE_PX

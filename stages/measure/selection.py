@@ -130,7 +130,7 @@ def _select_sh(
     degrees, colour = splats.sh_degrees.copy(), np.zeros((len(splats), 3))
     best, to = np.full(len(splats), np.inf), np.zeros(len(splats), np.int64)
     change = contributions.truncated_picture_change
-    for degree in range(splats.sh_degree):
+    for degree in range(change.shape[1]):
         saved = parameters_per_splat(degrees) - parameters_per_splat(np.full(1, degree))
         ratio = np.where(saved > 0, change[:, degree] / np.maximum(saved, 1), np.inf)
         better = (ratio < best) & ~removed

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ResourceError
 from stages.scene import Camera, Splats
 
 ALPHA_MIN = (
@@ -96,7 +96,7 @@ class Rendering:
     culled: int
 
 
-class MemoryFull(SplatError):  # noqa: N818 - names a state, as `Interrupted` does
+class MemoryFull(ResourceError):  # noqa: N818 - names a state, as `Interrupted` does
     """A device's memory cannot hold so many splats. fits: about how many it can."""
 
     def __init__(self, splats: int, fits: int, room: str) -> None:
@@ -106,7 +106,6 @@ class MemoryFull(SplatError):  # noqa: N818 - names a state, as `Interrupted` do
             wanted=f"About {fits:,} would fit.",
             hint=f"Train with --max-splats {fits}, close other programs on the card, or choose "
             "--backend cpu.",
-            family=Family.RESOURCES,
         )
         self.fits = fits
 

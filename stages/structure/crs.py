@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.distribution import install_command
-from stages.base.errors import Family, SplatError
+from stages.base.errors import UsageError
 from stages.base.stage import Report
 from stages.scene.place import (
     GEOGRAPHIC,
@@ -65,12 +65,11 @@ def in_crs(place: EarthPlace, crs: str, report: Report) -> EarthPlace:
     steps = _STEP_M * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     found = coordinates(steps)
     if not np.isfinite(found).all():
-        raise SplatError(
+        raise UsageError(
             "crs-elsewhere",
             given=f"The scene lies at {_written(place)}, which {crs} does not cover.",
             wanted="The system of the region where the photographs were taken.",
             hint="Choose another --crs, or leave it away.",
-            family=Family.USAGE,
         )
     _warn_outside(place, target, crs, report)
     grid = (found[1:4] - found[4:]).T / (2 * _STEP_M)
@@ -106,30 +105,27 @@ def projected_system(crs: str) -> Any:
     try:
         import pyproj
     except ImportError as error:
-        raise SplatError(
+        raise UsageError(
             "crs-needs-pyproj",
             given=f"--crs {crs} needs pyproj, which is not installed.",
             wanted="The extra `geo`.",
             hint=f"{install_command('geo')}; or leave --crs away.",
-            family=Family.USAGE,
         ) from error
     try:
         system = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
-        raise SplatError(
+        raise UsageError(
             "crs-unknown",
             given=f"--crs {crs} is not in the EPSG registry of PROJ {pyproj.proj_version_str}.",
             wanted="The code of a projected system, such as EPSG:25832 for UTM zone 32.",
             hint="Check the code.",
-            family=Family.USAGE,
         ) from error
     units = {axis.unit_name for axis in system.axis_info}
     if not system.is_projected or len(system.axis_info) != 2 or units != {"metre"}:
-        raise SplatError(
+        raise UsageError(
             "crs-not-projected",
             given=f"--crs {crs} ({system.name}) is not a horizontal grid in metres.",
             wanted="A projected system with two axes in metres, such as EPSG:25832.",
             hint="Latitude and longitude are written without --crs, as EPSG:4979.",
-            family=Family.USAGE,
         )
     return system

@@ -89,7 +89,7 @@ def repair_or_delete(database: Path) -> None:
             delete(database)
 
 
-class Features:
+class StoredFeatures:
     """Reads features and matches from a database, from several threads at once.
 
     immutable: nothing writes to the database meanwhile, so it is read without locks (which network

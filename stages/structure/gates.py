@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ReconstructionError, SplatError
 from stages.base.text import counted
 
 CALIBRATED, PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC = 2, 4, 5, 6  # COLMAP's TwoViewGeometry
@@ -120,7 +120,7 @@ THRESHOLDS = Thresholds()
 
 def failure(code: str, given: str, wanted: str, hint: str) -> SplatError:
     """The error for a gate that was not passed. It is raised if no configuration passes."""
-    return SplatError(code, given=given, wanted=wanted, hint=hint, family=Family.RECONSTRUCTION)
+    return ReconstructionError(code, given=given, wanted=wanted, hint=hint)
 
 
 MORE_OVERLAP = (

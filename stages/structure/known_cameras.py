@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base import threads
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
@@ -271,13 +271,12 @@ def _check_poses(out: Path, report: Report, allow_partial: bool) -> None:
         if explained
         else "Check that the file belongs to these photographs, under these names, uncropped."
     )
-    error = SplatError(
+    error = ReconstructionError(
         "cameras-do-not-fit",
         given=f"Only {ratio:.0%} of the matches between two photographs fit the file's cameras.",
         wanted=f"At least {INLIER_RATIO:.0%}, as cameras of these photographs have.",
         hint=f"{likely} --allow-partial goes on all the same; without --cameras, splat finds "
         "cameras itself.",
-        family=Family.RECONSTRUCTION,
     )
     if not allow_partial:
         raise error
@@ -347,11 +346,10 @@ def _check_usable(posed: Sequence[PosedPhoto], refine: bool) -> None:
             hint="Check that the file's names are those of the photographs.",
         )
     if refine and any(one.role == "test" for one in posed):
-        raise SplatError(
+        raise UsageError(
             "cameras-split-and-refined",
             given="--refine-cameras with --split: refinement moves the training cameras and not "
             "the test cameras, so the test views would no longer fit.",
             wanted="One of the two options.",
             hint="Leave --split away; then every eighth photograph is held out.",
-            family=Family.USAGE,
         )

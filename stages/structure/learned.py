@@ -42,7 +42,7 @@ def match_learned(job: Job) -> None:
     inliers = sqlite.inliers_of_pairs(partial)
     wanted = joining_pairs(_likeness(job, features), inliers, job.photographs)
     with (
-        closing(sqlite.Features(Path(job.source), immutable=True)) as stored,
+        closing(sqlite.StoredFeatures(Path(job.source), immutable=True)) as stored,
         pycolmap.Database.open(partial) as database,
     ):
         _write_keypoints(database, features)
@@ -94,7 +94,7 @@ def _write_keypoints(database: pycolmap.Database, features: Iterable[LearnedFeat
 def _write_matches(
     job: Job,
     database: pycolmap.Database,
-    stored: sqlite.Features,
+    stored: sqlite.StoredFeatures,
     features: list[LearnedFeatures],
     wanted: list[Pair],
 ) -> None:
@@ -133,7 +133,7 @@ class _Matcher:
         self._job, self._cameras, self._network = job, cameras, LighterGlue()
 
     def match(
-        self, pair: Pair, stored: sqlite.Features, features: list[LearnedFeatures]
+        self, pair: Pair, stored: sqlite.StoredFeatures, features: list[LearnedFeatures]
     ) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry, int]:
         """(matches by SIFT and learned features, two-view geometry, how many of its inliers are
         SIFT's)."""

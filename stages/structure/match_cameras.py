@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import SplatError, UsageError
 from stages.base.stage import Report
 from stages.base.text import counted, listed
 from stages.cameras.camera_file import CameraFile
@@ -181,12 +181,11 @@ def _twice(first: str, second: str, photo: str) -> SplatError:
 
 
 def _no_split() -> SplatError:
-    return SplatError(
+    return UsageError(
         "cameras-without-split",
         given="--split is given, but the camera file does not say which photographs are for "
         "training and which for testing.",
         wanted="transforms_train.json and transforms_test.json, or a file with train_filenames "
         "and test_filenames.",
         hint="Leave --split away; then every eighth photograph is held out.",
-        family=Family.USAGE,
     )

@@ -61,7 +61,7 @@ def select_pairs(job: Job) -> None:
     sqlite.merge_chunks(database, sorted(chunks_path(job).glob("*.db")))
     inliers = sqlite.inliers_of_pairs(database)
     missing: list[Pair] = []
-    with closing(sqlite.Features(database)) as stored:
+    with closing(sqlite.StoredFeatures(database)) as stored:
         features = _IndexedFeatures(job, stored)
         features.vocabulary()  # built once, and not in each chunk
         for wanted in _rounds(job, features, inliers):
@@ -81,11 +81,12 @@ def match_chunk(job: Job) -> None:
 
 @contextmanager
 def _matcher(job: Job, source: str, immutable: bool = False) -> Iterator[_Matcher]:
-    """A matcher with features from the database `source`; immutable: as in `database.Features`. Its
-    reader is closed before the writer, because the last to close a database tidies it up."""
+    """A matcher with features from the database `source`; immutable: as in
+    `database.StoredFeatures`. Its reader is closed before the writer, because the last to close a
+    database tidies it up."""
     with (
         pycolmap.Database.open(job.database) as database,
-        closing(sqlite.Features(Path(source), immutable)) as stored,
+        closing(sqlite.StoredFeatures(Path(source), immutable)) as stored,
     ):
         yield _Matcher(job, database, stored)
 
@@ -111,7 +112,7 @@ def _rounds(
 class _IndexedFeatures:
     """Features of photographs by position, indexed by visual word; for several threads."""
 
-    def __init__(self, job: Job, stored: sqlite.Features) -> None:
+    def __init__(self, job: Job, stored: sqlite.StoredFeatures) -> None:
         self._job, self._stored = job, stored
         self.vocabulary = functools.cache(self._vocabulary)
         self.index = functools.lru_cache(_CACHED)(self._index)
@@ -146,7 +147,9 @@ class _Matcher:
     """Matches and verifies pairs in several threads, and writes the results. inliers: of the pairs
     that are matched."""
 
-    def __init__(self, job: Job, database: pycolmap.Database, stored: sqlite.Features) -> None:
+    def __init__(
+        self, job: Job, database: pycolmap.Database, stored: sqlite.StoredFeatures
+    ) -> None:
         self.features = _IndexedFeatures(job, stored)
         self.inliers = sqlite.inliers_of_pairs(Path(job.database))
         self._job, self._database, self._stored = job, database, stored

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.errors import Family, SplatError
+from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
 from stages.scene import Camera, Photo
 from stages.scene.place import EarthPlace
@@ -148,22 +148,20 @@ def _from_markers(metres: float, sides: NDArray[np.float64], report: Report) -> 
 
 
 def _no_marker(why: str) -> SplatError:
-    return SplatError(
+    return ReconstructionError(
         "sfm-marker",
         given=f"--marker cannot be used: {why}.",
         wanted="Printed ArUco markers of one size, flat, sharp, with their white margin; alone or "
         "on a ChArUco board.",
         hint="Leave --marker away, or give a distance with --scale instead.",
-        family=Family.RECONSTRUCTION,
     )
 
 
 def _unusable(why: str) -> SplatError:
-    return SplatError(
+    return UsageError(
         "sfm-scale",
         given=f"--scale cannot be used: {why}.",
         wanted="Two photographs, as the capture names them, that were taken at different places, "
         "and the distance between their cameras in metres: --scale A.jpg B.jpg 0.85",
         hint="Choose two that are far apart: then an error of a centimetre matters little.",
-        family=Family.USAGE,
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event
 
 from stages.base.disk import disk_full
-from stages.base.errors import Family, Interrupted, SplatError
+from stages.base.errors import Interrupted, ReconstructionError
 from stages.base.parent import end_child, how_it_ended, python_module, start_child
 from stages.base.stage import Report
 from stages.structure.job import Job, read_progress
@@ -22,7 +22,7 @@ _PROGRESS = re.compile(r"I\d{8} ")  # an INFO line of glog
 _DISK_FULL = ("no space left on device", "database or disk is full", "disk quota exceeded")
 
 
-class WorkerCrashed(SplatError):  # noqa: N818 - says what happened
+class WorkerCrashed(ReconstructionError):  # noqa: N818 - says what happened
     """The worker ended with another status than 0 (negative for a signal).
 
     Args:
@@ -41,11 +41,10 @@ class WorkerCrashed(SplatError):  # noqa: N818 - says what happened
             wanted="COLMAP must finish without an error.",
             hint=f"Give the same command again; if it ends the same way, use smaller photographs "
             f"(--max-side). The whole log is {log}.",
-            family=Family.RECONSTRUCTION,
         )
 
 
-class WorkerTimedOut(SplatError):  # noqa: N818 - says what happened
+class WorkerTimedOut(ReconstructionError):  # noqa: N818 - says what happened
     """The worker was killed because its time was up. photographs: how many the job has."""
 
     def __init__(self, photographs: int) -> None:
@@ -55,7 +54,6 @@ class WorkerTimedOut(SplatError):  # noqa: N818 - says what happened
             wanted="Structure from motion must finish within --max-minutes.",
             hint="Allow more time with --max-minutes, or use fewer or smaller photographs "
             "(--max-side).",
-            family=Family.RECONSTRUCTION,
         )
 
 

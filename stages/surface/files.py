@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.lazy import load_object
 from stages.formats.gltf import linear_light
-from stages.formats.gltf_file import (
-    ARRAY_BUFFER,
-    Attribute,
-    accessor,
-    asset,
-    buffer_view,
-    write_glb,
-)
+from stages.formats.gltf_file import Attribute, asset, buffer_fields, write_glb
 from stages.formats.ply_header import header_text
 from stages.scene.flip import FLIP, flipped_place
 from stages.surface.mesh import NOTE, Mesh
@@ -30,7 +23,6 @@ from stages.surface.table import MeshFormat
 
 _VERTEX = np.dtype([("place", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
 _FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
-_ELEMENT_ARRAY_BUFFER = 34963
 _TRIANGLES = 4
 # Not taken from the writer: its error must not check itself.
 _Y_UP = np.array([1.0, -1.0, -1.0])
@@ -120,14 +112,6 @@ def _attributes(mesh: Mesh) -> dict[str, Attribute]:
 
 
 def _described(attributes: dict[str, Attribute], indices: Attribute) -> dict[str, Any]:
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, Any]] = []
-    offset = 0
-    for name, attribute in [*attributes.items(), ("", indices)]:
-        target = ARRAY_BUFFER if name else _ELEMENT_ARRAY_BUFFER
-        accessors.append(accessor(name, attribute, len(views)))
-        views.append(buffer_view(attribute, offset, target))
-        offset += attribute.rows.nbytes
     primitive = {
         "attributes": {name: i for i, name in enumerate(attributes)},
         "indices": len(attributes),
@@ -144,9 +128,7 @@ def _described(attributes: dict[str, Attribute], indices: Attribute) -> dict[str
                 "doubleSided": True,
             }
         ],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{}],
+        **buffer_fields([*attributes.items(), ("", indices)]),
     }
 
 

@@ -21,7 +21,7 @@ from stages.training.views import Level, ignore_masked, target_of
 
 DAMPING = 1.0  # pixels; a splat that covers so many takes half of its step
 # With more views each adds little, and each costs as much as two training steps.
-MAX_VIEWS = 48
+MAX_REFIT_VIEWS = 48
 HUBER_THRESHOLD = 0.03  # colour values: a larger error counts linearly, not squared
 
 
@@ -95,7 +95,7 @@ class ColourRefit:
 
 def needs_colour_refit(dropout: bool, views: int) -> bool:
     """Whether training used dropout, on few enough views for a refit to be worthwhile."""
-    return dropout and views <= MAX_VIEWS
+    return dropout and views <= MAX_REFIT_VIEWS
 
 
 def _huber_weights(error: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,5 +1,5 @@
 """Adaptive density control (Kerbl et al. 2023, section 5.2): splats are split where the mean
-gradient by their 2D position is large. Nearly transparent, very large and invalid ones are removed.
+gradient by their 2D position is large. Nearly transparent, very large and invalid ones are culled.
 
 A split replaces a splat by two along its longest axis (Deng et al. 2024, "Efficient Density Control
 for 3D Gaussian Splatting"), instead of a copy of a small splat and two random samples of a large
@@ -24,7 +24,7 @@ from stages.training.optimiser import Model
 CHILD_OFFSET = 0.6
 CHILD_LENGTH, CHILD_WIDTH = 0.7, 0.9
 CHILD_OPACITY = 0.7
-GIANT = 0.1  # x scene extent: a larger splat is removed
+GIANT = 0.1  # x scene extent: a larger splat is culled
 GRADIENT_THRESHOLD = 2e-4  # of the mean gradient by the 2D position, as published
 # Splats that fewer views see are densified last: floaters are among them.
 ENOUGH_VIEWS = 4.0
@@ -34,8 +34,8 @@ MIN_OPACITY = 0.005
 class DensityRule(Protocol):
     """What densifies: models in, models out."""
 
-    def prune(self, model: Model, remove_giants: bool) -> Model:
-        """The model without splats that no step can improve, see `AdaptiveDensity.prune`."""
+    def cull(self, model: Model, remove_giants: bool) -> Model:
+        """The model without splats that no step can improve, see `AdaptiveDensity.cull`."""
 
     def grow(self, model: Model, budget: int) -> Model:
         """The model with new splats, at most `budget` in all; accumulated gradients are reset."""
@@ -58,7 +58,7 @@ class AdaptiveDensity:
     views: int
     threshold: float = GRADIENT_THRESHOLD
 
-    def prune(self, model: Model, remove_giants: bool) -> Model:
+    def cull(self, model: Model, remove_giants: bool) -> Model:
         """The model without splats that are nearly transparent or not finite, and without giants if
         `remove_giants`."""
         keep = model.opacity_logits >= logit(MIN_OPACITY)
@@ -104,11 +104,11 @@ class BoundedDensity:
     rule: AdaptiveDensity
     bounds: tuple[float, ...]
 
-    def prune(self, model: Model, remove_giants: bool) -> Model:
-        """See `AdaptiveDensity.prune`."""
+    def cull(self, model: Model, remove_giants: bool) -> Model:
+        """See `AdaptiveDensity.cull`."""
         inside = self.inside(model)
-        outer = self.rule.prune(model.take(~inside), False)
-        return self.rule.prune(model.take(inside), remove_giants).joined(outer)
+        outer = self.rule.cull(model.take(~inside), False)
+        return self.rule.cull(model.take(inside), remove_giants).joined(outer)
 
     def grow(self, model: Model, budget: int) -> Model:
         """See `AdaptiveDensity.grow`."""

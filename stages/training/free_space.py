@@ -21,8 +21,9 @@ from stages.scene import Camera
 CELLS = 32  # along the longer side of a view; about as dense as the seeds
 NEAR = 0.5  # of the seeds' depth: a splat nearer than that is in front of the surface
 FAR = 1.15  # of the seeds' depth: a splat farther than that is hidden from the view
-MIN_VIEWS = 2  # views that look past a floater: the depth of a single view may be wrong
-MAX_VIEWS = 4  # views: so many would have corrected a floater, so what they look past is real
+MIN_VIEWS_PAST = 2  # views that look past a floater: the depth of a single view may be wrong
+# So many views would have corrected a floater, so what they look past is real.
+ENOUGH_VIEWS_PAST = 4
 
 
 @dataclass(frozen=True)
@@ -39,17 +40,18 @@ class FreeSpace:
     depths: tuple[NDArray[np.float64], ...]
 
     def contains(self, means: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """[N] which of the positions [N, 3] are in free space: at least MIN_VIEWS and fewer than
-        MAX_VIEWS views see a surface at more than twice their depth, and no view sees one there."""
+        """[N] which of the positions [N, 3] are in free space: at least
+        MIN_VIEWS_PAST and fewer than ENOUGH_VIEWS_PAST views see a surface at more than twice their
+        depth, and no view sees one there."""
         views_past = np.zeros(len(means), np.int32)
         open_rows = np.flatnonzero(np.isfinite(means).all(1))
         for camera, depths in zip(self.cameras, self.depths, strict=True):
             rows, relative = _relative_depths(camera, depths, means[open_rows])
             in_front = relative < NEAR
             views_past[open_rows[rows[in_front]]] += 1
-            views_past[open_rows[rows[~in_front & (relative <= FAR)]]] = MAX_VIEWS
-            open_rows = open_rows[views_past[open_rows] < MAX_VIEWS]
-        return (views_past >= MIN_VIEWS) & (views_past < MAX_VIEWS)
+            views_past[open_rows[rows[~in_front & (relative <= FAR)]]] = ENOUGH_VIEWS_PAST
+            open_rows = open_rows[views_past[open_rows] < ENOUGH_VIEWS_PAST]
+        return (views_past >= MIN_VIEWS_PAST) & (views_past < ENOUGH_VIEWS_PAST)
 
 
 def known_free_space(seeds: NDArray[np.floating], cameras: Sequence[Camera]) -> FreeSpace:

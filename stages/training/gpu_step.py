@@ -18,7 +18,7 @@ from torch import Tensor
 
 from stages.raster.definition import OPACITY, ROTATION, SH, RasterSettings, gradient_columns
 from stages.raster.gpu.device import gpu_errors_explained, interpreted
-from stages.raster.gpu.rasteriser import Drawn, GpuRasteriser, Scene, View
+from stages.raster.gpu.rasteriser import DeviceScene, DeviceView, Drawn, GpuRasteriser
 from stages.scene import IGNORE, TRANSPARENT, Camera
 from stages.scene.light import BRIGHT, gains_and_offsets
 from stages.training import gpu_kernels
@@ -94,15 +94,15 @@ class GpuTarget:
     uncovered: Tensor | None = None
     ignored: Tensor | None = None
     bright: Tensor | None = None
-    cameras: dict[Any, View] = field(default_factory=dict)
+    cameras: dict[Any, DeviceView] = field(default_factory=dict)
 
-    def view(self, rasteriser: GpuRasteriser, settings: RasterSettings) -> View:
+    def view(self, rasteriser: GpuRasteriser, settings: RasterSettings) -> DeviceView:
         """The view's camera, which is sent to the device once for each value of these settings."""
         key = settings.near, settings.dilation_px2, settings.antialias
         if key not in self.cameras:
             self.cameras[key] = rasteriser.view(self.level.camera, settings)
         known = self.cameras[key]
-        return View(known.cam, known.width, known.height, settings)
+        return DeviceView(known.cam, known.width, known.height, settings)
 
     def target(self, image: Tensor, background: Colour) -> tuple[Tensor, Tensor]:
         """(the target for `image` [>= 3, H, W], the means of its channels)."""
@@ -224,12 +224,12 @@ class GpuStep:
         image = self.rasteriser.draw(self._drawn_scene(smooth), view).image
         return np.ascontiguousarray(_host(image[:3]).transpose(1, 2, 0))
 
-    def _drawn_scene(self, smooth: bool, dropout: Dropout | None = None) -> Scene:
+    def _drawn_scene(self, smooth: bool, dropout: Dropout | None = None) -> DeviceScene:
         widths, rows = self._smoothing if smooth else self._unsmoothed, self._scene.rows
         if dropout is not None:
             rows = rows.clone()
             rows[:, OPACITY].masked_fill_(dropped(dropout, self._gradient_count), INVISIBLE)
-        return Scene(rows, self._scene.coefficients, widths)
+        return DeviceScene(rows, self._scene.coefficients, widths)
 
     def _target(self, level: Level) -> GpuTarget:
         key = id(level.means)  # the same object each time that a level is read
@@ -240,7 +240,7 @@ class GpuStep:
     def _adam(
         self,
         drawn: Drawn,
-        view: View,
+        view: DeviceView,
         parameters: Tensor,
         means2d: Tensor,
         rates: LearningRates,

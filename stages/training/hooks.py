@@ -79,7 +79,7 @@ class Densification:
         schedule = trainer.schedule
         if not schedule.densifies_after(step - 1):
             return
-        model = self.density.prune(trainer.model, schedule.removes_giants(step - 1))
+        model = self.density.cull(trainer.model, schedule.removes_giants(step - 1))
         budget = min(schedule.budget(step - 1, trainer.cap), trainer.cap)  # the cap may have fallen
         model = self.density.grow(model, budget)
         trainer.replace_model(model.take(morton.morton_order_of(model.means)))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.measure.contribution import measure_contributions
+from stages.measure.contribution import MAX_MEASURED_VIEWS, measure_contributions
 from stages.measure.evaluation import EvaluationView
 from stages.measure.selection import select_removal
 from stages.raster.smoothing import smoothed
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 SHARES = (0.52, 0.63, 0.74, 0.85)  # of the run, after which a round happens
 LARGEST_ROUND = 0.2  # of the splats
 LOSS_DB = 0.1  # PSNR of the training views that all rounds together may cost
-MAX_VIEWS = 48  # on which contributions are measured
 
 
 @dataclass(frozen=True)
@@ -63,14 +62,14 @@ class Sparsification:
         splats = splats_of(model, trainer.schedule.sh_degree, self.start, trainer.draw_settings)
         if trainer.smooth:
             splats = smoothed(splats, model.smoothing)
-        rows = evenly_spaced(range(len(trainer.train)), MAX_VIEWS)
+        rows = evenly_spaced(range(len(trainer.train)), MAX_MEASURED_VIEWS)
         cameras = [trainer.cameras[row] for row in rows]
         background = trainer.draw_settings.background
         views = (
             _evaluation_view(trainer.train[row], camera, background)
             for row, camera in zip(rows, cameras, strict=True)
         )
-        contributions = measure_contributions(splats, views, trainer.backend)
+        contributions = measure_contributions(splats, views, trainer.backend, truncation=False)
         change = contributions.sse * (10 ** (LOSS_DB / len(SHARES) / 10) - 1)
         most = int(LARGEST_ROUND * len(splats))
         every = len(rows) == len(trainer.train)

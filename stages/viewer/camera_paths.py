@@ -55,7 +55,7 @@ def interpolated(cameras: Sequence[Camera], splats: Splats, frames: int) -> tupl
     return tuple(_posed(lens, row) for row in np.stack(rows, axis=1))
 
 
-def smoothed(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
+def smoothed_path(cameras: Sequence[Camera], frames: float) -> tuple[Camera, ...]:
     """A smoothed hand-held path: positions and quaternions averaged with Gaussian weights whose
     standard deviation is `frames`. The ends stay near their positions."""
     keys = _keys(cameras)

@@ -130,7 +130,7 @@ def _past_views(cameras: list[Camera], splats: Splats, duration: Duration) -> li
         )
     cameras = [cameras[i] for i in camera_paths.tour(cameras, splats)]
     frames = _SMOOTHING_S * duration.frames_per_second
-    smooth = camera_paths.smoothed(_interpolated(cameras, splats, duration), frames)
+    smooth = camera_paths.smoothed_path(_interpolated(cameras, splats, duration), frames)
     return [camera_paths.levelled(camera) for camera in smooth]
 
 

@@ -32,7 +32,7 @@ from rich.table import Table
 from stages.raster.definition import MemoryFull, RasterSettings, splat_arrays
 from stages.raster.draw import render
 from stages.raster.gpu import device
-from stages.raster.gpu.rasteriser import GpuRasteriser, Scene, View
+from stages.raster.gpu.rasteriser import DeviceScene, DeviceView, GpuRasteriser
 from stages.scene import Camera, Splats
 from stages.training.gpu_step import GpuStep
 from stages.training.loss import channel_means
@@ -127,7 +127,9 @@ def _step(work: Callable[[], Any], rounds: int, splats: int) -> dict[str, float]
     return {"step_ms": taken, "bytes_a_splat": torch.cuda.max_memory_allocated() / splats}
 
 
-def _both(rasteriser: GpuRasteriser, scene: Scene, seen: View, entries: int, v: Any) -> None:
+def _both(
+    rasteriser: GpuRasteriser, scene: DeviceScene, seen: DeviceView, entries: int, v: Any
+) -> None:
     drawn = rasteriser.draw(scene, seen, capacity=entries)
     rasteriser.gradients(scene, seen, drawn, v)
 

@@ -19,7 +19,7 @@ from tests.scenes import cloud
 SAYING = [
     pytest.param(name, marks=[pytest.mark.slow] if name in ("usda", "usdc", "usdz") else [])
     for name, row in FORMATS.items()
-    if row.says_antialias
+    if row.says_drawing
 ]
 
 
@@ -121,9 +121,9 @@ def test_a_wrong_tag_shows_in_the_proof(tmp_path: Path) -> None:
 
 def test_the_choice_of_drawing_overrules_the_format() -> None:
     ply, page = FORMATS["ply"], FORMATS["html"]
-    assert [row.antialiased(AUTO) for row in (ply, page)] == [False, True]
-    assert [row.antialiased(PLAIN) for row in (ply, page)] == [False, False]
-    assert [row.antialiased(ANTIALIASED) for row in (ply, page)] == [True, True]
+    assert [row.holds_antialiased(AUTO) for row in (ply, page)] == [False, True]
+    assert [row.holds_antialiased(PLAIN) for row in (ply, page)] == [False, False]
+    assert [row.holds_antialiased(ANTIALIASED) for row in (ply, page)] == [True, True]
 
 
 def test_antialiased_splats_in_a_format_for_plain_viewers_are_a_loss() -> None:

@@ -1,4 +1,4 @@
-"""Densification and pruning during training, and the schedule."""
+"""Densification and culling during training, and the schedule."""
 
 import numpy as np
 import pytest
@@ -89,8 +89,8 @@ def test_faint_giant_and_broken_splats_go():
     m.opacity_logits[0] = logit(0.004)
     m.log_scales[1] = np.log(0.11 * EXTENT)
     m.means[2, 1] = np.nan
-    assert len(AdaptiveDensity(EXTENT, VIEWS).prune(m, remove_giants=True)) == 7
-    assert len(AdaptiveDensity(EXTENT, VIEWS).prune(m, remove_giants=False)) == 8
+    assert len(AdaptiveDensity(EXTENT, VIEWS).cull(m, remove_giants=True)) == 7
+    assert len(AdaptiveDensity(EXTENT, VIEWS).cull(m, remove_giants=False)) == 8
 
 
 @pytest.mark.parametrize("room", [0, 1, 3])

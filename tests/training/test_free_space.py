@@ -8,7 +8,7 @@ import pytest
 from stages.base.stage import Report
 from stages.scene import DrawSettings, look_at
 from stages.training import hooks
-from stages.training.free_space import MAX_VIEWS, MIN_VIEWS, known_free_space
+from stages.training.free_space import ENOUGH_VIEWS_PAST, MIN_VIEWS_PAST, known_free_space
 from stages.training.hooks import FLOATER_REMOVALS
 from stages.training.optimiser import new_model
 from stages.training.schedule import Schedule
@@ -62,14 +62,14 @@ def test_nothing_is_known_where_there_are_no_seeds():
     assert held([(0, 0, 4.8)], start=wall().take(np.arange(0))) == [False]
 
 
-@pytest.mark.parametrize("n", [MAX_VIEWS, MAX_VIEWS + 3])
+@pytest.mark.parametrize("n", [ENOUGH_VIEWS_PAST, ENOUGH_VIEWS_PAST + 3])
 def test_splats_that_many_views_confirm_are_kept_without_seeds(n):
     assert held([(0, 0, 4.8)], n=n) == [False]
 
 
 def test_one_view_is_not_enough():
     assert held([(0, 0, 4.8)], n=1) == [False]
-    assert held([(0, 0, 4.8)], n=MIN_VIEWS) == [True]
+    assert held([(0, 0, 4.8)], n=MIN_VIEWS_PAST) == [True]
 
 
 def test_a_surface_in_one_view_outweighs_free_space_in_others():
@@ -99,7 +99,7 @@ class Clouds:
     def __init__(self):
         self.made = 0
 
-    def prune(self, model, remove_giants):
+    def cull(self, model, remove_giants):
         return model
 
     def grow(self, model, budget):

@@ -36,7 +36,7 @@ from tests.training.pictures import view_of
 
 
 def trainer(views, start, steps, folder, report=None, degree=0, cap=10_000, backend="cpu"):
-    # of an extent of 10, no splat of these toys is large enough to be pruned as a giant
+    # of an extent of 10, no splat of these toys is large enough to be culled as a giant
     schedule = Schedule(steps=steps, extent=10.0, sh_degree=degree, n_start=len(start), seed=0)
     held_out = [
         EvaluationView(view.name, view.levels[-1].camera, view.levels[-1].pixels.transpose(1, 2, 0))
@@ -337,11 +337,11 @@ def test_the_stage_says_so_when_nothing_is_left(tmp_path, monkeypatch):
     assert error.value.code == "train-nothing-left"
 
 
-def test_nothing_at_all_can_be_taken_grown_and_pruned():
+def test_nothing_at_all_can_be_taken_grown_and_culled():
     empty = new_model(*splat_arrays(grid(2).take(np.zeros(4, bool))))
     strategy = AdaptiveDensity(1.0, views=8)
     assert len(strategy.grow(empty, 100)) == 0
-    assert len(strategy.prune(empty, remove_giants=True)) == 0
+    assert len(strategy.cull(empty, remove_giants=True)) == 0
     assert len(empty.take(np.zeros(0, bool))) == 0
 
 

@@ -35,10 +35,10 @@ def test_a_block_is_densified_only_in_its_own_rectangle(model) -> None:
 
 
 def test_giants_are_removed_only_inside(model) -> None:
-    assert sorted(BLOCK.prune(model, True).means[:, 0]) == [-2, -1, 1]
-    assert sorted(BLOCK.rule.prune(model, True).means[:, 0]) == [-1, 1]
+    assert sorted(BLOCK.cull(model, True).means[:, 0]) == [-2, -1, 1]
+    assert sorted(BLOCK.rule.cull(model, True).means[:, 0]) == [-1, 1]
 
 
 def test_transparent_splats_are_removed_everywhere(model) -> None:
     model.opacity_logits[1:3] = -20.0
-    assert sorted(BLOCK.prune(model, False).means[:, 0]) == [-2, 2]
+    assert sorted(BLOCK.cull(model, False).means[:, 0]) == [-2, 2]

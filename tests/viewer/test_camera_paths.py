@@ -12,7 +12,7 @@ from stages.viewer.camera_paths import (
     interpolated,
     length_in_turns,
     levelled,
-    smoothed,
+    smoothed_path,
     tour,
 )
 from tests import scenes
@@ -141,7 +141,7 @@ def test_a_steady_path_ends_where_it_did_and_turns_corners_gently() -> None:
     corner = [(x, 0, -5) for x in np.linspace(-2, 0, 60)]
     corner += [(0, y, -5) for y in np.linspace(0, -2, 60)]
     hand = [camera((x, y, -5), (x, y, -4)) for x, y, _ in corner]
-    steady = smoothed(hand, 6.0)
+    steady = smoothed_path(hand, 6.0)
 
     def kink(path) -> float:
         distorts = np.diff([c.centre for c in path], 2, axis=0)
@@ -152,7 +152,7 @@ def test_a_steady_path_ends_where_it_did_and_turns_corners_gently() -> None:
         np.testing.assert_allclose(steady[i].centre, hand[i].centre, atol=1e-9)
     far = max(np.linalg.norm(a.centre - b.centre) for a, b in zip(steady, hand, strict=True))
     assert far < 0.3
-    assert len(smoothed(hand[:1], 6.0)) == 1
+    assert len(smoothed_path(hand[:1], 6.0)) == 1
 
 
 def test_a_full_turn_is_one_turn_long() -> None:

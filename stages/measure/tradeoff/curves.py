@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.measure.bootstrap import Difference, paired_difference
-from stages.measure.coverage import CameraLayout, Gap, Patches, Region
+from stages.measure.coverage import CameraLayout, Gap, Patches, PoorRegion
 from stages.measure.evaluation import Score
 from stages.measure.shimmer import Framing
 from stages.scene import Camera
@@ -68,7 +68,7 @@ class Coverage:
     patches: Patches
     layout: CameraLayout | None
     gaps: tuple[Gap, ...]
-    regions: tuple[Region, ...]
+    regions: tuple[PoorRegion, ...]
     floaters: NDArray[np.float64]
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.base.text import counted
 from stages.measure.bootstrap import Difference
-from stages.measure.coverage import MIN_ANGLE_DEG, MIN_VIEWS, CameraLayout, Gap, Region
+from stages.measure.coverage import MIN_ANGLE_DEG, MIN_VIEWS, CameraLayout, Gap, PoorRegion
 from stages.measure.tradeoff.curves import Coverage, OperatingPoint, Tradeoff, time_to
 
 SMALL_LOSS_DB = 0.1  # that few people would see
@@ -196,7 +196,7 @@ def _gap(coverage: Coverage, layout: CameraLayout, number: int, gap: Gap) -> str
     )
 
 
-def _region(coverage: Coverage, letter: str, region: Region) -> str:
+def _region(coverage: Coverage, letter: str, region: PoorRegion) -> str:
     """Where a region is in the photograph that shows it best, and where to move from there."""
     camera, name = coverage.cameras[region.best], _name(coverage, region.best)
     pixels, _ = camera.project(region.centre[None])

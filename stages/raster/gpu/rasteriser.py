@@ -30,7 +30,7 @@ VISIBLE, CULLED = 1, 2  # as `project_kernel` writes them
 
 
 @dataclass(frozen=True)
-class Scene:
+class DeviceScene:
     """Splats on the device. rows [N, columns]: parameters, in the columns of a gradient row.
     coefficients: SH coefficients a channel. smoothing [N], or [0] for none."""
 
@@ -43,7 +43,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class View:
+class DeviceView:
     """A camera on the device, and how it draws. cam: see `camera_row`."""
 
     cam: Tensor
@@ -51,7 +51,7 @@ class View:
     height: int
     settings: RasterSettings
 
-    def coefficients(self, scene: Scene) -> int:
+    def coefficients(self, scene: DeviceScene) -> int:
         """Number of SH coefficients a channel that take part."""
         return min((self.settings.sh_degree + 1) ** 2, scene.coefficients)
 
@@ -95,8 +95,8 @@ class Forward:
     image: NDArray[np.float32]
     visible: NDArray[np.int32]
     culled: int
-    scene: Scene
-    view: View
+    scene: DeviceScene
+    view: DeviceView
     drawn: Drawn
 
 
@@ -152,7 +152,7 @@ class GpuRasteriser:
         found[:, LARGEST_WEIGHT] = largest.cpu().numpy()[forward.visible]
         return found
 
-    def scene(self, arrays: Arrays) -> Scene:
+    def scene(self, arrays: Arrays) -> DeviceScene:
         """Rows on the device from arrays on the host."""
         means, quaternions, log_scales, opacity_logits, sh, smoothing = with_smoothing(arrays)
         n, coefficients = len(means), sh.shape[1]
@@ -166,15 +166,19 @@ class GpuRasteriser:
         rows = np.zeros((n, gradient_columns(coefficients)), np.float32)
         np.concatenate(parts, 1, out=rows[:, : SH + 3 * coefficients])
         widths = torch.tensor(smoothing, device=self.device)
-        return Scene(torch.from_numpy(rows).to(self.device), coefficients, widths)
+        return DeviceScene(torch.from_numpy(rows).to(self.device), coefficients, widths)
 
-    def view(self, camera: Camera, settings: RasterSettings) -> View:
+    def view(self, camera: Camera, settings: RasterSettings) -> DeviceView:
         """A camera and settings, on the device."""
         cam = torch.from_numpy(camera_row(camera, settings)).to(self.device)
-        return View(cam, camera.width, camera.height, settings)
+        return DeviceView(cam, camera.width, camera.height, settings)
 
     def draw(
-        self, scene: Scene, view: View, depths: bool = False, capacity: int | None = None
+        self,
+        scene: DeviceScene,
+        view: DeviceView,
+        depths: bool = False,
+        capacity: int | None = None,
     ) -> Drawn:
         """Draw. capacity: number of entries that the lists have room for. By default it is read
         from the device, which waits for the device."""
@@ -213,7 +217,7 @@ class GpuRasteriser:
         return Drawn(image, transmittance, last, records, keys, status, made)
 
     def gradients(
-        self, scene: Scene, view: View, drawn: Drawn, v_image: Tensor
+        self, scene: DeviceScene, view: DeviceView, drawn: Drawn, v_image: Tensor
     ) -> tuple[Tensor, Tensor]:
         """([N, gradient_columns], [N, 2]) of parameters and of means on the picture, of the visible
         splats; zeros elsewhere. v_image [3, H, W]."""
@@ -241,13 +245,18 @@ class GpuRasteriser:
     def _grid(self, n: int) -> tuple[int]:
         return (-(-n // self.block),)
 
-    def _tiles(self, view: View) -> tuple[int, int, int]:
+    def _tiles(self, view: DeviceView) -> tuple[int, int, int]:
         """(tiles across, down, all)."""
         across, down = -(-view.width // self.tile), -(-view.height // self.tile)
         return across, down, across * down
 
     def _lists(
-        self, scene: Scene, view: View, shapes: Tensor, keys: Tensor, capacity: int | None
+        self,
+        scene: DeviceScene,
+        view: DeviceView,
+        shapes: Tensor,
+        keys: Tensor,
+        capacity: int | None,
     ) -> Lists:
         n, (across, _, tiles) = len(scene), self._tiles(view)
         like: dict[str, Any] = {"device": self.device}
@@ -288,7 +297,7 @@ class GpuRasteriser:
         return Lists(row_of[slots], slots, starts, firsts, counts, total)
 
     def _over_tiles(
-        self, kernel: Any, view: View, drawn: Drawn, planes: Tensor, out: Tensor
+        self, kernel: Any, view: DeviceView, drawn: Drawn, planes: Tensor, out: Tensor
     ) -> None:
         """Run a kernel from far to near over every tile's list; one row of `out` for each entry."""
         made = drawn.lists
