@@ -92,9 +92,10 @@ def _posed(folder: Path, pictures: list[str]) -> list[str]:
 
 def _without_pictures_of_scans(files: Iterable[str], pictures: list[str]) -> list[str]:
     """The pictures without those that 3D Scanner App puts beside its frames, a small copy of one
-    and the texture of its mesh: where a folder holds frame_*.json, frames have a .json each."""
+    and the texture of its mesh: in a folder with pictures of frames, each has its frame_*.json."""
     frames = {name.rpartition(".")[0] for name in files if _FRAME.search(name)}
-    scans = {name.rpartition("/")[0] for name in frames}
+    of_frames = (name for name in pictures if name.rpartition(".")[0] in frames)
+    scans = {name.rpartition("/")[0] for name in of_frames}
     return [
         name
         for name in pictures

@@ -112,3 +112,9 @@ def test_3d_scanner_app_s_other_pictures_are_no_photographs(tmp_path: Path) -> N
     assert [one.name for one in find(scan).sources] == ["frame_00000.jpg", "frame_00003.jpg"]
     both = [one.name for one in find(tmp_path).sources]
     assert both == ["more/a.jpg", "scan/frame_00000.jpg", "scan/frame_00003.jpg"]
+
+
+def test_photographs_beside_a_frame_without_its_picture_stay(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg")
+    (tmp_path / "frame_00000.json").write_text("{}")
+    assert [one.name for one in find(tmp_path).sources] == ["a.jpg"]
