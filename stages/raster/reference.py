@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.base import torch_vml
 from stages.raster.camera_row import clamp_limits
 from stages.raster.definition import (
     ALPHA_MAX,
@@ -36,6 +37,8 @@ from stages.raster.definition import (
 )
 from stages.raster.sh import C0, C1, C2, C3
 from stages.scene import Camera, Splats
+
+torch_vml.warm_up()
 
 BLOCK = 32  # pixels; the picture is computed block by block to bound memory
 MOST = 4_000_000  # (splat, pixel) pairs at once: 32 MB a tensor in float64, about 30 of them

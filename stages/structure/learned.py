@@ -18,6 +18,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
+from stages.base import torch_vml
 from stages.structure import database as sqlite
 from stages.structure.features import read_grey
 from stages.structure.job import Job, ProgressWriter
@@ -35,6 +36,7 @@ _SCALE = 4.0  # of a keypoint, pixels; COLMAP does not use it
 def match_learned(job: Job) -> None:
     """Write `job.database`: a copy of `job.source` with learned keypoints, and matches that may
     join `job.photographs` to the others."""
+    torch_vml.warm_up()
     torch.set_num_threads(1)  # photographs and pairs run side by side
     partial = Path(job.database).with_suffix(".partial.db")
     sqlite.copy(Path(job.source), partial)
