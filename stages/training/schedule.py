@@ -2,8 +2,8 @@
 
 The published schedule has 30,000 steps. Its events are scaled to the number of steps of the run,
 which may change during the run. Unlike the published one, it never resets opacities, draws at half
-the size in the first fifth, raises the learning rates of short runs (`boost`), lets all of them
-decay, and bounds the number of splats by a budget that rises linearly. Steps count from 0.
+the size in the first fifth, raises the learning rates of short runs, lets all of them decay, and
+bounds the number of splats by a budget that rises linearly. Steps count from 0.
 """
 
 from __future__ import annotations
@@ -12,11 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stages.training.optimiser import LearningRates
+
 PUBLISHED_STEPS = 30_000
-MEANS_LR = 1.6e-4  # x scene extent
-MEANS_LR_END = 0.01  # of the first
+MEANS_LR, MEANS_LR_END = 1.6e-4, 1.6e-6  # x scene extent: at the first and at the last step
 DENSIFICATION_END = 0.5  # share of the run in which the model is densified
-BOOST_POWER, BOOST_MAX = 0.6, 6.0
+# A run that is n times shorter than the published one, at most MOST_SHORTENED times, multiplies its
+# learning rates by n to these powers (docs/experiments/densification.md).
+MOST_SHORTENED = 20.0
+RATES_POWER = 0.6  # all, but those below
+MEANS_END_POWER = 1.2
+LOG_SCALES_POWER = 0.8
 # Learning rates decay from this share of the run on, to this share of their value.
 RATE_DECAY_FROM, RATE_DECAY_END = 0.6, 0.1
 MIN_DENSIFY_INTERVAL = 50  # steps: fewer see too little of the scene
@@ -72,20 +78,27 @@ class Schedule:
         """Whether the model is still densified after `step` steps."""
         return self.share(step) < DENSIFICATION_END
 
-    @property
-    def boost(self) -> float:
-        """Factor of all learning rates, larger for short runs: (30,000 / steps)^0.6, at most 6."""
-        return float(min(BOOST_MAX, max(1.0, (PUBLISHED_STEPS / self.steps) ** BOOST_POWER)))
+    def raised(self, power: float) -> float:
+        """Factor of a learning rate: how many times shorter this run is than the published one, to
+        `power`."""
+        times = min(MOST_SHORTENED, max(1.0, PUBLISHED_STEPS / self.steps))
+        return float(times**power)
 
-    def means_lr(self, step: int) -> float:
-        """Exponential decay to 1 %."""
-        decay = MEANS_LR_END ** self.share(step)
-        return float(MEANS_LR * self.extent * self.boost * decay)
+    def rates(self, step: int, few_views: bool = False) -> LearningRates:
+        """The learning rates of `step`: those of the means decay exponentially over the run, all
+        others from RATE_DECAY_FROM on.
 
-    def rate_factor(self, step: int) -> float:
-        """Factor of all other learning rates: the boost, with a decay at the end."""
+        few_views: raises the rate of log scales no more than the others. Splats that grow faster
+        become clouds in front of cameras if few training views show them.
+        """
+        first = MEANS_LR * self.raised(RATES_POWER)
+        last = MEANS_LR_END * self.raised(MEANS_END_POWER)
+        means = first * (last / first) ** self.share(step)
         decay = max(0.0, (self.share(step) - RATE_DECAY_FROM) / (1.0 - RATE_DECAY_FROM))
-        return float(self.boost * RATE_DECAY_END**decay)
+        factor = self.raised(RATES_POWER) * RATE_DECAY_END**decay
+        rates = LearningRates().scaled(means * self.extent, factor, self.extent)
+        power = RATES_POWER if few_views else LOG_SCALES_POWER
+        return replace(rates, log_scales=rates.log_scales * self.raised(power - RATES_POWER))
 
     def active_sh_degree(self, step: int) -> int:
         """One degree more every 1000 of 30,000 steps."""

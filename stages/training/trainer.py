@@ -127,8 +127,7 @@ class Trainer:
         settings = self.raster_settings(schedule.active_sh_degree(step))
         if self.random_background:
             settings = replace(settings, background=schedule.background(step))
-        means_lr, factor = schedule.means_lr(step), schedule.rate_factor(step)
-        rates = LearningRates().scaled(means_lr, factor, schedule.extent)
+        rates = schedule.rates(step, few_views=self.dropout)
         dropout = None
         if self.dropout and not schedule.densifying(step):  # it would distort the mean gradients
             dropout = Dropout(len(self.train), schedule.dropout_key(step))

@@ -13,7 +13,7 @@ from stages.training.density import (
     AdaptiveDensity,
     split_along_longest_axis,
 )
-from stages.training.optimiser import new_model
+from stages.training.optimiser import LearningRates, new_model
 from stages.training.schedule import Schedule
 
 EXTENT = 10.0
@@ -123,9 +123,10 @@ def schedule(steps):
 @pytest.mark.parametrize("steps", [1, 10, 1500, 30_000])
 def test_the_schedule_scales_to_any_number_of_steps(steps):
     s = schedule(steps)
-    assert 3.2e-4 <= s.means_lr(0) <= 6 * 3.2e-4
-    if steps > 1:
-        assert s.means_lr(steps) == pytest.approx(0.01 * s.means_lr(0))
+    first, last = s.rates(0), s.rates(steps)
+    assert 3.2e-4 <= first.means <= 6.1 * 3.2e-4
+    assert 0.0099 * first.means <= last.means <= 0.061 * first.means
+    assert last.sh_dc < 0.11 * first.sh_dc
     assert s.active_sh_degree(0) == 0
     assert s.active_sh_degree(steps) == 3
     growing = [step for step in range(steps) if s.densifies_after(step)]
@@ -138,10 +139,20 @@ def test_the_schedule_scales_to_any_number_of_steps(steps):
         assert seen[:7] != seen[7:14]
 
 
+def test_short_runs_raise_the_rate_of_scales_most_but_not_with_few_views():
+    published, short = schedule(30_000).rates(0), schedule(3000)
+    many, few = short.rates(0), short.rates(0, few_views=True)
+    assert many.log_scales == pytest.approx(10**0.8 * published.log_scales)
+    assert few.log_scales == pytest.approx(10**0.6 * published.log_scales)
+    for name in ("means", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
+        assert getattr(many, name) == pytest.approx(10**0.6 * getattr(published, name))
+        assert getattr(few, name) == getattr(many, name)
+
+
 def test_the_full_schedule_has_its_published_events():
     s = schedule(30_000)
-    assert s.means_lr(0) == pytest.approx(1.6e-4 * 2.0)
-    assert s.rate_factor(0) == 1.0
+    assert s.rates(0) == LearningRates(means=1.6e-4 * 2.0, extent=2.0)
+    assert s.rates(30_000).means == pytest.approx(1.6e-6 * 2.0)
     assert s.active_sh_degree(999) == 0
     assert s.active_sh_degree(1000) == 1
     assert s.densifies_after(499)

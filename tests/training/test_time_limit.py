@@ -6,7 +6,8 @@ import pytest
 from stages.base.stage import Report
 from stages.train import TrainSettings
 from stages.training.build import make_trainer
-from stages.training.schedule import RATE_DECAY_END, RESOLUTIONS, Schedule
+from stages.training.optimiser import LearningRates
+from stages.training.schedule import RATE_DECAY_END, RATES_POWER, RESOLUTIONS, Schedule
 from stages.training.time_limit import TimeLimit
 from tests.small_scene import small_scene
 
@@ -43,7 +44,8 @@ def test_a_run_with_a_time_limit_ends_within_a_tenth_of_it_and_goes_through_all_
     took, plan = simulated(seconds, cost)
     assert took == pytest.approx(seconds, rel=0.1)
     assert plan.share(plan.steps) == pytest.approx(1.0)
-    assert plan.rate_factor(plan.steps) == pytest.approx(RATE_DECAY_END * plan.boost)
+    raised = LearningRates().sh_dc * plan.raised(RATES_POWER)
+    assert plan.rates(plan.steps).sh_dc == pytest.approx(RATE_DECAY_END * raised)
 
 
 def test_a_time_limit_plans_no_more_steps_than_the_training_views_allow():
