@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stages.base.errors import SplatError
 from stages.base.stage import Report
-from stages.base.text import counted
+from stages.base.text import counted, listed
 from stages.cameras.camera_file import FilePoints
 from stages.photos.load import load_mask
 from stages.scene import TRANSPARENT, Camera
@@ -61,7 +61,9 @@ def find_points(
     if len(cloud.points) < POINTS_PER_PHOTOGRAPH * len(photographs):
         cameras = [camera for camera, _ in photographs.values()]
         outside = [_empty_space(folder, view) for _, view in photographs.values()]
-        cloud, source = _with_random(cloud, cameras, outside, seed, report), "random"
+        names = [view.photo.source for _, view in photographs.values()]
+        cloud = _with_random(cloud, cameras, names, outside, seed, report)
+        source = "random"
     report.metric("points_source", source)
     return cloud, observations
 
@@ -105,12 +107,13 @@ def _empty_space(folder: Path, view: PinholeView) -> NDArray[np.bool_] | None:
 def _with_random(
     cloud: FilePoints,
     cameras: Sequence[Camera],
+    names: Sequence[str],
     outside: Sequence[NDArray[np.bool_] | None],
     seed: int,
     report: Report,
 ) -> FilePoints:
     """The cloud with random points where most cameras look and none shows empty space."""
-    points, centre, radius = random_points(cameras, seed, outside)
+    points, centre, radius = random_points(cameras, seed, outside, names)
     at = ", ".join(f"{value:.3g}" for value in centre)
     report.warn(
         "cameras-random-start",
@@ -129,6 +132,7 @@ def _with_random(
 RANDOM_POINTS = 20_000
 _PARALLEL = 0.02  # smallest eigenvalue per camera; below, the optical axes are nearly parallel
 _SHARE = 0.5  # of the cameras must see a point
+_NAMED = 3  # photographs, as examples
 
 
 def count_views(cameras: Sequence[Camera], points: NDArray[np.float64]) -> NDArray[np.int32]:
@@ -141,7 +145,10 @@ def count_views(cameras: Sequence[Camera], points: NDArray[np.float64]) -> NDArr
 
 
 def random_points(
-    cameras: Sequence[Camera], seed: int, outside: Sequence[NDArray[np.bool_] | None] = ()
+    cameras: Sequence[Camera],
+    seed: int,
+    outside: Sequence[NDArray[np.bool_] | None] = (),
+    names: Sequence[str] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """(points [P, 3] in a ball that most cameras see, its centre [3], its radius).
 
@@ -152,6 +159,7 @@ def random_points(
         cameras: pinholes.
         seed: of the random points.
         outside: for each camera, the pixels [H, W] that show empty space; None for none.
+        names: for each camera, its photograph's, for the error.
 
     Raises SplatError "cameras-no-common-view".
     """
@@ -160,13 +168,15 @@ def random_points(
     perpendicular = np.eye(3) - np.einsum("vi,vj->vij", forward, forward)
     scatter = perpendicular.mean(axis=0)
     if np.linalg.eigvalsh(scatter)[0] < _PARALLEL:
-        raise _no_common_view("Their optical axes are nearly parallel")
+        axes = f"The optical axes of {_some(names, np.ones(len(cameras), np.bool_))}"
+        raise _no_common_view(f"{axes} are nearly parallel")
     middle = np.linalg.solve(scatter, np.einsum("vij,vj->i", perpendicular, centres) / len(cameras))
     depth = np.einsum("vi,vi->v", middle - centres, forward)
     half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]
     ahead = depth > 0
     if ahead.mean() < _SHARE:
-        raise _no_common_view("Most of them look away from where their optical axes meet")
+        sides = f"{_some(names, ~ahead)} look away from where the optical axes meet"
+        raise _no_common_view(f"{sides}, and {_some(names, ahead)} look towards it")
     radius = float(np.median(depth[ahead] * np.sin(np.arctan(half))[ahead]))
     random = np.random.default_rng(seed)
     directions = random.normal(size=(4 * RANDOM_POINTS, 3))
@@ -179,7 +189,9 @@ def random_points(
             points = points[~_in_empty_space(camera, empty, points)]
     points = points[:RANDOM_POINTS]
     if len(points) < RANDOM_POINTS // 20:
-        raise _no_common_view("Few of them see the same part of space")
+        sees = np.array([count_views([camera], middle[None])[0] > 0 for camera in cameras])
+        sides = f"{_some(names, sees)} have the place where the optical axes meet in their pictures"
+        raise _no_common_view(f"{sides}, and {_some(names, ~sees)} do not")
     return points, middle, radius
 
 
@@ -193,6 +205,14 @@ def _in_empty_space(
     found = np.zeros(len(points), np.bool_)
     found[shown] = empty[rows, columns]
     return found
+
+
+def _some(names: Sequence[str], chosen: NDArray[np.bool_]) -> str:
+    """ "5 of 12 photographs (a.jpg, b.jpg, c.jpg and 2 more)": those `chosen` [V] of all, with some
+    of their names, if they have names."""
+    called = listed([name for name, one in zip(names, chosen, strict=False) if one], _NAMED)
+    count = f"{chosen.sum()} of {counted(len(chosen), 'photograph')}"
+    return f"{count} ({called})" if called else count
 
 
 def _no_common_view(why: str) -> SplatError:

@@ -45,13 +45,32 @@ def test_cameras_side_by_side_have_no_middle() -> None:
     with pytest.raises(SplatError) as caught:
         random_points(row, seed=0)
     assert caught.value.code == "cameras-no-common-view"
+    assert "The optical axes of 8 of 8 photographs are nearly parallel" in caught.value.given
+
+
+def test_cameras_that_turn_their_backs_to_each_other_s_space_are_counted() -> None:
+    """Far cameras with narrow lenses, of which most look past the middle of the others' axes."""
+    eyes = [camera.centre for camera in around()]
+    aims = [MIDDLE + 2 * np.array([0.0, (-1) ** i, 0.0]) for i in range(12)]
+    narrow = [
+        Camera(800, 600, 9000.0, 9000.0, 400.0, 300.0, look_at(eye, aim))
+        for eye, aim in zip(eyes, aims, strict=True)
+    ]
+    with pytest.raises(SplatError) as caught:
+        random_points(narrow, seed=0, names=[f"{number}.jpg" for number in range(12)])
+    assert "0 of 12 photographs have the place" in caught.value.given
+    assert "12 of 12 photographs (0.jpg, 1.jpg, 2.jpg and 9 more) do not" in caught.value.given
 
 
 def test_cameras_that_look_outward_have_no_middle_before_them() -> None:
     outward = [camera(c.centre, 2 * c.centre - MIDDLE) for c in around()]
+    names = [f"{number}.jpg" for number in range(12)]
     with pytest.raises(SplatError) as caught:
-        random_points(outward, seed=0)
+        random_points([*outward[:9], *around()[9:]], seed=0, names=names)
     assert caught.value.code == "cameras-no-common-view"
+    given = caught.value.given
+    assert "9 of 12 photographs (0.jpg, 1.jpg, 2.jpg and 6 more) look away from" in given
+    assert "3 of 12 photographs (9.jpg, 10.jpg, 11.jpg) look towards it" in given
 
 
 def test_no_point_lies_where_a_photograph_shows_nothing() -> None:
