@@ -154,6 +154,7 @@ def run(
     remarks |= {
         "ingest-raw-not-read": found.raws,
         "ingest-format-not-read": found.other_pictures,
+        "ingest-beside-frames": found.beside_frames,
         "ingest-masks-cut-out": [picture.name for picture in pictures] if cut_out else (),
         "ingest-mask-unused": found.stray_masks,
         "ingest-mask-missing": bare if len(bare) < len(pictures) else (),

@@ -256,6 +256,17 @@ def test_hidden_files_and_other_files_are_passed_over(photos: Path) -> None:
     assert set(warnings) == {"ingest-few-photographs", "ingest-small"}
 
 
+def test_pictures_beside_the_frames_of_a_scan_are_named(photos: Path) -> None:
+    for number, photograph in enumerate(sorted(photos.iterdir())):
+        photograph.rename(photos / f"frame_0000{number}.jpg")
+        (photos / f"frame_0000{number}.json").write_text("{}")
+    save(photos / "thumb_00000.jpg", textured(1))
+    capture, warnings, report = ingested(photos)
+    assert len(capture.photos) == 3
+    assert "thumb_00000.jpg" in warnings["ingest-beside-frames"]
+    assert report.metrics["files_ignored"] == 3
+
+
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp", "heic"])
 @pytest.mark.parametrize("kept", [0.97, 0.5, 0.02])
 def test_truncated_photographs_are_named_and_left_out(

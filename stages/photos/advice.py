@@ -29,6 +29,9 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "ingest-raw-not-read": f"Raw files are not read: {{names}}. {RAW_ADVICE}",
     "ingest-format-not-read": "These formats are not read: {names}. "
     "Save the pictures as JPEG, PNG or TIFF if they belong to the capture.",
+    "ingest-beside-frames": "Pictures beside the frames of a 3D Scanner App scan, such as the "
+    "texture of its mesh, are not used: {names}. Move those that are photographs of the scene to "
+    "another folder of the capture.",
     "ingest-hdr": "High dynamic range is not used and colours may look pale: {names}. "
     "Switch HDR off in the camera, or export as SDR.",
     "ingest-colour-profile": "The colour profile is damaged, so sRGB was assumed: {names}. "

@@ -56,7 +56,9 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
     mask_of, stray = _remove_masks(files, folder, more_masks)
     names = sorted(files, key=natural_key)
     pictures = [name for name in names if suffix_of(name) in PICTURES]
-    photographs = _posed(folder, _without_pictures_of_scans(files, pictures))
+    in_scans = _without_pictures_of_scans(files, pictures)
+    beside_frames = tuple(name for name in pictures if name not in set(in_scans))
+    photographs = _posed(folder, in_scans)
     stems = {stem_of(name) for name in photographs}
     unpaired = [name for name in names if stem_of(name) not in stems]
     kinds = {
@@ -69,11 +71,12 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
         videos=tuple(Source(files[name], name, images[name]) for name in kinds["video"]),
         raws=kinds["raw"],
         other_pictures=kinds["other"],
-        others=len(names) - len(photographs) - sum(len(kind) for kind in kinds.values()),
+        others=len(names) - sum(map(len, (photographs, beside_frames, *kinds.values()))),
         masks=mask_of,
         stray_masks=stray,
         depths=depths,
         stray_depths=stray_depths,
+        beside_frames=beside_frames,
     )
     if not found.sources and not found.videos:
         raise _no_photographs(folder, found)

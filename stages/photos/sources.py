@@ -64,6 +64,8 @@ class Findings:
         raws, other_pictures: names of files that are not read. Like `videos` without those that
             share their name with a photograph (IMG_1.NEF, or a live picture's IMG_1.MOV, beside
             IMG_1.JPG).
+        beside_frames: names of pictures beside the frames of a 3D Scanner App scan, which are no
+            photographs.
         others: how many files are something else.
         masks: mask files by the name of their photograph.
         stray_masks: mask files that belong to no photograph.
@@ -80,6 +82,7 @@ class Findings:
     stray_masks: tuple[str, ...] = ()
     depths: Mapping[str, DepthFile] = field(default_factory=dict)
     stray_depths: tuple[str, ...] = ()
+    beside_frames: tuple[str, ...] = ()
 
 
 def suffix_of(name: str) -> str:

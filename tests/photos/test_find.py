@@ -109,7 +109,10 @@ def test_3d_scanner_app_s_other_pictures_are_no_photographs(tmp_path: Path) -> N
         Image.new("RGB", (8, 6)).save(scan / name)
     Image.new("RGB", (8, 6)).save(more / "a.jpg")
     (scan / "info.json").write_text("{}")
-    assert [one.name for one in find(scan).sources] == ["frame_00000.jpg", "frame_00003.jpg"]
+    found = find(scan)
+    assert [one.name for one in found.sources] == ["frame_00000.jpg", "frame_00003.jpg"]
+    assert found.beside_frames == ("textured_output.jpg", "thumb_00000.jpg")
+    assert found.others == 7  # .json files
     both = [one.name for one in find(tmp_path).sources]
     assert both == ["more/a.jpg", "scan/frame_00000.jpg", "scan/frame_00003.jpg"]
 
