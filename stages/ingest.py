@@ -120,11 +120,12 @@ def run(
     """
     from stages.photos import advice, capture_file, depth_files, masking
     from stages.photos.find import find
-    from stages.photos.masks import check_pairing, mask_folder
+    from stages.photos.masks import check_pairing, check_rig_mask, mask_folder
     from stages.photos.quality import near_duplicates
     from stages.scene import TRANSPARENT, Capture
 
     root = Path(inputs["photos"])
+    check_rig_mask(settings.rig_mask)
     apart = mask_folder(root, settings.masks)
     found = find(root, apart, depth_files.depth_source(root, settings.depth))
     check_pairing(found, apart, settings.masks)

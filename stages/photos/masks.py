@@ -19,6 +19,18 @@ def mask_folder(photos: Path, chosen: Path | None) -> Path | None:
     return chosen or (beside if beside.is_dir() and beside != photos.absolute() else None)
 
 
+def check_rig_mask(file: Path | None) -> None:
+    """Raises SplatError "file-missing" if the mask of all panoramas was given and is no file: where
+    no picture is a panorama it would never be opened."""
+    if file is not None and not file.is_file():
+        raise SplatError(
+            "file-missing",
+            given=f"--rig-mask {file} {'is a folder' if file.is_dir() else 'does not exist'}.",
+            wanted="A picture twice as wide as high, black where all panoramas show the stand.",
+            hint="Check the path; masks of single photographs are given with --masks.",
+        )
+
+
 def check_pairing(found: Findings, apart: Path | None, chosen: Path | None) -> None:
     """Check that masks which were given belong to photographs.
 

@@ -140,6 +140,15 @@ def test_a_rig_mask_hides_the_same_part_of_every_panorama(folder: Path, tmp_path
     assert all((capture.folder / photo.mask).is_file() for photo in capture.photos)
 
 
+@pytest.mark.parametrize(("name", "why"), [("none.png", "does not exist"), ("", "is a folder")])
+def test_a_rig_mask_that_is_no_file_is_refused(
+    folder: Path, tmp_path: Path, name: str, why: str
+) -> None:
+    with pytest.raises(SplatError, match=why) as caught:
+        ingested(folder, rig_mask=tmp_path / name)
+    assert caught.value.code == "file-missing"
+
+
 def test_a_rig_mask_of_another_shape_and_one_without_use_are_named(
     folder: Path, tmp_path: Path
 ) -> None:
