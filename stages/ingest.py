@@ -153,16 +153,11 @@ def run(
         code: [o.name for o in ingested if code in o.remarks] for code in advice.TEXTS
     }
     remarks |= {
-        "ingest-raw-not-read": found.raws,
-        "ingest-format-not-read": found.other_pictures,
-        "ingest-beside-frames": found.beside_frames,
         "ingest-masks-cut-out": [picture.name for picture in pictures] if cut_out else (),
-        "ingest-mask-unused": found.stray_masks,
         "ingest-mask-missing": bare if len(bare) < len(pictures) else (),
         "ingest-rig-mask-unused": _rig_mask_unused(photos, settings),
-        "ingest-depth-unused": found.stray_depths,
     }
-    advice.about_names(remarks, report.warn)
+    advice.about_names(remarks | advice.unused_files(found), report.warn)
     duplicates = near_duplicates([one.measures.thumbnail for one in usable if one.measures])
     first = {usable[i].name: usable[group[0]].name for group in duplicates for i in group}
     photos = tuple(replace(photo, duplicate_of=first.get(photo.source, "")) for photo in photos)

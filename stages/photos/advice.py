@@ -10,7 +10,7 @@ import numpy as np
 
 from stages.base.errors import SplatError
 from stages.base.text import counted, listed
-from stages.photos.sources import RAW_ADVICE
+from stages.photos.sources import RAW_ADVICE, Findings
 from stages.scene import Photo
 
 Warn = Callable[[str, str], None]
@@ -57,6 +57,17 @@ TEXTS = {  # by code, in the order of the warnings; {names} of files or photogra
     "Use the camera's original files; 1600 pixels and more are best.",
     "ingest-dark": "Very dark: {names}. Use more light, or a tripod and a longer exposure.",
 }
+
+
+def unused_files(found: Findings) -> dict[str, Sequence[str]]:
+    """Names of the files that ingest does not use, by the code of their warning."""
+    return {
+        "ingest-raw-not-read": found.raws,
+        "ingest-format-not-read": found.other_pictures,
+        "ingest-beside-frames": found.beside_frames,
+        "ingest-mask-unused": found.stray_masks,
+        "ingest-depth-unused": found.stray_depths,
+    }
 
 
 def about_names(names: Mapping[str, Sequence[str]], warn: Warn) -> None:

@@ -191,7 +191,8 @@ def random_points(
     if len(points) < RANDOM_POINTS // 20:
         sees = np.array([count_views([camera], middle[None])[0] > 0 for camera in cameras])
         sides = f"{_some(names, sees)} have the place where the optical axes meet in their pictures"
-        raise _no_common_view(f"{sides}, and {_some(names, ~sees)} do not")
+        sides = f"{sides}, and {_some(names, ~sees)} do not"
+        raise _no_common_view(f"Few of them see the same part of space: {sides}")
     return points, middle, radius
 
 
