@@ -48,7 +48,7 @@ def test_cameras_side_by_side_have_no_middle() -> None:
     assert "The optical axes of 8 of 8 photographs are nearly parallel" in caught.value.given
 
 
-def test_cameras_that_turn_their_backs_to_each_other_s_space_are_counted() -> None:
+def test_photographs_that_do_not_show_the_middle_are_counted() -> None:
     """Far cameras with narrow lenses, of which most look past the middle of the others' axes."""
     eyes = [camera.centre for camera in around()]
     aims = [MIDDLE + 2 * np.array([0.0, (-1) ** i, 0.0]) for i in range(12)]
