@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.atomic import partial_prefix
+from stages.base.blocks import reported_blocks
 from stages.base.errors import SplatError, UsageError
 from stages.editing import expression, levels, regions, transform
 from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
@@ -66,13 +67,11 @@ def apply_operations(
 def _prepare(parsed: ParsedOperation, target: Path) -> Operation:
     value = parsed.value
     match parsed.name:
-        case "crop":
-            return _keeping(regions.parse_region(value).contains)
-        case "drop":
-            contains = regions.parse_region(value).contains
-            return _keeping(lambda splats: ~contains(splats))
+        case "crop" | "drop" as name:
+            inside, wanted = regions.parse_region(value), name == "crop"
+            return _keeping(lambda splats: inside(splats.means.astype(np.float64)) == wanted)
         case "keep":
-            return _keeping(expression.parse_expression(value).evaluate)
+            return _keeping(expression.parse_expression(value))
         case "drop-floaters":
             return _without_floaters
         case "rotate":
@@ -99,7 +98,15 @@ def _prepare(parsed: ParsedOperation, target: Path) -> Operation:
 
 
 def _keeping(condition: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
-    return lambda scene: scene.with_splats(select_rows(scene.splats, condition(scene.splats)))
+    """Keep the splats for which a condition is true; it is computed for a block at a time."""
+
+    def kept(scene: EditedScene) -> EditedScene:
+        found = np.empty(len(scene.splats), bool)
+        for rows in reported_blocks(len(found)):
+            found[rows] = condition(scene.splats.take(rows))
+        return scene.with_splats(select_rows(scene.splats, found))
+
+    return kept
 
 
 def _transforming(similarity: Similarity) -> Operation:
