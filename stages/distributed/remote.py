@@ -255,30 +255,23 @@ class UploadListener(Listener):
     def __init__(self, run_folder: Path, remote: RemoteFolder) -> None:
         self._local, self._remote = run_folder, remote
         self._partial, self._saved_ns = "", 0
-        self._uploaded: dict[str, int] = {}  # modification times of uploaded files, nanoseconds
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._remote.put(self._local, [RUN_FILE])
         self._partial = f".{number}-{stage.name}.partial"
-        self._uploaded.clear()
+        if not resumed:  # a checkpoint of another request must not lie beside this one
+            (self._remote / self._partial).remove()
+            self._remote.put(self._local, [f"{self._partial}/{REQUEST}"])
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         from stages.training.checkpoint import FILE_NAME
 
-        folder = self._local / self._partial
+        name = f"{self._partial}/{FILE_NAME}"
         with suppress(OSError, SplatError):  # without a checkpoint, a resumed run repeats more
-            saved_ns = (folder / FILE_NAME).stat().st_mtime_ns
+            saved_ns = (self._local / name).stat().st_mtime_ns
             if saved_ns != self._saved_ns:
                 self._saved_ns = saved_ns
-                for name in (REQUEST, FILE_NAME):
-                    self._upload(folder, name)
-
-    def _upload(self, folder: Path, name: str) -> None:
-        """Upload a file of the working folder unless it is unchanged."""
-        made_ns = (folder / name).stat().st_mtime_ns
-        if self._uploaded.get(name) != made_ns:
-            (self._remote / self._partial).put(folder, [name])
-            self._uploaded[name] = made_ns
+                self._remote.put(self._local, [name])
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         label = f"{number}-{stage.name}"
