@@ -185,9 +185,10 @@ class LivePage:
         }
 
     def ended(self, how: str) -> None:
-        """how: "finished" or "stopped". The page gets it with its next request for the state."""
+        """how: "finished" or "stopped", of which the first counts. The page gets it with its next
+        request for the state."""
         self.frames.close()
-        self._state = {**self._state, "end": how}
+        self._state = {**self._state, "end": self._state["end"] or how}
 
     def _answer_state(self, query: dict[str, str]) -> Item:
         self.frames.mark_watched()
