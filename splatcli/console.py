@@ -14,6 +14,7 @@ from typing import Any
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.filesize import decimal
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -217,11 +218,7 @@ def figure(name: str, value: Any) -> str:
 
 def size(count: float) -> str:
     """Bytes as people read them: "1.3 MB"."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000 or unit == "GB":
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1000
-    raise AssertionError
+    return decimal(int(count))
 
 
 def fidelity(psnr_db: float) -> str:

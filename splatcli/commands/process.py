@@ -12,6 +12,7 @@ from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES
 from stages.base.errors import UsageError
+from stages.base.settings import changed
 from stages.distributed import blocks, cluster, sfm_chunks
 from stages.distributed.tasks import Executor
 from stages.run import runfolder
@@ -101,7 +102,7 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
         }
         if "formats" in changes:
             changes["formats"] = (*base["quantise"].formats, *given["formats"])
-        settings["quantise"] = options.changed(base["quantise"], changes)
+        settings["quantise"] = changed(base["quantise"], changes)
     if not is_known:
         settings = {**base, **settings}
     if name == "train" and console.mode.has_notes:

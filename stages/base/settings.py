@@ -21,7 +21,8 @@ from __future__ import annotations
 import math
 import re
 import types
-from dataclasses import MISSING, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields, replace
 from dataclasses import field as dataclass_field
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -165,3 +166,11 @@ def check_settings(settings: Any) -> None:
                 wanted="Both, or neither.",
                 hint=f"Add {other.flag}, or leave {setting.flag} out.",
             )
+
+
+def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
+    """`settings` with the typed fields that it has, checked. Raises as `check_settings`."""
+    names = {field.name for field in fields(settings)}
+    new = replace(settings, **{name: value for name, value in typed.items() if name in names})
+    check_settings(new)
+    return new

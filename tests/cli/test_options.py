@@ -69,7 +69,7 @@ def test_durations_read_well(seconds: float, text: str) -> None:
     assert console.duration(seconds) == text
 
 
-@pytest.mark.parametrize(("count", "text"), [(12, "12 B"), (1300, "1.3 kB"), (2.5e9, "2.5 GB")])
+@pytest.mark.parametrize(("count", "text"), [(12, "12 bytes"), (1300, "1.3 kB"), (2.5e9, "2.5 GB")])
 def test_sizes_read_well(count: float, text: str) -> None:
     assert console.size(count) == text
 
