@@ -97,7 +97,8 @@ def picture_sink(path: Path, depth: bool) -> Iterator[Put]:
 def _save(path: Path, rendering: Rendering, depth: bool) -> None:
     save_picture(path, eight_bits(rendering.image))
     if depth:
-        save_depth(path.with_suffix(".depth.tiff"), rendering.median_depth)
+        floats = np.ascontiguousarray(rendering.median_depth, np.float32)
+        save_picture(path.with_suffix(".depth.tiff"), floats)
 
 
 @contextmanager
@@ -158,21 +159,13 @@ def eight_bits(image: NDArray[np.floating]) -> NDArray[np.uint8]:
     return found
 
 
-def save_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write [H, W, 3] in the format that the suffix names. Raises SplatError."""
+def save_picture(path: Path, pixels: NDArray[np.uint8] | NDArray[np.float32]) -> None:
+    """Write colours [H, W, 3] uint8 in the format that the suffix names, or a depth [H, W] float32
+    as .tiff: z in world units, 0 for the background. Raises SplatError."""
     from PIL import Image
 
     with replacing(path) as partial:
         Image.fromarray(pixels).save(partial)
-
-
-def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
-    """Write [H, W] as a TIFF of 32-bit floats: z in world units, 0 for the background. Raises
-    SplatError."""
-    from PIL import Image
-
-    with replacing(path) as partial:
-        Image.fromarray(np.ascontiguousarray(depth, np.float32)).save(partial, "TIFF")
 
 
 def depth_range(depths: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
