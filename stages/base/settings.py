@@ -113,7 +113,7 @@ class Setting:
         return f"{what} of at least {self.low:,}." if self.low is not None else f"{what}."
 
 
-_KEYS = {field.name for field in fields(Setting)}
+_RENAMED = ("min", "max", "option")  # keys of metadata that a `Setting` holds under another name
 
 
 def setting(default: Any, help: str, **metadata: Any) -> Any:
@@ -131,15 +131,14 @@ def settings_of(settings_type: type) -> list[Setting]:
             hint = next(arg for arg in get_args(hint) if arg is not type(None))
             optional = True
         many = get_origin(hint) in (tuple, list)
-        default = field.default if field.default_factory is MISSING else field.default_factory()
         option = field.name.removesuffix("s") if many else field.name
-        more = {key: value for key, value in field.metadata.items() if key in _KEYS}
+        more = {key: value for key, value in field.metadata.items() if key not in _RENAMED}
         found.append(
             Setting(
                 name=field.name,
                 flag="--" + field.metadata.get("option", option).replace("_", "-"),
                 kind=get_args(hint)[0] if many else hint,
-                default=None if default is MISSING else default,
+                default=None if field.default is MISSING else field.default,
                 many=many,
                 optional=optional,
                 low=field.metadata.get("min"),
