@@ -182,11 +182,11 @@ def error_result(error: BaseException) -> TaskResult:
     return TaskResult(CRASHED, "bug", f"{type(error).__name__}: {reason_of(error)}.")
 
 
+@dataclass(frozen=True)
 class SerialExecutor:
     """Executes tasks one after another in this process."""
 
-    def __init__(self, listener: Listener | None = None) -> None:
-        self.listener = listener
+    listener: Listener | None = None
 
     def results(
         self, tasks: Sequence[Task], need: Resources, stop: Event | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,16 +29,6 @@ _ATTEMPTS = 8  # to meet a size: one or two are enough where bytes grow with spl
 _SAFETY = 0.995
 
 
-@dataclass(frozen=True)
-class AppliedOperation:
-    """One operation that was applied. before, after: the numbers of splats."""
-
-    parsed: ParsedOperation
-    before: int
-    after: int
-    scene: EditedScene
-
-
 def prepare_operations(
     parsed: Sequence[ParsedOperation], target: Path
 ) -> list[tuple[ParsedOperation, Operation]]:
@@ -49,8 +39,9 @@ def prepare_operations(
 
 def apply_operations(
     scene: EditedScene, chain: Sequence[tuple[ParsedOperation, Operation]]
-) -> Iterator[AppliedOperation]:
-    """Apply one operation after the other. Raises SplatError "edit-nothing-left"."""
+) -> Iterator[tuple[ParsedOperation, EditedScene]]:
+    """Apply one operation after the other; yields each with the scene after it. Raises SplatError
+    "edit-nothing-left"."""
     for parsed, operation in chain:
         before = len(scene.splats)
         scene = operation(scene)
@@ -61,7 +52,7 @@ def apply_operations(
                 wanted="At least one splat that remains.",
                 hint="`splat info` prints the bounds, sizes and opacities of a file.",
             )
-        yield AppliedOperation(parsed, before, len(scene.splats), scene)
+        yield parsed, scene
 
 
 def _prepare(parsed: ParsedOperation, target: Path) -> Operation:

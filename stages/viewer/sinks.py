@@ -87,14 +87,8 @@ _SAMPLED_SIDE = 240  # pixels
 Put = Callable[[Rendering], None]
 
 
-@contextmanager
-def picture_sink(path: Path, depth: bool) -> Iterator[Put]:
-    """Writes the picture `path`; with `depth` also its depth as .depth.tiff. Raises SplatError."""
-
-    yield lambda rendering: _save(path, rendering, depth)
-
-
-def _save(path: Path, rendering: Rendering, depth: bool) -> None:
+def save_rendering(path: Path, depth: bool, rendering: Rendering) -> None:
+    """Write the picture `path`; with `depth` also its depth as .depth.tiff. Raises SplatError."""
     save_picture(path, eight_bits(rendering.image))
     if depth:
         floats = np.ascontiguousarray(rendering.median_depth, np.float32)
@@ -111,7 +105,8 @@ def folder_sink(folder: Path, frames: int, depth: bool) -> Iterator[Put]:
     def put(rendering: Rendering) -> None:
         nonlocal number
         number += 1
-        _save(folder / f"frame_{number:0{max(4, len(str(frames)))}}.png", rendering, depth)
+        name = f"frame_{number:0{max(4, len(str(frames)))}}.png"
+        save_rendering(folder / name, depth, rendering)
 
     yield put
 
