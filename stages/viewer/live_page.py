@@ -178,6 +178,14 @@ class LivePage:
             "end": "",
         }
 
+    def drawable(self, draw: DrawView) -> None:
+        """Training can draw a frame; after its last step it draws the one that is kept."""
+        done = self._state["done"]
+        if done < self._state["total"]:
+            self.frames.offer(draw, done)
+        else:
+            self.frames.offer_last(draw, done)
+
     def ended(self, how: str) -> None:
         """how: "finished" or "stopped", of which the first counts. The page gets it with its next
         request for the state."""

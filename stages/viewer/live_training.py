@@ -35,7 +35,6 @@ class LiveTraining(Listener):
         self._warn = warn
         self._server: LocalServer | None = None
         self._page: LivePage | None = None
-        self._progress = (0, 0)
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         if stage.name != _STAGE:
@@ -59,17 +58,11 @@ class LiveTraining(Listener):
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         if self._page is not None and stage.name == _STAGE:
-            self._progress = (done, total)
             self._page.progressed(label, done, total, numbers)
 
     def drawable(self, stage: Stage, draw: DrawView) -> None:
-        if self._page is None:
-            return
-        done, total = self._progress
-        if done < total:
-            self._page.frames.offer(draw, done)
-        else:
-            self._page.frames.offer_last(draw, done)
+        if self._page is not None:
+            self._page.drawable(draw)
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         if self._page is not None and stage.name == _STAGE:
