@@ -113,12 +113,12 @@ class Setting:
         return f"{what} of at least {self.low:,}." if self.low is not None else f"{what}."
 
 
-_RENAMED = ("min", "max", "option")  # keys of metadata that a `Setting` holds under another name
-
-
-def setting(default: Any, help: str, **metadata: Any) -> Any:
+def setting(
+    default: Any, help: str, min: float | None = None, max: float | None = None, **metadata: Any
+) -> Any:
     """A field of a settings dataclass. metadata: as listed in this module's docstring."""
-    return dataclass_field(default=default, metadata={"help": help, **metadata})
+    bounds = {"low": min, "high": max}
+    return dataclass_field(default=default, metadata={"help": help, **bounds, **metadata})
 
 
 def settings_of(settings_type: type) -> list[Setting]:
@@ -131,18 +131,16 @@ def settings_of(settings_type: type) -> list[Setting]:
             hint = next(arg for arg in get_args(hint) if arg is not type(None))
             optional = True
         many = get_origin(hint) in (tuple, list)
-        option = field.name.removesuffix("s") if many else field.name
-        more = {key: value for key, value in field.metadata.items() if key not in _RENAMED}
+        more = dict(field.metadata)
+        option = more.pop("option", field.name.removesuffix("s") if many else field.name)
         found.append(
             Setting(
                 name=field.name,
-                flag="--" + field.metadata.get("option", option).replace("_", "-"),
+                flag="--" + option.replace("_", "-"),
                 kind=get_args(hint)[0] if many else hint,
                 default=None if field.default is MISSING else field.default,
                 many=many,
                 optional=optional,
-                low=field.metadata.get("min"),
-                high=field.metadata.get("max"),
                 **more,
             )
         )
