@@ -86,8 +86,8 @@ def _options(
 
 def _add(name: str, command: Any, example: str, *added: Iterable[Parameter], **more: Any) -> None:
     """Add a command with the parameters of `added` besides its own."""
-    found = with_parameters(command, chain(*added))
-    app.command(name, epilog=f"Example: {example}", **more)(guarded(found))
+    found = with_parameters(guarded(command), chain(*added))
+    app.command(name, epilog=f"Example: {example}", **more)(found)
 
 
 _RESULT = (QUIET, AS_JSON)

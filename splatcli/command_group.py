@@ -28,18 +28,19 @@ class CommandGroup(TyperGroup):
         **extra: Any,
     ) -> Any:
         """Parse and run; ends the process with the exit status if `standalone_mode`."""
-        words = sys.argv[1:] if args is None else list(args)
+        # of errors before a command runs, which sets it again
+        console.mode.as_json = "--json" in (sys.argv[1:] if args is None else args)
         try:
             status = super().main(
                 args, prog_name, complete_var, False, windows_expand_args, **extra
             )
         except SplatError as error:
-            status = console.show_error(error, "--json" in words)
+            status = console.show_error(error)
         except _UsageError as error:
             if type(error).__name__ == "NoArgsIsHelpError":  # it has shown the help
                 status = int(Family.USAGE)
             else:
-                status = console.show_error(_as_splat_error(error), "--json" in words)
+                status = console.show_error(_as_splat_error(error))
         if standalone_mode:
             sys.exit(status)
         return status

@@ -14,6 +14,7 @@ from typing import Any
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.filesize import decimal
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -69,43 +70,42 @@ def guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(command)
     def call(**values: Any) -> None:
         mode.quiet, mode.as_json = (values.pop(name, False) for name in ("quiet", "as_json"))
-        as_json = mode.as_json
         try:
             if values.pop("verbose", False):
-                _start_log(as_json)
+                _start_log()
             command(**values)
         except SplatError as error:
             log.write_failure(error)
-            raise typer.Exit(show_error(error, as_json)) from error
+            raise typer.Exit(show_error(error)) from error
         except (Interrupted, KeyboardInterrupt) as stop:
-            raise typer.Exit(show_stopped(as_json)) from stop
+            raise typer.Exit(show_stopped()) from stop
         except (typer.Exit, BrokenPipeError):
             raise
         except Exception as error:
             explained = as_splat_error(error, "the command", Path())
             if explained is not None:
                 log.write_failure(error)
-                raise typer.Exit(show_error(explained, as_json)) from error
+                raise typer.Exit(show_error(explained)) from error
             if os.environ.get("SPLAT_DEBUG") == "1":
                 raise
-            raise typer.Exit(show_bug(error, as_json)) from error
+            raise typer.Exit(show_bug(error)) from error
         finally:
             log.stop()
 
     return call
 
 
-def _start_log(as_json: bool) -> None:
+def _start_log() -> None:
     path = log.start()
-    if as_json:
+    if mode.as_json:
         emit("log", path=str(path) if path else None)
     else:
         note(f"Log: {path}" if path else "No log can be written to the temporary folder.")
 
 
-def show_error(error: SplatError, as_json: bool = False) -> int:
+def show_error(error: SplatError) -> int:
     """Print an error; returns the exit status."""
-    if as_json:
+    if mode.as_json:
         emit("error", **error.as_dict())
         return int(error.family)
     err.print(Text("Error: ", style="bold red") + Text(printable_name(error.given)))
@@ -115,10 +115,10 @@ def show_error(error: SplatError, as_json: bool = False) -> int:
     return int(error.family)
 
 
-def show_stopped(as_json: bool = False) -> int:
+def show_stopped() -> int:
     """Print how to go on after Ctrl-C; returns the exit status."""
     again = shlex.join(["splat", *sys.argv[1:]])
-    if as_json:
+    if mode.as_json:
         emit("stopped", go_on=again)
     else:
         err.print("Stopped. What was finished is kept.")
@@ -126,12 +126,12 @@ def show_stopped(as_json: bool = False) -> int:
     return STOPPED
 
 
-def show_bug(error: BaseException, as_json: bool = False) -> int:
+def show_bug(error: BaseException) -> int:
     """Print an unexpected failure and the log with its traceback; returns the exit status."""
     path = log.start()
     log.write_failure(error)
     what = f"{type(error).__name__}: {error}".splitlines()[0]
-    if as_json:
+    if mode.as_json:
         emit("bug", message=what, log=str(path) if path else None)
         return CRASHED
     err.print(Text("Unexpected failure: ", style="bold red") + Text(what))
@@ -218,11 +218,7 @@ def figure(name: str, value: Any) -> str:
 
 def size(count: float) -> str:
     """Bytes as people read them: "1.3 MB"."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000 or unit == "GB":
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1000
-    raise AssertionError
+    return decimal(int(count))
 
 
 def fidelity(psnr_db: float) -> str:

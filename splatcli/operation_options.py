@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from inspect import Parameter
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,16 @@ from splatcli.options import keyword
 from stages.editing.syntax import OPERATIONS, ParsedOperation, parse_file
 
 _FILE_OPTION = "ops"
-_WORDS = "splat.words"  # the key of the command's words in the context's `meta`
+_ORDER = "splat.order"  # the key of (option, value) pairs in the context's `meta`
 
 
 class OrderedCommand(TyperCommand):
-    """A command that keeps its words: the parser groups them by option."""
+    """A command that keeps the order of its options: the parser groups their values by option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        ctx.meta[_WORDS] = tuple(args)
+        found, _, order = self.make_parser(ctx).parse_args(list(args))
+        values = {name: iter(value) for name, value in found.items() if isinstance(value, list)}
+        ctx.meta[_ORDER] = [(one.name, next(values.get(one.name, iter(())), "")) for one in order]
         return super().parse_args(ctx, args)
 
 
@@ -50,22 +51,13 @@ def operation_parameters() -> list[Parameter]:
 
 
 def parsed_operations(ctx: typer.Context) -> list[ParsedOperation]:
-    """The operations in the order on the command line, those of files in the place of --ops. The
-    parser has accepted the words. Raises SplatError "edit-ops"."""
-    return list(_operations(iter(ctx.meta[_WORDS])))
-
-
-def _operations(words: Iterator[str]) -> Iterator[ParsedOperation]:
-    for word in words:
-        if word == "--":
-            return
-        flag, given, value = word.partition("=")
-        name = flag.removeprefix("--") if flag.startswith("--") else ""
-        if name != _FILE_OPTION and name not in OPERATIONS:
-            continue
+    """The operations in the order on the command line, those of files in the place of --ops. Raises
+    SplatError "edit-ops"."""
+    operations = []
+    for option, value in ctx.meta[_ORDER]:
+        name = option.replace("_", "-")
         if name == _FILE_OPTION:
-            yield from parse_file(Path(value if given else next(words)))
-        elif OPERATIONS[name].takes:
-            yield ParsedOperation(name, value if given else next(words))
-        else:
-            yield ParsedOperation(name)
+            operations += parse_file(Path(value))
+        elif name in OPERATIONS:
+            operations.append(ParsedOperation(name, value))
+    return operations

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 
-from stages.base.settings import PANELS, Setting, check_settings, settings_of
+from stages.base.settings import PANELS, Setting, settings_of
 
 _METAVARS = {int: "N", float: "X", bool: None, Path: "PATH"}
 
@@ -114,34 +113,21 @@ def given_only(given: Mapping[str, Any]) -> dict[str, Any]:
     return {n: tuple(value) if isinstance(value, list) else value for n, value in typed.items()}
 
 
-def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
-    """`settings` with the typed fields that it has, checked. Raises SplatError (option-value)."""
-    names = {field.name for field in fields(settings)}
-    new = replace(settings, **{name: value for name, value in typed.items() if name in names})
-    check_settings(new)
-    return new
-
-
 def with_parameters(
     command: Callable[..., Any], added: Iterable[inspect.Parameter]
 ) -> Callable[..., Any]:
-    """`command`, which takes **given, with the added parameters in the signature that typer sees;
-    options in the order of their panels."""
+    """`command`, which takes **given, after the added parameters were put into its signature, as
+    typer sees it; options in the order of their panels."""
     signature = inspect.signature(command, eval_str=True)
     own = [p for p in signature.parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
     # Typer shows panels in the order of their first options.
     every = sorted([*added, *own], key=lambda p: (p.kind, _panel_number(p)))
 
-    def call(**values: Any) -> Any:
-        return command(**values)
-
-    call.__name__ = command.__name__
-    call.__doc__ = command.__doc__
-    call.__annotations__ = {p.name: p.annotation for p in every}
-    call.__signature__ = signature.replace(  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in every}
+    command.__signature__ = signature.replace(  # type: ignore[attr-defined]
         parameters=every, return_annotation=None
     )
-    return call
+    return command
 
 
 def _panel_number(parameter: inspect.Parameter) -> int:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -36,7 +35,7 @@ def listener_for(mode: console.Mode) -> Listener:
         return Events()
     if mode.quiet:
         return Quiet()
-    return Bars(console.err) if console.err.is_terminal else Lines()
+    return Bars() if console.err.is_terminal else Lines()
 
 
 class Quiet(Listener):
@@ -128,7 +127,7 @@ def _figures(numbers: Numbers) -> str:
     return console.figures({name: value for name, value in numbers.items() if name not in _COUNTED})
 
 
-class Lines(Listener):
+class Lines(Quiet):
     """A line every few seconds, for output that goes to a file."""
 
     def __init__(self) -> None:
@@ -137,7 +136,8 @@ class Lines(Listener):
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._timer = _PhaseTimer()
-        console.note(_started(stage, number, reason, resumed))
+        how = "goes on" if resumed else "runs"
+        console.note(f"{number}/7 {stage.name}: {how} ({reason})")
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         now = time.monotonic()
@@ -149,18 +149,10 @@ class Lines(Listener):
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         console.note(f"{number}/7 {stage.name}: done in {console.duration(manifest.seconds)}")
-        warn(manifest)
+        super().finished(stage, number, manifest)
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
         console.note(f"{number}/7 {stage.name}: up to date")
-
-    def stopping(self) -> None:
-        console.note(STOPPING)
-
-
-def _started(stage: Stage, number: int, reason: str, resumed: bool) -> str:
-    how = "goes on" if resumed else "runs"
-    return f"{number}/7 {stage.name}: {how} ({reason})"
 
 
 class _Rate(ProgressColumn):
@@ -171,27 +163,37 @@ class _Rate(ProgressColumn):
         return Text(_rate(speed) if speed else "", style="dim")
 
 
-class Bars(Listener):
+def _bar(
+    *first: ProgressColumn, last: Sequence[ProgressColumn] = (), disable: bool = False
+) -> Progress:
+    """A bar on standard error, between its first and its last columns."""
+    return Progress(
+        *first,
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        _Rate(),
+        TimeRemainingColumn(compact=True),
+        *last,
+        console=console.err,
+        transient=True,
+        disable=disable,
+    )
+
+
+class Bars(Quiet):
     """A bar for each stage, with rate, remaining time and figures."""
 
-    def __init__(self, screen: Console) -> None:
-        self._screen = screen
+    def __init__(self) -> None:
         self._progress: Progress | None = None
         self._timer = _PhaseTimer()
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._close()
         self._timer = _PhaseTimer()
-        self._progress = Progress(
+        self._progress = _bar(
             TextColumn(f"[bold]{number}/7 {stage.name:<8}[/bold]"),
             TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            _Rate(),
-            TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[figures]}", markup=False, style="cyan"),
-            console=self._screen,
-            transient=True,
+            last=[TextColumn("{task.fields[figures]}", markup=False, style="cyan")],
         )
         waiting = "going on" if resumed else "starting"
         self._task = self._progress.add_task(waiting, total=None, figures="")
@@ -213,14 +215,11 @@ class Bars(Listener):
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         self._close()
         line = f"{number}/7 {stage.name:<8} done in {console.duration(manifest.seconds)}"
-        self._screen.print(Text(line, style="green"))
-        warn(manifest)
+        console.note(line, "green")
+        super().finished(stage, number, manifest)
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
-        self._screen.print(Text(f"{number}/7 {stage.name:<8} up to date", style="dim"))
-
-    def stopping(self) -> None:
-        self._screen.print(STOPPING)
+        console.note(f"{number}/7 {stage.name:<8} up to date", "dim")
 
     def ended(self) -> None:
         self._close()
@@ -237,16 +236,7 @@ def counting(what: str, total: int) -> Iterator[Callable[[], None]]:
     remaining time. One item is not worth a count, but for machines."""
     done, last, timer, mode = 0, time.monotonic(), _PhaseTimer(), console.mode
     shown = mode.has_notes and total > 1
-    bar = Progress(
-        TextColumn(what),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        _Rate(),
-        TimeRemainingColumn(compact=True),
-        console=console.err,
-        transient=True,
-        disable=not (shown and console.err.is_terminal),
-    )
+    bar = _bar(TextColumn(what), disable=not (shown and console.err.is_terminal))
     task = bar.add_task(what, total=total)
     timer.new_phase(0, total)
 

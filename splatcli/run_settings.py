@@ -10,7 +10,7 @@ import typer
 
 from splatcli import console, options
 from stages import STAGE_NAMES, load_stage
-from stages.base.settings import Setting, settings_of
+from stages.base.settings import Setting, changed, settings_of
 from stages.raster.backends import backend_of, backend_of_settings
 
 DEFAULT_PRESET = "standard"
@@ -109,7 +109,7 @@ def combined(
     chosen = dict(base)
     if preset is not None and "train" in chosen:
         chosen["train"] = presets()[preset]
-    found = {name: options.changed(settings, given) for name, settings in chosen.items()}
+    found = {name: changed(settings, given) for name, settings in chosen.items()}
     if given.keys() & {"backend", "device"}:  # an error now, not after an hour of other work
         with_backend = [settings for settings in found.values() if hasattr(settings, "backend")]
         for name in {backend_of_settings(settings) for settings in with_backend}:

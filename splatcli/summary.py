@@ -83,11 +83,10 @@ def _assets(pipeline: Pipeline) -> list[tuple[str, int, str]]:
     manifest = pipeline.manifest("export")
     if manifest is None:
         return []
-    folder = pipeline.stage_folder("export")
-    exported = pipeline.load("export")
+    assets = pipeline.load("export")
     return [
-        (str(folder / file.path), file.size_bytes, _quality(manifest, file.format))
-        for file in exported.files
+        (str(assets.folder / file.path), file.size_bytes, _quality(manifest, file.format))
+        for file in assets.files
     ]
 
 

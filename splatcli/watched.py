@@ -39,7 +39,8 @@ def watched(command: Callable[[], None]) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, forwarded)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if status < 0 and -status not in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        status = console.show_error(_crashed(status), "--json" in sys.argv)
+        console.mode.as_json = "--json" in sys.argv
+        status = console.show_error(_crashed(status))
     elif status < 0:  # end as it did
         signal.signal(-status, signal.SIG_DFL)
         os.kill(os.getpid(), -status)

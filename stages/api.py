@@ -4,11 +4,12 @@ its use; `splat process` does the same with a progress bar."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stages import STAGE_NAMES, load_stage
+from stages.base.settings import changed
 from stages.raster.backends import backend_of_settings
 from stages.run.pipeline import Listener, Pipeline
 from stages.run.results import reconstruction_of
@@ -69,12 +70,10 @@ def process(
         raise ValueError(f"preset {preset!r}: one of {', '.join(PRESETS)} is wanted")
     settings: dict[str, Any] = {name: load_stage(name).settings_type() for name in STAGE_NAMES}
     settings["train"] = PRESETS[preset]
-    known = {name: {field.name for field in fields(found)} for name, found in settings.items()}
-    if unknown := options.keys() - set().union(*known.values()):
+    known = {field.name for found in settings.values() for field in fields(found)}
+    if unknown := options.keys() - known:
         raise TypeError(f"no stage has the option {', '.join(sorted(unknown))}")
-    for name, found in settings.items():
-        given = {key: value for key, value in options.items() if key in known[name]}
-        settings[name] = replace(found, **given)
+    settings = {name: changed(found, options) for name, found in settings.items()}
     pipeline = Pipeline(run_folder, photos)
     manifests = pipeline.run(settings, listener=listener)
     return Scene(

@@ -15,7 +15,7 @@ from splatcli import console, log, options, run_settings
 from splatcli.arguments import Cluster
 from stages.distributed.batch import WAITING, BatchTable, Row, run_names, running_stage
 from stages.distributed.cluster import open_executor
-from stages.distributed.tasks import TaskResult, resources_of
+from stages.distributed.tasks import TaskResult, resources_of, task_for
 
 
 def batch(
@@ -50,9 +50,7 @@ def batch(
     log.write_settings(settings)
     runs = remote.parse_location(out)
     photos = run_names(remote.expand_locations(captures))
-    tasks = [
-        remote.task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()
-    ]
+    tasks = [task_for(remote.joined(runs, name), path, settings) for name, path in photos.items()]
     with (
         remote.prepare_output(runs) as local_folder,
         open_executor(cluster, runs, photos.values()) as executor,

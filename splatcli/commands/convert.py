@@ -100,31 +100,24 @@ def _proven(source: Path, target: Path, splats: Splats) -> tuple[dict[str, Any],
 def _progress() -> Iterator[Callable[[str], None]]:
     """Yield a function to call at the beginning of each step. It prints a line or an event; on a
     terminal it shows a bar with the progress of the step."""
-    done = 0
-    if not (console.mode.has_notes and console.err.is_terminal):
-
-        def begin(label: str) -> None:
-            nonlocal done
-            console.step(label, done=done, total=_STEPS)
-            done += 1
-
-        yield begin
-        return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
     from stages.base.blocks import progress_reported_to
 
+    done, shown = 0, console.mode.has_notes and console.err.is_terminal
     columns = TextColumn("{task.description}", markup=False), BarColumn(24), TaskProgressColumn()
-    with Progress(*columns, console=console.err, transient=True) as bar:
-        task = bar.add_task("", total=None)
+    bar = Progress(*columns, console=console.err, transient=True, disable=not shown)
+    task = bar.add_task("", total=None)
 
-        def begin_bar(label: str) -> None:
-            nonlocal done
-            done += 1
-            bar.reset(task, total=None, description=f"{done}/{_STEPS} {label}")
+    def begin(label: str) -> None:
+        nonlocal done
+        if not shown:
+            console.step(label, done=done, total=_STEPS)
+        done += 1
+        bar.reset(task, total=None, description=f"{done}/{_STEPS} {label}")
 
-        def update(rows: int, total: int) -> None:
-            bar.update(task, completed=rows, total=total)
+    def update(rows: int, total: int) -> None:
+        bar.update(task, completed=rows, total=total)
 
-        with progress_reported_to(update):
-            yield begin_bar
+    with bar, progress_reported_to(update):
+        yield begin

@@ -61,11 +61,11 @@ def checks() -> Iterator[Check]:
     yield Check("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "not set"))
     yield _memory()
     yield _disk()
-    yield _kernel_cache()
-    yield _gpu()
-    yield _readable("photographs", _photograph_formats)
-    yield _readable("videos", _video_codecs)
-    yield _readable("cameras", _camera_files)
+    yield _attempted("kernel cache", _kernel_cache)
+    yield _attempted("GPU", _gpu, needed=False)
+    yield _attempted("photographs read", _photograph_formats)
+    yield _attempted("videos read", _video_codecs)
+    yield _attempted("cameras read", _camera_files)
     for backend in BACKENDS:
         yield _backend(backend)
     yield Check("--backend auto", backend_of(AUTO).name)
@@ -96,48 +96,54 @@ def _disk() -> Check:
     return Check("free disk here", console.size(free), advice=advice)
 
 
-def _kernel_cache() -> Check:
+def _attempted(name: str, value: Callable[[], str], needed: bool = True) -> Check:
+    """The check whose value is computed; or why that failed, if a library or a driver is missing or
+    broken, which may raise anything."""
     try:
-        from stages.raster.kernels import cache
-
-        own, others = cache.folder(), cache.others()
-        value = f"{own}, {console.size(cache.size_bytes(own))}"
-        if others:
-            value += f"; {counted(len(others), 'other version')} beside it, "
-            value += console.size(sum(map(cache.size_bytes, others)))
-        return Check("kernel cache", value)
-    except Exception as error:  # no place to write to, or no Numba
-        return Check("kernel cache", reason_of(error), ok=False)
+        return Check(name, value())
+    except Exception as error:
+        return Check(name, reason_of(error), ok=not needed)
 
 
-def _readable(what: str, names: Callable[[], list[str]]) -> Check:
-    """The formats that the libraries of this machine can read."""
-    label = f"{what} read"
-    try:
-        return Check(label, ", ".join(names()))
-    except Exception as error:  # of a library that is missing or broken
-        return Check(label, reason_of(error), ok=False)
+def _kernel_cache() -> str:
+    """The folder and its size. Raises if there is no place to write to, or no Numba."""
+    from stages.raster.kernels import cache
+
+    own, others = cache.folder(), cache.others()
+    value = f"{own}, {console.size(cache.size_bytes(own))}"
+    if others:
+        value += f"; {counted(len(others), 'other version')} beside it, "
+        value += console.size(sum(map(cache.size_bytes, others)))
+    return value
 
 
-def _photograph_formats() -> list[str]:
+def _gpu() -> str:
+    """The GPU, also if torch cannot use it."""
+    from stages.raster.gpu import device
+
+    missing = device.missing()
+    return f"{missing}; {device.built()}" if missing else device.describe()
+
+
+def _photograph_formats() -> str:
     from PIL import Image
 
     from stages.photos.decode import FORMATS, readers_set_up
 
     with readers_set_up():
-        return [name for name in FORMATS if name in Image.OPEN]
+        return ", ".join(name for name in FORMATS if name in Image.OPEN)
 
 
-def _video_codecs() -> list[str]:
+def _video_codecs() -> str:
     import av
 
-    return [name for name in _VIDEO_CODECS if name in av.codecs_available]
+    return ", ".join(name for name in _VIDEO_CODECS if name in av.codecs_available)
 
 
-def _camera_files() -> list[str]:
+def _camera_files() -> str:
     from stages.cameras.table import CAMERA_FILES
 
-    return [row.description for row in CAMERA_FILES]
+    return ", ".join(row.description for row in CAMERA_FILES)
 
 
 def _backend(backend: Backend) -> Check:
@@ -149,14 +155,3 @@ def _backend(backend: Backend) -> Check:
     except Exception as error:
         return Check(label, f"not present ({reason_of(error)})", ok=False)
     return Check(label, "present")
-
-
-def _gpu() -> Check:
-    """The GPU, also if torch cannot use it."""
-    try:
-        from stages.raster.gpu import device
-
-        missing = device.missing()
-        return Check("GPU", f"{missing}; {device.built()}" if missing else device.describe())
-    except Exception as error:  # a broken driver may raise anything
-        return Check("GPU", reason_of(error))

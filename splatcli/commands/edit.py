@@ -17,7 +17,6 @@ from stages.base.errors import UsageError
 from stages.run import results
 
 if TYPE_CHECKING:
-    from stages.editing.operations import AppliedOperation
     from stages.editing.scene import EditedScene
     from stages.editing.syntax import ParsedOperation
 
@@ -75,9 +74,9 @@ def _edit(
         before, start_db = len(scene.splats), scene.psnr_db()
         facts: dict[str, Any] = {"source": str(source), "splats_before": before}
         steps = []
-        for step in operations.apply_operations(scene, prepared):
-            scene = step.scene
-            steps.append(_report(step))
+        for one, edited in operations.apply_operations(scene, prepared):
+            steps.append(_report(one, len(scene.splats), edited))
+            scene = edited
         facts |= {"splats": len(scene.splats), "units": scene.units, "steps": steps}
         if start_db is not None:
             facts |= {"psnr_before_db": round(start_db, 3), "psnr_db": _db(scene)}
@@ -133,20 +132,18 @@ def _db(scene: EditedScene) -> float | None:
     return None if found is None else round(found, 3)
 
 
-def _report(step: AppliedOperation) -> dict[str, Any]:
-    facts: dict[str, Any] = {
-        "operation": str(step.parsed),
-        "splats_before": step.before,
-        "splats": step.after,
-    }
-    psnr = _db(step.scene)
+def _report(parsed: ParsedOperation, before: int, scene: EditedScene) -> dict[str, Any]:
+    """The effect of an operation, which is printed. before: splats. scene: after it."""
+    after = len(scene.splats)
+    facts: dict[str, Any] = {"operation": str(parsed), "splats_before": before, "splats": after}
+    psnr = _db(scene)
     if psnr is not None:
         facts["psnr_db"] = psnr
     if console.mode.as_json:
         console.emit("operation", **facts)
     elif not console.mode.quiet:
         cost = f", {console.figure('psnr_db', psnr)}" if psnr is not None else ""
-        console.note(f"{step.parsed}: {step.before:,} -> {step.after:,} splats{cost}")
+        console.note(f"{parsed}: {before:,} -> {after:,} splats{cost}")
     return facts
 
 

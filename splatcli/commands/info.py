@@ -174,11 +174,10 @@ def _about_run(pipeline: Pipeline) -> dict[str, Any]:
         facts["levelled"] = bool(reconstruction.levelled)
     manifest = pipeline.manifest("export")
     if manifest is not None:
-        folder = pipeline.stage_folder("export")
-        proven = manifest.metrics.get("formats", {})
+        assets, proven = pipeline.load("export"), manifest.metrics.get("formats", {})
         facts["assets"] = {
-            str(folder / file.path): _size_and_fidelity(file, proven.get(file.format, {}))
-            for file in pipeline.load("export").files
+            str(assets.folder / file.path): _size_and_fidelity(file, proven.get(file.format, {}))
+            for file in assets.files
         }
     return facts
 

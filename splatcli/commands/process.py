@@ -12,6 +12,7 @@ from splatcli.arguments import Cluster, Out, Photos, Run
 from splatcli.folders import DEFAULT, find_run_folder
 from stages import STAGE_NAMES
 from stages.base.errors import UsageError
+from stages.base.settings import changed
 from stages.distributed import blocks, cluster, sfm_chunks
 from stages.distributed.tasks import Executor
 from stages.run import runfolder
@@ -32,14 +33,16 @@ def process(
 
     Finished work is kept: after an interruption the same command goes on where it stopped.
     """
+    from stages.cameras.table import read_cameras
+
     run_folder, photos = _run_folder_and_photos(photos, out)
     pipeline = distribute(Pipeline(run_folder, photos), cluster)
     given = options.given_only(given)
     view, preset = given.pop("view", False), given.pop("preset", None)
     base = run_settings.defaults() if photos is not None else pipeline.recorded_settings()
     settings = run_settings.combined(base, given, preset)
-    if "cameras" in given:
-        _check_cameras(given["cameras"])
+    if "cameras" in given:  # an error now, before the photographs are read
+        read_cameras(given["cameras"])
     if photos is None and console.mode.has_notes:
         console.note(run_settings.training_summary(settings["train"], given, preset))
     _run(pipeline, settings, view=view)
@@ -78,13 +81,6 @@ def _run_folder_and_photos(photos: Path | None, out: Path | None) -> tuple[Path,
     return out or DEFAULT, photos
 
 
-def _check_cameras(path: Path) -> None:
-    """Raises SplatError for a camera file that cannot be read, before the photographs are."""
-    from stages.cameras.table import read_cameras
-
-    read_cameras(path)
-
-
 def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
     """One stage, with the recorded settings and the given options. The stages after training take
     little time: those that are missing in between run too."""
@@ -101,7 +97,7 @@ def _run_stage(name: str, pipeline: Pipeline, given: Mapping[str, Any]) -> None:
         }
         if "formats" in changes:
             changes["formats"] = (*base["quantise"].formats, *given["formats"])
-        settings["quantise"] = options.changed(base["quantise"], changes)
+        settings["quantise"] = changed(base["quantise"], changes)
     if not is_known:
         settings = {**base, **settings}
     if name == "train" and console.mode.has_notes:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -202,7 +203,7 @@ def _sink(
     if kind == "folder":
         return sinks.folder_sink(options.out, len(cameras), options.depth), {}
     if kind == "picture":
-        return sinks.picture_sink(options.out, options.depth), {}
+        return nullcontext(partial(sinks.save_rendering, options.out, options.depth)), {}
     near_far = sinks.sampled_range(draw, cameras) if options.depth else None
     size = cameras[0].width, cameras[0].height
     facts = {"depth_near": near_far[0], "depth_far": near_far[1]} if near_far else {}

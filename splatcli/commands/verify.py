@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -17,7 +17,7 @@ from stages.run import results, runfolder
 from stages.run.pipeline import Pipeline
 
 if TYPE_CHECKING:
-    from stages.proof.prover import Proof
+    from stages.proof.prover import Proof, Prover
     from stages.scene import QuantisedSplats, Splats, View
 
 _ITSELF = "itself"
@@ -31,31 +31,13 @@ _ONLY_ITSELF = (
 class _Original:
     """What files are compared with.
 
-    name: for messages. source_format: the format that it was read from. itself: whether it is the
-    file to verify. backend: of the rendering. quantised: of a run.
+    name: for messages. provers_of: one for each model of splats that a file may hold, likeliest
+    first. itself: whether it is the file to verify.
     """
 
-    splats: Splats
-    views: tuple[View, ...]
     name: str
-    source_format: str = ""
+    provers_of: Callable[[Path], Iterable[Prover]]
     itself: bool = False
-    backend: str = "auto"
-    quantised: QuantisedSplats | None = None
-
-    def candidates(self, file: Path) -> Iterator[Splats]:
-        """The splats that `file` may hold, likeliest first: of a run, those that its export writes,
-        which may be fine-tuned for the format, then those that a conversion would write."""
-        from stages.formats import format_of
-        from stages.formats.quantisation import splats_to_write
-
-        row = format_of(file)
-        if self.quantised is None:
-            yield self.splats
-            return
-        yield splats_to_write(row, self.quantised)
-        if row.ending in self.quantised.finetuned:
-            yield splats_to_write(row, replace(self.quantised, finetuned={}))
 
 
 def verify(
@@ -78,29 +60,20 @@ def verify(
     code must read the same. Exit status 7 if a file is wrong.
     """
     from stages import formats
-    from stages.proof.prover import Prover, cameras_for, provers_of
 
     files = _files(target)
     for file in files:
         formats.format_of(file)  # raises before any work is done
     console.note_compiling()
-    original, prover_of, found = None, None, []
+    original, found = None, []
     for number, file in enumerate(files):
         console.step(f"verifying {file}", done=number, total=len(files))
         # Our own reader first: it reports damage that makes other parsers crash.
         read = formats.read(file)
-        if original is None or prover_of is None:
-            original = _original(file, against, read)
-            cameras = cameras_for(original.splats, original.views)
-            if original.quantised is not None:
-                prover_of = provers_of(original.quantised, cameras, original.backend)
-            else:
-                prover_of = Prover.of(
-                    original.splats, cameras, original.backend, original.source_format
-                ).with_original
+        original = original or _original(file, against, read)
         del read
-        for splats in original.candidates(file):
-            proof = prover_of(splats).prove(file, exact=original.itself)
+        for prover in original.provers_of(file):
+            proof = prover.prove(file, exact=original.itself)
             if not proof.fault:
                 break
         found.append((file, proof))
@@ -135,25 +108,50 @@ def _files(target: Path | None) -> list[Path]:
 def _original(file: Path, against: Path | None, read: Splats) -> _Original:
     """read: what our own reader finds in `file`."""
     from stages import formats
-    from stages.formats.values import drop_undrawable
 
     if against is not None and not against.is_dir():
         around = (results.run_around(path) for path in (against, file))
         views = next(filter(None, map(results.views_of, around)), ())
-        splats = drop_undrawable(formats.read(against))[0]
-        return _Original(splats, views, str(against), formats.format_of(against).ending)
+        return _of_file(str(against), against, formats.read(against), views)
     if against is not None and not runfolder.is_run_folder(against):
         raise runfolder.missing(against)
     run = Pipeline(against) if against is not None else results.run_around(file)
     if run is None or (against is None and run.manifest("quantise") is None):
-        source_format = formats.format_of(file).ending
-        return _Original(drop_undrawable(read)[0], (), _ITSELF, source_format, itself=True)
-    views = run.load("sfm").views
-    quantised = run.load("quantise")
-    splats = drop_undrawable(quantised.splats)[0]
-    backend = results.backend_of_run(run)
-    name = f"the run {run.run_folder}"
-    return _Original(splats, views, name, backend=backend, quantised=quantised)
+        return replace(_of_file(_ITSELF, file, read), itself=True)
+    return _of_run(run)
+
+
+def _of_file(name: str, file: Path, read: Splats, views: tuple[View, ...] = ()) -> _Original:
+    """read: the splats of `file`. views: of the capture, if it is known."""
+    from stages.formats import format_of
+    from stages.formats.values import drop_undrawable
+    from stages.proof.prover import Prover, cameras_for
+
+    splats = drop_undrawable(read)[0]
+    cameras = cameras_for(splats, views)
+    prover = Prover.of(splats, cameras, source_format=format_of(file).ending)
+    return _Original(name, lambda verified: [prover])
+
+
+def _of_run(run: Pipeline) -> _Original:
+    """The splats that the run's export writes to a file, which may be fine-tuned for its format,
+    then those that a conversion would write."""
+    from stages.formats import format_of
+    from stages.formats.quantisation import splats_to_write
+    from stages.formats.values import drop_undrawable
+    from stages.proof.prover import cameras_for, provers_of
+
+    quantised: QuantisedSplats = run.load("quantise")
+    cameras = cameras_for(drop_undrawable(quantised.splats)[0], run.load("sfm").views)
+    prover_of = provers_of(quantised, cameras, results.backend_of_run(run))
+
+    def provers(file: Path) -> Iterator[Prover]:
+        row = format_of(file)
+        yield prover_of(splats_to_write(row, quantised))
+        if row.ending in quantised.finetuned:
+            yield prover_of(splats_to_write(row, replace(quantised, finetuned={})))
+
+    return _Original(f"the run {run.run_folder}", provers)
 
 
 def _facts(file: Path, proof: Proof, original: _Original) -> dict[str, Any]:

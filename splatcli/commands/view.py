@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +16,7 @@ from splatcli import console
 from splatcli.arguments import RunOrFile
 from splatcli.folders import load_target
 from splatcli.options import number
+from stages.base import interrupt
 from stages.base.errors import SplatError, UsageError
 from stages.run import results
 from stages.run.pipeline import Pipeline
@@ -113,22 +113,13 @@ def _serve(server: LocalServer, count: int, open_browser: bool) -> None:
 def one_signal_stops() -> Iterator[None]:
     """Handle the end of the terminal or of the session as Ctrl-C, and ignore what follows the first
     signal, so that the temporary folder is removed. Signals that are ignored already stay so."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {getattr(signal, name): signal.getsignal(getattr(signal, name)) for name in names}
-    handled = [one for one, handler in before.items() if handler != signal.SIG_IGN]
+    possible = interrupt.signals("SIGINT", "SIGTERM", "SIGHUP")
+    handled = [one for one in possible if signal.getsignal(one) != signal.SIG_IGN]
 
     def stop(received: int, frame: FrameType | None) -> None:
         for one in handled:
             signal.signal(one, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    for one in handled:
-        signal.signal(one, stop)
-    try:
+    with interrupt.handling(handled, stop):
         yield
-    finally:
-        for one in handled:
-            signal.signal(one, before[one])

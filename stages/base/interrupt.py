@@ -4,11 +4,31 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
-_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM") if hasattr(signal, name))
+
+def signals(*names: str) -> list[signal.Signals]:
+    """Those of these names that the system has."""
+    return [getattr(signal, name) for name in names if hasattr(signal, name)]
+
+
+@contextmanager
+def handling(
+    numbers: Sequence[int], handle: Callable[[int, FrameType | None], None]
+) -> Iterator[None]:
+    """Inside the block, `handle` receives these signals. Outside the main thread nothing is
+    changed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -16,9 +36,6 @@ def stop_on_signals(stop: threading.Event, on_stop: Callable[[], None]) -> Itera
     """The first SIGINT or SIGTERM sets `stop` and calls `on_stop`; the second raises
     KeyboardInterrupt; a third ends the process. Outside the main thread nothing is changed.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def handle(number: int, frame: FrameType | None) -> None:
         if stop.is_set():
@@ -27,9 +44,5 @@ def stop_on_signals(stop: threading.Event, on_stop: Callable[[], None]) -> Itera
         stop.set()
         on_stop()
 
-    before = {number: signal.signal(number, handle) for number in _SIGNALS}
-    try:
+    with handling(signals("SIGINT", "SIGTERM"), handle):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

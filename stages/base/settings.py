@@ -21,7 +21,8 @@ from __future__ import annotations
 import math
 import re
 import types
-from dataclasses import MISSING, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields, replace
 from dataclasses import field as dataclass_field
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -112,12 +113,12 @@ class Setting:
         return f"{what} of at least {self.low:,}." if self.low is not None else f"{what}."
 
 
-_KEYS = {field.name for field in fields(Setting)}
-
-
-def setting(default: Any, help: str, **metadata: Any) -> Any:
+def setting(
+    default: Any, help: str, min: float | None = None, max: float | None = None, **metadata: Any
+) -> Any:
     """A field of a settings dataclass. metadata: as listed in this module's docstring."""
-    return dataclass_field(default=default, metadata={"help": help, **metadata})
+    bounds = {"low": min, "high": max}
+    return dataclass_field(default=default, metadata={"help": help, **bounds, **metadata})
 
 
 def settings_of(settings_type: type) -> list[Setting]:
@@ -130,19 +131,16 @@ def settings_of(settings_type: type) -> list[Setting]:
             hint = next(arg for arg in get_args(hint) if arg is not type(None))
             optional = True
         many = get_origin(hint) in (tuple, list)
-        default = field.default if field.default_factory is MISSING else field.default_factory()
-        option = field.name.removesuffix("s") if many else field.name
-        more = {key: value for key, value in field.metadata.items() if key in _KEYS}
+        more = dict(field.metadata)
+        option = more.pop("option", field.name.removesuffix("s") if many else field.name)
         found.append(
             Setting(
                 name=field.name,
-                flag="--" + field.metadata.get("option", option).replace("_", "-"),
+                flag="--" + option.replace("_", "-"),
                 kind=get_args(hint)[0] if many else hint,
-                default=None if default is MISSING else default,
+                default=None if field.default is MISSING else field.default,
                 many=many,
                 optional=optional,
-                low=field.metadata.get("min"),
-                high=field.metadata.get("max"),
                 **more,
             )
         )
@@ -165,3 +163,11 @@ def check_settings(settings: Any) -> None:
                 wanted="Both, or neither.",
                 hint=f"Add {other.flag}, or leave {setting.flag} out.",
             )
+
+
+def changed(settings: Any, typed: Mapping[str, Any]) -> Any:
+    """`settings` with the typed fields that it has, checked. Raises as `check_settings`."""
+    names = {field.name for field in fields(settings)}
+    new = replace(settings, **{name: value for name, value in typed.items() if name in names})
+    check_settings(new)
+    return new

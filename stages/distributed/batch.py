@@ -14,7 +14,8 @@ from stages import STAGE_NAMES
 from stages.base.atomic import replacing
 from stages.base.errors import SplatError, UsageError
 from stages.distributed import remote
-from stages.distributed.tasks import Location, TaskResult
+from stages.distributed.remote import Location
+from stages.distributed.tasks import TaskResult
 from stages.run.manifest import Manifest
 
 FILE_NAME = "batch.csv"

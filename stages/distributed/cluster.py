@@ -21,9 +21,9 @@ from typing import Any
 from stages import STAGE_NAMES, load_stage
 from stages.base.distribution import NAME, VERSION, install_command
 from stages.base.errors import Family, Interrupted, ResourceError, SplatError, UsageError
+from stages.distributed.remote import Location
 from stages.distributed.tasks import (
     Executor,
-    Location,
     Resources,
     SerialExecutor,
     Task,

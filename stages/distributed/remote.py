@@ -10,24 +10,24 @@ from __future__ import annotations
 import errno
 import importlib
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeAlias
 
 from stages.base.atomic import make_folder
 from stages.base.disk import disk_full
 from stages.base.distribution import install_command
 from stages.base.errors import Family, SplatError
 from stages.base.stage import Numbers, Stage
-from stages.distributed.tasks import Location, RunTask
-from stages.run.attempt import Listeners
 from stages.run.lock import locked
 from stages.run.manifest import MANIFEST, Manifest
 from stages.run.pipeline import Listener
 from stages.run.request import REQUEST
 from stages.run.runfile import RUN_FILE
+
+Location: TypeAlias = Path | str  # a path, or a URL
 
 
 def parse_location(text: str) -> Location:
@@ -188,56 +188,37 @@ def _error(code: str, url: str, what: str, hint: str, family: Family = Family.IN
     return SplatError(code, given=f"{url}: {what}.", wanted=wanted, hint=hint, family=family)
 
 
-@dataclass(frozen=True)
-class RemoteRunTask:
-    """A `tasks.RunTask` whose photographs or run folder are at a URL. Its temporary folder is made
-    in TMPDIR."""
-
-    run_folder: Location
-    photos: Location
-    settings: Mapping[str, Any]
-
-    @property
-    def folder(self) -> Path:
-        is_url = isinstance(self.run_folder, str)
-        return Path(tempfile.gettempdir()) if is_url else Path(self.run_folder)
-
-    def run(self, listener: Listener | None = None) -> None:
-        with tempfile.TemporaryDirectory(prefix="splat-") as name:
-            photos = _fetched(self.photos, Path(name) / "photographs")
-            run_folder, upload = self.run_folder, Listener()
-            if isinstance(run_folder, str):
-                remote, run_folder = RemoteFolder.at(run_folder), Path(name) / "run"
-                remote.fetch(remote.names(), run_folder)
-                upload = UploadListener(run_folder, remote)
-            try:
-                listeners = Listeners(upload, listener or Listener())
-                RunTask(run_folder, photos, self.settings).run(listeners)
-            except SplatError as error:
-                if error.code == "disk-full":  # of the temporary folder
-                    raise
-                given = error.given.replace(str(run_folder), str(self.run_folder))
-                error.given = given.replace(str(photos), str(self.photos))
+@contextmanager
+def local_copies(
+    run_folder: Location, photos: Location | None
+) -> Iterator[tuple[Path, Path | None, Listener]]:
+    """(run folder, photographs, listener of the run). Paths stay as they are. What is at a URL is
+    copied into a temporary folder in TMPDIR, and the listener uploads what the run makes; a
+    SplatError in the block then names the URL. Raises SplatError."""
+    if not isinstance(run_folder, str) and not isinstance(photos, str):
+        yield run_folder, photos, Listener()
+        return
+    with tempfile.TemporaryDirectory(prefix="splat-") as name:
+        local, upload = run_folder, Listener()
+        local_photos = _fetched(photos, Path(name) / "photographs")
+        if isinstance(local, str):
+            remote, local = RemoteFolder.at(local), Path(name) / "run"
+            remote.fetch(remote.names(), local)
+            upload = UploadListener(local, remote)
+        try:
+            yield local, local_photos, upload
+        except SplatError as error:
+            if error.code == "disk-full":  # of the temporary folder
                 raise
+            given = error.given.replace(str(local), str(run_folder))
+            error.given = given.replace(str(local_photos), str(photos))
+            raise
 
 
-def task_for(
-    run_folder: Location, photos: Location, settings: Mapping[str, Any]
-) -> RunTask | RemoteRunTask:
-    """The task of one run, with absolute paths."""
-    if isinstance(run_folder, Path) and isinstance(photos, Path):
-        return RunTask(run_folder.absolute(), photos.absolute(), settings)
-    run_folder, photos = (
-        location.absolute() if isinstance(location, Path) else location
-        for location in (run_folder, photos)
-    )
-    return RemoteRunTask(run_folder, photos, settings)
-
-
-def _fetched(photos: Location, target: Path) -> Path:
+def _fetched(photos: Location | None, target: Path) -> Path | None:
     """The local path of the photographs; those at a URL are copied into `target` under their own
     name. Raises SplatError."""
-    if isinstance(photos, Path):
+    if not isinstance(photos, str):
         return photos
     remote = RemoteFolder.at(photos)
     names = remote.names()
@@ -255,30 +236,23 @@ class UploadListener(Listener):
     def __init__(self, run_folder: Path, remote: RemoteFolder) -> None:
         self._local, self._remote = run_folder, remote
         self._partial, self._saved_ns = "", 0
-        self._uploaded: dict[str, int] = {}  # modification times of uploaded files, nanoseconds
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         self._remote.put(self._local, [RUN_FILE])
         self._partial = f".{number}-{stage.name}.partial"
-        self._uploaded.clear()
+        if not resumed:  # a checkpoint of another request must not lie beside this one
+            (self._remote / self._partial).remove()
+            self._remote.put(self._local, [f"{self._partial}/{REQUEST}"])
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         from stages.training.checkpoint import FILE_NAME
 
-        folder = self._local / self._partial
+        name = f"{self._partial}/{FILE_NAME}"
         with suppress(OSError, SplatError):  # without a checkpoint, a resumed run repeats more
-            saved_ns = (folder / FILE_NAME).stat().st_mtime_ns
+            saved_ns = (self._local / name).stat().st_mtime_ns
             if saved_ns != self._saved_ns:
                 self._saved_ns = saved_ns
-                for name in (REQUEST, FILE_NAME):
-                    self._upload(folder, name)
-
-    def _upload(self, folder: Path, name: str) -> None:
-        """Upload a file of the working folder unless it is unchanged."""
-        made_ns = (folder / name).stat().st_mtime_ns
-        if self._uploaded.get(name) != made_ns:
-            (self._remote / self._partial).put(folder, [name])
-            self._uploaded[name] = made_ns
+                self._remote.put(self._local, [name])
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         label = f"{number}-{stage.name}"

@@ -6,15 +6,18 @@ A task holds paths and settings, its result only figures. All data is in run fol
 from __future__ import annotations
 
 import logging
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol
 
 from stages.base.errors import CRASHED, Family, Interrupted, SplatError
 from stages.base.text import reason_of
+from stages.distributed.remote import Location, local_copies
+from stages.run.attempt import Listeners
 from stages.run.failures import as_splat_error
 from stages.run.pipeline import Listener, Pipeline
 
@@ -22,8 +25,6 @@ if TYPE_CHECKING:
     from stages.structure.chunks import Chunk
 
 _log = logging.getLogger(__name__)
-
-Location: TypeAlias = Path | str  # a path, or a URL
 
 
 class Task(Protocol):
@@ -41,22 +42,35 @@ class Task(Protocol):
 class RunTask:
     """`splat process PHOTOS --out RUN_FOLDER`.
 
+    run_folder, photos: what is at a URL is copied to this machine first, see `remote.local_copies`.
     photos: None to continue the run folder. settings: by stage name; stages that are left out use
     the recorded ones. until: the last stage.
     """
 
-    run_folder: Path
-    photos: Path | None = None
+    run_folder: Location
+    photos: Location | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     until: str | None = None
 
     @property
     def folder(self) -> Path:
-        return self.run_folder
+        is_url = isinstance(self.run_folder, str)
+        return Path(tempfile.gettempdir()) if is_url else Path(self.run_folder)
 
     def run(self, listener: Listener | None = None) -> None:
-        pipeline = Pipeline(self.run_folder, self.photos)
-        pipeline.run(self.settings, until=self.until, listener=listener)
+        with local_copies(self.run_folder, self.photos) as (run_folder, photos, upload):
+            listeners = Listeners(upload, listener or Listener())
+            pipeline = Pipeline(run_folder, photos)
+            pipeline.run(self.settings, until=self.until, listener=listeners)
+
+
+def task_for(run_folder: Location, photos: Location, settings: Mapping[str, Any]) -> RunTask:
+    """The task of one run, with absolute paths."""
+    run_folder, photos = (
+        location.absolute() if isinstance(location, Path) else location
+        for location in (run_folder, photos)
+    )
+    return RunTask(run_folder, photos, settings)
 
 
 @dataclass(frozen=True)
@@ -168,11 +182,11 @@ def error_result(error: BaseException) -> TaskResult:
     return TaskResult(CRASHED, "bug", f"{type(error).__name__}: {reason_of(error)}.")
 
 
+@dataclass(frozen=True)
 class SerialExecutor:
     """Executes tasks one after another in this process."""
 
-    def __init__(self, listener: Listener | None = None) -> None:
-        self.listener = listener
+    listener: Listener | None = None
 
     def results(
         self, tasks: Sequence[Task], need: Resources, stop: Event | None = None

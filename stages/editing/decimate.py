@@ -219,13 +219,7 @@ class Moments:
         return self.opacities * self.areas
 
     def take(self, rows: slice | NDArray[np.intp]) -> Moments:
-        return Moments(
-            self.means[rows],
-            self.covariances[rows],
-            self.opacities[rows],
-            self.colours[rows],
-            self.areas[rows],
-        )
+        return replace(self, **{name: values[rows] for name, values in vars(self).items()})
 
     def shapes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(quaternions [N, 4], log_scales [N, 3]) of the covariances."""

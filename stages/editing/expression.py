@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import ast
 import functools
-import operator
+import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.base.blocks import reported_blocks
 from stages.base.errors import SplatError, UsageError
 from stages.scene import Splats, dc_to_rgb
 
@@ -34,21 +32,22 @@ VARIABLES: Mapping[str, Column] = {
     "degree": lambda splats: splats.sh_degrees.astype(np.float64),
 }
 _LONGEST, _DEEPEST = 1000, 40
+# NumPy's functions, so that scalars divide by 0 like arrays
 _ARITHMETIC: dict[type[ast.AST], Any] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.UAdd: operator.pos,
-    ast.USub: operator.neg,
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.UAdd: np.positive,
+    ast.USub: np.negative,
 }
 _COMPARISONS: dict[type[ast.AST], Any] = {
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+    ast.Eq: np.equal,
+    ast.NotEq: np.not_equal,
 }
 
 
@@ -56,28 +55,14 @@ class _RefusedError(ValueError):
     """Why a text is no condition."""
 
 
-@dataclass(frozen=True)
-class Expression:
-    """A checked condition."""
-
-    tree: ast.expr
-
-    def evaluate(self, splats: Splats) -> NDArray[np.bool_]:
-        """[N] whether the condition is true; false where a comparison meets NaN."""
-        found = np.empty(len(splats), bool)
-        for rows in reported_blocks(len(splats)):
-            with np.errstate(all="ignore"):
-                found[rows] = _value(self.tree, splats.take(rows))
-        return found
-
-
-def parse_expression(text: str) -> Expression:
-    """Check `text`. Raises SplatError "edit-keep" for what is no condition."""
+def parse_expression(text: str) -> Callable[[Splats], NDArray[np.bool_]]:
+    """The condition of `text`: for N splats [N] whether it is true; false where a comparison meets
+    NaN. Raises SplatError "edit-keep" for what is no condition."""
     try:
         if len(text) > _LONGEST:
             raise _RefusedError(f"it is longer than {_LONGEST} characters")
-        tree = ast.parse(text.strip(), mode="eval").body
-        if _checked(tree) is not bool:
+        kind, value = _built(ast.parse(text.strip(), mode="eval").body)
+        if kind is not bool:
             raise _RefusedError("it is a number, and not true or false")
     except _RefusedError as refused:
         raise _wrong(text, str(refused)) from refused
@@ -85,77 +70,65 @@ def parse_expression(text: str) -> Expression:
         raise _wrong(text, f"it cannot be read ({error.msg})") from error
     except (ValueError, MemoryError, RecursionError) as error:
         raise _wrong(text, "it cannot be read") from error
-    return Expression(tree)
+
+    def condition(splats: Splats) -> NDArray[np.bool_]:
+        with np.errstate(all="ignore"):
+            return np.full(len(splats), value(splats), bool)
+
+    return condition
 
 
-def _checked(node: ast.expr, depth: int = 0) -> type:
-    """The type of `node`, bool or float. Raises _RefusedError."""
+def _built(node: ast.expr, depth: int = 0) -> tuple[type, Callable[[Splats], Any]]:
+    """(bool or float, the function that computes `node` for N splats: [N], or one value for all).
+    Raises _RefusedError."""
     if depth > _DEEPEST:
         raise _RefusedError(f"it is nested deeper than {_DEEPEST}")
-
-    def each(parts: list[ast.expr], wanted: type) -> None:
-        for part in parts:
-            if _checked(part, depth + 1) is not wanted:
-                kind = "true or false" if wanted is bool else "a number"
-                raise _RefusedError(f"{ast.unparse(part)!r} stands where {kind} is wanted")
-
-    match node:
-        case ast.BoolOp(values=values):
-            each(values, bool)
-            return bool
-        case ast.UnaryOp(op=ast.Not(), operand=operand):
-            each([operand], bool)
-            return bool
-        case ast.Compare(left=left, ops=signs, comparators=others):
-            if all(type(sign) in _COMPARISONS for sign in signs):
-                each([left, *others], float)
-                return bool
-        case ast.BinOp(left=left, op=sign, right=right) if type(sign) in _ARITHMETIC:
-            each([left, right], float)
-            return float
-        case ast.UnaryOp(op=sign, operand=operand) if type(sign) in _ARITHMETIC:
-            each([operand], float)
-            return float
-        case ast.Constant(value=bool()):
-            return bool
-        case ast.Constant(value=int() | float() as value):
-            if abs(value) > 1e300:
-                raise _RefusedError("it holds a number that is too large")
-            return float
-        case ast.Name(id=name):
-            if name in VARIABLES:
-                return float
-            raise _RefusedError(f"there is no variable {name!r}")
-    raise _RefusedError(f"{ast.unparse(node)[:60]!r} is not understood")
-
-
-def _value(node: Any, splats: Splats) -> Any:
-    """The value of a checked tree: [N], or one value for all splats."""
     match node:
         case ast.Constant(value=bool() as truth):
-            return truth
+            return bool, lambda splats: truth
         case ast.Constant(value=int() | float() as number):
-            return float(number)
+            if abs(number) > 1e300:
+                raise _RefusedError("it holds a number that is too large")
+            return float, lambda splats: float(number)
         case ast.Name(id=name):
-            return VARIABLES[name](splats).astype(np.float64)
-        case ast.BoolOp(op=sign, values=values):
-            together = np.logical_and if isinstance(sign, ast.And) else np.logical_or
-            return functools.reduce(together, [_value(part, splats) for part in values])
-        case ast.UnaryOp(op=ast.Not(), operand=operand):
-            return np.logical_not(_value(operand, splats))
-        case ast.UnaryOp(op=sign, operand=operand):
-            return _ARITHMETIC[type(sign)](_value(operand, splats))
-        case ast.BinOp(left=left, op=sign, right=right):
-            # as NumPy values, so that scalars divide by 0 like arrays
-            both = np.float64(1) * _value(left, splats), np.float64(1) * _value(right, splats)
-            return _ARITHMETIC[type(sign)](*both)
-        case ast.Compare(left=left, ops=signs, comparators=others):
-            terms = [_value(term, splats) for term in (left, *others)]
-            found = True
-            for comparison, a, b in zip(signs, terms[:-1], terms[1:], strict=True):
-                found = np.logical_and(found, _COMPARISONS[type(comparison)](a, b))
-            return found
-    raise AssertionError(ast.dump(node))
+            if name not in VARIABLES:
+                raise _RefusedError(f"there is no variable {name!r}")
+            return float, lambda splats: VARIABLES[name](splats).astype(np.float64)
+    kind, wanted, apply, parts = _operation(node)
+    terms = []
+    for part in parts:
+        found, term = _built(part, depth + 1)
+        if found is not wanted:
+            what = "true or false" if wanted is bool else "a number"
+            raise _RefusedError(f"{ast.unparse(part)!r} stands where {what} is wanted")
+        terms.append(term)
+    return kind, lambda splats: apply(*(term(splats) for term in terms))
+
+
+def _operation(node: ast.expr) -> tuple[type, type, Callable[..., Any], list[ast.expr]]:
+    """(the type of the result, the type of each operand, the function, the operands). Raises
+    _RefusedError."""
+    match node:
+        case ast.BoolOp(op=sign, values=parts):
+            both = np.logical_and if isinstance(sign, ast.And) else np.logical_or
+            return bool, bool, lambda *values: functools.reduce(both, values), parts
+        case ast.UnaryOp(op=ast.Not(), operand=part):
+            return bool, bool, np.logical_not, [part]
+        case ast.UnaryOp(op=sign, operand=part) if type(sign) in _ARITHMETIC:
+            return float, float, _ARITHMETIC[type(sign)], [part]
+        case ast.BinOp(left=left, op=sign, right=right) if type(sign) in _ARITHMETIC:
+            return float, float, _ARITHMETIC[type(sign)], [left, right]
+        case ast.Compare(left=left, ops=signs, comparators=others) if all(
+            type(sign) in _COMPARISONS for sign in signs
+        ):
+            compare = [_COMPARISONS[type(sign)] for sign in signs]
+
+            def compared(*values: Any) -> Any:
+                pairs = zip(compare, itertools.pairwise(values), strict=True)
+                return functools.reduce(np.logical_and, [holds(*pair) for holds, pair in pairs])
+
+            return bool, float, compared, [left, *others]
+    raise _RefusedError(f"{ast.unparse(node)[:60]!r} is not understood")
 
 
 def _wrong(text: str, why: str) -> SplatError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.atomic import partial_prefix
+from stages.base.blocks import reported_blocks
 from stages.base.errors import SplatError, UsageError
 from stages.editing import expression, levels, regions, transform
 from stages.editing.decimate import FAR_ROUND_SHARE, NEAR_ROUND_SHARE, decimate
@@ -28,16 +29,6 @@ _ATTEMPTS = 8  # to meet a size: one or two are enough where bytes grow with spl
 _SAFETY = 0.995
 
 
-@dataclass(frozen=True)
-class AppliedOperation:
-    """One operation that was applied. before, after: the numbers of splats."""
-
-    parsed: ParsedOperation
-    before: int
-    after: int
-    scene: EditedScene
-
-
 def prepare_operations(
     parsed: Sequence[ParsedOperation], target: Path
 ) -> list[tuple[ParsedOperation, Operation]]:
@@ -48,8 +39,9 @@ def prepare_operations(
 
 def apply_operations(
     scene: EditedScene, chain: Sequence[tuple[ParsedOperation, Operation]]
-) -> Iterator[AppliedOperation]:
-    """Apply one operation after the other. Raises SplatError "edit-nothing-left"."""
+) -> Iterator[tuple[ParsedOperation, EditedScene]]:
+    """Apply one operation after the other; yields each with the scene after it. Raises SplatError
+    "edit-nothing-left"."""
     for parsed, operation in chain:
         before = len(scene.splats)
         scene = operation(scene)
@@ -60,19 +52,17 @@ def apply_operations(
                 wanted="At least one splat that remains.",
                 hint="`splat info` prints the bounds, sizes and opacities of a file.",
             )
-        yield AppliedOperation(parsed, before, len(scene.splats), scene)
+        yield parsed, scene
 
 
 def _prepare(parsed: ParsedOperation, target: Path) -> Operation:
     value = parsed.value
     match parsed.name:
-        case "crop":
-            return _keeping(regions.parse_region(value).contains)
-        case "drop":
-            contains = regions.parse_region(value).contains
-            return _keeping(lambda splats: ~contains(splats))
+        case "crop" | "drop" as name:
+            inside, wanted = regions.parse_region(value), name == "crop"
+            return _keeping(lambda splats: inside(splats.means.astype(np.float64)) == wanted)
         case "keep":
-            return _keeping(expression.parse_expression(value).evaluate)
+            return _keeping(expression.parse_expression(value))
         case "drop-floaters":
             return _without_floaters
         case "rotate":
@@ -99,7 +89,15 @@ def _prepare(parsed: ParsedOperation, target: Path) -> Operation:
 
 
 def _keeping(condition: Callable[[Splats], NDArray[np.bool_]]) -> Operation:
-    return lambda scene: scene.with_splats(select_rows(scene.splats, condition(scene.splats)))
+    """Keep the splats for which a condition is true; it is computed for a block at a time."""
+
+    def kept(scene: EditedScene) -> EditedScene:
+        found = np.empty(len(scene.splats), bool)
+        for rows in reported_blocks(len(found)):
+            found[rows] = condition(scene.splats.take(rows))
+        return scene.with_splats(select_rows(scene.splats, found))
+
+    return kept
 
 
 def _transforming(similarity: Similarity) -> Operation:

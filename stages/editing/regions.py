@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError, FileKind, reading
-from stages.base.blocks import reported_blocks
 from stages.base.errors import UsageError
 from stages.base.text import reason_of
-from stages.scene import Splats
 
 Inside = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points [M, 3] -> [M]
 _HULL = FileKind(
@@ -23,41 +20,27 @@ _HULL = FileKind(
     "A .json with a list of [x, y, z], or a .ply with vertices; at least four, not in one plane.",
     "Write the corners down, or save them as points from another program.",
 )
-_CELLS = 1 << 22  # point x face, of one block
 _VIEW = 12  # numbers of a lasso that hold its camera
 
 
-@dataclass(frozen=True)
-class Region:
-    """inside: which points [M, 3] lie in the region, its boundary included."""
-
-    inside: Inside
-
-    def contains(self, splats: Splats) -> NDArray[np.bool_]:
-        """[N] whether the centre of each splat lies inside."""
-        found = np.empty(len(splats), bool)
-        for rows in reported_blocks(len(splats)):
-            found[rows] = self.inside(splats.means[rows].astype(np.float64))
-        return found
-
-
-def parse_region(text: str) -> Region:
-    """The region of `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or `lasso:...`, which
-    the page of `splat view` writes. Raises SplatError "edit-region", "edit-hull-unreadable"."""
+def parse_region(text: str) -> Inside:
+    """Which points lie in the region `box:x0,y0,z0,x1,y1,z1`, `sphere:x,y,z,r`, `hull:FILE` or
+    `lasso:...`, which the page of `splat view` writes; its boundary is included. Raises SplatError
+    "edit-region", "edit-hull-unreadable"."""
     kind, _, rest = text.partition(":")
     if kind == "box" and (ends := parse_numbers(rest, 6)) is not None:
         low, high = ends[:3], ends[3:]
         if (low <= high).all():
-            return Region(lambda at: np.asarray(((at >= low) & (at <= high)).all(axis=1)))
+            return lambda at: np.asarray(((at >= low) & (at <= high)).all(axis=1))
     if kind == "sphere" and (ball := parse_numbers(rest, 4)) is not None and ball[3] > 0:
         middle, radius = ball[:3], ball[3]
-        return Region(lambda at: np.asarray(np.linalg.norm(at - middle, axis=1) <= radius))
+        return lambda at: np.asarray(np.linalg.norm(at - middle, axis=1) <= radius)
     if kind == "hull" and rest:
-        return Region(_inside_hull(Path(rest)))
+        return _inside_hull(Path(rest))
     if kind == "lasso" and (drawn := parse_numbers(rest, rest.count(",") + 1)) is not None:
         view, corners = drawn[:_VIEW], drawn[_VIEW:]
         if len(corners) >= 6 and len(corners) % 2 == 0:
-            return Region(_inside_lasso(view, corners.reshape(-1, 2)))
+            return _inside_lasso(view, corners.reshape(-1, 2))
     raise UsageError(
         "edit-region",
         given=f"{text[:100]!r} is no region of space.",
@@ -92,11 +75,9 @@ def _inside_hull(path: Path) -> Inside:
     slack = 1e-9 * float(np.abs(points).max())
 
     def inside(at: NDArray[np.float64]) -> NDArray[np.bool_]:
-        found = np.empty(len(at), bool)
-        step = max(1, _CELLS // len(faces))
-        for start in range(0, len(at), step):
-            part = slice(start, start + step)
-            found[part] = (at[part] @ faces[:, :3].T + faces[:, 3] <= slack).all(axis=1)
+        found = np.ones(len(at), bool)
+        for face in faces:
+            found &= at @ face[:3] + face[3] <= slack
         return found
 
     return inside

@@ -59,19 +59,20 @@ class Listener:
 
 
 def attempt(
-    stage: Stage,
-    settings: Any,
     request: Request,
+    settings: Any,
     inputs: Mapping[str, Any],
     space: Workspace,
     stop: Event,
     listener: Listener,
 ) -> Manifest:
-    """Run `stage` in `space.partial`, which `Workspace.begin` prepared, and make its output final.
+    """Run the stage of `request` in `space.partial`, which `Workspace.begin` prepared, and make its
+    output final. settings: as the stage takes them; a limit of time may be shorter than requested.
 
     Raises Interrupted (the working folder is kept), SplatError for an error of the operating
     system, and whatever else the stage raises.
     """
+    stage = request.stage
     report = Report(stop_requested=stop)
     report.listener = lambda label, done, total, numbers: listener.progressed(
         stage, label, done, total, numbers
@@ -102,8 +103,8 @@ def attempt(
 def _manifest(request: Request, report: Report, folder: Path, usage: _Usage) -> Manifest:
     outputs = record_files(folder, leave_out=BOOKKEEPING)
     return Manifest(
-        stage=request.stage,
-        version=request.version,
+        stage=request.stage.name,
+        version=request.stage.version,
         settings=request.settings,
         inputs=request.inputs,
         input_files=request.input_files,

@@ -187,14 +187,14 @@ class Pipeline:
         stage, settings = step.stage, planner.wanted[step.stage.name]
         space = self.layout.workspace(stage)
         request = planner.request(stage)
-        resumed = space.begin(request, stage.settings_type)
+        resumed = space.begin(request)
         listener.started(stage, step.number, step.reason, resumed)
         inputs = {name: self.load(name) for name in stage.reads} or {
             PHOTOS: planner.existing_photos()
         }
         if began is not None:
             settings = within_limit(stage.name, settings, time.monotonic() - began)
-        return attempt(stage, settings, request, inputs, space, stop, listener)
+        return attempt(request, settings, inputs, space, stop, listener)
 
     def _check_allowed(
         self, planner: Planner, until: str | None, may_run: Collection[str] | None

@@ -11,7 +11,7 @@ from stages.base.errors import SplatError
 from stages.base.stage import Stage
 from stages.run.digests import FileRecords, combined_digest, damage, record_files
 from stages.run.manifest import Manifest
-from stages.run.request import Request, request_for, why_again
+from stages.run.request import Request, settings_to_data, why_again
 from stages.run.workspace import Layout
 
 PHOTOS = "photos"  # the input of a stage that reads no other
@@ -80,11 +80,7 @@ class Planner:
         if manifest is None:
             first = "was interrupted" if interrupted else "has not run yet"
             return Step(stage, number, True, failure or first, None, interrupted, bool(failure))
-        reasons = why_again(
-            self._request_if_known(stage, manifest, bool(waiting)),
-            manifest,
-            stage.settings_type,
-        )
+        reasons = why_again(self._request_if_known(stage, manifest, bool(waiting)), manifest)
         broken = damage(space.final, manifest.outputs)[:_NAMED_AT_MOST]
         reasons += waiting + [f"its output {change}" for change in broken]
         runs = bool(reasons)
@@ -99,7 +95,7 @@ class Planner:
         files = self._files(stage, settings)
         inputs = {name: self._digests[name] for name in stage.reads}
         inputs |= {name: combined_digest(records) for name, records in files.items()}
-        return request_for(stage, settings, inputs, files)
+        return Request(stage, settings_to_data(settings), inputs, files)
 
     def _files(self, stage: Stage, settings: Any) -> dict[str, FileRecords]:
         """Records of the user's own files that the stage reads, by input: photographs, masks, depth
@@ -158,5 +154,6 @@ class Planner:
         were moved away after ingest are none."""
         gone = not stage.reads and (self.photos is None or not self.photos.exists())
         if waiting or gone:
-            return request_for(stage, self.wanted[stage.name], done.inputs, done.input_files)
+            settings = settings_to_data(self.wanted[stage.name])
+            return Request(stage, settings, done.inputs, done.input_files)
         return self.request(stage)

@@ -22,34 +22,33 @@ REQUEST = "request.json"
 
 @dataclass(frozen=True)
 class Request:
-    """stage, version: which code runs. settings: plain data. inputs: digest by name. input_files:
-    records of the user's own files behind an input."""
+    """stage: which code runs. settings: plain data. inputs: digest by name. input_files: records of
+    the user's own files behind an input."""
 
-    stage: str
-    version: int
+    stage: Stage
     settings: dict[str, Any]
     inputs: dict[str, str]
     input_files: dict[str, FileRecords]
 
-    def key(self, settings_type: type) -> dict[str, Any]:
+    def key(self) -> dict[str, Any]:
         """What must be equal to resume an interrupted attempt, as plain data. Settings that do not
         affect the output, and those that may change on resuming ("midway"), are left out."""
-        midway = {setting.name for setting in settings_of(settings_type) if setting.midway}
-        free = _quiet_fields(settings_type) | midway
+        every = settings_of(self.stage.settings_type)
+        free = {one.name for one in every if one.midway or not one.affects_output}
         settings = {k: v for k, v in self.settings.items() if k not in free}
-        return {"version": self.version, "settings": settings, "inputs": self.inputs}
+        return {"version": self.stage.version, "settings": settings, "inputs": self.inputs}
 
-    def write(self, folder: Path, settings_type: type) -> None:
+    def write(self, folder: Path) -> None:
         """Write the request into a working folder. Raises OSError."""
-        write_json(folder / REQUEST, self.key(settings_type))
+        write_json(folder / REQUEST, self.key())
 
-    def matches(self, folder: Path, settings_type: type) -> bool:
+    def matches(self, folder: Path) -> bool:
         """Whether the work in a folder was begun for an equal request."""
         try:
             left = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
             return False
-        return bool(left == json.loads(json.dumps(self.key(settings_type))))
+        return bool(left == json.loads(json.dumps(self.key())))
 
 
 def settings_to_data(settings: Any) -> dict[str, Any]:
@@ -72,30 +71,28 @@ def settings_from_data(settings_type: type, data: Mapping[str, Any]) -> Any:
     return settings_type(**known)
 
 
-def why_again(request: Request, done: Manifest, settings_type: type) -> list[str]:
+def why_again(request: Request, done: Manifest) -> list[str]:
     """The differences between a request and the finished run, as text; [] if there are none."""
     reasons = []
-    if request.version != done.version:
-        reasons.append(f"new version of the stage ({done.version} -> {request.version})")
-    reasons += _settings_changes(request.settings, done.settings, settings_type)
+    if request.stage.version != done.version:
+        reasons.append(f"new version of the stage ({done.version} -> {request.stage.version})")
+    reasons += _settings_changes(request, done)
     for name in sorted(request.inputs.keys() | done.inputs.keys()):
         if request.inputs.get(name) != done.inputs.get(name):
             reasons += _input_changes(name, request, done)
     return reasons
 
 
-def _settings_changes(
-    now: Mapping[str, Any], then: Mapping[str, Any], settings_type: type
-) -> list[str]:
+def _settings_changes(request: Request, done: Manifest) -> list[str]:
     """["steps 7000 -> 30000"]. A setting that the finished run lacks counts as its default."""
-    defaults = settings_to_data(settings_type())
-    quiet = _quiet_fields(settings_type)
+    settings_type = request.stage.settings_type
+    before = {**settings_to_data(settings_type()), **done.settings}
     changes = []
-    for name, value in now.items():
-        before = then.get(name, defaults.get(name))
-        if name not in quiet and value != before:
-            label = name.replace("_", " ")
-            changes.append(f"{label} {_show(before)} -> {_show(value)}")
+    for setting in settings_of(settings_type):
+        then, now = before[setting.name], request.settings[setting.name]
+        if setting.affects_output and then != now:
+            label = setting.name.replace("_", " ")
+            changes.append(f"{label} {_show(then)} -> {_show(now)}")
     return changes
 
 
@@ -117,14 +114,3 @@ def _show(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return "none" if value is None else str(value)
-
-
-def _quiet_fields(settings_type: type) -> set[str]:
-    return {setting.name for setting in settings_of(settings_type) if not setting.affects_output}
-
-
-def request_for(
-    stage: Stage, settings: Any, inputs: dict[str, str], input_files: dict[str, FileRecords]
-) -> Request:
-    """The request for `stage` with these settings and inputs."""
-    return Request(stage.name, stage.version, settings_to_data(settings), inputs, input_files)

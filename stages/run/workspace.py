@@ -57,11 +57,11 @@ class Workspace:
         except (OSError, ValueError, LookupError, TypeError):
             return ""
 
-    def begin(self, request: Request, settings_type: type) -> bool:
+    def begin(self, request: Request) -> bool:
         """Prepare the working folder. True if it holds work on the same request. Raises OSError."""
         if self.partial.exists():
             (self.partial / _FAILURE).unlink(missing_ok=True)
-            if request.matches(self.partial, settings_type):
+            if request.matches(self.partial):
                 for half in list(self.partial.rglob(".partial-*")):  # a killed writer left these
                     if half.is_dir() and not half.is_symlink():
                         shutil.rmtree(half)
@@ -70,7 +70,7 @@ class Workspace:
                 return True
             shutil.rmtree(self.partial)
         self.partial.mkdir()
-        request.write(self.partial, settings_type)
+        request.write(self.partial)
         return False
 
     def finish(self, manifest: Manifest) -> None:

@@ -123,11 +123,8 @@ def _spline(keys: NDArray[np.float64], spans: NDArray[np.float64]) -> NDArray[np
     apart, quaternions of length 1."""
     from scipy.interpolate import CubicHermiteSpline
 
-    slopes = np.diff(keys, axis=0) / spans[:, None]
-    tangents = np.concatenate([slopes[:1], np.empty_like(keys[1:-1]), slopes[-1:]])
-    both = (keys[2:] - keys[:-2]) / (spans[:-1] + spans[1:])[:, None]
-    tangents[1:-1] = slopes[:-1] - both + slopes[1:]
     ends = np.concatenate([[0.0], np.cumsum(spans)])
+    tangents = np.gradient(keys, ends, axis=0)  # for uneven knots those of Catmull and Rom
     shares = np.linspace(0.0, 1.0, _SAMPLES, endpoint=False)
     at = np.append((ends[:-1, None] + spans[:, None] * shares).ravel(), ends[-1])
     curve: NDArray[np.float64] = CubicHermiteSpline(ends, keys, tangents)(at)

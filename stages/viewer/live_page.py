@@ -14,10 +14,10 @@ from __future__ import annotations
 import base64
 import json
 import queue
-import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -47,14 +47,6 @@ class Frame:
     seconds: float
 
 
-@dataclass
-class _Request:
-    camera: Camera
-    answered: threading.Event = field(default_factory=threading.Event)
-    frame: Frame | None = None
-    abandoned: bool = False
-
-
 class LiveFrames:
     """Connects one training thread, which offers to draw, with any number of requests.
 
@@ -63,7 +55,7 @@ class LiveFrames:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._requests: queue.Queue[_Request] = queue.Queue(maxsize=1)
+        self._requests: queue.Queue[tuple[Camera, Future[Frame | None]]] = queue.Queue(maxsize=1)
         self._not_before = self._last_seen = -np.inf
         self._camera: Camera | None = None
         self._last: Frame | None = None
@@ -77,13 +69,16 @@ class LiveFrames:
         self.mark_watched()
         if self._closed:
             return self._last
-        request = _Request(camera)
+        frame: Future[Frame | None] = Future()
         try:
-            self._requests.put(request, timeout=timeout_s)
+            self._requests.put((camera, frame), timeout=timeout_s)
         except queue.Full:
             return None
-        request.abandoned = not request.answered.wait(timeout_s)
-        return request.frame or self._last
+        try:
+            return frame.result(timeout_s) or self._last
+        except (TimeoutError, CancelledError):
+            frame.cancel()
+            return self._last
 
     def mark_watched(self) -> None:
         """Note that a viewer is there, even if it requests no frame for a while."""
@@ -97,10 +92,9 @@ class LiveFrames:
         """Draw the requested frame, if there is one and `LARGEST_SHARE` allows it."""
         if self._requests.empty() or self._clock() < self._not_before:
             return
-        request = self._requests.get_nowait()
-        if not request.abandoned:
-            request.frame = self._draw(draw, request.camera, step)
-            request.answered.set()
+        camera, frame = self._requests.get_nowait()
+        if frame.set_running_or_notify_cancel():
+            frame.set_result(self._draw(draw, camera, step))
 
     def offer_last(self, draw: DrawView, step: int) -> None:
         """Training has ended: draw one more frame for the viewer, which is kept."""
@@ -112,7 +106,7 @@ class LiveFrames:
         """Draw no more frames, and let no request wait any longer."""
         self._closed = True
         while not self._requests.empty():
-            self._requests.get_nowait().answered.set()
+            self._requests.get_nowait()[1].cancel()
 
     def _draw(self, draw: DrawView, camera: Camera, step: int) -> Frame | None:
         start = self._clock()
@@ -184,10 +178,19 @@ class LivePage:
             "end": "",
         }
 
+    def drawable(self, draw: DrawView) -> None:
+        """Training can draw a frame; after its last step it draws the one that is kept."""
+        done = self._state["done"]
+        if done < self._state["total"]:
+            self.frames.offer(draw, done)
+        else:
+            self.frames.offer_last(draw, done)
+
     def ended(self, how: str) -> None:
-        """how: "finished" or "stopped". The page gets it with its next request for the state."""
+        """how: "finished" or "stopped", of which the first counts. The page gets it with its next
+        request for the state."""
         self.frames.close()
-        self._state = {**self._state, "end": how}
+        self._state = {**self._state, "end": self._state["end"] or how}
 
     def _answer_state(self, query: dict[str, str]) -> Item:
         self.frames.mark_watched()

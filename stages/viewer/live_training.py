@@ -35,8 +35,6 @@ class LiveTraining(Listener):
         self._warn = warn
         self._server: LocalServer | None = None
         self._page: LivePage | None = None
-        self._end = "stopped"
-        self._progress = (0, 0)
 
     def started(self, stage: Stage, number: int, reason: str, resumed: bool) -> None:
         if stage.name != _STAGE:
@@ -60,22 +58,15 @@ class LiveTraining(Listener):
 
     def progressed(self, stage: Stage, label: str, done: int, total: int, numbers: Numbers) -> None:
         if self._page is not None and stage.name == _STAGE:
-            self._progress = (done, total)
             self._page.progressed(label, done, total, numbers)
 
     def drawable(self, stage: Stage, draw: DrawView) -> None:
-        if self._page is None:
-            return
-        done, total = self._progress
-        if done < total:
-            self._page.frames.offer(draw, done)
-        else:
-            self._page.frames.offer_last(draw, done)
+        if self._page is not None:
+            self._page.drawable(draw)
 
     def finished(self, stage: Stage, number: int, manifest: Manifest) -> None:
         if self._page is not None and stage.name == _STAGE:
-            self._end = "finished"
-            self._page.ended(self._end)
+            self._page.ended("finished")
 
     def skipped(self, stage: Stage, number: int, manifest: Manifest) -> None:
         if stage.name == _STAGE:
@@ -87,8 +78,7 @@ class LiveTraining(Listener):
     def ended(self) -> None:
         if self._server is None or self._page is None:
             return
-        if self._end == "stopped":
-            self._page.ended(self._end)
+        self._page.ended("stopped")  # unless training has finished
         self._wait_for_page(self._page)
         self._server.shutdown()
         self._server.server_close()

@@ -87,17 +87,12 @@ _SAMPLED_SIDE = 240  # pixels
 Put = Callable[[Rendering], None]
 
 
-@contextmanager
-def picture_sink(path: Path, depth: bool) -> Iterator[Put]:
-    """Writes the picture `path`; with `depth` also its depth as .depth.tiff. Raises SplatError."""
-
-    yield lambda rendering: _save(path, rendering, depth)
-
-
-def _save(path: Path, rendering: Rendering, depth: bool) -> None:
+def save_rendering(path: Path, depth: bool, rendering: Rendering) -> None:
+    """Write the picture `path`; with `depth` also its depth as .depth.tiff. Raises SplatError."""
     save_picture(path, eight_bits(rendering.image))
     if depth:
-        save_depth(path.with_suffix(".depth.tiff"), rendering.median_depth)
+        floats = np.ascontiguousarray(rendering.median_depth, np.float32)
+        save_picture(path.with_suffix(".depth.tiff"), floats)
 
 
 @contextmanager
@@ -110,7 +105,8 @@ def folder_sink(folder: Path, frames: int, depth: bool) -> Iterator[Put]:
     def put(rendering: Rendering) -> None:
         nonlocal number
         number += 1
-        _save(folder / f"frame_{number:0{max(4, len(str(frames)))}}.png", rendering, depth)
+        name = f"frame_{number:0{max(4, len(str(frames)))}}.png"
+        save_rendering(folder / name, depth, rendering)
 
     yield put
 
@@ -158,21 +154,13 @@ def eight_bits(image: NDArray[np.floating]) -> NDArray[np.uint8]:
     return found
 
 
-def save_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
-    """Write [H, W, 3] in the format that the suffix names. Raises SplatError."""
+def save_picture(path: Path, pixels: NDArray[np.uint8] | NDArray[np.float32]) -> None:
+    """Write colours [H, W, 3] uint8 in the format that the suffix names, or a depth [H, W] float32
+    as .tiff: z in world units, 0 for the background. Raises SplatError."""
     from PIL import Image
 
     with replacing(path) as partial:
         Image.fromarray(pixels).save(partial)
-
-
-def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
-    """Write [H, W] as a TIFF of 32-bit floats: z in world units, 0 for the background. Raises
-    SplatError."""
-    from PIL import Image
-
-    with replacing(path) as partial:
-        Image.fromarray(np.ascontiguousarray(depth, np.float32)).save(partial, "TIFF")
 
 
 def depth_range(depths: Sequence[NDArray[np.float32]]) -> tuple[float, float]:

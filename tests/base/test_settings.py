@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 
 from stages import STAGE_NAMES, load_stage
 from stages.base.errors import SplatError
-from stages.base.settings import Setting, check_settings, settings_of
+from stages.base.settings import Setting, check_settings, setting, settings_of
 
 EVERY = {
     f"{name}-{setting.name}": (name, setting)
@@ -21,12 +21,12 @@ NUMBERS = {key: pair for key, pair in EVERY.items() if pair[1].kind in (int, flo
 
 @dataclass(frozen=True)
 class Settings:
-    side: int = field(default=5, metadata={"min": 1, "max": 9})
-    rate: float | None = field(default=None, metadata={"min": 0.5})
-    names: tuple[str, ...] = field(default=("a",), metadata={"choices": ("a", "b")})
-    title: str = field(default="x", metadata={"pattern": "[a-z]+", "wanted": "Small letters."})
+    side: int = setting(5, "", min=1, max=9)
+    rate: float | None = setting(None, "", min=0.5)
+    names: tuple[str, ...] = setting(("a",), "", choices=("a", "b"))
+    title: str = setting("x", "", pattern="[a-z]+", wanted="Small letters.")
     loud: bool = False
-    louder: bool = field(default=False, metadata={"needs": "loud"})
+    louder: bool = setting(False, "", needs="loud")
 
 
 def with_value(name: str, setting: Setting, value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import pytest
 import typer
@@ -10,15 +10,16 @@ from typer.testing import CliRunner
 
 from splatcli import console, options
 from stages.base.errors import SplatError
+from stages.base.settings import setting
 
 
 @dataclass(frozen=True)
 class Settings:
-    long_side: int = field(default=1600, metadata={"help": "Long side (px).", "min": 0})
-    rate: float | None = field(default=None, metadata={"help": "Rate (1/s).", "max": 2})
-    kind: str = field(default="a", metadata={"help": "Kind.", "choices": ("a", "b")})
-    names: tuple[str, ...] = field(default=(), metadata={"help": "A name."})
-    loud: bool = field(default=False, metadata={"help": "Shout."})
+    long_side: int = setting(1600, "Long side (px).", min=0)
+    rate: float | None = setting(None, "Rate (1/s).", max=2)
+    kind: str = setting("a", "Kind.", choices=("a", "b"))
+    names: tuple[str, ...] = setting((), "A name.")
+    loud: bool = setting(False, "Shout.")
 
 
 def parse(*words: str) -> dict:
@@ -69,7 +70,7 @@ def test_durations_read_well(seconds: float, text: str) -> None:
     assert console.duration(seconds) == text
 
 
-@pytest.mark.parametrize(("count", "text"), [(12, "12 B"), (1300, "1.3 kB"), (2.5e9, "2.5 GB")])
+@pytest.mark.parametrize(("count", "text"), [(12, "12 bytes"), (1300, "1.3 kB"), (2.5e9, "2.5 GB")])
 def test_sizes_read_well(count: float, text: str) -> None:
     assert console.size(count) == text
 

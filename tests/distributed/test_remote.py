@@ -110,7 +110,6 @@ def test_each_checkpoint_is_uploaded_once_and_its_request_only_once(store, tmp_p
     run = remote.RemoteFolder.at("memory://runs/hill")
     (tmp_path / RUN_FILE).write_text("{}")
     back = remote.UploadListener(tmp_path, run)
-    back.started(train.STAGE, 4, "", False)
     system_put = store.put_file
 
     def putting(source: str, target: str) -> None:
@@ -120,6 +119,7 @@ def test_each_checkpoint_is_uploaded_once_and_its_request_only_once(store, tmp_p
     store.put_file = putting
     try:
         (partial / REQUEST).write_text(REQUEST)
+        back.started(train.STAGE, 4, "", False)
         for steps in (1, 2, 3):
             (partial / "checkpoint.bin").write_text(f"after {steps}")
             os.utime(partial / "checkpoint.bin", ns=(steps, steps))
@@ -128,6 +128,7 @@ def test_each_checkpoint_is_uploaded_once_and_its_request_only_once(store, tmp_p
     finally:
         del store.put_file
     assert [PurePosixPath(path).name for path in put] == [
+        RUN_FILE,
         REQUEST,
         "checkpoint.bin",
         "checkpoint.bin",

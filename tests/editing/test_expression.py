@@ -34,7 +34,7 @@ SPLATS = scenes.splats(
     ],
 )
 def test_a_condition_says_which_splats_stay(text: str, wanted: list[bool]) -> None:
-    assert parse_expression(text).evaluate(SPLATS).tolist() == wanted
+    assert parse_expression(text)(SPLATS).tolist() == wanted
 
 
 @pytest.mark.parametrize(
@@ -75,4 +75,4 @@ def test_anything_else_is_refused_with_the_names_that_there_are(text: str) -> No
 
 def test_a_value_that_is_no_number_is_not_kept() -> None:
     broken = scenes.splats([[np.nan, 0, 0], [1, 0, 0]])
-    assert parse_expression("x < 5").evaluate(broken).tolist() == [False, True]
+    assert parse_expression("x < 5")(broken).tolist() == [False, True]

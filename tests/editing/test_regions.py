@@ -14,15 +14,15 @@ from stages.editing.regions import parse_region
 from tests import scenes
 
 MEANS = np.random.default_rng(3).uniform(-2, 2, (500, 3))
-SPLATS = scenes.splats(MEANS)
+CENTRES = scenes.splats(MEANS).means.astype(np.float64)
 CORNERS = [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 
 
 def test_a_box_and_a_ball() -> None:
-    box = parse_region("box:-1,-1,-1,1,1.5,2").contains(SPLATS)
-    means = SPLATS.means
+    box = parse_region("box:-1,-1,-1,1,1.5,2")(CENTRES)
+    means = CENTRES
     assert (box == ((means >= -1) & (means <= [1, 1.5, 2])).all(1)).all()
-    ball = parse_region("sphere:0.5,0,0,1.2").contains(SPLATS)
+    ball = parse_region("sphere:0.5,0,0,1.2")(CENTRES)
     assert (ball == (np.linalg.norm(means - [0.5, 0, 0], axis=1) <= 1.2)).all()
     assert 0 < ball.sum() < 500
 
@@ -31,16 +31,16 @@ def test_a_hull_of_the_corners_of_a_box_is_the_box(tmp_path: Path) -> None:
     (tmp_path / "points.json").write_text(json.dumps(CORNERS))
     mesh = trimesh.Trimesh(CORNERS, trimesh.creation.box((2, 2, 2)).faces, process=False)
     mesh.export(tmp_path / "points.ply")
-    wanted = parse_region("box:-1,-1,-1,1,1,1").contains(SPLATS)
+    wanted = parse_region("box:-1,-1,-1,1,1,1")(CENTRES)
     for name in ("points.json", "points.ply"):
-        assert (parse_region(f"hull:{tmp_path / name}").contains(SPLATS) == wanted).all()
+        assert (parse_region(f"hull:{tmp_path / name}")(CENTRES) == wanted).all()
 
 
 def test_a_lasso_is_what_lies_before_the_camera_and_within_its_corners() -> None:
     """By hand: a camera at z = -1 that looks along z, 100 pixels to the unit; an L of corners."""
     view = "100,0,0,0,0,100,0,0,0,0,1,1"
-    found = parse_region(f"lasso:{view},0,0,100,0,100,50,50,50,50,100,0,100").contains(SPLATS)
-    x, y, z = SPLATS.means.astype(np.float64).T
+    found = parse_region(f"lasso:{view},0,0,100,0,100,50,50,50,50,100,0,100")(CENTRES)
+    x, y, z = CENTRES.T
     u, v = 100 * x / (z + 1), 100 * y / (z + 1)
     whole = (z > -1) & (u > 0) & (v > 0) & (u < 100) & (v < 100)
     assert (found == whole & ~((u > 50) & (v > 50))).all()

@@ -49,7 +49,7 @@ def scene(splats: Splats) -> EditedScene:
 def after(start: EditedScene, *words: str) -> EditedScene:
     parsed = [ParsedOperation(*word.split(maxsplit=1)) for word in words]
     *_, last = apply_operations(start, prepare_operations(parsed, Path("scene.ply")))
-    return last.scene
+    return last[1]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from stages.base.settings import setting
 from stages.base.stage import Report, Stage
 
 
@@ -18,7 +19,7 @@ class CopySettings:
 
 @dataclass(frozen=True)
 class CountSettings:
-    iterations: int = field(default=7000, metadata={"help": "steps", "min": 1})
+    iterations: int = setting(7000, "steps", min=1)
     seed: int = field(default=0, metadata={"help": "random seed"})
     tool: str = field(default="pen", metadata={"help": "what counts", "midway": True})
 

@@ -16,7 +16,6 @@ from stages.viewer.sinks import (
     depth_range,
     eight_bits,
     film,
-    save_depth,
     save_picture,
 )
 from tests.tolerances import FILM_LEVELS
@@ -126,7 +125,7 @@ def test_odd_sizes_raise_value_error(tmp_path: Path) -> None:
 
 def test_depth_is_read_back_exactly(tmp_path: Path) -> None:
     depth = np.random.default_rng(1).normal(5, 2, (7, 9)).astype(np.float32)
-    save_depth(tmp_path / "a.tiff", depth)
+    save_picture(tmp_path / "a.tiff", depth)
     read = cv2.imread(str(tmp_path / "a.tiff"), cv2.IMREAD_UNCHANGED)
     assert read is not None
     assert read.dtype == np.float32
