@@ -24,18 +24,18 @@ _ADOBE_TO_SRGB = np.array(
 _ADOBE_GAMMA = 563 / 256
 
 
-def icc_to_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, bool]:
-    """(`image` in sRGB, whether that changed it). Grey and CMYK pictures become RGB.
+def icc_to_srgb(image: Image.Image, profile: bytes) -> Image.Image:
+    """`image` in sRGB; itself if that changes nothing. Grey and CMYK pictures become RGB.
 
     Raises ImageCms.PyCMSError for a profile that is damaged, or made for another colour mode.
     """
     transform = _transform(profile, image.mode)
     if transform is None:
-        return image, False
+        return image
     converted = ImageCms.applyTransform(image, transform)
     assert converted is not None
     converted.info.pop("icc_profile", None)
-    return converted, True
+    return converted
 
 
 @lru_cache(maxsize=32)
