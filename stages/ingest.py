@@ -223,11 +223,11 @@ def _ingest_photograph(
 ) -> _Ingested:
     from stages.photos import faces
     from stages.photos.decode import Unusable, decode
-    from stages.photos.panorama import SPHERE, hint_for, kind_of
+    from stages.photos.panorama import SPHERE, hint_for, panorama
 
     try:
         decoded = decode(source.path, settings.max_side, budget)
-        kind = kind_of(decoded)
+        kind = panorama(decoded.pixels, decoded.stored, decoded.exif.projection)
         if kind == SPHERE:
             decoded = decode(source.path, int(faces.WIDTHS * settings.max_side), budget)
         elif kind:

@@ -37,14 +37,17 @@ class MaskedPhoto:
         mask: [H, W], 0 outside; None where everything counts.
         outside: what is outside, as in `scene.Photo`.
         scaled: whether a mask file had another size than the photograph.
-        share: of the photograph that is inside.
     """
 
     decoded: Decoded
     mask: NDArray[np.uint8] | None = None
     outside: str = ""
     scaled: bool = False
-    share: float = 1.0
+
+    @property
+    def share(self) -> float:
+        """The share of the photograph that is inside."""
+        return 1.0 if self.mask is None else float(np.mean(self.mask > 127))
 
     @classmethod
     def of(
@@ -75,14 +78,13 @@ class MaskedPhoto:
         if outside == TRANSPARENT and file is not None:
             black = np.where(mask[..., None] > 0, decoded.pixels, np.uint8(0))
             decoded = replace(decoded, pixels=black, unchanged_jpeg=None)
-        return cls(decoded, mask, outside, scaled, float(np.mean(mask > 127)))
+        return cls(decoded, mask, outside, scaled)
 
     def without(self, file: Path, name: str) -> MaskedPhoto:
         """Without what the mask in `file` is black at. Raises SplatError "mask-unfit"."""
         kept, scaled = _read(file, name, False, self.decoded)
         mask = np.where(kept, np.uint8(255) if self.mask is None else self.mask, np.uint8(0))
-        share = float(np.mean(mask > 127))
-        return MaskedPhoto(self.decoded, mask, IGNORE, self.scaled or scaled, share)
+        return MaskedPhoto(self.decoded, mask, IGNORE, self.scaled or scaled)
 
     def file(self, image: str) -> str:
         """Where the mask of the normalised picture `image` goes; "" without one."""
@@ -168,7 +170,7 @@ def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArra
 
 def turned_with(image: Image.Image, decoded: Decoded) -> tuple[Image.Image, str]:
     """(a mask or a depth map, turned upright with its photograph if it has the orientation of the
-    stored file; both sizes in words if its proportions are not those of the photograph, else "")."""
+    stored file; both sizes in words if their proportions differ even so, else "")."""
     upright, stored = decoded.upright, decoded.stored
     if _same_aspect(image.size, upright):
         return image, ""

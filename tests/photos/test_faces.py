@@ -57,7 +57,8 @@ def faces(pixels: np.ndarray, mask: np.ndarray | None = None) -> Iterator[Cut]:
     whole = MaskedPhoto(Decoded(pixels, pixels.shape[1::-1], Exif()), mask, outside)
     photo = Photo("a.png", "photos/a.png", *whole.decoded.stored, None, "camera", 1.0, 0.0, None)
     for part, cut in face_photos(photo, whole):
-        assert part.face is not None and part.focal_px is not None
+        assert part.face is not None
+        assert part.focal_px is not None
         name = part.name.removeprefix("a.png/")
         yield Cut(name, cut.decoded.pixels, cut.mask, part.focal_px, part.face.turn)
 
