@@ -32,12 +32,12 @@ def numbers(holder: Any, key: str, count: int, default: Any = None) -> NDArray[n
     return array
 
 
-def agreed(said: Iterable[bool], doubt: str) -> bool:
+def agreed(said: Iterable[bool], message: str) -> bool:
     """What all places of a file say that say anything; False if none does. Raises BadFileError
-    `doubt` if they disagree."""
+    `message` if they disagree."""
     answers = set(said)
     if len(answers) > 1:
-        raise BadFileError(doubt)
+        raise BadFileError(message)
     return True in answers
 
 
