@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -174,14 +174,12 @@ def _warn_of_missing(count: int, dropped: int, report: Report) -> None:
 def _warn_of_losses(row: Format, path: Path, splats: Splats, report: Report) -> None:
     from stages.formats.losses import losses_of
 
-    for loss in losses_of(row, path.name, splats):
-        report.warn(f"export-{row.ending.replace('.', '-')}-{loss.code}", loss.text)
+    for code, text in losses_of(row, path.name, splats).items():
+        report.warn(f"export-{row.ending.replace('.', '-')}-{code}", text)
 
 
 def _write_index(folder: Path, files: list[ExportedFile]) -> None:
-    entries = [
-        {"format": file.format, "path": file.path, "size_bytes": file.size_bytes} for file in files
-    ]
+    entries = [asdict(file) for file in files]
     (folder / _INDEX).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 

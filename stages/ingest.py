@@ -138,9 +138,9 @@ def run(
     for source in found.videos:
         ingested += _ingest_video(source, settings, folder, report)
     unusable = [(one.name, str(one.error), one.error.hint) for one in ingested if one.error]
-    advice.about_left_out(unusable, report.warn)
+    advice.about_left_out("ingest-left-out", unusable, report.warn)
     bad = [(one.name, str(one.bad_depth), one.bad_depth.hint) for one in ingested if one.bad_depth]
-    advice.about_depth(bad, report.warn)
+    advice.about_left_out("ingest-depth-left-out", bad, report.warn)
     usable = [one for one in ingested if one.photos]
     if len(usable) < FEWEST_PHOTOGRAPHS:
         raise advice.too_few(root, len(usable), FEWEST_PHOTOGRAPHS, unusable)
@@ -223,11 +223,11 @@ def _ingest_photograph(
 ) -> _Ingested:
     from stages.photos import faces
     from stages.photos.decode import Unusable, decode
-    from stages.photos.panorama import SPHERE, hint_for, kind_of
+    from stages.photos.panorama import SPHERE, hint_for, panorama
 
     try:
         decoded = decode(source.path, settings.max_side, budget)
-        kind = kind_of(decoded)
+        kind = panorama(decoded.pixels, decoded.stored, decoded.exif.projection)
         if kind == SPHERE:
             decoded = decode(source.path, int(faces.WIDTHS * settings.max_side), budget)
         elif kind:

@@ -107,8 +107,8 @@ def run(
     Metrics: psnr_raw_db, psnr_kept_db, psnr_splat32_db (means over the held-out views, or over
     the deciding views where none are held out), sh_degree, splats_by_sh_degree, bits (if a .sog is
     requested), raw_mib, kept_mib; formats: by format that was fine-tuned to, rounded_db and
-    finetuned_db (see `capacity.rounding`). Raises SplatError if a photograph cannot be read, and
-    Interrupted.
+    finetuned_db (see `capacity.format_finetuning`). Raises SplatError if a photograph cannot be
+    read, and Interrupted.
     """
     from stages.capacity.bits import choose_bits
     from stages.capacity.format_finetuning import FormatFinetuning

@@ -42,7 +42,7 @@ def convert(
         splats = formats.read(source)
         begin(f"writing {target}")
         dropped = formats.write(target, splats, units=formats.units_of(source))
-        warnings = [loss.text for loss in losses_of(rows[1], target.name, splats)]
+        warnings = [*losses_of(rows[1], target.name, splats).values()]
         begin(f"comparing {target}")
         found, loss = _proven(source, target, drop_undrawable(splats)[0])
         warnings += [loss] if loss else []

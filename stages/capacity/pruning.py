@@ -172,7 +172,8 @@ class Pruner:
 
     def _remove_unneeded(self, found: PruningResult, state: Contributions) -> Contributions:
         """Remove floaters, and splats that no view shows, whatever else may go."""
-        removal = self._select_below(found, state, 0.0, ROUND_SHARE, len(found.splats) - 1)
+        most = len(found.splats) - 1
+        removal = select_removal(found.splats, state, self._cameras, 0.0, most, ROUND_SHARE)
         if removal is None:
             return state
         fewer = removal.apply(found.splats)
@@ -233,11 +234,7 @@ class Pruner:
         limit = found.rate_distortion.sse_per_parameter * self.targets.strength
         most = max(1, int((ROUND_SHARE if excess else share) * len(found.splats)))
         most = min(most, excess or most, len(found.splats) - 1)
-        return self._select_below(found, state, math.inf if forced else limit, share, most)
-
-    def _select_below(
-        self, found: PruningResult, state: Contributions, limit: float, share: float, most: int
-    ) -> Removal | None:
+        limit = math.inf if forced else limit
         return select_removal(found.splats, state, self._cameras, limit, most, share)
 
 

@@ -11,8 +11,8 @@ quantisation steps disturb the others.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,62 +20,14 @@ from numpy.typing import NDArray
 
 from stages import formats
 from stages.base.lazy import load_object
-from stages.formats.axes import smallest_rotations
-from stages.formats.quantisation import BitDepths, quantise_splats, splats_to_write
 from stages.formats.table import Format
-from stages.measure.evaluation import EvaluationView, mean_psnr_db
-from stages.scene import QuantisedSplats, Splats
+from stages.scene import Splats
 from stages.training.finetune import FineTuner
 
 # Parameters (fields of `LearningRates`) in the order in which they are rounded. First those that
 # the others compensate for least well; DC colour last: it is rounded finely, and the picture is
 # linear in it.
 ORDER = ("sh_rest", "opacity_logits", "quaternions", "means", "log_scales", "sh_dc")
-
-
-@dataclass
-class RoundingFinetuner:
-    """Fine-tunes splats to the rounding of formats.
-
-    Args:
-        finetuner: on the training views.
-        deciding_views: training views that decide whether fine-tuning has helped.
-        backend: name of the rasteriser that draws those.
-        steps: of fine-tuning after each rounded attribute.
-        view_counts: [N] in how many views each splat is visible.
-    """
-
-    finetuner: FineTuner
-    deciding_views: Sequence[EvaluationView]
-    backend: str
-    steps: int
-    view_counts: NDArray[np.int32]
-
-    def finetune(self, row: Format, quantised: QuantisedSplats) -> tuple[Splats, dict[str, float]]:
-        """(the splats that a file of the format should hold; mean PSNR of the deciding views drawn
-        from that file, without and with fine-tuning). Raises Interrupted."""
-        self.finetuner.steps = 0  # so that a file does not depend on those before it
-        plain = splats_to_write(row, quantised)
-        found = splats_to_write(row, replace(quantised, decisions={}))
-        bits = quantised.decisions.get("bits")
-
-        def written(splats: Splats) -> Splats:
-            return write_and_read(row, splats)
-
-        rounded = written
-        if row.quantiser and isinstance(bits, dict):
-            depths, found = BitDepths(**bits), smallest_rotations(found)
-
-            def rounded(splats: Splats) -> Splats:
-                return quantise_splats(splats, depths)
-
-        found = finetune_to_rounding(rounded, found, self.finetuner, self.steps, self.view_counts)
-        plain_db, finetuned_db = (
-            mean_psnr_db(written(splats), self.deciding_views, self.backend)
-            for splats in (plain, found)
-        )
-        figures = {"rounded_db": round(plain_db, 3), "finetuned_db": round(finetuned_db, 3)}
-        return (found if finetuned_db > plain_db else plain), figures
 
 
 def finetune_to_rounding(

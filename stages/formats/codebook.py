@@ -69,7 +69,7 @@ def nearest(codebook: NDArray[np.float64], values: NDArray[np.floating]) -> NDAr
 
 
 def vector_palette(
-    vectors: NDArray[np.float32], size: int, seed: int = 0
+    vectors: NDArray[np.float32], size: int
 ) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """(palette [at most `size`, D], label of each of the `vectors` [N, D]).
 
@@ -86,7 +86,7 @@ def vector_palette(
     palette = [np.zeros((1, vectors.shape[1]), np.float32)]
     some = [np.flatnonzero(vectors[part].any(axis=1)) + part.start for part in blocks(len(vectors))]
     rows = np.concatenate([np.zeros(0, np.intp), *some])
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     sample = np.sort(rng.permutation(rows)[:_SAMPLE])
     coarse = _centres(vectors[sample], min(_COARSE, max(1, size // 8)), rng)
     cluster = np.empty(len(rows), np.int32)

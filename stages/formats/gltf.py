@@ -22,6 +22,7 @@ from stages.formats.values import (
 )
 from stages.scene import Splats, dc_to_rgb
 from stages.scene.flip import SH_SIGNS, flipped
+from stages.scene.light import linear_light
 
 
 def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
@@ -87,12 +88,7 @@ def _sh_attributes(splats: Splats) -> dict[str, Attribute]:
     return found
 
 
-def fallback_colours(splats: Splats, opacities: NDArray[np.float32]) -> NDArray[np.float64]:
+def fallback_colours(splats: Splats, opacities: NDArray[np.float32]) -> NDArray[np.floating]:
     """[N, 4] linear light and opacity in 0..1: COLOR_0, for viewers that only draw points."""
     encoded = np.clip(dc_to_rgb(splats.sh[:, 0].astype(np.float64)), 0, 1)
     return np.concatenate([linear_light(encoded), opacities[:, None]], axis=1)
-
-
-def linear_light(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Linear light in 0..1 of sRGB values in 0..1 (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

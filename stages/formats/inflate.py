@@ -47,11 +47,12 @@ def check_size(count: int, file_bytes: int) -> None:
 def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np.uint8]:
     """[count] bytes of the zstd frame in the next `packed_bytes` of the file.
 
-    `count` must have passed `check_size`. Raises BadFileError for a damaged frame.
+    `packed_bytes` must be at most the size of the file, and `count` must have passed `check_size`,
+    because that much memory is allocated. Raises BadFileError for a damaged frame.
     """
     import zstandard
 
-    packed = file.read(packed_bytes) if packed_bytes <= _left(file) else b""
+    packed = file.read(packed_bytes)
     if len(packed) < packed_bytes:
         raise BadFileError("it is cut short")
     unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
@@ -63,10 +64,3 @@ def read_zstd_frame(file: BinaryIO, packed_bytes: int, count: int) -> NDArray[np
     except zstandard.ZstdError as error:
         raise BadFileError(f"it is damaged ({error})") from error
     return out
-
-
-def _left(file: BinaryIO) -> int:
-    here = file.tell()
-    end = file.seek(0, 2)
-    file.seek(here)
-    return end - here

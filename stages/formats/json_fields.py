@@ -1,8 +1,8 @@
-"""Numbers and places in the JSON of files, checked before use: a file may come from anywhere."""
+"""Numbers, places and answers in files, checked before use: a file may come from anywhere."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +30,15 @@ def numbers(holder: Any, key: str, count: int, default: Any = None) -> NDArray[n
     if array.shape != (count,) or not np.isfinite(array).all():
         raise BadFileError(f"{key} is not {count} numbers")
     return array
+
+
+def agreed(said: Iterable[bool], message: str) -> bool:
+    """What all places of a file say that say anything; False if none does. Raises BadFileError
+    `message` if they disagree."""
+    answers = set(said)
+    if len(answers) > 1:
+        raise BadFileError(message)
+    return True in answers
 
 
 def located(splats: Splats, holder: Any) -> Splats:

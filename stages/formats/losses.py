@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from stages.base.lazy import load_object
@@ -12,41 +11,28 @@ from stages.formats.values import drop_undrawable
 from stages.scene import Splats
 
 
-@dataclass(frozen=True)
-class FormatLoss:
-    """One thing that a file lacks: the end of a stable code, and a text for the user."""
-
-    code: str
-    text: str
-
-
-def losses_of(row: Format, file_name: str, splats: Splats) -> list[FormatLoss]:
-    """What a file of the format `row` cannot hold of `splats`; most files hold everything."""
-    found: list[FormatLoss] = []
+def losses_of(row: Format, file_name: str, splats: Splats) -> dict[str, str]:
+    """What a file of the format `row` cannot hold of `splats`: texts for the user by the end of
+    their stable code. Most files hold everything."""
+    found: dict[str, str] = {}
     splats = drop_undrawable(splats)[0]
     if not len(splats):
         return found
     if row.position_loss and (loss := load_object(row.position_loss)(splats)):
         advice = "`splat edit --drop-floaters` removes outliers; .ply, .glb and .usdz hold them."
-        found.append(FormatLoss("range", f"{file_name} {loss}. {advice}"))
+        found["range"] = f"{file_name} {loss}. {advice}"
     if splats.draw_settings.antialias and not row.drawn_antialiased:
-        found.append(
-            FormatLoss(
-                "drawing",
-                f"{file_name} holds splats for antialiased drawing"
-                f"{'' if row.says_drawing else ', of which the file says nothing'}, and most "
-                f"programs draw .{row.ending} plainly: splats look too strong there, the more the "
-                "farther away. A viewer that compensates opacities (Spark, Brush, PlayCanvas with "
-                "antialiasing switched on) draws it right. For others, in the run's folder: "
-                f"`splat export run --format {row.ending} --drawing plain`.",
-            )
+        found["drawing"] = (
+            f"{file_name} holds splats for antialiased drawing"
+            f"{'' if row.says_drawing else ', of which the file says nothing'}, and most programs "
+            f"draw .{row.ending} plainly: splats look too strong there, the more the farther away. "
+            "A viewer that compensates opacities (Spark, Brush, PlayCanvas with antialiasing "
+            "switched on) draws it right. For others, in the run's folder: "
+            f"`splat export run --format {row.ending} --drawing plain`."
         )
     if not row.holds_origin and is_located(splats):
-        found.append(
-            FormatLoss(
-                "origin",
-                f"{file_name} has no field for where the scene lies, which was written to "
-                f"{offset_path(Path(file_name)).name}.",
-            )
+        found["origin"] = (
+            f"{file_name} has no field for where the scene lies, which was written to "
+            f"{offset_path(Path(file_name)).name}."
         )
     return found

@@ -28,17 +28,14 @@ from stages.scene.recentring import recentred
 
 _ROWS_AT_ONCE = 1 << 14  # 4 MB of degree 3, so that the columns of a block fit the cache
 _Tables = Iterator[tuple[slice, NDArray[Any]]]
-_REQUIRED = (
-    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
+_NORMAL = ("nx", "ny", "nz")  # not required of a file
 
 
 def property_names(degree: int) -> list[str]:
     """The columns, in the order of the reference layout, at one SH degree for all."""
     rest = 3 * ((degree + 1) ** 2 - 1)
     return [
-        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *("x", "y", "z", *_NORMAL, "f_dc_0", "f_dc_1", "f_dc_2"),
         *(f"f_rest_{i}" for i in range(rest)),
         "opacity",
         *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -130,8 +127,8 @@ def _fill(splats: Splats, table: NDArray[Any], rest_count: int) -> None:
 
 
 def _check_is_splats(header: Header) -> None:
-    names = {name for name, _ in header.vertex.properties}
-    missing = [name for name in _REQUIRED if name not in names]
+    names = {*_NORMAL, *(name for name, _ in header.vertex.properties)}
+    missing = [name for name in property_names(0) if name not in names]
     if missing and any(element.name == "face" for element in header.elements):
         raise BadFileError("it is a mesh of triangles, not splats")
     if missing:

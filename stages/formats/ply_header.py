@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import BadFileError
-from stages.formats.json_fields import place_of
+from stages.formats.json_fields import agreed, place_of
 from stages.scene.place import EarthPlace
 
 HEADER_LIMIT_BYTES = 1 << 20
@@ -116,7 +116,7 @@ def read_header(file: BinaryIO) -> Header:
         raise BadFileError("its header does not end")
     encoding, origin, elements = "", np.zeros(3), []
     stated = None
-    antialias: set[bool] = set()
+    said: list[bool] = []
     for line in re.split(r"[\r\n]+", start[: end.start()].decode("utf-8", "replace"))[1:]:
         words = line.split()
         match words:
@@ -131,28 +131,27 @@ def read_header(file: BinaryIO) -> Header:
             case ["property", *rest] if elements:
                 elements[-1] = _with_property(elements[-1], rest)
             case ["comment", *words]:
-                antialias |= _antialias(words)
+                said += _antialias(words)
             case [] | ["obj_info", *_]:
                 pass
             case _:
                 raise BadFileError(f"its header holds a line that is not understood: {line[:80]!r}")
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise BadFileError(f"its encoding {encoding[:40]!r} is not known")
-    if len(antialias) > 1:
-        raise BadFileError("its comments contradict each other about antialiasing")
+    antialias = agreed(said, "its comments contradict each other about antialiasing")
     place = place_of(stated, origin)
-    return Header(encoding, tuple(elements), origin, place, True in antialias, end.end())
+    return Header(encoding, tuple(elements), origin, place, antialias, end.end())
 
 
-def _antialias(words: list[str]) -> set[bool]:
-    """What a comment says of opacity compensation: {} for nothing. Brush writes "SplatRenderMode:
+def _antialias(words: list[str]) -> list[bool]:
+    """What a comment says of opacity compensation: [] for nothing. Brush writes "SplatRenderMode:
     mip" or "default", Postshot "antialiased 1" or "0"."""
     match [word.lower() for word in words]:
         case ["splatrendermode:", "mip"] | ["antialiased", "1"]:
-            return {True}
+            return [True]
         case ["splatrendermode:", "default"] | ["antialiased", "0"]:
-            return {False}
-    return set()
+            return [False]
+    return []
 
 
 def _count(text: str) -> int:

@@ -20,9 +20,9 @@ from stages.formats.sog import (
     palette_of,
     palette_size,
     position_range,
-    symmetric_exp,
     symmetric_log,
 )
+from stages.formats.sog_read import symmetric_exp
 from stages.formats.table import Format
 from stages.formats.values import (
     drop_undrawable,

@@ -157,11 +157,6 @@ def symmetric_log(means: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.sign(exact) * np.log1p(np.abs(exact))
 
 
-def symmetric_exp(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of `symmetric_log`."""
-    return np.sign(encoded) * np.expm1(np.abs(encoded))
-
-
 def _shapes(
     splats: Splats, places: NDArray[np.intp], meta: dict[str, Any]
 ) -> dict[str, NDArray[np.uint8]]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from stages.base.bad_files import BadFileError
 from stages.base.blocks import reported_blocks
 from stages.formats import smallest_three
-from stages.formats.json_fields import located, numbers, whole
+from stages.formats.json_fields import agreed, located, numbers, whole
 from stages.formats.values import allocate, logits_of
 from stages.scene import Splats
 
@@ -113,7 +113,7 @@ class Source:
             encoded = ends[0] + (ends[1] - ends[0]) * steps
             others = smallest_three.from_fractions(rotations[rows, :3] / 255.0)
             with np.errstate(over="ignore", invalid="ignore"):
-                out.means[:] = np.sign(encoded) * np.expm1(np.abs(encoded))
+                out.means[:] = symmetric_exp(encoded)
                 out.sh[:, 0] = books[0][colours[rows, :3]]
                 out.log_scales[:] = books[1][scales[rows, :3]]
             out.quaternions[:] = smallest_three.join(
@@ -177,6 +177,11 @@ class Source:
         return pixels.reshape(-1, 4)[:count]
 
 
+def symmetric_exp(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions of their symmetric logarithms, see `sog.symmetric_log`."""
+    return np.sign(encoded) * np.expm1(np.abs(encoded))
+
+
 def _webp_size(content: bytes) -> tuple[int, int]:
     """(width, height) from the header, before a decoder allocates memory."""
     kind = content[12:16] if content[:4] == b"RIFF" and content[8:12] == b"WEBP" else b""
@@ -198,8 +203,6 @@ def _part(meta: dict[str, Any], name: str) -> dict[str, Any]:
 def antialias_of(meta: dict[str, Any]) -> bool:
     """Whether meta.json asks for opacity compensation: `antialias` of the specification, `model` of
     splat-transform."""
-    said = {bool(meta["antialias"])} if "antialias" in meta else set()
-    said |= {meta["model"] == ANTIALIASED} if "model" in meta else set()
-    if len(said) > 1:
-        raise BadFileError("its meta.json contradicts itself: antialias and model disagree")
-    return True in said
+    said = [bool(meta["antialias"])] if "antialias" in meta else []
+    said += [meta["model"] == ANTIALIASED] if "model" in meta else []
+    return agreed(said, "its meta.json contradicts itself: antialias and model disagree")

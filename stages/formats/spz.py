@@ -43,7 +43,7 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
     """Write `splats`.
 
     The format has no field for units and the origin; `formats.write` writes them beside it. A splat
-    beyond the range of 24 bits (see `count_out_of_range`) is moved closer along its ray and scaled
+    beyond the range of 24 bits (see `position_loss`) is moved closer along its ray and scaled
     down, which looks the same from the centre. Raises SplatError when the file cannot be written.
     """
     degree = int(splats.sh_degrees.max(initial=0))
@@ -70,19 +70,15 @@ def write(path: Path, splats: Splats, *, units: str = "arbitrary") -> None:
                 packed.write(np.ascontiguousarray(array(splats.take(rows))).data)
 
 
-def count_out_of_range(splats: Splats) -> int:
-    """The number of splats that lie farther out than the file can hold."""
+def position_loss(splats: Splats) -> str:
+    """What happens to the splats that lie farther out than the file can hold; "" if none does."""
     means = splats.means
     reach = _reach(_fractional_bits(means))
-    return sum(
+    count = sum(
         int(np.count_nonzero(np.abs(means[rows]).max(axis=1, initial=0.0) > reach))
         for rows in blocks(len(means))
     )
-
-
-def position_loss(splats: Splats) -> str:
-    """What happens to the splats that lie farther out than the file can hold; "" if none does."""
-    if not (count := count_out_of_range(splats)):
+    if not count:
         return ""
     return (
         f"holds positions of 24 bits, and {counted(count, 'splat')} of {len(splats):,} lie farther "

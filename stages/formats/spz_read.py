@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import gzip
 import struct
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,17 +37,34 @@ _EXTENSIONS_LIMIT_BYTES = 1 << 20
 _AXES_EXTENSION, _Y_UP, _OURS = 0xADBE0003, (0, 4), 6
 
 
-@dataclass(frozen=True)
-class _Content:
-    """arrays: [N, bytes] of positions, opacities, colours, scales, rotations, SH. y_up: whether the
-    axes are those of SPZ; else they are ours."""
+class Header(NamedTuple):
+    """The values of `HEADER`. splats: how many; streams: how many follow in version 4."""
 
+    magic: bytes
     version: int
+    splats: int
     degree: int
     bits: int
     flags: int
-    arrays: list[NDArray[np.uint8]]
-    y_up: bool
+    streams: int
+
+    @classmethod
+    def of(cls, content: bytes) -> Header:
+        """The header that `content` begins with."""
+        return cls(*HEADER.unpack_from(content))
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Bytes a splat takes in each array: positions, opacities, colours, scales, rotations, SH.
+        Raises BadFileError for a degree or a precision that no file has."""
+        degree, bits = self.degree, self.bits
+        if degree > 3 or bits > 31:
+            raise BadFileError(f"its SH degree is {degree} and its fractional bits are {bits}")
+        return (9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
+
+
+# header, extensions, arrays [N, bytes]
+_Content = tuple[Header, bytes, list[NDArray[np.uint8]]]
 
 
 def read(path: Path) -> Splats:
@@ -60,61 +76,57 @@ def read(path: Path) -> Splats:
         plain = file.read(len(MAGIC)) == MAGIC
         file.seek(0)
         size = path.stat().st_size
-        content = _plain(file, size) if plain else _gzipped(file, size)
-        splats = _decoded(content).with_antialias(bool(content.flags & ANTIALIASED))
-        return flipped(splats, reuse=True) if content.y_up else splats
+        head, extensions, arrays = _plain(file, size) if plain else _gzipped(file, size)
+        y_up = _is_y_up(extensions) if head.flags & _HAS_EXTENSIONS else True
+        splats = _decoded(head, arrays).with_antialias(bool(head.flags & ANTIALIASED))
+        return flipped(splats, reuse=True) if y_up else splats
 
 
 def _gzipped(file: BinaryIO, size: int) -> _Content:
     stream = gzip.GzipFile(fileobj=file)
-    magic, version, count, degree, bits, flags, _ = HEADER.unpack(
-        read_rows(stream, 1, HEADER.size).tobytes()
-    )
-    if magic != MAGIC:
+    head = Header.of(read_rows(stream, 1, HEADER.size).tobytes())
+    if head.magic != MAGIC:
         raise BadFileError("it does not hold 'NGSP'")
-    if version not in (2, 3):
-        raise BadFileError(f"it is SPZ version {version} in gzip; there 2 and 3 are read")
-    sizes = widths(version, degree, bits)
-    check_size(count * sum(sizes), size)
-    arrays = [read_rows(stream, count, size) for size in sizes]
-    extra = read_rest(stream)
-    y_up = _is_y_up(extra) if flags & _HAS_EXTENSIONS else True
-    return _Content(version, degree, bits, flags, arrays, y_up)
+    if head.version not in (2, 3):
+        raise BadFileError(f"it is SPZ version {head.version} in gzip; there 2 and 3 are read")
+    check_size(head.splats * sum(head.widths), size)
+    arrays = [read_rows(stream, head.splats, width) for width in head.widths]
+    return head, read_rest(stream), arrays
 
 
 def _plain(file: BinaryIO, size: int) -> _Content:
-    head, extra, table = _table(file, size)
-    _, version, count, degree, bits, flags, streams = head
-    sizes = widths(version, degree, bits)
+    head, extensions, table = _table(file, size)
+    sizes, count = head.widths, head.splats
     check_size(count * sum(sizes), size)
-    if streams < len(sizes) - (sizes[-1] == 0):
-        raise BadFileError(f"it has {streams} streams for {len(sizes)} arrays")
+    if head.streams < len(sizes) - (sizes[-1] == 0):
+        raise BadFileError(f"it has {head.streams} streams for {len(sizes)} arrays")
     arrays = []
     for width, (packed, declared) in zip(sizes, [*table, (0, 0)], strict=False):
         if declared != count * width:
             raise BadFileError(f"it declares {declared} bytes for {count} times {width}")
+        if packed > size:
+            raise BadFileError("it is cut short")
         arrays.append(read_zstd_frame(file, packed, declared).reshape(count, width))
-    y_up = _is_y_up(extra) if flags & _HAS_EXTENSIONS else True
-    return _Content(version, degree, bits, flags, arrays, y_up)
+    return head, extensions, arrays
 
 
-def _table(file: BinaryIO, size: int) -> tuple[tuple[Any, ...], bytes, list[tuple[int, int]]]:
+def _table(file: BinaryIO, size: int) -> tuple[Header, bytes, list[tuple[int, int]]]:
     """(header, extensions, (packed, unpacked) bytes of each stream) of a file of version 4. The
     file position is then at the streams."""
     head = file.read(HEADER.size + _TABLE_STARTS.size)
     if len(head) < HEADER.size + _TABLE_STARTS.size:
         raise BadFileError("it is cut short")
-    values = HEADER.unpack_from(head)
+    values = Header.of(head)
     (starts,) = _TABLE_STARTS.unpack_from(head, HEADER.size)
-    if values[1] != 4:
-        raise BadFileError(f"it is SPZ version {values[1]} without gzip; there 4 is read")
+    if values.version != 4:
+        raise BadFileError(f"it is SPZ version {values.version} without gzip; there 4 is read")
     if not 0 <= starts - len(head) <= min(_EXTENSIONS_LIMIT_BYTES, size):
         raise BadFileError(f"its table starts at {starts}")
-    extra = file.read(starts - len(head))
-    table = file.read(values[-1] * _TABLE_ROW.size)
-    if len(table) < values[-1] * _TABLE_ROW.size:
+    extensions = file.read(starts - len(head))
+    table = file.read(values.streams * _TABLE_ROW.size)
+    if len(table) < values.streams * _TABLE_ROW.size:
         raise BadFileError("it is cut short")
-    return values, extra, list(_TABLE_ROW.iter_unpack(table))
+    return values, extensions, list(_TABLE_ROW.iter_unpack(table))
 
 
 def packed_sizes(path: Path) -> list[int]:
@@ -124,13 +136,6 @@ def packed_sizes(path: Path) -> list[int]:
             return []
         file.seek(0)
         return [packed for packed, _ in _table(file, path.stat().st_size)[2]]
-
-
-def widths(version: int, degree: int, bits: int) -> tuple[int, ...]:
-    """Bytes a splat takes in each array."""
-    if degree > 3 or bits > 31:
-        raise BadFileError(f"its SH degree is {degree} and its fractional bits are {bits}")
-    return (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1))
 
 
 def _is_y_up(records: bytes) -> bool:
@@ -148,17 +153,17 @@ def _is_y_up(records: bytes) -> bool:
     return True
 
 
-def _decoded(content: _Content) -> Splats:
+def _decoded(head: Header, arrays: list[NDArray[np.uint8]]) -> Splats:
     """The splats in the axes of the file."""
-    positions, opacities, colours, scales, rotations, sh = content.arrays
-    splats = allocate(len(positions), content.degree)
+    positions, opacities, colours, scales, rotations, sh = arrays
+    splats = allocate(len(positions), head.degree)
     for rows in reported_blocks(len(positions)):
         out = splats.take(rows)
         padded = np.zeros((len(out), 3, 4), np.uint8)
         padded[:, :, 1:] = positions[rows].reshape(-1, 3, 3)
         fixed = padded.view("<i4")[:, :, 0] >> 8  # the shift extends the sign
-        out.means[:] = fixed / float(1 << content.bits)
-        out.quaternions[:] = _rotations(rotations[rows], content.version)
+        out.means[:] = fixed / float(1 << head.bits)
+        out.quaternions[:] = _rotations(rotations[rows], head.version)
         out.log_scales[:] = scales[rows].astype(np.float32) / 16 - 10
         out.opacity_logits[:] = logits_of(opacities[rows, 0] / 255)
         out.sh[:, 0] = (colours[rows] / 255 - 0.5) / COLOUR_SCALE

@@ -23,7 +23,7 @@ from stages.base.atomic import make_folder, partial_prefix, replacing
 from stages.base.bad_files import BadFileError, reading
 from stages.base.blocks import reported_blocks
 from stages.formats import html, sog
-from stages.formats.json_fields import located, location_fields, whole
+from stages.formats.json_fields import agreed, located, location_fields, whole
 from stages.formats.sog_read import Source, antialias_of, in_folder, in_zip
 from stages.formats.table import CHUNK_FOLDER
 from stages.formats.values import allocate, fill
@@ -60,7 +60,8 @@ def write(
     views: tuple[View, ...] = (),
     coarser: Sequence[Splats] = (),
 ) -> None:
-    """Write a streamed SOG and, beside it, a page that shows it on any web server.
+    """Write a streamed SOG and, beside it, a page that shows it on any web server. Makes the
+    folder, replaces an earlier asset in it, and writes lod-meta.json last.
 
     Args:
         path: the asset's lod-meta.json.
@@ -71,13 +72,7 @@ def write(
 
     Raises SplatError when the asset cannot be written.
     """
-    write_levels(path, [splats, *coarser], units)
-    html.write_beside(path, splats, units, views, splat_widths(path, splats))
-
-
-def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
-    """Write `levels`, finest first, all drawable and in one frame. Makes the folder, replaces an
-    earlier asset in it, and writes lod-meta.json last. Raises SplatError."""
+    levels = [splats, *coarser]
     make_folder(path.parent)
     tree = _cut(levels)
     partial = path.with_name(partial_prefix() + "chunks")
@@ -90,7 +85,7 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
             "asset": {
                 "generator": "splat",
                 "units": units,
-                **location_fields(levels[0].origin, levels[0].place),
+                **location_fields(splats.origin, splats.place),
             },
             "count": sum(counts),
             "counts": counts,
@@ -108,6 +103,7 @@ def write_levels(path: Path, levels: Sequence[Splats], units: str) -> None:
                 new.rename(path.with_name(new.name))
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+    html.write_beside(path, splats, units, views, splat_widths(path, splats))
 
 
 def _cut(levels: Sequence[Splats]) -> _Tree:
@@ -225,15 +221,8 @@ def read(path: Path) -> Splats:
             fill(splats.take(slice(end, end + count)), chunk.take(slice(offset, offset + count)))
             end += count
     splats = located(splats, meta.get("asset"))
-    return splats.with_antialias(_antialias(sources))
-
-
-def _antialias(sources: Sequence[Source]) -> bool:
-    """Whether the chunks ask for opacity compensation. Raises BadFileError if they disagree."""
-    found = {antialias_of(source.meta()) for source in sources}
-    if len(found) > 1:
-        raise BadFileError("its chunks disagree about antialiasing")
-    return True in found
+    said = (antialias_of(source.meta()) for source in sources)
+    return splats.with_antialias(agreed(said, "its chunks disagree about antialiasing"))
 
 
 def _leaf_lods(tree: Any) -> Iterator[dict[str, Any]]:

@@ -183,17 +183,11 @@ def check_finite(splats: Splats) -> Splats:
         np.clip(logits, -1e30, 1e30, out=logits)
     clean = replace(splats, sh_degrees=sh_degrees_used(splats.sh))
     for name in (*ROW_FIELDS[:-1], "origin"):
-        bad = count_nonfinite(getattr(clean, name))
+        values = getattr(clean, name)
+        bad = sum(int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)))
         if bad and not allows_nonfinite():
             raise BadFileError(f"{bad} values of {name} are not finite numbers")
     return clean
-
-
-def count_nonfinite(values: NDArray[np.floating]) -> int:
-    """The number of NaN and infinite `values`."""
-    return sum(
-        int((~np.isfinite(values[rows])).sum()) for rows in blocks(len(values)) if values.size
-    )
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:

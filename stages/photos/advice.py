@@ -77,20 +77,20 @@ def about_names(names: Mapping[str, Sequence[str]], warn: Warn) -> None:
             warn(code, text.format(names=listed(found)))
 
 
-def about_left_out(unusable: Sequence[tuple[str, str, str]], warn: Warn) -> None:
-    """unusable: (name, why, what to do) of files that cannot be used."""
+LEFT_OUT = {  # by code: what becomes of the first files that cannot be used, and of the others
+    "ingest-left-out": ("is left out", "left out, for similar reasons"),
+    "ingest-depth-left-out": ("is used without its depth map", "without their depth maps"),
+}
+
+
+def about_left_out(code: str, unusable: Sequence[tuple[str, str, str]], warn: Warn) -> None:
+    """Warn with a code of `LEFT_OUT`. unusable: (name, why, what to do) of photographs that cannot
+    be used, or whose depth maps cannot."""
+    first, others = LEFT_OUT[code]
     for name, why, hint in unusable[:_NAMED]:
-        warn("ingest-left-out", f"{name} is left out: {why}. {hint}.")
+        warn(code, f"{name} {first}: {why}. {hint}.")
     if rest := [name for name, *_ in unusable[_NAMED:]]:
-        warn("ingest-left-out", f"Also left out, for similar reasons: {listed(rest)}.")
-
-
-def about_depth(left_out: Sequence[tuple[str, str, str]], warn: Warn) -> None:
-    """left_out: (photograph, why, what to do) of depth maps that cannot be used."""
-    for name, why, hint in left_out[:_NAMED]:
-        warn("ingest-depth-left-out", f"{name} is used without its depth map: {why}. {hint}.")
-    if rest := [name for name, *_ in left_out[_NAMED:]]:
-        warn("ingest-depth-left-out", f"Also without their depth maps: {listed(rest)}.")
+        warn(code, f"Also {others}: {listed(rest)}.")
 
 
 def about_capture(

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
+from stages.scene.light import linear_light
+
 P3 = 12  # ITU-T H.273: SMPTE EG 432-1 (Display P3)
 HDR_TRANSFERS = (16, 18)  # PQ, HLG
 # Linear RGB to linear sRGB; both spaces have the white point D65. From the primaries in
@@ -24,18 +26,18 @@ _ADOBE_TO_SRGB = np.array(
 _ADOBE_GAMMA = 563 / 256
 
 
-def icc_to_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, bool]:
-    """(`image` in sRGB, whether that changed it). Grey and CMYK pictures become RGB.
+def icc_to_srgb(image: Image.Image, profile: bytes) -> Image.Image:
+    """`image` in sRGB; itself if that changes nothing. Grey and CMYK pictures become RGB.
 
     Raises ImageCms.PyCMSError for a profile that is damaged, or made for another colour mode.
     """
     transform = _transform(profile, image.mode)
     if transform is None:
-        return image, False
+        return image
     converted = ImageCms.applyTransform(image, transform)
     assert converted is not None
     converted.info.pop("icc_profile", None)
-    return converted, True
+    return converted
 
 
 @lru_cache(maxsize=32)
@@ -76,7 +78,7 @@ def nclx_is_hdr(nclx: dict[str, Any] | None) -> bool:
 
 def p3_to_srgb(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Display P3 [H, W, 3] to sRGB; colours outside sRGB are clipped."""
-    return _convert(pixels, _srgb_decoded(np.arange(256) / 255), P3_TO_SRGB)
+    return _convert(pixels, linear_light(np.arange(256) / 255), P3_TO_SRGB)
 
 
 def adobe_to_srgb(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -98,16 +100,11 @@ def _convert(
 
 
 def srgb_encoded(linear: NDArray[Any]) -> NDArray[Any]:
-    """The sRGB transfer function (IEC 61966-2-1)."""
+    """The sRGB transfer function (IEC 61966-2-1); the inverse of `linear_light`."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def _srgb_decoded(value: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Its inverse."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def luminance(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
     """[H, W] relative linear luminance of sRGB pixels (ITU-R BT.709 weights)."""
-    linear = _srgb_decoded(np.arange(256) / 255).astype(np.float32)[pixels]
+    linear = linear_light(np.arange(256) / 255).astype(np.float32)[pixels]
     return linear @ np.array([0.2126, 0.7152, 0.0722], np.float32)

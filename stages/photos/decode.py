@@ -77,6 +77,12 @@ class Decoded:
     hdr: bool = False
     bad_profile: bool = False
 
+    @property
+    def upright(self) -> tuple[int, int]:
+        """(width, height) of the file, turned upright."""
+        width, height = self.stored
+        return (height, width) if self.exif.orientation >= 5 else (width, height)  # quarter turns
+
 
 class PixelBudget:
     """Limits how many pixels threads decode at once."""
@@ -178,8 +184,9 @@ def _decode(image: Image.Image, data: bytes, max_side: int) -> Decoded:
         exif = replace(exif, orientation=1)  # the decoder has turned the pixels already
     native_mode = image.mode
     basic = _resized(_basic_mode(_loaded(image, data)), size, stored)
-    shown, alpha = _over_black(basic)
-    shown, converted, bad_profile = _in_srgb(shown, info.get("icc_profile"))
+    black, alpha = _over_black(basic)
+    shown, bad_profile = _in_srgb(black, info.get("icc_profile"))
+    converted = shown is not black
     upright = exif.orientation == 1
     if not upright:
         shown = shown.transpose(UPRIGHT[exif.orientation])
@@ -272,14 +279,12 @@ def _resized(image: Image.Image, size: tuple[int, int], stored: tuple[int, int])
     return image.resize(size, Image.Resampling.LANCZOS, box=box, reducing_gap=3.0)
 
 
-def _in_srgb(image: Image.Image, profile: bytes | None) -> tuple[Image.Image, bool, bool]:
-    """(the picture in sRGB, whether that changed it, whether its profile was unusable)."""
-    if profile:
-        try:
-            return (*colour.icc_to_srgb(image, profile), False)
-        except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
-            return image, False, True
-    return image, False, False
+def _in_srgb(image: Image.Image, profile: bytes | None) -> tuple[Image.Image, bool]:
+    """(the picture in sRGB, itself if that changes nothing; whether its profile is unusable)."""
+    try:
+        return colour.icc_to_srgb(image, profile) if profile else image, False
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return image, True
 
 
 def _unidentified(data: bytes) -> Unusable:

@@ -22,10 +22,10 @@ from PIL import Image
 from stages.base.errors import SplatError
 from stages.cameras import nerfstudio
 from stages.cameras.nerfstudio import MILLIMETRE
-from stages.photos.decode import UPRIGHT, Decoded, Unusable, check_size
-from stages.photos.masking import QUARTERS, same_aspect
+from stages.photos.decode import Decoded, Unusable, check_size
+from stages.photos.masking import turned_with
 from stages.photos.masks import pair_masks
-from stages.photos.sources import DepthFile, Findings, suffix_of
+from stages.photos.sources import DepthFile, Findings, folder_beside, suffix_of
 from stages.scene import fitted_size
 
 FOLDERS = ("depth", "depths")  # beside the photographs' folder, or in it
@@ -41,8 +41,7 @@ _CONFIDENCE = re.compile(r"(^|/)conf_[0-9]+\.")
 def depth_source(photos: Path, chosen: Path | None) -> Path | None:
     """What holds the depth maps outside the photographs' folder: the folder or transforms.json that
     was chosen, or a folder called depth beside the photographs'."""
-    near = (photos.absolute().parent / name for name in FOLDERS)
-    return chosen or next((p for p in near if p.is_dir() and p != photos.absolute()), None)
+    return chosen or folder_beside(photos, FOLDERS)
 
 
 def files_of(source: Path) -> list[Path]:
@@ -152,16 +151,11 @@ def read_depth(file: DepthFile, decoded: Decoded) -> NDArray[np.float32]:
 
 
 def _upright(metres: NDArray[np.float32], decoded: Decoded, name: str) -> NDArray[np.float32]:
-    """Turned with the photograph where it has the proportions of the stored file."""
-    size, stored = metres.shape[::-1], decoded.stored
-    turn = UPRIGHT.get(decoded.exif.orientation)
-    upright = (stored[1], stored[0]) if turn in QUARTERS else stored
-    if turn in QUARTERS and same_aspect(size, stored) and not same_aspect(size, upright):
-        metres = np.asarray(Image.fromarray(metres).transpose(turn))
-    elif not same_aspect(size, upright):
-        sizes = f"{size[0]} x {size[1]}, the photograph {upright[0]} x {upright[1]}"
+    """Turned with the photograph, see `turned_with`. Raises Unusable."""
+    turned, sizes = turned_with(Image.fromarray(metres), decoded)
+    if sizes:
         raise Unusable(f"{name} is {sizes}", "Use a map with its photograph's proportions")
-    return metres
+    return np.asarray(turned)
 
 
 def _values(path: Path) -> NDArray[Any]:

@@ -116,14 +116,6 @@ def read_exif(image: Any) -> Exif:
         tags = {**dict(main), **dict(main.get_ifd(_EXIF_IFD))}
     except Exception:  # Pillow's parsers raise whatever the damage leads to
         return Exif()
-    try:
-        interoperability = main.get_ifd(_INTEROPERABILITY_IFD)
-    except Exception:  # before Pillow 13 also where there is none
-        interoperability = {}
-    try:
-        gps = dict(main.get_ifd(_GPS_IFD))
-    except Exception:
-        gps = {}
     xmp = getattr(image, "info", {}).get("xmp")
     xmp = xmp if isinstance(xmp, bytes) else b""
     orientation = _number(tags.get(0x0112))
@@ -140,10 +132,18 @@ def read_exif(image: Any) -> Exif:
         iso=_iso(tags),
         pixels=(width, height) if width and height else None,
         focal_plane_px_per_mm=_focal_plane_px_per_mm(tags),
-        adobe_rgb=_text(interoperability.get(1)) == "R03",
-        gps=read_gps(gps, xmp),
+        adobe_rgb=_text(_ifd(main, _INTEROPERABILITY_IFD).get(1)) == "R03",
+        gps=read_gps(_ifd(main, _GPS_IFD), xmp),
         projection=projection_of(xmp),
     )
+
+
+def _ifd(main: Any, number: int) -> dict[int, Any]:
+    """The tags of a directory; none if it is missing or damaged."""
+    try:
+        return dict(main.get_ifd(number))
+    except Exception:  # before Pillow 13 also where there is none
+        return {}
 
 
 def _iso(tags: dict[int, Any]) -> float | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import cv2
@@ -35,59 +35,34 @@ WIDTHS = math.pi / math.tan(math.radians(FIELD_DEG / 2))
 _MARGIN = 4  # pixels that the picture is continued by on all sides, for interpolation
 
 
-@dataclass(frozen=True)
-class CutFace:
-    """A face that was cut out.
+def face_photos(photo: Photo, masked: MaskedPhoto) -> Iterator[tuple[Photo, MaskedPhoto]]:
+    """The faces of a panorama as photographs, with their pictures and masks; `photo` and `masked`
+    are of the whole.
 
-    Args:
-        name: its direction: longitude and latitude of its middle ("072+25").
-        pixels: [S, S, 3] uint8.
-        mask: [S, S] uint8, 0 outside; None where everything counts.
-        focal_px: of its pinhole camera, whose principal point is its middle.
-        turn: as in `scene.Face`.
+    They are square and have as many pixels a degree as its horizon has. Those that the mask leaves
+    nothing of are left out.
     """
-
-    name: str
-    pixels: NDArray[np.uint8]
-    mask: NDArray[np.uint8] | None
-    focal_px: float
-    turn: tuple[float, float, float, float]
-
-
-def faces(pixels: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> Iterator[CutFace]:
-    """The faces of a panorama [H, W, 3], with as many pixels a degree as its horizon has; those
-    that `mask` [H, W] leaves nothing of are left out."""
+    pixels = masked.decoded.pixels
     height, width = pixels.shape[:2]
     side = max(16, int(width / WIDTHS))
     focal = 0.5 * side / math.tan(math.radians(FIELD_DEG / 2))
     around = _continued(pixels)
-    kept = None if mask is None else _continued(mask)
+    kept = None if masked.mask is None else _continued(masked.mask)
     for yaw, pitch in DIRECTIONS:
         rotation = face_rotation(yaw, pitch)
         tables = _tables(rotation, side, focal, width, height)
-        cut = None if kept is None else cv2.remap(kept, *tables, cv2.INTER_NEAREST)
-        if cut is not None and not cut.any():
-            continue
+        mask = None
+        if kept is not None:
+            mask = np.asarray(cv2.remap(kept, *tables, cv2.INTER_NEAREST), np.uint8)
+            if not mask.any():
+                continue
+        shown = np.asarray(cv2.remap(around, *tables, cv2.INTER_CUBIC), np.uint8)
+        cut = replace(masked.decoded, pixels=shown, unchanged_jpeg=None)
+        part = replace(masked, decoded=cut, mask=mask)
+        described = face_photo(photo, direction_name(yaw, pitch), side, side, focal)
         w, x, y, z = quaternions_of(rotation).tolist()
-        yield CutFace(
-            direction_name(yaw, pitch),
-            np.asarray(cv2.remap(around, *tables, cv2.INTER_CUBIC), np.uint8),
-            None if cut is None else np.asarray(cut, np.uint8),
-            focal,
-            (w, x, y, z),
-        )
-
-
-def face_photos(photo: Photo, masked: MaskedPhoto) -> Iterator[tuple[Photo, MaskedPhoto]]:
-    """The faces of a panorama as photographs, with their pictures and masks; `photo` and `masked`
-    are of the whole."""
-    for face in faces(masked.decoded.pixels, masked.mask):
-        cut = replace(masked.decoded, pixels=face.pixels, unchanged_jpeg=None)
-        part = replace(masked, decoded=cut, mask=face.mask)
-        side = len(face.pixels)
-        described = face_photo(photo, face.name, side, side, face.focal_px)
-        mask, place = part.file(described.image), Face(photo.camera, photo.name, face.turn)
-        yield replace(described, mask=mask, face=place), part
+        place = Face(photo.camera, photo.name, (w, x, y, z))
+        yield replace(described, mask=part.file(described.image), face=place), part
 
 
 def direction_name(yaw_deg: int, pitch_deg: int) -> str:

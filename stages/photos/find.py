@@ -49,9 +49,7 @@ def find(folder: Path, more_masks: Path | None = None, depth: Path | None = None
         name = printable_name(folder.name)
         return Findings((), (Source(folder, name, f"{PHOTOS_FOLDER}{name}"),), (), (), 0)
     _check_folder(folder)
-    files: dict[str, Path] = {}
-    for path in _walk(folder):
-        files[printable_name(path.relative_to(folder).as_posix())] = path
+    files = _files_by_name(folder)
     depths, stray_depths = _remove_depths(files, folder, depth)
     mask_of, stray = _remove_masks(files, folder, more_masks)
     names = sorted(files, key=natural_key)
@@ -121,8 +119,7 @@ def _remove_masks(
         inside = {}  # a folder of nothing but masks holds photographs
     found = {short: files.pop(name) for name, short in inside.items()}
     if apart is not None and apart.is_dir() and apart != folder.resolve():
-        for path in _walk(apart):
-            found[printable_name(path.relative_to(apart).as_posix())] = path
+        found |= _files_by_name(apart)
         for name in [name for name, path in files.items() if path.resolve().is_relative_to(apart)]:
             del files[name]
     found = {name: path for name, path in found.items() if suffix_of(name) in masks.MASK_SUFFIXES}
@@ -147,8 +144,8 @@ def _remove_depths(
     if source is not None and source.is_file():
         maps, unit = nerfstudio.depth_maps(source)
     elif source is not None and source.is_dir() and source.resolve() != folder.resolve():
-        every = {path.relative_to(source).as_posix(): path for path in _walk(source)}
-        maps = {name: every[name] for name in every if suffix_of(name) in depth_files.SUFFIXES}
+        every = _files_by_name(source).items()
+        maps = {name: path for name, path in every if suffix_of(name) in depth_files.SUFFIXES}
     apart = {path.resolve() for path in maps.values()}
     inside = {name for name in files if depth_files.is_map(name)}
     inside |= {name for name, path in files.items() if apart and path.resolve() in apart}
@@ -169,6 +166,11 @@ def _remove_depths(
         if path not in used and not depth_files.needs_no_photograph(name, files)
     )
     return paired, tuple(sorted(stray, key=natural_key))
+
+
+def _files_by_name(folder: Path) -> dict[str, Path]:
+    """The files of a folder and its sub-folders by their names relative to it."""
+    return {printable_name(path.relative_to(folder).as_posix()): path for path in _walk(folder)}
 
 
 def _walk(folder: Path) -> Iterable[Path]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,18 +35,16 @@ class Field:
     Args:
         camera, lens: of the photograph.
         radius_px: of the image circle around the principal point; infinite if it has none.
-        angle: from the axis, radians, up to which the lens is injective.
     """
 
     camera: Camera
     lens: Lens
-    radius_px: float
-    angle: float
+    radius_px: float = np.inf
 
-    @classmethod
-    def of(cls, camera: Camera, lens: Lens, radius_px: float = np.inf) -> Field:
-        """The field of view of a fisheye."""
-        return cls(camera, lens, radius_px, lens.widest_angle())
+    @cached_property
+    def angle(self) -> float:
+        """The angle from the axis, radians, up to which the lens is injective."""
+        return self.lens.widest_angle()
 
     def shows(self, rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(pixels [..., 2] of the photograph, [...] whether it shows the rays [..., 3])."""

@@ -37,14 +37,17 @@ class MaskedPhoto:
         mask: [H, W], 0 outside; None where everything counts.
         outside: what is outside, as in `scene.Photo`.
         scaled: whether a mask file had another size than the photograph.
-        share: of the photograph that is inside.
     """
 
     decoded: Decoded
     mask: NDArray[np.uint8] | None = None
     outside: str = ""
     scaled: bool = False
-    share: float = 1.0
+
+    @property
+    def share(self) -> float:
+        """The share of the photograph that is inside."""
+        return 1.0 if self.mask is None else float(np.mean(self.mask > 127))
 
     @classmethod
     def of(
@@ -75,14 +78,13 @@ class MaskedPhoto:
         if outside == TRANSPARENT and file is not None:
             black = np.where(mask[..., None] > 0, decoded.pixels, np.uint8(0))
             decoded = replace(decoded, pixels=black, unchanged_jpeg=None)
-        return cls(decoded, mask, outside, scaled, float(np.mean(mask > 127)))
+        return cls(decoded, mask, outside, scaled)
 
     def without(self, file: Path, name: str) -> MaskedPhoto:
         """Without what the mask in `file` is black at. Raises SplatError "mask-unfit"."""
         kept, scaled = _read(file, name, False, self.decoded)
         mask = np.where(kept, np.uint8(255) if self.mask is None else self.mask, np.uint8(0))
-        share = float(np.mean(mask > 127))
-        return MaskedPhoto(self.decoded, mask, IGNORE, self.scaled or scaled, share)
+        return MaskedPhoto(self.decoded, mask, IGNORE, self.scaled or scaled)
 
     def file(self, image: str) -> str:
         """Where the mask of the normalised picture `image` goes; "" without one."""
@@ -103,10 +105,9 @@ def cuts_out_object(masks: Sequence[Path], invert: bool) -> bool:
     kept = []
     for path in evenly_spaced(masks, _LOOKED_AT):
         try:
-            values = _values(_opened(path, path.name))
+            inside = _bright(_opened(path, path.name))
         except SplatError:
             continue
-        inside = values > 0.5 * max(float(values.max()), 1.0)
         small = cv2.resize(inside.astype(np.float32), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
         kept.append((small > 0.5) ^ invert)
     if not kept or np.mean([_is_object(one) for one in kept]) < CUTS_OUT:
@@ -154,41 +155,28 @@ def check_shares(photos: Sequence[Photo], shares: Sequence[float], files: bool) 
 
 
 def _read(path: Path, name: str, invert: bool, decoded: Decoded) -> tuple[NDArray[np.bool_], bool]:
-    """([H, W] what the mask keeps, whether it had another size than the photograph's file).
-
-    A mask with the orientation of the stored file is turned upright with it. Raises SplatError
-    "mask-unfit".
-    """
-    image, stored = _opened(path, name), decoded.stored
-    turn = UPRIGHT.get(decoded.exif.orientation)
-    upright = (stored[1], stored[0]) if turn in QUARTERS else stored
-    if (
-        turn is not None
-        and turn in QUARTERS
-        and same_aspect(image.size, stored)
-        and not same_aspect(image.size, upright)
-    ):
-        image = image.transpose(turn)
-    if not same_aspect(image.size, upright):
-        sizes = f"{image.width} x {image.height}, the photograph {upright[0]} x {upright[1]}"
+    """([H, W] what the mask keeps, whether it had another size than the photograph's file). Raises
+    SplatError "mask-unfit"."""
+    image, sizes = turned_with(_opened(path, name), decoded)
+    if sizes:
         raise _unfit(path, name, f"it is {sizes}")
-    values = _values(image)
-    kept = values > 0.5 * max(float(values.max()), 1.0)
-    if invert:
-        kept = ~kept
+    kept = _bright(image) ^ invert
     height, width = decoded.pixels.shape[:2]
     resized = cv2.resize(
         kept.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST_EXACT
     )
-    return np.asarray(resized > 0), image.size != upright
+    return np.asarray(resized > 0), image.size != decoded.upright
 
 
-QUARTERS = (
-    Image.Transpose.TRANSPOSE,
-    Image.Transpose.ROTATE_270,
-    Image.Transpose.TRANSVERSE,
-    Image.Transpose.ROTATE_90,
-)
+def turned_with(image: Image.Image, decoded: Decoded) -> tuple[Image.Image, str]:
+    """(a mask or a depth map, turned upright with its photograph if it has the orientation of the
+    stored file; both sizes in words if their proportions differ even so, else "")."""
+    upright, stored = decoded.upright, decoded.stored
+    if _same_aspect(image.size, upright):
+        return image, ""
+    if upright != stored and _same_aspect(image.size, stored):
+        return image.transpose(UPRIGHT[decoded.exif.orientation]), ""
+    return image, f"{image.width} x {image.height}, the photograph {upright[0]} x {upright[1]}"
 
 
 def _opened(path: Path, name: str) -> Image.Image:
@@ -205,6 +193,12 @@ def _opened(path: Path, name: str) -> Image.Image:
     raise _unfit(path, name, f"it has more than {MAX_MEGAPIXELS} megapixels")
 
 
+def _bright(image: Image.Image) -> NDArray[np.bool_]:
+    """[H, W] where a mask is brighter than half of its brightest pixel."""
+    values = _values(image)
+    return values > 0.5 * max(float(values.max()), 1.0)
+
+
 def _values(image: Image.Image) -> NDArray[np.float32]:
     """[H, W] brightness, or alpha if the picture has alpha and a single colour."""
     if image.mode in ("P", "PA") or "transparency" in image.info:
@@ -217,7 +211,7 @@ def _values(image: Image.Image) -> NDArray[np.float32]:
     return np.asarray(grey, np.float32)
 
 
-def same_aspect(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
+def _same_aspect(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
     """Whether both have the same aspect ratio, to a few hundredths."""
     return abs(size[0] * wanted[1] / (size[1] * wanted[0]) - 1.0) < MAX_ASPECT_DIFFERENCE
 

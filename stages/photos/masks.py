@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 from stages.base.errors import SplatError
-from stages.photos.sources import Findings, stem_of
+from stages.photos.sources import Findings, folder_beside, stem_of
 
 FOLDER = "masks"  # beside the photographs' folder, or in it
 MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".webp"})
@@ -15,8 +15,7 @@ MASK_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".w
 def mask_folder(photos: Path, chosen: Path | None) -> Path | None:
     """The folder of masks outside the photographs' folder: the one that was chosen, or one called
     masks beside it."""
-    beside = photos.absolute().parent / FOLDER
-    return chosen or (beside if beside.is_dir() and beside != photos.absolute() else None)
+    return chosen or folder_beside(photos, (FOLDER,))
 
 
 def check_rig_mask(file: Path | None) -> None:

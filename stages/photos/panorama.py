@@ -9,13 +9,9 @@ nothing: phones take such photographs.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from stages.photos.decode import Decoded
 
 _TAG = rb"GPano:%s\s*(?:=\s*[\"']|>)\s*(\w{1,40})"
 _WIDTHS = (b"FullPanoWidthPixels", b"CroppedAreaImageWidthPixels")
@@ -69,11 +65,6 @@ def panorama(pixels: NDArray[np.uint8], stored: tuple[int, int], projection: str
     if _two_fisheyes(small):
         return _FISHEYES
     return SPHERE if _wraps(small) else ""
-
-
-def kind_of(decoded: Decoded) -> str:
-    """See `panorama`."""
-    return panorama(decoded.pixels, decoded.stored, decoded.exif.projection)
 
 
 def hint_for(kind: str) -> str:

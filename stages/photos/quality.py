@@ -13,6 +13,9 @@ from stages.scene import fitted_size
 
 MEASURED_SIDE_PX = 800
 THUMBNAIL_PX = (48, 36)
+# Correlation of thumbnails above which two photographs count as taken from one spot; a shift by
+# half a percent of the picture's width brings it to about 0.98.
+_ALIKE = 0.98
 _SECOND_DERIVATIVES = tuple(
     np.array(kernel, np.float32)
     for kernel in (
@@ -86,14 +89,8 @@ def _thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
     return small / norm if norm > 1.0 else np.zeros_like(small)
 
 
-def near_duplicates(
-    thumbnails: list[NDArray[np.float32]], alike: float = 0.98
-) -> list[tuple[int, ...]]:
-    """Groups of indices of photographs that show nearly the same, each group in order.
-
-    alike: correlation of thumbnails above which two photographs count as taken from one spot; a
-    shift by half a percent of the picture's width brings it to about 0.98.
-    """
+def near_duplicates(thumbnails: list[NDArray[np.float32]]) -> list[tuple[int, ...]]:
+    """Groups of indices of photographs that show nearly the same, each group in order."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -101,7 +98,7 @@ def near_duplicates(
     pairs = [
         (first, first + 1 + int(second))
         for first in range(len(stack))
-        for second in np.flatnonzero(stack[first + 1 :] @ stack[first] > alike)
+        for second in np.flatnonzero(stack[first + 1 :] @ stack[first] > _ALIKE)
     ]
     ends = np.array(pairs, np.intp).reshape(-1, 2).T
     links = coo_array((np.ones(len(pairs)), ends), shape=(len(stack), len(stack)))

@@ -85,6 +85,12 @@ class Findings:
     beside_frames: tuple[str, ...] = ()
 
 
+def folder_beside(photos: Path, names: Iterable[str]) -> Path | None:
+    """The first folder of these names beside the photographs' own; None if there is none."""
+    near = (photos.absolute().parent / name for name in names)
+    return next((path for path in near if path.is_dir() and path != photos.absolute()), None)
+
+
 def suffix_of(name: str) -> str:
     """The ending of a name, lower case: ".jpg"."""
     return PurePosixPath(name).suffix.lower()

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from stages.base.atomic import replacing
-from stages.photos.decode import Decoded
 from stages.photos.masking import MaskedPhoto
 from stages.scene import Photo
 
@@ -18,47 +17,37 @@ _JPEG_QUALITY = 95
 
 
 def write_photo(photo: Photo, masked: MaskedPhoto, folder: Path) -> Photo:
-    """Write the picture and the mask of `photo`, relative to `folder`; returns `photo`. Raises
-    SplatError if they cannot be written."""
-    target = folder / photo.image
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_picture(target, masked.decoded)
-    if masked.mask is not None:
-        write_mask(folder / photo.mask, masked.mask)
-    return photo
-
-
-def write_picture(path: Path, decoded: Decoded) -> None:
-    """Write the picture as JPEG (4:4:4) or PNG, by the suffix of `path`.
+    """Write the picture and the mask of `photo`, relative to `folder`; returns `photo`.
 
     A JPEG that needed no change keeps its bytes, because encoding it again would lose detail.
-    Raises SplatError if it cannot be written.
+    Raises SplatError if they cannot be written.
     """
-    as_png = path.suffix.lower() == ".png"
-    data = None if as_png else decoded.unchanged_jpeg
-    if data is None:
-        encoded = io.BytesIO()
-        picture = Image.fromarray(decoded.pixels)
-        if as_png:
-            picture.save(encoded, "PNG", compress_level=3)
-        else:
-            picture.save(encoded, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
-        data = encoded.getvalue()
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
-
-
-def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
-    """Write a mask [H, W] as grey PNG. Raises SplatError if it cannot be written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    encoded = io.BytesIO()
-    Image.fromarray(mask).save(encoded, "PNG", compress_level=3)
-    with replacing(path) as temporary:
-        temporary.write_bytes(encoded.getvalue())
+    target, decoded = folder / photo.image, masked.decoded
+    unchanged = None if target.suffix.lower() == ".png" else decoded.unchanged_jpeg
+    _write(target, unchanged or _encoded(decoded.pixels, target.suffix))
+    if masked.mask is not None:
+        _write(folder / photo.mask, _encoded(masked.mask, ".png"))
+    return photo
 
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
     """Write a depth map [h, w] as .npy. Raises SplatError if it cannot be written."""
+    content = io.BytesIO()
+    np.lib.format.write_array(content, np.ascontiguousarray(depth), (1, 0), allow_pickle=False)
+    _write(path, content.getvalue())
+
+
+def _encoded(pixels: NDArray[np.uint8], suffix: str) -> bytes:
+    """A picture [H, W, 3], or grey [H, W], as PNG or JPEG (4:4:4), by the suffix."""
+    content, picture = io.BytesIO(), Image.fromarray(pixels)
+    if suffix.lower() == ".png":
+        picture.save(content, "PNG", compress_level=3)
+    else:
+        picture.save(content, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+    return content.getvalue()
+
+
+def _write(path: Path, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.lib.format.write_array(file, np.ascontiguousarray(depth), (1, 0), allow_pickle=False)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)

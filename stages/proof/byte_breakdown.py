@@ -116,10 +116,9 @@ def spz(path: Path) -> ByteBreakdown:
     if sizes:
         return ByteBreakdown(dict(zip(_SPZ, sizes, strict=False)))
     with gzip.open(path) as file:
-        head = file.read(spz_read.HEADER.size)
-    _, version, count, degree, bits, _, _ = spz_read.HEADER.unpack(head)
-    widths = spz_read.widths(version, degree, bits)
-    parts = {what: count * width for what, width in zip(_SPZ, widths, strict=True) if width}
+        head = spz_read.Header.of(file.read(spz_read.HEADER.size))
+    widths = zip(_SPZ, head.widths, strict=True)
+    parts = {what: head.splats * width for what, width in widths if width}
     return ByteBreakdown(parts, unpacked=True)
 
 

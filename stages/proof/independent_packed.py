@@ -3,8 +3,13 @@ arithmetic. They share no code with `stages.formats`."""
 
 from __future__ import annotations
 
+import gzip
+import io
 import itertools
+import json
 import math
+import struct
+import zipfile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -60,9 +65,6 @@ def compressed_ply(path: Path) -> Splats:
 
 
 def spz(path: Path) -> Splats:
-    import gzip
-    import struct
-
     content = gzip.decompress(path.read_bytes())
     magic, version, n, degree, fraction, flags = struct.unpack_from("<IIIBBB", content)
     assert magic == 0x5053474E, "the header does not begin with NGSP"
@@ -111,10 +113,6 @@ def _smallest_three(parts: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 def streamed_sog(path: Path) -> Splats:
     """The finest level, leaves in the order of their chunks and rows."""
-    import io
-    import json
-    import zipfile
-
     meta = json.loads(path.read_text("utf-8"))
     waiting, found = [meta["tree"]], {}
     while waiting:
@@ -137,9 +135,6 @@ def streamed_sog(path: Path) -> Splats:
 
 
 def sog(path: Path | BinaryIO) -> Splats:
-    import json
-    import zipfile
-
     from PIL import Image
 
     with zipfile.ZipFile(path) as package:

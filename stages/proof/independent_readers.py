@@ -96,11 +96,12 @@ def html(path: Path) -> Splats:
 
 
 def splat(path: Path) -> Splats:
-    content, size = _Bytes(path), path.stat().st_size
+    size = path.stat().st_size
     assert size % 32 == 0, "its records are not all whole"
 
     def values_of(rows: slice) -> dict[str, NDArray[np.floating]]:
-        part = np.frombuffer(content[32 * rows.start : 32 * rows.stop], np.uint8).reshape(-1, 32)
+        count = 32 * (rows.stop - rows.start)
+        part = np.fromfile(path, np.uint8, count, offset=32 * rows.start).reshape(-1, 32)
         floats = np.ascontiguousarray(part[:, :24]).view("<f4")
         colours = part[:, 24:28].astype(np.float32) / 255
         return {
@@ -114,20 +115,11 @@ def splat(path: Path) -> Splats:
     return splats_by_rows(size // 32, values_of)
 
 
-class _Bytes:
-    """The bytes of a file from `start`; a slice of it is read from disk."""
-
-    def __init__(self, path: Path, start: int = 0) -> None:
-        self.path, self.start = path, start
-
-    def __getitem__(self, part: slice) -> bytes:
-        with self.path.open("rb") as file:
-            file.seek(self.start + part.start)
-            return file.read(part.stop - part.start)
+_Place = tuple[Path, int]  # a file, and the byte at which something begins in it
 
 
-def _gltf_parts(path: Path) -> tuple[Any, _Bytes]:
-    """(the document, the content of its first buffer)."""
+def _gltf_parts(path: Path) -> tuple[Any, _Place]:
+    """(the document, the place of its first buffer)."""
     from urllib.parse import unquote
 
     from pygltflib import GLTF2
@@ -135,24 +127,24 @@ def _gltf_parts(path: Path) -> tuple[Any, _Bytes]:
     if path.suffix.lower() == ".gltf":
         document = GLTF2.gltf_from_json(path.read_text(encoding="utf-8"))
         name = unquote(document.buffers[0].uri) if document.buffers else path.name
-        return document, _Bytes(path.parent / name)
+        return document, (path.parent / name, 0)
     with path.open("rb") as file:
         head = np.frombuffer(file.read(20), "<u4")
         assert file.seek(0, 2) == head[2], "its length is not that of its header"
         file.seek(20)
         document = GLTF2.gltf_from_json(file.read(int(head[3])).decode("utf-8"))
-    return document, _Bytes(path, 20 + int(head[3]) + 8)
+    return document, (path, 20 + int(head[3]) + 8)
 
 
 def gltf(path: Path) -> Splats:
-    document, blob = _gltf_parts(path)
+    document, buffer = _gltf_parts(path)
     scale = 1.0
     if document.nodes:
         scale = (document.nodes[0].scale or [1.0])[0]
 
     def values(primitive: Any, name: str) -> NDArray[np.floating]:
         accessor = document.accessors[getattr(primitive.attributes, name)]
-        return _accessor_values(accessor, document.bufferViews[accessor.bufferView], blob)
+        return _accessor_values(accessor, document.bufferViews[accessor.bufferView], buffer)
 
     prefix = "KHR_gaussian_splatting:"
     parts = []
@@ -181,17 +173,18 @@ def gltf(path: Path) -> Splats:
     return concatenate(parts).with_antialias(antialias)
 
 
-def _accessor_values(accessor: Any, view: Any, blob: _Bytes) -> NDArray[np.floating]:
+def _accessor_values(accessor: Any, view: Any, buffer: _Place) -> NDArray[np.floating]:
     """[count, components], one element after the other; c / (2^b - 1) or, signed,
     c / (2^(b - 1) - 1) of normalised integers (glTF 2.0, section 3.6.2.2)."""
     kind = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor.componentType]
     largest = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535, 5126: 1}[accessor.componentType]
     element = np.dtype((kind, ({"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type],)))
     step = view.byteStride or element.itemsize
-    start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+    start = buffer[1] + (view.byteOffset or 0) + (accessor.byteOffset or 0)
     # a record whose padding is the space between two elements; the last element may lack it
     record = np.dtype({"names": ["v"], "formats": [element], "offsets": [0], "itemsize": step})
-    data = blob[start : start + accessor.count * step].ljust(accessor.count * step, b"\0")
+    length = accessor.count * step
+    data = np.fromfile(buffer[0], np.uint8, length, offset=start).tobytes().ljust(length, b"\0")
     values = np.frombuffer(data, record, accessor.count)["v"]
     if not accessor.normalized:
         return values

@@ -21,7 +21,7 @@ from stages.scene.capture import (
     split_held_out,
     training_extent,
 )
-from stages.scene.draw_settings import DrawSettings, draw_settings_of, near_plane
+from stages.scene.draw_settings import DrawSettings, draw_settings_of
 from stages.scene.splats import (
     ROW_FIELDS,
     SH_C0,
@@ -60,7 +60,6 @@ __all__ = [
     "load_splats",
     "logit",
     "look_at",
-    "near_plane",
     "parameters_per_splat",
     "rgb_to_dc",
     "save_splats",

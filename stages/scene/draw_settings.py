@@ -54,12 +54,8 @@ def draw_settings_of(
 ) -> DrawSettings:
     """How splats trained on these views are drawn. The others: as in `DrawSettings`."""
     cut_out = any(view.outside == TRANSPARENT for view in views)
-    return DrawSettings(near_plane(views), side, float(cut_out), light, antialias, vignetting)
-
-
-def near_plane(views: tuple[View, ...]) -> float:
-    """The near plane of a capture, world units; see `NEAR_SHARE`."""
-    return NEAR_SHARE * scene_extent(views)
+    near = NEAR_SHARE * scene_extent(views)
+    return DrawSettings(near, side, float(cut_out), light, antialias, vignetting)
 
 
 def near_plane_of(means: NDArray[np.floating]) -> float:

@@ -30,6 +30,11 @@ def gains_and_offsets(light: Light) -> tuple[NDArray[np.float32], NDArray[np.flo
     return gains.astype(np.float32), (OFFSET * (gains - 1.0)).astype(np.float32)
 
 
+def linear_light(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Linear light in 0..1 of sRGB values in 0..1."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + OFFSET) / 1.055) ** POWER)
+
+
 def powers_of_radius(square: NDArray[np.floating]) -> NDArray[np.floating]:
     """[..., 3] the powers r^2, r^4 and r^6 of distances whose squares are given."""
     return np.stack([square, square**2, square**3], axis=-1)

@@ -132,7 +132,7 @@ def _cuts(
         chosen = evenly_spaced(opaque, LOOKED_AT)
         pictures = (read_picture(source / photos[i].image) for i in chosen)
         radius = circle_radius(brightest(pictures), camera) if chosen else float("inf")
-        field = Field.of(camera, lenses[members[0]], radius)
+        field = Field(camera, lenses[members[0]], radius)
         if field.folded_share() > _LOST_SHARE:
             folded += [photos[i].name for i in members]
         faces = faces_of(field)

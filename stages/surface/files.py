@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.base.lazy import load_object
-from stages.formats.gltf import linear_light
 from stages.formats.gltf_file import Attribute, asset, buffer_fields, write_glb
 from stages.formats.ply_header import header_text
 from stages.scene.flip import FLIP, flipped_place
+from stages.scene.light import linear_light
 from stages.surface.mesh import NOTE, Mesh
 from stages.surface.table import MeshFormat
 

@@ -10,12 +10,14 @@ import pytest
 
 from stages import export, formats
 from stages.base.stage import Report
-from stages.capacity.rounding import RoundingFinetuner, finetune_to_rounding, write_and_read
+from stages.capacity.format_finetuning import FormatFinetuning
+from stages.capacity.rounding import finetune_to_rounding, write_and_read
 from stages.export import ExportSettings
 from stages.formats import FORMATS
 from stages.formats.axes import smallest_rotations
 from stages.formats.quantisation import BitDepths, quantise_splats
 from stages.measure.evaluation import load_evaluation_views, mean_psnr_db
+from stages.quantise import QuantiseSettings
 from stages.scene import QuantisedSplats, split_held_out, training_extent
 from stages.training.finetune import FineTuner
 from tests.small_scene import SmallScene, small_scene
@@ -68,8 +70,11 @@ def test_what_is_read_comes_in_the_order_that_was_written(scene: SmallScene, nam
 
 def quantised(scene: SmallScene, *names: str) -> tuple[QuantisedSplats, dict[str, dict]]:
     plain = QuantisedSplats(scene.splats, {"bits": vars(FEW)})
-    rounding = RoundingFinetuner(finetuner(scene), views(scene), "cpu", 10, no_counts(scene))
-    found = {name: rounding.finetune(FORMATS[name], plain) for name in names}
+    settings = QuantiseSettings(rounding_steps=10, backend="cpu")
+    finetuning = FormatFinetuning(
+        *(finetuner(scene), finetuner(scene), views(scene), no_counts(scene), settings, Report())
+    )
+    found = {name: finetuning.to_rounding_of(FORMATS[name], plain) for name in names}
     finetuned = {name: splats for name, (splats, _) in found.items()}
     return replace(plain, finetuned=finetuned), {name: f for name, (_, f) in found.items()}
 

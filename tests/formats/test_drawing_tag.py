@@ -127,7 +127,7 @@ def test_the_choice_of_drawing_overrules_the_format() -> None:
 
 
 def test_antialiased_splats_in_a_format_for_plain_viewers_are_a_loss() -> None:
-    codes = [loss.code for loss in losses_of(FORMATS["ply"], "scene.ply", scene(True))]
+    codes = [*losses_of(FORMATS["ply"], "scene.ply", scene(True))]
     assert codes == ["drawing"]
     assert not losses_of(FORMATS["ply"], "scene.ply", scene(False))
     assert not losses_of(FORMATS["html"], "scene.html", scene(True))

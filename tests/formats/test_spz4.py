@@ -79,8 +79,9 @@ def test_a_file_cut_short_anywhere_is_refused(tmp_path: Path) -> None:
 
 def test_a_bomb_is_refused_before_it_unpacks(tmp_path: Path) -> None:
     zstandard = pytest.importorskip("zstandard")
-    count, sizes = 20_000_000, spz_read.widths(4, 3, 12)
+    count = 20_000_000
     head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 3, 12, 0, 6, 32)
+    sizes = spz_read.Header.of(head).widths
     packed = zstandard.compress(bytes(1 << 20))
     table = b"".join(struct.pack("<QQ", len(packed), count * size) for size in sizes)
     (tmp_path / "a.spz").write_bytes(head + table + packed * 6)

@@ -30,7 +30,6 @@ from stages.scene import (
     Splats,
     View,
     draw_settings_of,
-    near_plane,
 )
 from tests.scenes import BACKENDS, join, splats
 from tests.small_scene import SmallScene, small_scene
@@ -53,7 +52,7 @@ def in_units(scene: SmallScene, factor: float) -> tuple[Splats, Reconstruction]:
         found,
         means=found.means * np.float32(factor),
         log_scales=found.log_scales + np.float32(np.log(factor)),
-        draw_settings=DrawSettings(near_plane(tuple(views)), 72),
+        draw_settings=draw_settings_of(tuple(views), 72),
     )
     return larger, replace(scene.reconstruction, views=tuple(views))
 

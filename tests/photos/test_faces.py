@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -12,8 +14,11 @@ from stages import ingest
 from stages.base.errors import SplatError
 from stages.base.stage import Report
 from stages.photos import capture_file
-from stages.photos.faces import DIRECTIONS, FIELD_DEG, WIDTHS, CutFace, face_rotation, faces
-from stages.scene import IGNORE, Camera, Capture, View, split_held_out
+from stages.photos.decode import Decoded
+from stages.photos.exif import Exif
+from stages.photos.faces import DIRECTIONS, FIELD_DEG, WIDTHS, face_photos, face_rotation
+from stages.photos.masking import MaskedPhoto
+from stages.scene import IGNORE, Camera, Capture, Photo, View, split_held_out
 from stages.scene.rotations import matrices_of
 from tests.photos.films import film
 from tests.photos.spheres import sphere, two_fisheyes
@@ -36,7 +41,29 @@ def coded(width: int = WIDTH) -> np.ndarray:
     return np.round(127.5 + 127.5 * directions(width)).astype(np.uint8)
 
 
-def rays(face: CutFace) -> np.ndarray:
+class Cut(NamedTuple):
+    """A face: its direction, pixels and mask, and its pinhole camera."""
+
+    name: str
+    pixels: np.ndarray
+    mask: np.ndarray | None
+    focal_px: float
+    turn: tuple[float, float, float, float]
+
+
+def faces(pixels: np.ndarray, mask: np.ndarray | None = None) -> Iterator[Cut]:
+    """The faces of a panorama."""
+    outside = "" if mask is None else IGNORE
+    whole = MaskedPhoto(Decoded(pixels, pixels.shape[1::-1], Exif()), mask, outside)
+    photo = Photo("a.png", "photos/a.png", *whole.decoded.stored, None, "camera", 1.0, 0.0, None)
+    for part, cut in face_photos(photo, whole):
+        assert part.face is not None
+        assert part.focal_px is not None
+        name = part.name.removeprefix("a.png/")
+        yield Cut(name, cut.decoded.pixels, cut.mask, part.focal_px, part.face.turn)
+
+
+def rays(face: Cut) -> np.ndarray:
     """[S, S, 3] the unit direction of each pixel of a face, in the panorama's axes."""
     side = len(face.pixels)
     at = (np.arange(side) + 0.5 - side / 2) / face.focal_px

@@ -42,7 +42,7 @@ def random_directions(field: Field, count: int = 20_000) -> np.ndarray:
 def test_faces_show_the_whole_field_of_view_and_their_middle_most_of_it(
     size: tuple[int, int], degrees: float, radius: float, names: list[str]
 ) -> None:
-    field = Field.of(camera(*size, degrees), EQUIDISTANT, radius)
+    field = Field(camera(*size, degrees), EQUIDISTANT, radius)
     faces = faces_of(field)
     assert [face.name for face in faces] == names
     directions = random_directions(field)
@@ -54,7 +54,7 @@ def test_faces_show_the_whole_field_of_view_and_their_middle_most_of_it(
 
 
 def test_a_face_of_a_distorting_lens_is_cropped_to_what_is_seen() -> None:
-    field = Field.of(camera(900, 900, 190), LENS, 440)
+    field = Field(camera(900, 900, 190), LENS, 440)
     faces = faces_of(field)
     for face in faces:
         inside = field.shows(face.rays())[1]
@@ -72,21 +72,21 @@ def test_a_face_of_a_distorting_lens_is_cropped_to_what_is_seen() -> None:
 def test_one_pinhole_is_enough_where_it_shows_three_quarters(
     size: tuple[int, int], degrees: float, radius: float
 ) -> None:
-    assert faces_of(Field.of(camera(*size, degrees), EQUIDISTANT, radius)) == ()
+    assert faces_of(Field(camera(*size, degrees), EQUIDISTANT, radius)) == ()
 
 
 def test_the_only_picture_of_a_narrow_circle_ends_at_it() -> None:
     """By hand: the corner of a square that reaches 60 degrees to its sides lies at 67.8."""
     taken = camera(800, 800, 120)
-    assert not only_face(Field.of(taken, EQUIDISTANT, 400)).whole
-    assert only_face(Field.of(taken, EQUIDISTANT, 460)).whole
+    assert not only_face(Field(taken, EQUIDISTANT, 400)).whole
+    assert only_face(Field(taken, EQUIDISTANT, 460)).whole
 
 
 def test_a_lens_that_folds_is_used_up_to_there() -> None:
     """By hand: a (1 - a^2 / 9) is largest at a = sqrt(3), 99 degrees, where it is 2 / sqrt(3)."""
     lens = Lens("fisheye", (-1 / 9,))
     taken = camera(800, 800, 180)
-    field = Field.of(taken, lens)
+    field = Field(taken, lens)
     assert field.angle == pytest.approx(np.sqrt(3), abs=0.01)
     directions = field.directions()
     assert np.arccos(directions[:, 2]).max() <= field.angle + 1e-9
@@ -95,4 +95,4 @@ def test_a_lens_that_folds_is_used_up_to_there() -> None:
     beyond = np.hypot(x - 400, y - 400) > edge
     assert field.folded_share() == pytest.approx(beyond.mean(), abs=0.01)
     assert len(faces_of(field)) == 5
-    assert Field.of(taken, EQUIDISTANT).folded_share() == 0.0
+    assert Field(taken, EQUIDISTANT).folded_share() == 0.0
