@@ -30,7 +30,7 @@ from stages.raster.kernels.simd64 import (
     dmin,
     dselect,
     dsqrt,
-    istore,
+    dstore,
 )
 
 TILE = 16  # pixels across and down
@@ -215,8 +215,8 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
     last = dmin(dfloor(dmax(right + (x - 0.5), -2.0)), width - 1.0)
     first_block, last_block = dfloor(first * (1.0 / BLOCK)), dfloor(last * (1.0 / BLOCK))
     nothing = dgt(first, last)
-    istore(spans, at, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
-    istore(spans, at + 8, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
+    dstore(spans, at, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
+    dstore(spans, at + 8, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
 
 
 @kernel
