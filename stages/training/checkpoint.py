@@ -135,15 +135,9 @@ def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
     """The contents of a whole checkpoint, read from the end of its magic number on."""
     header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
-    steps, since, share = header["plan"]
-    state = TrainingState(
-        int(header["step"]),
-        (int(steps), int(since), float(share)),
-        header["history"],
-        [Elapsed(**t) for t in header["times"]],
-        [Provenance(**entry) for entry in header["provenance"]],
-        header["refinement"],
-    )
+    header["times"] = [Elapsed(**entry) for entry in header["times"]]
+    header["provenance"] = [Provenance(**entry) for entry in header["provenance"]]
+    state = TrainingState(**header | {"plan": tuple(header["plan"])})
     return Model(*(np.ascontiguousarray(a) for a in arrays)), state
 
 

@@ -30,20 +30,10 @@ vge, vgt, vand, vselect = _F32.greater_equal, _F32.greater, _F32.both, _F32.sele
 vabs, vsqrt = _F32.abs, _F32.sqrt
 bits16 = _F32.bits
 vnot = _F32.function(_F32.mask, 1, lambda b, x: b.not_(x))
+splat16 = _F32.function(f32x16, 1, lambda b, x: x)  # the same float32 in all lanes
 # a * b + c and c - a * b, rounded once
 vfma = _F32.function(f32x16, 3, lambda b, x, y, z: _F32.call(b, "fma", x, y, z))
 vfnma = _F32.function(f32x16, 3, lambda b, x, y, z: _F32.call(b, "fma", b.fneg(x), y, z))
-
-
-@intrinsic
-def splat16(typingctx: Any, scalar: Any) -> Any:
-    """The same float32 in all lanes."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _F32.broadcast(builder, args[0])
-
-    return f32x16(types.float32), codegen
-
 
 # --- memory --------------------------------------------------------------------------------------
 

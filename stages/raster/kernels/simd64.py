@@ -36,10 +36,6 @@ def _neg(a):
     return (lambda a: _subtract(-0.0, a)) if a is f64x8 else None
 
 
-def _lane_constant(index: int) -> Any:
-    return ir.Constant(I32, index)
-
-
 # --- memory --------------------------------------------------------------------------------------
 
 
@@ -59,7 +55,7 @@ def gather8(typingctx: Any, array: Any, rows: Any, stride: Any, column: Any) -> 
             loaded = builder.load(at)
             if sig.args[0].dtype != types.float64:
                 loaded = builder.fpext(loaded, ir.DoubleType())
-            value = builder.insert_element(value, loaded, _lane_constant(k))
+            value = builder.insert_element(value, loaded, ir.Constant(I32, k))
         return value
 
     return f64x8(array, rows, types.intp, types.intp), codegen
@@ -72,7 +68,7 @@ def scatter8(typingctx: Any, array: Any, rows: Any, stride: Any, column: Any, va
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         for k in range(LANES):
             at = _element(context, builder, sig, args, k)
-            lane = builder.extract_element(args[4], _lane_constant(k))
+            lane = builder.extract_element(args[4], ir.Constant(I32, k))
             if sig.args[0].dtype != types.float64:
                 lane = builder.fptrunc(lane, ir.FloatType())
             builder.store(lane, at)
