@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,9 +155,7 @@ def target_of(
     return pixels if level.mask is None else np.where(level.mask > 0, pixels, image[:3])
 
 
-def evened(
-    level: Level,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None, NDArray[np.float32] | None]:
+def evened(level: Level) -> tuple[NDArray[Any], NDArray[np.bool_] | None, NDArray[Any] | None]:
     """(the photograph [3, H, W] in 0..1, in the median exposure and white balance if its light is
     corrected; [3, H, W] where it was overexposed before that, or None; [H, W] how much of the
     background shows if it is cut out, or None)."""
@@ -168,7 +166,7 @@ def evened(
         gains, offsets = (row[:, None, None] for row in gains_and_offsets(level.light))
         overexposed = pixels >= BRIGHT
         pixels = (pixels - offsets * solid) / gains
-    return pixels, overexposed, None if cut_out is None else 1 - solid
+    return pixels, overexposed, None if cut_out is None else np.asarray(1 - solid)
 
 
 def ignore_masked(level: Level, v_image: NDArray[np.float32]) -> None:

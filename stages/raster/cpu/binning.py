@@ -7,8 +7,10 @@ of rows, then written tile by tile, nearest splat first.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.raster.cpu.projection import (
     GB,
@@ -19,7 +21,7 @@ from stages.raster.cpu.projection import (
     GX,
     GY,
 )
-from stages.raster.definition import ALPHA_MIN
+from stages.raster.definition import ALPHA_MIN, Arrays
 from stages.raster.kernels.simd import kernel, prefetch, take_ticket
 from stages.raster.kernels.simd64 import (
     dceil,
@@ -71,19 +73,33 @@ def radix_order(keys, order, keys2, order2):
             keys[i], order[i] = keys2[i], order2[i]
 
 
-def sort_by_depth(visible, paint, arrays, keys, order, keys2, order2):
+def sort_by_depth(
+    visible: NDArray[np.int32],
+    paint: NDArray[np.float32],
+    arrays: Arrays,
+    keys: NDArray[np.float32],
+    order: NDArray[np.int32],
+    keys2: NDArray[np.uint32],
+    order2: NDArray[np.int32],
+) -> None:
     """order [V]: indices into `visible`, nearest first; see `_order_ties` for equal depths."""
     keys[:], order[:] = paint[visible, 3], np.arange(len(visible))
     # depths are positive, so their bits sort as they do
     radix_order(keys.view(np.uint32), order, keys2, order2)
-    _order_ties(order, keys, visible, *arrays)
+    _order_ties(order, keys, visible, arrays)
 
 
-def _order_ties(order, depths, visible, means, quaternions, log_scales, opacity_logits, sh):
+def _order_ties(
+    order: NDArray[np.int32],
+    depths: NDArray[np.float32],
+    visible: NDArray[np.int32],
+    arrays: Arrays,
+) -> None:
     """Put runs of equal `depths` [V], which are sorted, into the order that `reference` defines:
     by the splats' own values. Few splats are left to compare after their means."""
+    means, quaternions, log_scales, opacity_logits, sh = arrays
     tied = np.flatnonzero(_in_runs(depths[1:] == depths[:-1]))
-    run = depths[tied]
+    run: NDArray[Any] = depths[tied]
     by_coefficient = sh.reshape(len(sh), 3 * sh.shape[1])
     for values in (means, opacity_logits[:, None], log_scales, quaternions, by_coefficient):
         if not len(tied):
@@ -98,9 +114,9 @@ def _order_ties(order, depths, visible, means, quaternions, log_scales, opacity_
         tied, run = tied[left], run[left]
 
 
-def _in_runs(same):
+def _in_runs(same: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """[n + 1] whether an element equals a neighbour; same [n]: each and the next."""
-    return np.append(same, False) | np.append(False, same)
+    return np.asarray(np.append(same, False) | np.append(False, same))
 
 
 @kernel
