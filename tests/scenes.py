@@ -18,6 +18,7 @@ from stages.raster.definition import (
     splat_arrays,
     used_columns,
 )
+from stages.raster.draw import rendering_of
 from stages.scene import Camera, Splats, logit, rgb_to_dc
 
 # Those that run everywhere. What they are held to, tests/raster/test_gpu.py holds the GPU's to.
@@ -88,6 +89,13 @@ def join(*parts):
 
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+def render_filtered(scene, view, settings, backend, widths):
+    """As `raster.draw.render`, under 3D smoothing filters of `widths` [N], as training draws."""
+    arrays = (*splat_arrays(scene), widths)
+    forward = backends.rasteriser_of(backend).forward(arrays, view, settings, depths=True)
+    return rendering_of(forward)
 
 
 def gradients(backend, scene, view, v_image, settings=None, smoothing=None):

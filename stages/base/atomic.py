@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import os
 import platform
 import re
 import shutil
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -64,6 +65,12 @@ def replacing(path: Path) -> Iterator[Path]:
         # An error here must not hide the one that is being raised.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_csv(path: Path, rows: Iterable[Iterable[object]]) -> None:
+    """Write a table, its head first, as `replacing` does. Raises SplatError."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def sync_folder(folder: Path) -> None:

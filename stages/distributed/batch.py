@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 
 from stages import STAGE_NAMES
-from stages.base.atomic import replacing
+from stages.base.atomic import write_csv
 from stages.base.errors import SplatError, UsageError
 from stages.distributed import remote
 from stages.distributed.remote import Location
@@ -92,11 +91,8 @@ class BatchTable:
 
     def write(self) -> None:
         """Write batch.csv, whole or not at all. Raises SplatError."""
-        path = self.folder / FILE_NAME
-        with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(field.name for field in fields(Row))
-            writer.writerows(map(astuple, self.rows))
+        names = [field.name for field in fields(Row)]
+        write_csv(self.folder / FILE_NAME, (names, *map(astuple, self.rows)))
         if isinstance(self.runs, str):
             remote.RemoteFolder.at(self.runs).put(self.folder, [FILE_NAME])
 

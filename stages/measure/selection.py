@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stages.measure.contribution import Contributions, near_view_frusta
 from stages.measure.floaters import near_camera_floaters, splats_in_masks
+from stages.raster.sh import own_coefficients
 from stages.scene import SH_C0, Camera, Splats, morton, parameters_per_splat
 
 # Predictions for single splats add up only while few are removed at once, and of so many
@@ -43,8 +44,7 @@ class Removal:
 
     def apply(self, splats: Splats) -> Splats:
         """What is left of them."""
-        degree_of_term = np.floor(np.sqrt(np.arange(splats.sh.shape[1])))
-        kept = (degree_of_term <= self.degrees[:, None])[:, :, None]
+        kept = own_coefficients(self.degrees, splats.sh.shape[1])
         sh = np.where(kept, splats.sh, splats.sh.dtype.type(0))
         sh[:, 0] += (self.colour / SH_C0).astype(sh.dtype)
         return replace(splats, sh=sh, sh_degrees=self.degrees).take(~self.removed)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.measure.contribution import blend_weights, colours_by_degree
+from stages.raster.sh import own_coefficients
 from stages.scene import Camera, Splats, dc_to_rgb, rgb_to_dc
 
 
@@ -44,8 +45,7 @@ def truncate_sh(splats: Splats, degrees: NDArray[np.uint8]) -> Splats:
     """Each splat's coefficients above its degree [N] set to zero; `sh` no wider than the highest
     degree needs."""
     narrow = splats.with_sh_degree(int(degrees.max(initial=0)))
-    degree_of = np.floor(np.sqrt(np.arange(narrow.sh.shape[1])))
-    kept = (degree_of <= degrees[:, None])[:, :, None]
+    kept = own_coefficients(degrees, narrow.sh.shape[1])
     sh = np.where(kept, narrow.sh, narrow.sh.dtype.type(0))
     return replace(narrow, sh=sh, sh_degrees=np.minimum(degrees, narrow.sh_degrees))
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.raster.backends import AUTO, rasteriser_of
-from stages.raster.definition import RasterSettings, Rendering, splat_arrays
+from stages.raster.definition import Forward, RasterSettings, Rendering, splat_arrays
 from stages.scene import Camera, Splats
 from stages.scene.draw_settings import near_plane_of
 
@@ -18,7 +17,6 @@ def render(
     camera: Camera,
     settings: RasterSettings | None = None,
     backend: str = AUTO,
-    smoothing: NDArray[np.float32] | None = None,
 ) -> Rendering:
     """Draw `splats` as `camera` sees them.
 
@@ -27,37 +25,30 @@ def render(
         camera: in the frame of `splats.means`; `splats.local` moves other cameras there.
         settings: by default `raster_settings_of(splats)`.
         backend: see `raster.backends`. Raises ValueError for an unknown one.
-        smoothing: [N] width of each splat's 3D smoothing filter, world units; None for none. See
-            `raster.smoothing`.
     """
-    return renderer(splats, settings, backend, smoothing)(camera)
+    return renderer(splats, settings, backend)(camera)
 
 
 def renderer(
-    splats: Splats,
-    settings: RasterSettings | None = None,
-    backend: str = AUTO,
-    smoothing: NDArray[np.float32] | None = None,
+    splats: Splats, settings: RasterSettings | None = None, backend: str = AUTO
 ) -> Callable[[Camera], Rendering]:
     """A function that draws the same splats from one camera after another and keeps its buffers.
     Its results are copies. Arguments as of `render`."""
     chosen = settings or raster_settings_of(splats)
     rasteriser, arrays = rasteriser_of(backend), splat_arrays(splats)
-    if smoothing is not None:
-        arrays = (*arrays, np.ascontiguousarray(smoothing, np.float32))
+    return lambda camera: rendering_of(rasteriser.forward(arrays, camera, chosen, depths=True))
 
-    def draw(camera: Camera) -> Rendering:
-        forward = rasteriser.forward(arrays, camera, chosen, depths=True)
-        image = forward.image
-        return Rendering(
-            np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
-            image[3].copy(),
-            image[4].copy(),
-            image[5].copy(),
-            forward.culled,
-        )
 
-    return draw
+def rendering_of(forward: Forward) -> Rendering:
+    """A copy of the result of a forward pass with depths."""
+    image = forward.image
+    return Rendering(
+        np.ascontiguousarray(image[:3].transpose(1, 2, 0)),
+        image[3].copy(),
+        image[4].copy(),
+        image[5].copy(),
+        forward.culled,
+    )
 
 
 def supersampled(draw: Callable[[Camera], Rendering], side: int) -> Callable[[Camera], Rendering]:

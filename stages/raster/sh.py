@@ -1,10 +1,14 @@
-"""Real spherical harmonics to degree 3, as tables of numbers for every backend.
+"""Real spherical harmonics to degree 3, as tables of numbers for every backend, and which of them
+a splat has.
 
 Order and signs are the reference trainer's (Kerbl et al. 2023): degree by degree, m = -l..l, with
 the Condon-Shortley sign, for a unit direction (x, y, z) from the camera to the splat.
 """
 
 from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
 
 C0 = 0.28209479177387814  # sqrt(1 / (4 pi))
 C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
@@ -16,3 +20,9 @@ C3 = (
     0.3731763325901154,
     1.445305721320277,
 )
+
+
+def own_coefficients(sh_degrees: NDArray[np.integer], count: int) -> NDArray[np.bool_]:
+    """[N, count, 1] which of the first `count` SH coefficients a splat of each degree [N] has."""
+    own = (sh_degrees.astype(np.int64) + 1) ** 2
+    return np.asarray(np.arange(count)[:, None] < own[:, None, None])

@@ -51,14 +51,13 @@ def make_collision_mesh(
     """
     training, _ = split_held_out(reconstruction.views)
     cameras = depth_maps.select_cameras([view.camera for view in training])
-    settings = raster_settings_of(splats)
 
     def tick(number: int) -> None:
         if report.stop_requested.is_set():
             raise Interrupted(f"stopped after {number} of {len(cameras)} cameras")
         report.progress(number, len(cameras), "drawing depth")
 
-    maps = depth_maps.draw_depth_maps(splats, cameras, settings, backend, tick)
+    maps = depth_maps.draw_depth_maps(splats, cameras, backend, tick)
     report.progress(len(cameras), len(cameras), "fusing depth")
     region = fuse.observed_box(maps)
     if region is None:
@@ -70,7 +69,8 @@ def make_collision_mesh(
             f"Memory is short: the mesh was made of {voxels:,} voxels instead of "
             f"{fuse.VOXELS:,}. Close other programs and export again for a finer one.",
         )
-    volume = fuse.fuse_depth_maps(maps, fuse.empty_volume(*region, voxels), settings.near)
+    near = raster_settings_of(splats).near
+    volume = fuse.fuse_depth_maps(maps, fuse.empty_volume(*region, voxels), near)
     fine, removed = extract.remove_small_components(extract.extract_surface(volume))
     mesh = extract.simplify(fine, triangles)
     if not len(mesh.faces):

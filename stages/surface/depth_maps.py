@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.raster.definition import RasterSettings
-from stages.raster.draw import render
+from stages.raster.draw import renderer
 from stages.scene import Camera, Splats, evenly_spaced
 
 SIDE_PX = 480
@@ -39,11 +38,8 @@ class DepthMap:
         """[M, 3] positions in the world of every `step`-th pixel with a weight."""
         trusted = np.flatnonzero(self.weight > 0)[::step]
         places = unproject(self.camera, self.depth).reshape(-1, 3)[trusted]
-        rotation, translation = (
-            self.camera.world_to_camera[:3, :3],
-            self.camera.world_to_camera[:3, 3],
-        )
-        return np.asarray((places - translation) @ rotation)
+        pose = self.camera.world_to_camera
+        return np.asarray((places - pose[:3, 3]) @ pose[:3, :3])
 
 
 def unproject(camera: Camera, depth: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -62,9 +58,8 @@ def select_cameras(cameras: list[Camera]) -> list[Camera]:
 def draw_depth_maps(
     splats: Splats,
     cameras: list[Camera],
-    settings: RasterSettings,
     backend: str,
-    tick: Callable[[int], None] = lambda number: None,
+    tick: Callable[[int], None],
 ) -> list[DepthMap]:
     """Draw the median depth from each camera: where the transmittance falls to one half.
 
@@ -73,10 +68,10 @@ def draw_depth_maps(
 
     tick: called with the number of each camera before it is drawn.
     """
-    maps = []
+    draw, maps = renderer(splats, backend=backend), []
     for number, camera in enumerate(cameras):
         tick(number)
-        drawn = render(splats, camera, settings, backend=backend)
+        drawn = draw(camera)
         depth = drawn.median_depth
         solid = (drawn.alpha >= _MIN_ALPHA) & (depth > 0) & np.isfinite(depth)
         depth = np.where(solid, depth, 0).astype(np.float32)

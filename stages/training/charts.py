@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stages.base.atomic import replacing
 from stages.measure.evaluation import SIZES
+from stages.photos.load import scaled_image
 
 SHEET_COLUMN = 480  # pixels, at most
 ERROR_GAIN = 4.0
@@ -25,6 +26,7 @@ def contact_sheet(
     photograph): photograph, render, absolute error x 4; and a .txt beside it that says which number
     is which photograph, since the picture's font knows only ASCII."""
     import cv2
+    from PIL import Image
 
     strips, legend = [], []
     for number, (name, decibels, image, truth) in enumerate(rows, 1):
@@ -44,7 +46,8 @@ def contact_sheet(
         return
     width = max(strip.shape[1] for strip in strips)
     padded = [np.pad(s, ((0, 0), (0, width - s.shape[1]), (0, 0))) for s in strips]
-    _write_png(path, np.vstack(padded))
+    with replacing(path) as temporary:
+        Image.fromarray(np.vstack(padded)).save(temporary, format="PNG")
     with replacing(path.with_suffix(".txt")) as temporary:
         temporary.write_text("".join(legend), encoding="utf-8")
 
@@ -71,16 +74,7 @@ def training_plot(path: Path, history: Sequence[dict[str, Any]]) -> None:
 
 
 def _fitted(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    import cv2
-
-    scale = min(1.0, SHEET_COLUMN / image.shape[1])
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    small = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
+    height, width = image.shape[:2]
+    scale = min(1.0, SHEET_COLUMN / width)
+    small = scaled_image(image, max(1, round(width * scale)), max(1, round(height * scale)))
     return np.asarray(np.round(np.clip(small, 0, 1) * 255), np.uint8)
-
-
-def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    from PIL import Image
-
-    with replacing(path) as temporary:
-        Image.fromarray(image).save(temporary, format="PNG")

@@ -78,13 +78,13 @@ class TrainingState:
 def save_checkpoint(folder: Path, model: Model, state: TrainingState) -> None:
     """Write the checkpoint, once it is complete, under its name; the one before it is kept."""
     path, temporary = folder / FILE_NAME, folder / _TEMPORARY
-    with temporary.open("wb") as file:
-        hashing = _HashingWriter(file)
+    with temporary.open("w+b") as file:
         header = json.dumps(dataclasses.asdict(state)).encode()
-        hashing.write(MAGIC + len(header).to_bytes(8, "little") + header)
+        file.write(MAGIC + len(header).to_bytes(8, "little") + header)
         for array in vars(model).values():
-            npy.write_array(hashing, array, allow_pickle=False)
-        file.write(hashing.digest())
+            npy.write_array(file, array, allow_pickle=False)
+        file.seek(0)
+        file.write(hashlib.file_digest(file, "sha256").digest())
         file.flush()
         os.fsync(file.fileno())
     if path.exists():
@@ -118,20 +118,6 @@ def load_checkpoint(
     return None
 
 
-class _HashingWriter:
-    """Writes to a file and computes the SHA-256 of what is written."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self._sha256 = file, hashlib.sha256()
-
-    def write(self, data: bytes) -> None:
-        self._sha256.update(data)
-        self._file.write(data)
-
-    def digest(self) -> bytes:
-        return self._sha256.digest()
-
-
 def _is_whole(file: BinaryIO) -> bool:
     """Whether the file ends in the SHA-256 of what is before it. Goes back to its start."""
     sha256 = hashlib.sha256()
@@ -149,15 +135,9 @@ def _read(file: BinaryIO) -> tuple[Model, TrainingState]:
     """The contents of a whole checkpoint, read from the end of its magic number on."""
     header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     arrays = [npy.read_array(file, allow_pickle=False) for _ in dataclasses.fields(Model)]
-    steps, since, share = header["plan"]
-    state = TrainingState(
-        int(header["step"]),
-        (int(steps), int(since), float(share)),
-        header["history"],
-        [Elapsed(**t) for t in header["times"]],
-        [Provenance(**entry) for entry in header["provenance"]],
-        header["refinement"],
-    )
+    header["times"] = [Elapsed(**entry) for entry in header["times"]]
+    header["provenance"] = [Provenance(**entry) for entry in header["provenance"]]
+    state = TrainingState(**header | {"plan": tuple(header["plan"])})
     return Model(*(np.ascontiguousarray(a) for a in arrays)), state
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.raster.definition import SH, Rasteriser, RasterSettings, used_columns
+from stages.raster.sh import own_coefficients
 from stages.training.optimiser import Model
 from stages.training.views import Level, ignore_masked, target_of
 
@@ -48,7 +49,8 @@ class ColourRefit:
             huber = _huber_weights(error)
             self._add(forward, huber * error, gradient)
             self._add(forward, huber, weight, absolute=True)
-        direction = np.where(_own_coefficients(model), gradient / (weight + DAMPING), 0.0)
+        own = own_coefficients(model.sh_degrees, model.sh.shape[1])
+        direction = np.where(own, gradient / (weight + DAMPING), 0.0)
         slope = float((gradient * direction).sum())
         moved = replace(model, sh=(model.sh + direction).astype(np.float32))
         curvature = self._change(model, moved) + 2.0 * slope  # of the error along the direction
@@ -102,10 +104,3 @@ def _huber_weights(error: NDArray[np.float32]) -> NDArray[np.float32]:
     """1 for errors up to HUBER_THRESHOLD, less beyond."""
     threshold = np.float32(HUBER_THRESHOLD)
     return np.asarray(threshold / np.maximum(np.abs(error), threshold), np.float32)
-
-
-def _own_coefficients(model: Model) -> NDArray[np.bool_]:
-    """[N, coefficients, 1] which SH coefficients each splat has."""
-    coefficients = np.arange(model.sh.shape[1])
-    own = coefficients < (model.sh_degrees[:, None].astype(int) + 1) ** 2
-    return np.asarray(own[:, :, None])

@@ -19,8 +19,8 @@ from torch import Tensor
 from stages.raster.definition import OPACITY, ROTATION, SH, RasterSettings, gradient_columns
 from stages.raster.gpu.device import gpu_errors_explained, interpreted
 from stages.raster.gpu.rasteriser import DeviceScene, DeviceView, Drawn, GpuRasteriser
-from stages.scene import IGNORE, TRANSPARENT, Camera
-from stages.scene.light import BRIGHT, gains_and_offsets
+from stages.raster.sh import own_coefficients
+from stages.scene import IGNORE, Camera
 from stages.training import gpu_kernels
 from stages.training.dropout import (
     FACTORS,
@@ -40,7 +40,7 @@ from stages.training.optimiser import (
     empty_model,
 )
 from stages.training.step import StepInput
-from stages.training.views import Colour, Level
+from stages.training.views import Colour, Level, evened
 
 LAG = 8  # steps after which the host reads the results of a step
 SPARE = 1.5  # room for the lists, relative to the largest number so far
@@ -84,7 +84,7 @@ class GpuTarget:
         means: [3] of the channels.
         uncovered: [H, W] how much of the background shows in a cut-out view.
         ignored: [H, W] where the render is not compared.
-        bright: [3, H, W] where the view is overexposed.
+        overexposed: [3, H, W] where the photograph is.
         cameras: on the device, by the settings that they depend on.
     """
 
@@ -93,7 +93,7 @@ class GpuTarget:
     means: Tensor
     uncovered: Tensor | None = None
     ignored: Tensor | None = None
-    bright: Tensor | None = None
+    overexposed: Tensor | None = None
     cameras: dict[Any, DeviceView] = field(default_factory=dict)
 
     def view(self, rasteriser: GpuRasteriser, settings: RasterSettings) -> DeviceView:
@@ -109,8 +109,8 @@ class GpuTarget:
         if self.level.plain:
             return self.pixels, self.means
         target = self.pixels
-        if self.bright is not None:
-            target = torch.where(self.bright, torch.maximum(target, image[:3]), target)
+        if self.overexposed is not None:
+            target = torch.where(self.overexposed, torch.maximum(target, image[:3]), target)
         if self.uncovered is not None:
             behind = [self.uncovered * channel for channel in background]
             target = target + torch.stack(behind)
@@ -127,22 +127,15 @@ class GpuTarget:
 def gpu_target_of(level: Level, device: torch.device) -> GpuTarget:
     """The view, on the device."""
 
-    def sent(array: Any) -> Tensor:
-        return torch.tensor(array, device=device)
+    def sent(array: Any) -> Any:
+        return None if array is None else torch.tensor(array, device=device)
 
     if level.plain:
         return GpuTarget(level, sent(level.pixels), sent(level.means))
-    pixels, bright = level.pixels * np.float32(1 / 255), None
-    cut_out = level.mask if level.outside == TRANSPARENT else None
-    solid = np.float32(1) if cut_out is None else cut_out * np.float32(1 / 255)
-    if level.light is not None:
-        gains, offsets = (row[:, None, None] for row in gains_and_offsets(level.light))
-        bright = sent(pixels >= BRIGHT)
-        pixels = (pixels - offsets * solid) / gains
-    uncovered = None if cut_out is None else sent(1 - solid)
+    pixels, overexposed, uncovered = map(sent, evened(level))
     ignores = level.mask is not None and level.outside == IGNORE
     ignored = sent(level.mask == 0) if ignores else None
-    return GpuTarget(level, sent(pixels), sent(level.means), uncovered, ignored, bright)
+    return GpuTarget(level, pixels, sent(level.means), uncovered, ignored, overexposed)
 
 
 class GpuStep:
@@ -269,13 +262,11 @@ class GpuStep:
         """[N, columns] 0 for SH coefficients above a splat's own degree, else 1; None if every
         splat has all coefficients."""
         coefficients = model.sh.shape[1]
-        own = (model.sh_degrees.astype(np.int64) + 1) ** 2
-        if (own >= coefficients).all():
+        own = own_coefficients(model.sh_degrees, coefficients)
+        if own.all():
             return None
         kept = np.ones((len(model), gradient_columns(coefficients)), np.float32)
-        kept[:, SH : SH + 3 * coefficients] = np.repeat(
-            np.arange(coefficients) < own[:, None], 3, axis=1
-        )
+        kept[:, SH : SH + 3 * coefficients] = np.repeat(own[:, :, 0], 3, axis=1)
         return self._on_device(kept)
 
     def _on_device(self, array: NDArray[Any]) -> Tensor:

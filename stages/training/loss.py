@@ -16,13 +16,11 @@ SSIM_WEIGHT = 0.2  # Kerbl et al. 2023
 
 @dataclass(frozen=True)
 class Loss:
-    """value = 0.8 l1 + 0.2 (1 - ssim); v_image [3, H, W]: gradient of H x W x value, so that its
-    entries do not depend on the size of the picture."""
+    """value = 0.8 l1 + 0.2 (1 - ssim)."""
 
     value: float
     l1: float
     ssim: float
-    v_image: NDArray[np.float32]
 
 
 def channel_means(target: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -44,13 +42,15 @@ def image_loss(
     ssim_weight: float = SSIM_WEIGHT,
     means: NDArray[np.float32] | None = None,
 ) -> Loss:
-    """Compare image [>= 3, H, W] with target [3, H, W]; the gradient is written to v_image.
+    """Compare image [>= 3, H, W] with target [3, H, W].
 
-    target: float32 in 0..1, or bytes. means: its `channel_means`, if known.
+    v_image [3, H, W]: receives the gradient of H x W x value, so that its entries do not depend on
+    the size of the picture. target: float32 in 0..1, or bytes. means: its `channel_means`, if
+    known.
     """
     _, height, width = target.shape
     means = channel_means(target) if means is None else means
     sums = np.zeros((3 * strip_count(height), 2))
     pool.share(loss_strips, image, target, _scale(target), means, ssim_weight, v_image, sums)
     l1, ssim = (float(s) for s in sums.sum(0) / (3 * height * width))
-    return Loss((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim, v_image)
+    return Loss((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim)

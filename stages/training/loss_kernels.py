@@ -30,7 +30,6 @@ from stages.raster.kernels.simd import (
     vfnma,
     vgt,
     vload,
-    vload_levels,
     vselect,
     vstore,
     vsum,
@@ -69,9 +68,9 @@ def _load_row(image, target, scale, channel, y, mean, xs, ds, at):
             xs[x], ds[x] = _F(0.0), _F(0.0)
         return
     for x in range(0, whole, 16):
-        value = vload_levels(image, start + x)
+        value = vload(image, start + x)
         vstore(xs, at + PAD + x, value - level)
-        vstore(ds, at + PAD + x, value - vload_levels(target, start + x) * splat16(scale))
+        vstore(ds, at + PAD + x, value - vload(target, start + x) * splat16(scale))
     for x in range(whole, width):
         value = image[channel, y, x]
         xs[at + PAD + x] = value - mean

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import SupportsInt, TypeVar
 
 import numpy as np
@@ -39,7 +38,11 @@ class MemoryLimitedStep:
 
     def load(self, model: Model) -> None:
         """See `step.TrainingStep`; loads the most opaque splats that fit."""
-        while (fits := self._refused(partial(self.inner.load, model), len(model))) is not None:
+        while True:
+            try:
+                return self.inner.load(model)
+            except MemoryFull as full:
+                fits = self._lowered(full, len(model))
             model = most_opaque(model, fits)
 
     def model(self) -> Model:
@@ -55,21 +58,17 @@ class MemoryLimitedStep:
         return self._done(lambda: self.inner.draw(camera, settings, smooth))
 
     def _done(self, work: Callable[[], Made]) -> Made:
-        found: list[Made] = []
-        while (fits := self._refused(lambda: found.append(work()), len(self))) is not None:
+        while True:
+            try:
+                return work()
+            except MemoryFull as full:
+                fits = self._lowered(full, len(self))
+            # here, because the error holds what the work had allocated
             self.load(most_opaque(self.inner.model(), fits))
-        return found[0]
 
-    def _refused(self, work: Callable[[], None], splats: int) -> int | None:
-        """Do the work; None if it succeeded, else how many of the splats fit. By then the memory of
-        the work is free again."""
-        try:
-            work()
-        except MemoryFull as full:
-            if not 0 < full.fits < splats:
-                raise
-            fits = full.fits
-        else:
-            return None
-        self._full(fits)
-        return fits
+    def _lowered(self, full: MemoryFull, splats: int) -> int:
+        """How many of the splats fit, which is reported; raises `full` if that is none or all."""
+        if not 0 < full.fits < splats:
+            raise full
+        self._full(full.fits)
+        return full.fits

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.base.atomic import replacing
+from stages.base.atomic import write_csv
 from stages.base.stage import Report
 from stages.measure.evaluation import (
     EvaluationView,
@@ -80,14 +80,11 @@ def write_history(
 ) -> None:
     """The evaluations during the run as `history.csv` and as a plot. The times, which differ
     between equal runs, go only into the report."""
-    lines = ["step,splats,psnr_db,ssim"]
+    rows: list[tuple[object, ...]] = [("step", "splats", "psnr_db", "ssim")]
     for entry in history:
-        lines.append(
-            f"{entry['step']},{entry['splats']},{entry.get('psnr_db', float('nan')):.4f},"
-            f"{entry.get('ssim', float('nan')):.5f}"
-        )
-    with replacing(folder / "history.csv") as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        psnr_db, ssim = (entry.get(name, float("nan")) for name in ("psnr_db", "ssim"))
+        rows.append((entry["step"], entry["splats"], f"{psnr_db:.4f}", f"{ssim:.5f}"))
+    write_csv(folder / "history.csv", rows)
     training_plot(folder / "training.png", history)
     both = zip(history, times, strict=True)
     report.metric("history", [entry | asdict(elapsed) for entry, elapsed in both])

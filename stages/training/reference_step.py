@@ -21,6 +21,7 @@ from stages.raster.definition import (
     Backward,
     used_columns,
 )
+from stages.raster.sh import own_coefficients
 from stages.scene import TRANSPARENT
 from stages.scene.light import BRIGHT, OFFSET, POWER
 from stages.training.loss import SSIM_WEIGHT
@@ -127,8 +128,8 @@ def adam(
     model.log_scales[rows] -= shift[:, LOG_SCALE:OPACITY]
     model.opacity_logits[rows] -= shift[:, OPACITY]
     by_coefficient = shift[:, SH : used_columns(coefficients)].reshape(len(rows), coefficients, 3)
-    own = np.arange(coefficients) < (model.sh_degrees[rows, None].astype(int) + 1) ** 2
-    model.sh[rows, :coefficients] -= np.where(own[:, :, None], by_coefficient, 0.0)
+    own = own_coefficients(model.sh_degrees[rows], coefficients)
+    model.sh[rows, :coefficients] -= np.where(own, by_coefficient, 0.0)
     gradient = backward.means2d[whole].astype(np.float64) * (0.5 * width, 0.5 * height)
     model.gradient_sum[rows] += np.hypot(*gradient.T) / (width * height)
     model.gradient_count[rows] += 1

@@ -9,10 +9,10 @@ compared with, where the view is masked or its light is corrected:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import overload
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,12 +66,18 @@ class Level:
         return self.mask is None and self.light is None
 
 
+class Levels(Protocol):
+    """A view at each of RESOLUTIONS; the last has the full size."""
+
+    def __getitem__(self, level: int, /) -> Level: ...
+
+
 @dataclass(frozen=True)
 class TrainingView:
-    """A training view at each of RESOLUTIONS."""
+    """A training view."""
 
     name: str
-    levels: Sequence[Level]
+    levels: Levels
 
     def prefetch(self, level: int) -> None:
         """Announce that a level is needed soon."""
@@ -79,7 +85,7 @@ class TrainingView:
             self.levels.prefetch(level)
 
 
-class _Stored(Sequence[Level]):
+class _Stored:
     """Levels whose pixels and masks are stored in an album, in the order of their addition."""
 
     def __init__(self, album: Album) -> None:
@@ -94,16 +100,7 @@ class _Stored(Sequence[Level]):
     def prefetch(self, level: int) -> None:
         self._album.expect(self._known[level][1])
 
-    def __len__(self) -> int:
-        return len(self._known)
-
-    @overload
-    def __getitem__(self, level: int) -> Level: ...
-    @overload
-    def __getitem__(self, level: slice) -> Sequence[Level]: ...
-    def __getitem__(self, level: int | slice) -> Level | Sequence[Level]:
-        if isinstance(level, slice):
-            return [self[i] for i in range(len(self))[level]]
+    def __getitem__(self, level: int, /) -> Level:
         bare, number, masked = self._known[level]
         mask = None if masked is None else self._album.picture(masked)
         return replace(bare, pixels=self._album.picture(number), mask=mask)
@@ -150,17 +147,26 @@ def target_of(
     photograph's bytes where nothing has to be done, else float32, mostly in 0..1."""
     if level.plain:
         return level.pixels
-    pixels = level.pixels * np.float32(1 / 255)
+    pixels, overexposed, uncovered = evened(level)
+    if overexposed is not None:
+        pixels = np.where(overexposed, np.maximum(pixels, image[:3]), pixels)
+    if uncovered is not None:
+        return pixels + uncovered * np.array(background, np.float32)[:, None, None]
+    return pixels if level.mask is None else np.where(level.mask > 0, pixels, image[:3])
+
+
+def evened(level: Level) -> tuple[NDArray[Any], NDArray[np.bool_] | None, NDArray[Any] | None]:
+    """(the photograph [3, H, W] in 0..1, in the median exposure and white balance if its light is
+    corrected; [3, H, W] where it was overexposed before that, or None; [H, W] how much of the
+    background shows if it is cut out, or None)."""
+    pixels, overexposed = level.pixels * np.float32(1 / 255), None
     cut_out = level.mask if level.outside == TRANSPARENT else None
     solid = np.float32(1) if cut_out is None else cut_out * np.float32(1 / 255)
     if level.light is not None:
         gains, offsets = (row[:, None, None] for row in gains_and_offsets(level.light))
         overexposed = pixels >= BRIGHT
         pixels = (pixels - offsets * solid) / gains
-        pixels = np.where(overexposed, np.maximum(pixels, image[:3]), pixels)
-    if cut_out is not None:
-        return pixels + (1 - solid) * np.array(background, np.float32)[:, None, None]
-    return pixels if level.mask is None else np.where(level.mask > 0, pixels, image[:3])
+    return pixels, overexposed, None if cut_out is None else np.asarray(1 - solid)
 
 
 def ignore_masked(level: Level, v_image: NDArray[np.float32]) -> None:

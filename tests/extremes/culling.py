@@ -7,7 +7,16 @@ import numpy as np
 from stages.raster.definition import RasterSettings
 from stages.raster.draw import render
 from tests.extremes.measured import Measured, broken, broken_gradients, difference, worst
-from tests.scenes import PARAMETERS, camera, cloud, gradients, join, splats, textbook_alpha
+from tests.scenes import (
+    PARAMETERS,
+    camera,
+    cloud,
+    gradients,
+    join,
+    render_filtered,
+    splats,
+    textbook_alpha,
+)
 from tests.tolerances import FLOAT32_IMAGE, FLOAT32_OUTPUT
 
 FLAT = np.ones((48, 64, 3), np.float32)
@@ -40,11 +49,11 @@ def widths_out_of_range(backend):
     """Smoothing filters of a width that is none."""
     good, view, settings = cloud(50), camera(), RasterSettings()
     at_ease = np.full(50, 0.01, np.float32)
-    alone = render(good, view, settings, backend, at_ease).image
+    alone = render_filtered(good, view, settings, backend, at_ease).image
     bad = np.array([np.nan, np.inf, -np.inf, -0.01, np.exp(45.0)], np.float32)
     both = join(cloud(len(bad), seed=9), good)
     widths = np.concatenate([bad, at_ease])
-    drawn = render(both, view, settings, backend, widths)
+    drawn = render_filtered(both, view, settings, backend, widths)
     found = gradients(backend, both, view, FLAT, settings, widths)
     left = sum(int(np.count_nonzero(found[name][: len(bad)])) for name in PARAMETERS)
     return [

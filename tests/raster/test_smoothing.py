@@ -17,6 +17,7 @@ from tests.scenes import (
     gradients,
     join,
     relative,
+    render_filtered,
     splats,
 )
 from tests.tolerances import FINITE_DIFFERENCE, FLOAT32_GRADIENT, FLOAT32_IMAGE
@@ -42,7 +43,7 @@ def test_a_filter_as_wide_as_the_splat_worked_by_hand():
 def test_the_filter_built_in_draws_the_same_picture(backend):
     scene, view = cloud(300), camera()
     widths = widths_for(scene)
-    filtered = render(scene, view, WIDE, backend, widths).image
+    filtered = render_filtered(scene, view, WIDE, backend, widths).image
     np.testing.assert_allclose(
         filtered, render(smoothed(scene, widths), view, WIDE, backend).image, atol=FLOAT32_IMAGE
     )
@@ -52,7 +53,7 @@ def test_the_filter_built_in_draws_the_same_picture(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_filter_of_width_0_is_none(backend):
     scene, view = cloud(100), camera()
-    none = render(scene, view, WIDE, backend, np.zeros(100, np.float32))
+    none = render_filtered(scene, view, WIDE, backend, np.zeros(100, np.float32))
     np.testing.assert_array_equal(none.image, render(scene, view, WIDE, backend).image)
 
 
@@ -101,7 +102,7 @@ def test_splats_of_no_size_under_the_filter_leave_all_finite(backend):
     dust.log_scales[:] = [[-80, -80, -80], [-300, 0, 0], [40, -300, -300]]
     scene, view = join(dust, cloud(30)), camera()
     widths = np.full(len(scene), 0.01, np.float32)
-    drawn = render(scene, view, WIDE, backend, widths)
+    drawn = render_filtered(scene, view, WIDE, backend, widths)
     assert np.isfinite(drawn.image).all()
     assert drawn.culled == 0
     found = gradients(backend, scene, view, np.ones((48, 64, 3)), WIDE, widths)

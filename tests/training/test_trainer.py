@@ -482,7 +482,10 @@ def test_pictures_on_disk_train_to_the_same_bytes_as_pictures_in_memory(tmp_path
     held = [
         TrainingView(
             view.name,
-            tuple(Level(one.camera, one.pixels.copy(), one.means) for one in view.levels),
+            tuple(
+                Level(one.camera, one.pixels.copy(), one.means)
+                for one in map(view.levels.__getitem__, (0, 1))
+            ),
         )
         for view in stored
     ]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from stages.base.atomic import replacing
+from stages.base.atomic import write_csv
 from stages.base.errors import UsageError
 from stages.base.text import counted
 from stages.measure.bootstrap import Difference, paired_difference
@@ -152,13 +151,13 @@ def write_comparison(folder: Path, comparison: Comparison) -> list[Path]:
     a, b = (candidate.name for candidate in comparison.candidates)
     pairs = list(zip(*comparison.scores, strict=True))
     table = folder / "compare.csv"
-    with replacing(table) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        names = ("first_psnr_db", "second_psnr_db", "first_ssim", "second_ssim")
-        writer.writerow(("photograph", *names))
-        for one, two in pairs:
-            figures = (one.psnr_db, two.psnr_db, one.ssim, two.ssim)
-            writer.writerow((one.name, *(f"{x:.5f}" for x in figures)))
+    lines: list[tuple[str, ...]] = [
+        ("photograph", "first_psnr_db", "second_psnr_db", "first_ssim", "second_ssim")
+    ]
+    for one, two in pairs:
+        figures = (one.psnr_db, two.psnr_db, one.ssim, two.ssim)
+        lines.append((one.name, *(f"{x:.5f}" for x in figures)))
+    write_csv(table, lines)
     report = folder / "report.html"
     rows = [
         (

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from stages.base.atomic import replacing
+from stages.base.atomic import write_csv
 from stages.measure.evaluation import image_renderer
 from stages.measure.image_metrics import psnr_text
 from stages.measure.tradeoff import html, summary
@@ -42,10 +41,7 @@ def write_report(folder: Path, name: str, tradeoff: Tradeoff, inputs: TradeoffIn
     SplatError."""
     plots = {path.stem: path for path in write_plots(folder, tradeoff)}
     table = folder / "tradeoff.csv"
-    with replacing(table) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows(_rows(tradeoff))
+    write_csv(table, (_COLUMNS, *_rows(tradeoff)))
     introduction = (
         f"Quality is the PSNR of {len(tradeoff.scores)} held-out views, which training never saw, "
         f"drawn {tradeoff.side_px} pixels large. Intervals (95 %) are of the difference to this "

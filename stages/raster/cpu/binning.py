@@ -7,8 +7,10 @@ of rows, then written tile by tile, nearest splat first.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stages.raster.cpu.projection import (
     GB,
@@ -19,7 +21,7 @@ from stages.raster.cpu.projection import (
     GX,
     GY,
 )
-from stages.raster.definition import ALPHA_MIN
+from stages.raster.definition import ALPHA_MIN, Arrays
 from stages.raster.kernels.simd import kernel, prefetch, take_ticket
 from stages.raster.kernels.simd64 import (
     dceil,
@@ -30,7 +32,7 @@ from stages.raster.kernels.simd64 import (
     dmin,
     dselect,
     dsqrt,
-    istore,
+    dstore,
 )
 
 TILE = 16  # pixels across and down
@@ -71,82 +73,50 @@ def radix_order(keys, order, keys2, order2):
             keys[i], order[i] = keys2[i], order2[i]
 
 
-@kernel
-def sort_by_depth(visible, paint, arrays, keys, order, keys2, order2):
-    """order [V]: indices into `visible`, nearest first; see `_comes_before` for equal depths."""
-    for place in range(len(visible)):
-        keys[place] = paint[visible[place], 3]
-        order[place] = place
+def sort_by_depth(
+    visible: NDArray[np.int32],
+    paint: NDArray[np.float32],
+    arrays: Arrays,
+    keys: NDArray[np.float32],
+    order: NDArray[np.int32],
+    keys2: NDArray[np.uint32],
+    order2: NDArray[np.int32],
+) -> None:
+    """order [V]: indices into `visible`, nearest first; see `_order_ties` for equal depths."""
+    keys[:], order[:] = paint[visible, 3], np.arange(len(visible))
     # depths are positive, so their bits sort as they do
     radix_order(keys.view(np.uint32), order, keys2, order2)
-    sort_ties(keys.view(np.uint32), order, visible, *arrays)
+    _order_ties(order, keys, visible, arrays)
 
 
-@kernel
-def _comes_before(p, q, visible, means, quaternions, log_scales, opacity_logits, sh):
-    """The order of equal depths that `reference` defines: by the splats' own values."""
-    i, j = visible[p], visible[q]
-    for k in range(3):
-        if means[i, k] != means[j, k]:
-            return means[i, k] < means[j, k]
-    if opacity_logits[i] != opacity_logits[j]:
-        return opacity_logits[i] < opacity_logits[j]
-    for k in range(3):
-        if log_scales[i, k] != log_scales[j, k]:
-            return log_scales[i, k] < log_scales[j, k]
-    for k in range(4):
-        if quaternions[i, k] != quaternions[j, k]:
-            return quaternions[i, k] < quaternions[j, k]
-    for coefficient in range(sh.shape[1]):
-        for channel in range(3):
-            if sh[i, coefficient, channel] != sh[j, coefficient, channel]:
-                return sh[i, coefficient, channel] < sh[j, coefficient, channel]
-    return False
+def _order_ties(
+    order: NDArray[np.int32],
+    depths: NDArray[np.float32],
+    visible: NDArray[np.int32],
+    arrays: Arrays,
+) -> None:
+    """Put runs of equal `depths` [V], which are sorted, into the order that `reference` defines:
+    by the splats' own values. Few splats are left to compare after their means."""
+    means, quaternions, log_scales, opacity_logits, sh = arrays
+    tied = np.flatnonzero(_in_runs(depths[1:] == depths[:-1]))
+    run: NDArray[Any] = depths[tied]
+    by_coefficient = sh.reshape(len(sh), 3 * sh.shape[1])
+    for values in (means, opacity_logits[:, None], log_scales, quaternions, by_coefficient):
+        if not len(tied):
+            return
+        own = values[visible[order[tied]]]
+        sorting = np.lexsort((*own.T[::-1], run))
+        order[tied] = order[tied][sorting]
+        own, run = own[sorting], run[sorting]
+        same = (run[1:] == run[:-1]) & (own[1:] == own[:-1]).all(axis=1)
+        run = np.cumsum(np.append(0, ~same))
+        left = _in_runs(same)
+        tied, run = tied[left], run[left]
 
 
-@kernel
-def sort_ties(keys, order, visible, means, quaternions, log_scales, opacity_logits, sh):
-    """Sort runs of equal keys by the splats' values. A heap sort, because a flat wall can have
-    thousands of ties.
-
-    order: indices into `visible`, which holds the rows.
-    """
-    n = len(order)
-    start = 0
-    while start < n:
-        end = start + 1
-        while end < n and keys[end] == keys[start]:
-            end += 1
-        if end - start > 1:
-            run = order[start:end]
-            _heap_sort(run, visible, means, quaternions, log_scales, opacity_logits, sh)
-        start = end
-
-
-@kernel
-def _heap_sort(run, visible, means, quaternions, log_scales, opacity_logits, sh):
-    n = len(run)
-    for step in range(n // 2 - 1 + n):
-        # build the heap from the last parent up, then move the largest to the end
-        if step < n // 2:
-            root, size = n // 2 - 1 - step, n
-        else:
-            size = n - 1 - (step - n // 2)
-            run[0], run[size] = run[size], run[0]
-            root = 0
-        while True:
-            child = 2 * root + 1
-            if child >= size:
-                break
-            a, b = run[child], run[min(child + 1, size - 1)]
-            if _comes_before(a, b, visible, means, quaternions, log_scales, opacity_logits, sh):
-                child += 1
-            if not _comes_before(
-                run[root], run[child], visible, means, quaternions, log_scales, opacity_logits, sh
-            ):
-                break
-            run[root], run[child] = run[child], run[root]
-            root = child
+def _in_runs(same: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[n + 1] whether an element equals a neighbour; same [n]: each and the next."""
+    return np.asarray(np.append(same, False) | np.append(False, same))
 
 
 @kernel
@@ -215,8 +185,8 @@ def _block_spans(geometry, row, width, y0, y1, reach2, top, spans, at):
     last = dmin(dfloor(dmax(right + (x - 0.5), -2.0)), width - 1.0)
     first_block, last_block = dfloor(first * (1.0 / BLOCK)), dfloor(last * (1.0 / BLOCK))
     nothing = dgt(first, last)
-    istore(spans, at, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
-    istore(spans, at + 8, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
+    dstore(spans, at, dselect(empty, _FAR, dselect(nothing, _FAR, first_block)))
+    dstore(spans, at + 8, dselect(empty, -1.0, dselect(nothing, -1.0, last_block)))
 
 
 @kernel

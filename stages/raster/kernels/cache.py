@@ -2,7 +2,8 @@
 
 Numba notices a changed kernel file, but not a change in a file that it imports. A folder named by
 the digest of all of them cannot serve a stale kernel, and works where the package is read-only.
-Folders of other versions are removed, except the most recent and those that a running process uses.
+Folders of other versions are removed, except the most recent and those that were used within a day.
+A process that still uses one that is removed compiles again what it has not loaded yet.
 """
 
 from __future__ import annotations
@@ -12,18 +13,15 @@ import os
 import shutil
 import sys
 import tempfile
+import time
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
-from filelock import FileLock
-
 KEPT = 3  # folders of compiled kernels, the one in use included
 PACKAGES = ("raster", "structure", "surface", "training")  # those with kernels
 _VARIABLE = "NUMBA_CACHE_DIR"
-_WAIT_S = 60.0  # for another process that is removing old folders
-_IN_USE = "in-use-{}"  # a lock for each process that uses a folder, held until the process ends
-_held: list[FileLock] = []
+UNUSED_S = 24 * 3600.0  # since a process began to use a folder, before it may be removed
 
 
 def folder() -> Path:
@@ -95,40 +93,19 @@ def _owner(path: Path) -> int:
 
 
 def _use(root: Path, name: str) -> None:
-    """Make the folder of kernels `name` under `root`, mark it as in use by this process, and remove
-    old ones. Raises OSError, also if another process does not finish this (Timeout)."""
-    root.mkdir(parents=True, exist_ok=True)
-    with FileLock(root / "lock", timeout=_WAIT_S):  # nobody marks a folder that is being removed
-        (root / name).mkdir(exist_ok=True)
-        mark = root / name / _IN_USE.format(os.getpid())
-        lock = FileLock(mark)
-        lock.acquire(timeout=0)
-        os.utime(mark)
-        _held.append(lock)
-        os.environ[_VARIABLE] = str(root / name)
-        _clear_marks(root / name, sparing=mark)
-        for path in others()[KEPT - 1 :]:
-            with suppress(OSError):
-                _clear_marks(path)
+    """Make the folder of kernels `name` under `root`, mark it as used now, and remove old ones.
+    Raises OSError where nothing can be written."""
+    kernels = root / name
+    kernels.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=kernels):
+        os.utime(kernels)
+    os.environ[_VARIABLE] = str(kernels)
+    for path in others()[KEPT - 1 :]:
+        with suppress(OSError):  # another process may be removing it
+            if _last_use(path) < time.time() - UNUSED_S:
                 shutil.rmtree(path)
 
 
 def _last_use(path: Path) -> float:
-    """When a process last began to use a folder of kernels."""
-    marks = path.glob(_IN_USE.format("*"))
-    return max((mark.stat().st_mtime for mark in marks), default=path.stat().st_mtime)
-
-
-def _clear_marks(path: Path, sparing: Path | None = None) -> None:
-    """Remove the marks of processes that have ended. Raises OSError (Timeout) at the first mark of
-    one that still runs, unless `sparing` is given."""
-    for mark in path.glob(_IN_USE.format("*")):
-        if mark == sparing:
-            continue
-        try:
-            with FileLock(mark, timeout=0):
-                pass
-            mark.unlink(missing_ok=True)
-        except OSError:
-            if sparing is None:
-                raise
+    """When a process last began to use a folder of kernels, or added one."""
+    return path.stat().st_mtime

@@ -30,58 +30,15 @@ vge, vgt, vand, vselect = _F32.greater_equal, _F32.greater, _F32.both, _F32.sele
 vabs, vsqrt = _F32.abs, _F32.sqrt
 bits16 = _F32.bits
 vnot = _F32.function(_F32.mask, 1, lambda b, x: b.not_(x))
+splat16 = _F32.function(f32x16, 1, lambda b, x: x)  # the same float32 in all lanes
 # a * b + c and c - a * b, rounded once
 vfma = _F32.function(f32x16, 3, lambda b, x, y, z: _F32.call(b, "fma", x, y, z))
 vfnma = _F32.function(f32x16, 3, lambda b, x, y, z: _F32.call(b, "fma", b.fneg(x), y, z))
 
-
-@intrinsic
-def splat16(typingctx: Any, scalar: Any) -> Any:
-    """The same float32 in all lanes."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _F32.broadcast(builder, args[0])
-
-    return f32x16(types.float32), codegen
-
-
 # --- memory --------------------------------------------------------------------------------------
 
 
-@intrinsic
-def vload(typingctx: Any, array: Any, index: Any) -> Any:
-    """array[index : index + 16] of a C-contiguous 1-D float32 array; not bounds-checked."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_F32.pointer(context, builder, sig, args), align=4)
-
-    return f32x16(array, types.intp), codegen
-
-
-@intrinsic
-def vload_levels(typingctx: Any, array: Any, index: Any) -> Any:
-    """16 elements of a flat array of float32 or of bytes, as float32."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        if sig.args[0].dtype == types.float32:
-            return builder.load(_F32.pointer(context, builder, sig, args), align=4)
-        address = address_of(context, builder, sig.args[0], args[0], args[1])
-        levels = ir.VectorType(ir.IntType(8), LANES)
-        loaded = builder.load(builder.bitcast(address, levels.as_pointer()), align=1)
-        return builder.uitofp(loaded, _F32.llvm)
-
-    return f32x16(array, types.intp), codegen
-
-
-@intrinsic
-def vstore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """array[index : index + 16] = value; not bounds-checked."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _F32.pointer(context, builder, sig, args), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, f32x16), codegen
+vload, vstore = _F32.loader(), _F32.storer()
 
 
 def _row_of_four(context: Any, builder: Any, array_type: Any, args: Any, row: int) -> Any:
@@ -204,7 +161,7 @@ def store_sums8(
             group //= 2
         sums = _fold(builder, vectors[0], vectors[0], group)
         half = builder.shuffle_vector(sums, sums, lane_constants(range(8)))
-        address = _F32.pointer(context, builder, sig, args)
+        address = address_of(context, builder, sig.args[0], args[0], args[1])
         builder.store(half, builder.bitcast(address, half.type.as_pointer()), align=4)
         return context.get_dummy_value()
 

@@ -36,78 +36,12 @@ def _neg(a):
     return (lambda a: _subtract(-0.0, a)) if a is f64x8 else None
 
 
-def _lane_constant(index: int) -> Any:
-    return ir.Constant(I32, index)
-
-
 # --- memory --------------------------------------------------------------------------------------
 
 
-@intrinsic
-def dload(typingctx: Any, array: Any, index: Any) -> Any:
-    """array[index : index + 8] of a C-contiguous float64 or float32 array; not bounds-checked."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = address_of(context, builder, sig.args[0], args[0], args[1])
-        if sig.args[0].dtype == types.float64:
-            return builder.load(builder.bitcast(address, _F64.llvm.as_pointer()), align=8)
-        narrow = ir.VectorType(ir.FloatType(), LANES)
-        value = builder.load(builder.bitcast(address, narrow.as_pointer()), align=4)
-        return builder.fpext(value, _F64.llvm)
-
-    return f64x8(array, types.intp), codegen
-
-
-@intrinsic
-def dstore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """array[index : index + 8] = value of a C-contiguous float64 array; not bounds-checked."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _F64.pointer(context, builder, sig, args), align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, f64x8), codegen
-
-
-def _entry(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Address of entry args[1] of an array of eights."""
-    start = builder.mul(args[1], ir.Constant(args[1].type, LANES))
-    return _F64.pointer(context, builder, sig, [args[0], start])
-
-
-# Intrinsics, because a kernel would be compiled again for each constant in a call.
-@intrinsic
-def at(typingctx: Any, work: Any, k: Any) -> Any:
-    """Entry k of a float64 array of eights: work[8 k : 8 k + 8]; not bounds-checked."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_entry(context, builder, sig, args), align=8)
-
-    return f64x8(work, types.intp), codegen
-
-
-@intrinsic
-def put(typingctx: Any, work: Any, k: Any, value: Any) -> Any:
-    """The inverse of `at`."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _entry(context, builder, sig, args), align=8)
-        return context.get_dummy_value()
-
-    return types.void(work, types.intp, f64x8), codegen
-
-
-@intrinsic
-def istore(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """array[index : index + 8] = value, rounded to zero, of an int64 array; not bounds-checked."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = address_of(context, builder, sig.args[0], args[0], args[1])
-        whole = builder.fptosi(args[2], _F64.integers)
-        builder.store(whole, builder.bitcast(address, _F64.integers.as_pointer()), align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, f64x8), codegen
+dload, dstore = _F64.loader(), _F64.storer()
+# entry k of a float64 array of eights: work[8 k : 8 k + 8]
+at, put = _F64.loader(LANES), _F64.storer(LANES)
 
 
 @intrinsic
@@ -121,7 +55,7 @@ def gather8(typingctx: Any, array: Any, rows: Any, stride: Any, column: Any) -> 
             loaded = builder.load(at)
             if sig.args[0].dtype != types.float64:
                 loaded = builder.fpext(loaded, ir.DoubleType())
-            value = builder.insert_element(value, loaded, _lane_constant(k))
+            value = builder.insert_element(value, loaded, ir.Constant(I32, k))
         return value
 
     return f64x8(array, rows, types.intp, types.intp), codegen
@@ -134,7 +68,7 @@ def scatter8(typingctx: Any, array: Any, rows: Any, stride: Any, column: Any, va
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         for k in range(LANES):
             at = _element(context, builder, sig, args, k)
-            lane = builder.extract_element(args[4], _lane_constant(k))
+            lane = builder.extract_element(args[4], ir.Constant(I32, k))
             if sig.args[0].dtype != types.float64:
                 lane = builder.fptrunc(lane, ir.FloatType())
             builder.store(lane, at)

@@ -120,10 +120,50 @@ class Lanes:
         one = builder.insert_element(undefined, scalar, ir.Constant(I32, 0))
         return builder.shuffle_vector(one, undefined, lane_constants([0] * self.lanes))
 
-    def pointer(self, context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Address of the vector at args[1] in the array args[0]; not bounds-checked."""
-        address = address_of(context, builder, sig.args[0], args[0], args[1])
-        return builder.bitcast(address, self.llvm.as_pointer())
+    def loader(self, step: int = 1) -> Any:
+        """An intrinsic (array, index): the lanes array[step x index : step x index + lanes].
+
+        The array is flat or C-contiguous, of floats (not wider than the lanes) or of bytes; not
+        bounds-checked. An intrinsic, because a kernel would be compiled again for each constant
+        index.
+        """
+
+        def typed(typingctx: Any, array: Any, index: Any) -> Any:
+            def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+                address, stored = self._place(context, builder, sig, args, step)
+                value = builder.load(address, align=stored.bitwidth // 8)
+                if stored == self._scalar:
+                    return value
+                convert = builder.fpext if isinstance(stored, types.Float) else builder.uitofp
+                return convert(value, self.llvm)
+
+            return self.vector(array, types.intp), codegen
+
+        return intrinsic(typed)
+
+    def storer(self, step: int = 1) -> Any:
+        """An intrinsic (array, index, value), the inverse of `loader`: into an array of the lanes'
+        type, or rounded to zero into one of integers as wide."""
+
+        def typed(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+            def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+                address, stored = self._place(context, builder, sig, args, step)
+                whole = isinstance(stored, types.Integer)
+                value = builder.fptosi(args[2], self.integers) if whole else args[2]
+                builder.store(value, address, align=stored.bitwidth // 8)
+                return context.get_dummy_value()
+
+            return types.void(array, types.intp, self.vector), codegen
+
+        return intrinsic(typed)
+
+    def _place(self, context: Any, builder: Any, sig: Any, args: Any, step: int) -> Any:
+        """(address of a vector of elements of the array args[0], at step x args[1]; their type)."""
+        stored = sig.args[0].dtype
+        index = builder.mul(args[1], ir.Constant(args[1].type, step))
+        address = address_of(context, builder, sig.args[0], args[0], index)
+        elements = ir.VectorType(context.get_data_type(stored), self.lanes)
+        return builder.bitcast(address, elements.as_pointer()), stored
 
     def function(self, result: Any, arity: int, emit: Any) -> Any:
         """An intrinsic of `arity` vectors, masks or scalars. Scalars are broadcast.

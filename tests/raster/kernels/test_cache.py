@@ -6,9 +6,8 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
-
-from filelock import FileLock
 
 from stages.raster.kernels import cache
 
@@ -69,32 +68,43 @@ def test_home_that_cannot_be_written_gives_way_to_the_temporary_folder(tmp_path:
     assert tmp_path in Path(shown).parents
 
 
-def test_old_folders_go_less_the_newest_few_and_those_in_use(tmp_path: Path) -> None:
-    root = tmp_path / "cache" / "splat"
-    for age in range(6):
-        folder = root / f"kernels-{age}"
+def test_old_folders_go_less_the_newest_few_and_those_used_within_a_day(tmp_path: Path) -> None:
+    root, day = tmp_path / "cache" / "splat", 24 * 3600
+    hours = {"now": 0.5, "today": 20, "yesterday": 25, "last-week": 7 * 24, "last-year": 365 * 24}
+    for name, ago in hours.items():
+        folder = root / f"kernels-{name}"
         folder.mkdir(parents=True)
         (folder / "x.nbi").write_text("kernel")
-        (folder / "in-use-1").write_text("")
-        os.utime(folder / "in-use-1", (1e9 - age, 1e9 - age))
-    held = root / "kernels-5" / "in-use-2"
-    with FileLock(held):
-        os.utime(held, (1e9 - 9, 1e9 - 9))
-        own = python(f"import stages.raster.kernels; {SHOW}", tmp_path)
-    kept = {"kernels-0", "kernels-1", "kernels-5", Path(own).name}
+        os.utime(folder, (time.time() - 3600 * ago,) * 2)
+    own = python(f"import stages.raster.kernels; {SHOW}", tmp_path)
+    kept = {"kernels-now", "kernels-today", Path(own).name}
     assert {path.name for path in root.glob("kernels-*")} == kept
-    assert len(kept) == cache.KEPT + 1  # the one in use
+    assert len(kept) == cache.KEPT
+    for name in ("now", "today"):
+        os.utime(root / f"kernels-{name}", (time.time() - 2 * day,) * 2)
+    (root / "kernels-newer").mkdir()
+    (root / "kernels-newest").mkdir()
+    python("import stages.raster.kernels", tmp_path)
+    kept = {"kernels-newer", "kernels-newest", Path(own).name}
+    assert {path.name for path in root.glob("kernels-*")} == kept
 
 
-def test_a_killed_process_does_not_keep_its_folder(tmp_path: Path) -> None:
-    code = f"import os, signal, stages.raster.kernels; {SHOW}; os.kill(os.getpid(), signal.SIGKILL)"
-    env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-    env["XDG_CACHE_HOME"] = str(tmp_path / "cache")
-    subprocess.run([sys.executable, "-c", code], env=env, check=False, timeout=60)
-    (dead,) = (tmp_path / "cache" / "splat").glob("kernels-*/in-use-*")
-    own = Path(python(f"import stages.raster.kernels; {SHOW}", tmp_path))
-    assert own == dead.parent
-    assert not dead.exists()
+def test_many_folders_used_within_a_day_stay(tmp_path: Path) -> None:
+    root = tmp_path / "cache" / "splat"
+    for number in range(6):
+        (root / f"kernels-{number}").mkdir(parents=True)
+    python("import stages.raster.kernels", tmp_path)
+    assert len(list(root.glob("kernels-*"))) == 7
+
+
+def test_kernels_of_a_folder_that_is_removed_are_compiled_again(tmp_path: Path) -> None:
+    code = (
+        "import shutil; from stages.raster.kernels import cache\n"
+        "shutil.rmtree(cache.folder())\n"
+        "from stages.surface.fuse_kernels import _clip\n"
+        "print(_clip(0.0, 1.0, 0.5, 0.0), cache.are_compiled('_clip'))"
+    )
+    assert python(code, tmp_path) == "(0.0, 1.0) True"
 
 
 def test_only_this_package_imports_numba() -> None:
