@@ -20,7 +20,7 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     Georeference,
-    cameras_of,
+    camera_file,
     json_of,
     poses_of,
     stored_size,
@@ -70,11 +70,11 @@ def read(path: Path) -> CameraFile:
     with reading(with_picture[0], CAMERAS):
         names = [getattr(found[file], "name", file.stem) for file in with_picture]
         to_world = np.array([pose for _, pose in posed])
-        with np.errstate(all="ignore"):  # `make_views` checks the result
+        with np.errstate(all="ignore"):  # `camera_file` checks the result
             rotations = OPENGL_FROM_OURS @ to_world[:, :, :3].transpose(0, 2, 1)
         poses = poses_of(rotations, to_world[:, :, 3])
-        views, lenses = cameras_of(names, [(values, PINHOLE) for values, _ in posed], poses)
-        return CameraFile(views, pictures, lenses, _SESSION)
+        optics = [(values, PINHOLE) for values, _ in posed]
+        return camera_file(pictures, names, optics, poses, _SESSION)
 
 
 def _picture(folder: Path, stem: str) -> Path | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stages.base.atomic import replacing
 from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras import colmap_records as records
-from stages.cameras.camera_file import CameraFile, FilePoints, cameras_of
+from stages.cameras.camera_file import CameraFile, FilePoints, camera_file
 from stages.cameras.colmap_records import POINT2D, ImageRecord
 from stages.scene import Camera
 from stages.scene.rotations import matrices_of, quaternions_of
@@ -175,11 +175,11 @@ def _read(folder: Path) -> tuple[CameraFile, list[ImageRecord]]:
         if missing:
             raise BadFileError(f"there is no camera {min(missing)}")
         poses = np.array([image.pose for image in images], np.float64).reshape(-1, 7)
-        with np.errstate(invalid="ignore"):  # `cameras_of` rejects a quaternion of length 0
+        with np.errstate(invalid="ignore"):  # `camera_file` rejects a quaternion of length 0
             rotations = matrices_of(poses[:, :4])
         own = [optics[image.camera] for image in images]
         matrices = np.concatenate([rotations, poses[:, 4:, None]], axis=2)
-        views, lenses = cameras_of([image.name for image in images], own, matrices)
-    near = [base / "images" for base in (folder, folder.parent, folder.parent.parent)]
-    pictures = next((path for path in near if path.is_dir()), near[0])
-    return CameraFile(views, pictures, lenses), images
+        near = [base / "images" for base in (folder, folder.parent, folder.parent.parent)]
+        pictures = next((path for path in near if path.is_dir()), near[0])
+        names = [image.name for image in images]
+        return camera_file(pictures, names, own, matrices), images

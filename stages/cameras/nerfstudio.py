@@ -28,10 +28,10 @@ from stages.base.bad_files import CAMERAS, BadFileError, reading
 from stages.cameras.camera_file import (
     CameraFile,
     FilePoints,
+    camera_file,
     check_inside,
     content_of,
     file_points,
-    make_views,
     poses_of,
     stored_size,
 )
@@ -100,19 +100,16 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
         frames = data["frames"]
         if not all(isinstance(frame, dict) for frame in frames):
             raise BadFileError("a frame is not an object")
-        numbers = np.array(
-            [_read_numbers(ChainMap(frame, data), path.parent, size) for frame in frames],
-            np.float64,
-        ).reshape(-1, 6)
-        if not np.isfinite(numbers).all():
+        merged = [ChainMap(frame, data) for frame in frames]
+        optics = [(_read_numbers(one, path.parent, size), _read_lens(one)) for one in merged]
+        if not np.isfinite([numbers for numbers, _ in optics]).all():
             raise BadFileError("a size or focal length is not a number")
         saved = np.zeros((len(frames), 3, 4))
         for row, frame in zip(saved, frames, strict=True):
             row[:] = np.array(_required(frame, "transform_matrix"), np.float64)[:3]
         names = [str(_required(frame, "file_path")) for frame in frames]
-        views = make_views(names, numbers[:, :2], numbers[:, 2:], _our_poses(data, saved))
-        lenses = tuple(_read_lens(ChainMap(frame, data)) for frame in frames)
-        return CameraFile(_with_roles(views, data), path.parent, lenses)
+        found = camera_file(path.parent, names, optics, _our_poses(data, saved))
+        return replace(found, views=_with_roles(found.views, data))
 
 
 def read_points(path: Path) -> FilePoints | None:
@@ -170,7 +167,7 @@ def _saved_pose(world_to_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 def _our_poses(data: dict[str, Any], saved: NDArray[np.float64]) -> NDArray[np.float64]:
     """[V, 3, 4] world to camera of OpenGL camera-to-world matrices [V, 3, 4]."""
     turn, shift, scale = _applied(data)
-    with np.errstate(over="ignore", invalid="ignore"):  # `make_views` checks the result
+    with np.errstate(over="ignore", invalid="ignore"):  # `camera_file` checks the result
         centres = (saved[:, :, 3] / scale - shift) @ turn
         rotations = OPENGL_FROM_OURS @ saved[:, :, :3].transpose(0, 2, 1) @ turn
     return poses_of(rotations, centres)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.base.bad_files import CAMERAS, BadFileError, reading
-from stages.cameras.camera_file import CameraFile, cameras_of, poses_of, stored_size
+from stages.cameras.camera_file import CameraFile, camera_file, poses_of, stored_size
 from stages.cameras.lens import PINHOLE, Lens
 from stages.cameras.xml_file import parsed
 
@@ -53,8 +53,7 @@ def read(path: Path) -> CameraFile:
             optics.append((_intrinsics(about, *stored_size(picture)), _lens(about)))
             poses.append(poses_of(rotation.reshape(1, 3, 3), position.reshape(1, 3))[0])
     with reading(next(iter(sorted(path.glob("*.xmp")))), CAMERAS):
-        views, lenses = cameras_of(names, optics, np.array(poses).reshape(-1, 3, 4))
-        return CameraFile(views, path, lenses)
+        return camera_file(path, names, optics, np.array(poses).reshape(-1, 3, 4))
 
 
 def _description(path: Path) -> Element:
