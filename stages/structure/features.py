@@ -65,7 +65,7 @@ def _features(job: Job, positions: list[int]) -> Iterator[tuple[int, Features]]:
     root = Path(job.images_root)
 
     def of_photograph(position: int) -> Features:
-        mask = job.masks[position] if job.masks else ""
+        mask = job.masks[position]
         picture = root / job.names[position]
         settings = job.max_features, job.peak_threshold
         return sift_features(picture, *settings, root / mask if mask else None)

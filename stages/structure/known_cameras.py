@@ -3,7 +3,6 @@ the camera file, from matches with the poses held fixed, or at random."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -25,11 +24,12 @@ from stages.scene import Camera, Capture, Photo, Reconstruction
 from stages.scene.rotations import quaternions_of
 from stages.structure import database as sqlite
 from stages.structure.finish import COLMAP, Observations, write_reconstruction
-from stages.structure.job import CameraGuess, Job, known_cameras_path, prepare_work_folder
+from stages.structure.job import CameraGuess, Job, prepare_work_folder
 from stages.structure.known_points import find_points
 from stages.structure.levelling import levelling_rotation, up_direction
 from stages.structure.match_cameras import PosedPhoto, match_cameras
 from stages.structure.metric_scale import KnownScale, find_metric_scale
+from stages.structure.pairs import Pair
 from stages.structure.pinhole_views import PinholeView, write_pinhole_views
 from stages.structure.process import run_step
 from stages.structure.sparse_model import camera_centres
@@ -137,15 +137,9 @@ def _job(
     """The job for the training views, each with a camera of its own. The faces of a photograph are
     a rig."""
     photos, chosen = [view.photo for view in views], [view.camera for view in views]
-    known = {
-        "intrinsics": np.array([(c.fx, c.fy, c.cx, c.cy) for c in chosen]),
-        "sizes": np.array([(c.width, c.height) for c in chosen], np.int32),
-        "world_to_camera": np.array([c.world_to_camera for c in chosen]),
-        "rotations": np.array([view.rotation for view in views]),
-        "photographs": np.unique([view.number for view in views], return_inverse=True)[1],
-    }
-    known["pairs"] = neighbours(known["world_to_camera"], known["rotations"], known["photographs"])
-    faces = any(photo.face for photo in photos)
+    photographs = np.unique([view.number for view in views], return_inverse=True)[1]
+    poses = np.array([camera.world_to_camera for camera in chosen])
+    rotations = np.array([view.rotation for view in views])
     job = Job(
         step="",
         images_root=str((folder / IMAGES).resolve()),
@@ -155,16 +149,20 @@ def _job(
         names=tuple(photo.picture for photo in photos),
         masks=tuple(_mask_from_images(photo) for photo in photos),
         camera_of=tuple(range(len(views))),
-        frame_of=tuple(known["photographs"].tolist()) if faces else (),
+        frame_of=tuple(photographs.tolist()),
         cameras=tuple(_guess(view) for view in views),
         seed=seed,
         threads=threads.count(),
         max_features=max_features,
         refine=refine,
+        pairs=tuple(neighbours(poses, rotations, photographs)),
+        known={
+            "intrinsics": [(c.fx, c.fy, c.cx, c.cy) for c in chosen],
+            "world_to_camera": poses.tolist(),
+            "rotations": rotations.tolist(),
+        },
     )
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(v).tobytes() for v in known.values()))
-    prepare_work_folder(work, job, digest.hexdigest())
-    np.savez(known_cameras_path(job), **known)  # type: ignore[arg-type]
+    prepare_work_folder(work, job)
     return job
 
 
@@ -181,8 +179,8 @@ def _mask_from_images(photo: Photo) -> str:
 
 def neighbours(
     poses: NDArray[np.float64], faces: NDArray[np.float64], photographs: NDArray[np.int64]
-) -> NDArray[np.int32]:
-    """[Q, 2] pairs to match: each view with those nearest in position and direction, and with the
+) -> list[Pair]:
+    """The pairs to match: each view with those nearest in position and direction, and with the
     same part of the photographs next in order, in case the poses are wrong. The views of one
     photograph show different things, and are not matched.
 
@@ -210,7 +208,7 @@ def neighbours(
         following = photographs[second] - photographs[first] <= _NEXT_IN_ORDER
         keep = selected[first, second] | (following & alike)
         first, second = first[keep], second[keep]
-    return np.stack([first, second], axis=1).astype(np.int32)
+    return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
 def _match(job: Job, work: Path, report: Report, seconds_left: Callable[[], float]) -> None:

@@ -57,7 +57,7 @@ def _features(job: Job) -> list[LearnedFeatures]:
     network, root, progress = XFeat(), Path(job.images_root), ProgressWriter(Path(job.progress))
 
     def of_photograph(position: int) -> LearnedFeatures:
-        mask = job.masks[position] if job.masks else ""
+        mask = job.masks[position]
         picture = read_grey(root / job.names[position])
         return network.features(picture, read_grey(root / mask) if mask else None)
 

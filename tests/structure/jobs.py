@@ -16,5 +16,7 @@ def job(folder: Path) -> Job:
         progress="",
         names=("é 1.jpg",),
         camera_of=(0,),
+        frame_of=(0,),
         cameras=(CameraGuess(640, 480, None),),
+        masks=("",),
     )
