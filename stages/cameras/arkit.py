@@ -22,6 +22,7 @@ from stages.cameras.camera_file import (
     Georeference,
     camera_file,
     json_of,
+    picture_beside,
     poses_of,
     stored_size,
 )
@@ -30,7 +31,6 @@ from stages.cameras.nerfstudio import OPENGL_FROM_OURS
 
 _FRAMES = "frame_*.json"
 _POLYCAM = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".heic")
 _CENTRE = 0.5  # ARKit counts pixels from the centre of the first one, we from its corner
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # ahead stands for north
 _SESSION = Georeference(1.0, _UP, "ARKit's tracking")
@@ -57,7 +57,7 @@ def read(path: Path) -> CameraFile:
     images = dict(_POLYCAM).get(path.name)
     files = sorted(path.glob("*.json" if images else _FRAMES))
     pictures = path.parent / images if images else path
-    found = {file: _picture(pictures, file.stem) for file in files}
+    found = {file: picture_beside(pictures / file.name) for file in files}
     with_picture = [file for file in files if found[file] is not None] or files
     posed = []
     for file in with_picture:
@@ -75,11 +75,6 @@ def read(path: Path) -> CameraFile:
         poses = poses_of(rotations, to_world[:, :, 3])
         optics = [(values, PINHOLE) for values, _ in posed]
         return camera_file(pictures, names, optics, poses, _SESSION)
-
-
-def _picture(folder: Path, stem: str) -> Path | None:
-    near = (folder / f"{stem}{suffix}" for suffix in _SUFFIXES)
-    return next((path for path in near if path.is_file()), None)
 
 
 def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Posed:

@@ -25,6 +25,7 @@ MAX_FILE_BYTES = 1 << 30  # cameras and points of thousands of photographs take 
 MAX_SIDE_PX = 100_000
 MAX_DISTANCE = 1e12  # world units; its square is far from overflowing
 ROTATION_TOLERANCE = 1e-3  # of R^T R, for text with three decimals
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".heic")  # of pictures
 _EXACT = 1e-9  # of R^T R: a larger error is not rounding of float64
 
 
@@ -197,6 +198,12 @@ def size_of_picture(folder: Path, name: str) -> tuple[int, int]:
         if (near / name).is_file():
             return stored_size(near / name)
     raise BadFileError(f"{name[:80]} is not found, and its size is needed")
+
+
+def picture_beside(path: Path) -> Path | None:
+    """The picture of the same name as a camera file; None if there is none."""
+    near = (path.with_suffix(suffix) for name in _SUFFIXES for suffix in (name, name.upper()))
+    return next((picture for picture in near if picture.is_file()), None)
 
 
 def stored_size(path: Path) -> tuple[int, int]:

@@ -27,13 +27,13 @@ from stages.structure.finish import COLMAP, Observations, write_reconstruction
 from stages.structure.job import CameraGuess, Job, prepare_work_folder
 from stages.structure.known_points import find_points
 from stages.structure.levelling import levelling_rotation, up_direction
-from stages.structure.match_cameras import PosedPhoto, match_cameras
+from stages.structure.match_cameras import match_cameras
 from stages.structure.metric_scale import KnownScale, find_metric_scale
 from stages.structure.pairs import Pair
 from stages.structure.pinhole_views import PinholeView, write_pinhole_views
 from stages.structure.process import run_step
 from stages.structure.sparse_model import camera_centres
-from stages.structure.undistorted_images import IMAGES, mask_file
+from stages.structure.undistorted_images import IMAGES, PosedPhoto, mask_file
 
 NEIGHBOURS = 10
 _NEXT_IN_ORDER = 2  # photographs, which are matched whatever the poses say
@@ -80,8 +80,7 @@ def reconstruct(
     posed = match_cameras(found, capture, split, allow_partial, report)
     _check_usable(posed, refine)
     shutil.rmtree(folder / COLMAP, ignore_errors=True)
-    photos, taken, lenses = zip(*((p.photo, p.camera, p.lens) for p in posed), strict=True)
-    views = write_pinhole_views(photos, taken, lenses, capture.folder, folder, report)
+    views = write_pinhole_views(posed, capture.folder, folder, report)
     training = [i for i, view in enumerate(views) if posed[view.number].role != "test"]
     job = _job([views[i] for i in training], folder, work, seed, max_features, refine)
     _match(job, work, report, seconds_left)
@@ -92,17 +91,9 @@ def reconstruct(
     cloud, observations = find_points(
         from_file, triangulated, training, views, _whole(views, posed), folder, seed, report
     )
-    georeference = found.georeference
-    if georeference.metres_per_unit and not known_scale.metres_per_unit:
-        known_scale = replace(
-            known_scale,
-            metres_per_unit=georeference.metres_per_unit,
-            source=georeference.source,
-        )
-    known_scale = replace(known_scale, place=georeference.place)
-    axes = georeference.axes
+    known_scale = replace(known_scale, georeference=found.georeference)
     roles = [posed[view.number].role for view in views]
-    return _finish(views, roles, cloud, observations, folder, report, known_scale, axes)
+    return _finish(views, roles, cloud, observations, folder, report, known_scale)
 
 
 def _whole(views: Sequence[PinholeView], posed: Sequence[PosedPhoto]) -> list[Camera]:
@@ -289,10 +280,10 @@ def _finish(
     folder: Path,
     report: Report,
     known_scale: KnownScale,
-    axes: NDArray[np.float64] | None,
 ) -> Reconstruction:
-    """Level, recentre and scale; write the COLMAP model. axes: as in `Georeference`."""
-    turn, levelled = _levelling(views, axes)
+    """Level, recentre and scale; write the COLMAP model."""
+    georeference = known_scale.georeference
+    turn, levelled = _levelling(views, georeference.axes)
     middle = np.median(np.repeat(cloud.points, np.maximum(cloud.tracks, 1), axis=0), axis=0)
     world_from_new = np.eye(4)
     world_from_new[:3, :3], world_from_new[:3, 3] = turn.T, middle
@@ -300,8 +291,9 @@ def _finish(
     points = (cloud.points - middle) @ turn.T
     photos = [view.photo for view in views]
     pictures = [folder / IMAGES / photo.picture for photo in photos]
-    if known_scale.place is not None:
-        known_scale = replace(known_scale, place=known_scale.place.moved(world_from_new))
+    if georeference.place is not None:
+        place = georeference.place.moved(world_from_new)
+        known_scale = replace(known_scale, georeference=replace(georeference, place=place))
     scale = find_metric_scale(known_scale, photos, cameras, pictures, levelled, report)
     if scale is not None:
         points, cameras = scale.points(points), scale.cameras(cameras)

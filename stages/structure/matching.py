@@ -74,7 +74,6 @@ def select_pairs(job: Job) -> None:
 def match_chunk(job: Job) -> None:
     """Match and verify the pairs of the job's chunk, into a database of its own."""
     new_database.create(Path(job.database), job, ())
-    sqlite.take_cameras(Path(job.database), Path(job.source))
     with _matcher(job, job.source, immutable=True) as matcher:
         matcher.run(list(job.pairs))
 
