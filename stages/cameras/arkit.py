@@ -27,7 +27,7 @@ from stages.cameras.camera_file import (
     stored_size,
 )
 from stages.cameras.lens import PINHOLE
-from stages.cameras.nerfstudio import OPENGL_FROM_OURS
+from stages.cameras.nerfstudio import OPENGL_FROM_OURS, required
 
 _FRAMES = "frame_*.json"
 _POLYCAM = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
@@ -78,8 +78,8 @@ def read(path: Path) -> CameraFile:
 
 
 def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Posed:
-    intrinsics = np.array(_required(frame, "intrinsics"), np.float64)
-    pose = np.array(_required(frame, "cameraPoseARFrame"), np.float64)
+    intrinsics = np.array(required(frame, "intrinsics"), np.float64)
+    pose = np.array(required(frame, "cameraPoseARFrame"), np.float64)
     if intrinsics.size != 9 or pose.size != 16:
         raise BadFileError("intrinsics are not 9 numbers, or the pose is not 16")
     (fx, _, cx), (_, fy, cy), _ = intrinsics.reshape(3, 3).tolist()
@@ -91,11 +91,5 @@ def _scanner_app(frame: dict[str, Any], picture: Path | None) -> Posed:
 
 def _polycam(frame: dict[str, Any], _: Path | None) -> Posed:
     names = ("width", "height", "fx", "fy", "cx", "cy")
-    pose = [[float(_required(frame, f"t_{i}{j}")) for j in range(4)] for i in range(3)]
-    return [float(_required(frame, name)) for name in names], np.array(pose)
-
-
-def _required(frame: dict[str, Any], key: str) -> Any:
-    if key not in frame:
-        raise BadFileError(f"it has no {key}")
-    return frame[key]
+    pose = [[float(required(frame, f"t_{i}{j}")) for j in range(4)] for i in range(3)]
+    return [float(required(frame, name)) for name in names], np.array(pose)

@@ -89,6 +89,11 @@ class FilePoints:
     tracks: NDArray[np.int32]
 
 
+NO_POINTS = FilePoints(
+    np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, np.int32)
+)
+
+
 def file_points(
     points: NDArray[np.floating],
     colours: NDArray[Any] | None = None,

@@ -106,8 +106,8 @@ def read(path: Path, size: tuple[int, int] | None = None) -> CameraFile:
             raise BadFileError("a size or focal length is not a number")
         saved = np.zeros((len(frames), 3, 4))
         for row, frame in zip(saved, frames, strict=True):
-            row[:] = np.array(_required(frame, "transform_matrix"), np.float64)[:3]
-        names = [str(_required(frame, "file_path")) for frame in frames]
+            row[:] = np.array(required(frame, "transform_matrix"), np.float64)[:3]
+        names = [str(required(frame, "file_path")) for frame in frames]
         found = camera_file(path.parent, names, optics, _our_poses(data, saved))
         return replace(found, views=_with_roles(found.views, data))
 
@@ -139,7 +139,7 @@ def depth_maps(path: Path) -> tuple[dict[str, Path], float]:
         for frame in data["frames"]:
             if named := str(frame.get("depth_file_path") or ""):
                 check_inside(path.parent, named, path.parent)
-                found[str(_required(frame, "file_path"))] = path.parent / named
+                found[str(required(frame, "file_path"))] = path.parent / named
         return found, unit
 
 
@@ -201,7 +201,7 @@ def _read_numbers(
     if "w" in merged and "h" in merged:
         width, height = float(merged["w"]), float(merged["h"])
     else:
-        width, height = _picture_size(folder, str(_required(merged, "file_path")), size)
+        width, height = _picture_size(folder, str(required(merged, "file_path")), size)
     fx = _focal(merged, "x", width, None)
     return [
         width,
@@ -221,7 +221,7 @@ def _focal(merged: Mapping[str, Any], axis: str, side: float, otherwise: float |
         return 0.5 * side / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
     if otherwise is not None and f"fl_{axis}" not in merged:
         return otherwise
-    return float(_required(merged, f"fl_{axis}"))
+    return float(required(merged, f"fl_{axis}"))
 
 
 def _picture_size(folder: Path, name: str, otherwise: tuple[int, int] | None) -> tuple[int, int]:
@@ -247,7 +247,8 @@ def _read_lens(merged: Mapping[str, Any]) -> Lens:
     return Lens("fisheye" if fisheye else "perspective", (k1, k2, k3, k4), tangential=(p1, p2))
 
 
-def _required(values: Mapping[str, Any], key: str) -> Any:
+def required(values: Mapping[str, Any], key: str) -> Any:
+    """A value of a frame. Raises BadFileError if it has none."""
     if key not in values:
         raise BadFileError(f"a frame has no {key}")
     return values[key]

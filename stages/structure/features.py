@@ -50,7 +50,7 @@ def extract_chunk(job: Job) -> None:
 
 
 def _extract(job: Job, missing: list[int], have: int) -> None:
-    progress = ProgressWriter(Path(job.progress))
+    progress = ProgressWriter(job)
     cv2.setNumThreads(1)  # one thread per photograph is faster than several
     with pycolmap.Database.open(job.database) as database:
         for done, (position, (keypoints, descriptors)) in enumerate(_features(job, missing), 1):

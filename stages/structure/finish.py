@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.base.stage import Report
 from stages.cameras.camera_file import FilePoints
-from stages.cameras.colmap import ColmapModel, write_colmap_model
+from stages.cameras.colmap import Observations, write_model
 from stages.cameras.undistortion import SimpleRadial, undistorted_px
 from stages.scene import Camera, Capture, Photo, Reconstruction, View
 from stages.structure.gps import MetricScale
@@ -29,19 +28,6 @@ from stages.structure.undistorted_images import (
 
 COLMAP = "colmap"
 SPARSE = f"{COLMAP}/sparse/0"
-
-
-@dataclass(frozen=True)
-class Observations:
-    """points [O], views [O], px [O, 2]: which point each view observes at which pixel of its
-    undistorted picture; sorted by point, then view."""
-
-    points: NDArray[np.int32]
-    views: NDArray[np.int32]
-    px: NDArray[np.float64]
-
-
-NO_OBSERVATIONS = Observations(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)))
 
 
 def finish(
@@ -120,19 +106,8 @@ def write_reconstruction(
         levelled: whether up is -Y.
         metric: how the world became metric; None if it is not.
     """
-    write_colmap_model(
-        folder / SPARSE,
-        ColmapModel(
-            names=tuple(photo.picture for photo in photos),
-            cameras=tuple(cameras),
-            points=cloud.points,
-            colours=cloud.colours,
-            errors_px=cloud.errors_px,
-            observed_points=observations.points,
-            observing_views=observations.views,
-            observed_px=observations.px,
-        ),
-    )
+    names = [photo.picture for photo in photos]
+    write_model(folder / SPARSE, names, cameras, cloud, observations)
     views = tuple(
         View(
             photo.name,

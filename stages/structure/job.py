@@ -48,7 +48,6 @@ class Job:
         images_root: folder that `names` and `masks` are relative to.
         database: COLMAP's database.
         out: folder for the model of mapping (`sparse_model.save_model`).
-        progress: file for the worker's progress (`ProgressWriter`).
         names: [P] in the capture's order, which fixes the image ids (position + 1).
         camera_of: [P] index into `cameras`.
         frame_of: [P] number of each photograph's frame, from 0: the faces of a panorama share one.
@@ -74,7 +73,6 @@ class Job:
     images_root: str
     database: str
     out: str
-    progress: str
     names: tuple[str, ...]
     camera_of: tuple[int, ...]
     frame_of: tuple[int, ...]
@@ -138,7 +136,6 @@ def job_of(capture: Capture, work: Path, seed: int, max_features: int, matching:
         images_root=str(capture.folder.resolve()),
         database=str(work / "base.db"),
         out="",
-        progress="",
         names=tuple(photo.image for photo in capture.photos),
         masks=tuple(photo.mask for photo in capture.photos),
         camera_of=tuple(camera_of),
@@ -155,7 +152,7 @@ def prepare_work_folder(work: Path, job: Job) -> None:
     """Keep what an interrupted run left in `work` if it was the same job; clear it otherwise."""
     description = work / "description.json"
     # Locations and the number of threads change no result.
-    same = {"images_root": "", "database": "", "out": "", "progress": "", "threads": 0}
+    same = {"images_root": "", "database": "", "out": "", "threads": 0}
     wanted = json.dumps(asdict(job) | same, sort_keys=True)
     try:
         unchanged = description.read_text(encoding="utf-8") == wanted
@@ -187,14 +184,19 @@ def chunks_path(job: Job) -> Path:
     return Path(job.database).with_suffix(".chunks")
 
 
+def progress_path(job: Job) -> Path:
+    """File with the worker's progress (`ProgressWriter`)."""
+    return Path(job.database).with_name("progress.json")
+
+
 _SECONDS = 0.2  # between two writes
 
 
 class ProgressWriter:
-    """Writes the file at `path`."""
+    """Writes `progress_path`."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, job: Job) -> None:
+        self._path = progress_path(job)
         self._next = 0.0
 
     def write(self, phase: str, done: int, total: int) -> None:
@@ -209,10 +211,10 @@ class ProgressWriter:
         os.replace(partial, self._path)
 
 
-def read_progress(path: Path) -> tuple[str, int, int] | None:
+def read_progress(job: Job) -> tuple[str, int, int] | None:
     """(phase, done, total) as last written; None before the first time."""
     try:
-        phase, done, total = json.loads(path.read_text())
+        phase, done, total = json.loads(progress_path(job).read_text())
         return str(phase), int(done), int(total)
     except (OSError, ValueError, TypeError):
         return None

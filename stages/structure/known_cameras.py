@@ -18,12 +18,13 @@ from stages.base.errors import ReconstructionError, SplatError, UsageError
 from stages.base.stage import Report
 from stages.base.text import counted
 from stages.cameras.camera_file import FilePoints
+from stages.cameras.colmap import Observations
 from stages.cameras.table import read_cameras, read_points
 from stages.cameras.undistortion import undistorted_camera
 from stages.scene import Camera, Capture, Photo, Reconstruction
 from stages.scene.rotations import quaternions_of
 from stages.structure import database as sqlite
-from stages.structure.finish import COLMAP, Observations, write_reconstruction
+from stages.structure.finish import COLMAP, write_reconstruction
 from stages.structure.job import CameraGuess, Job, prepare_work_folder
 from stages.structure.known_points import find_points
 from stages.structure.levelling import levelling_rotation, up_direction
@@ -136,7 +137,6 @@ def _job(
         images_root=str((folder / IMAGES).resolve()),
         database=str(work / "known.db"),
         out=str(work / "known"),
-        progress=str(work / "progress.json"),
         names=tuple(photo.picture for photo in photos),
         masks=tuple(_mask_from_images(photo) for photo in photos),
         camera_of=tuple(range(len(views))),

@@ -24,7 +24,6 @@ def sample_job(folder: Path, photographs: int) -> Job:
         images_root=str(folder),
         database=str(folder / "base.db"),
         out="",
-        progress=str(folder / "progress.json"),
         names=tuple(names),
         camera_of=(0,) * len(names),
         frame_of=tuple(range(len(names))),
