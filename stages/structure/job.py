@@ -104,7 +104,7 @@ class Job:
     @classmethod
     def read(cls, path: Path) -> Job:
         stored = json.loads(path.read_text(encoding="utf-8"))
-        data = {
+        data: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in stored.items()
         }
